@@ -8,8 +8,9 @@ def run() -> None:
     """Run the command line of this process and exit, see cli.main()."""
     interrupted = bool
     try:
-        from .process import interrupted, prepare
+        from .process import interrupted, prepare, use_utf8
 
+        use_utf8()
         prepare()
         from .cli import main
 

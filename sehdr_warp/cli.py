@@ -139,8 +139,9 @@ def parse_command(words: list[str]) -> tuple[Callable, Any]:
 
 def _run(argv: list[str]) -> None:
     """Set the process up and run a command line."""
-    from .process import calm_threads
+    from .process import calm_threads, check_working_directory
 
+    check_working_directory()
     calm_threads()
     if shutil.get_terminal_size().columns < MIN_COLUMNS:
         os.environ["COLUMNS"] = str(MIN_COLUMNS)

@@ -231,8 +231,17 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
         raise InputError(other, problem, "move it away, or choose another place")
 
 
+def require_text(name: Path | str) -> None:
+    """Raise InputError if a name is not UTF-8 text, which JSON, OpenEXR and USD cannot hold."""
+    try:
+        str(name).encode()
+    except UnicodeEncodeError:
+        raise InputError(ascii(str(name)), "is a name that is not UTF-8 text", "rename it") from None
+
+
 def _check_place(path: Path) -> None:
     """Raises InputError where what is to hold `path` is a file, SehdrError where there is no right to write there."""
+    require_text(path)
     parent = next(parent for parent in path.absolute().parents if parent.exists())
     if not parent.is_dir():
         raise InputError(parent, "is a file, or in one, and not a folder", "choose another place")

@@ -4,6 +4,7 @@ Each folder has its list in the file LIST: a line `SHA-256  name` for each file.
 user's, because the list no longer has its hash.
 """
 
+import errno
 import hashlib
 import os
 from contextlib import suppress
@@ -56,9 +57,15 @@ def listed(folder: Path) -> set[bytes]:
 
 def list_file(temporary: Path, path: Path) -> None:
     """Add a file that is about to get its name to the list of its folder, in one write, as others may add theirs."""
-    handle = os.open(path.parent / LIST, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    file, line = path.parent / LIST, hash_line(temporary, path.name) + b"\n"
+    handle = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
     try:
-        os.write(handle, hash_line(temporary, path.name) + b"\n")
+        if os.write(handle, line) < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
+    except OSError:
+        if os.fstat(handle).st_size == 0:  # It was made for nothing.
+            file.unlink(missing_ok=True)
+        raise
     finally:
         os.close(handle)
 

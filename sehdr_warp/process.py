@@ -71,6 +71,24 @@ def prepare() -> None:
     threading.excepthook = lambda told: None if interrupted() else thread_hook(told)
 
 
+def use_utf8() -> None:
+    """Start this program again in Python's UTF-8 mode if the locale has another encoding.
+
+    Names of files are UTF-8 almost everywhere, whatever the locale says, and libraries take them for UTF-8.
+    """
+    if sys.getfilesystemencoding() != "utf-8" and not sys.flags.utf8_mode and os.environ.get("PYTHONUTF8") != "1":
+        os.environ["PYTHONUTF8"] = "1"
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+def check_working_directory() -> None:
+    """Raise SehdrError if the working directory was deleted, in which native libraries fail to load."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise SehdrError(f"the working directory cannot be used ({error.strerror}); cd to another") from None
+
+
 def calm_threads() -> None:
     """Has OpenMP's threads, torch's and ours, wait awake for no longer than from one launch to the next. By themselves
     they wait so long that a training on a processor shared with other programs takes most of its time for it. Before

@@ -133,3 +133,28 @@ def test_narrow_terminals_get_help(columns):
         call, env=os.environ | {"COLUMNS": str(columns)}, capture_output=True, timeout=60, check=False
     )
     assert ended.returncode == 0 and b"--iterations" in ended.stdout
+
+
+def test_names_are_utf8_in_any_locale(tmp_path):
+    """As the locale C has it where Python is told to believe that."""
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    (tmp_path / "für.toml").write_text('base = "demo"\nseed = 7\n')
+    done = subprocess.run(
+        [sys.executable, "-m", "sehdr_warp", "config", "für.toml", "--diff"],
+        cwd=tmp_path,
+        env={**environment, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True,
+        timeout=60,
+    )
+    assert done.returncode == 0 and b"seed = 7" in done.stdout, done.stderr
+
+
+def test_a_working_directory_that_is_gone_is_told(tmp_path):
+    code = "import os, sys; os.rmdir(os.getcwd()); sys.argv = ['sehdr-warp', 'presets']; "
+    code += "from sehdr_warp.__main__ import run; run()"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1 and done.stderr.startswith("sehdr-warp: the working directory cannot be used"), done
+    assert len(done.stderr.splitlines()) == 1

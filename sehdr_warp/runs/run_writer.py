@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
-from ..files import atomic_folder, atomic_path, make_parents, remove_stale, write_json, writing
+from ..files import atomic_folder, atomic_path, make_parents, remove_stale, require_text, write_json, writing
 from ..model.confidence import Evidence
 from ..model.radiance_field import RadianceField
 from ..scene import Scene
@@ -82,6 +82,7 @@ class RunWriter(RunFolder):
         """
         if self.path.exists() and not self.path.is_dir():
             raise InputError(self.path, "is a file", "choose another folder for the run")
+        require_text(self.path)
         self.refuse_links()
         remove_stale(self.config)
         if not self.path.exists() or self._is_empty():
@@ -129,6 +130,8 @@ class RunWriter(RunFolder):
         """
         from .. import __version__
 
+        for name in (scene.name, data.get("path") or "", *(view.name for view in scene.views)):
+            require_text(name)
         self.lock()
         self.check(resume=False, overwrite=overwrite)  # Reading the photos took time.
         info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}

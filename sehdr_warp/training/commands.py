@@ -16,6 +16,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..errors import SehdrError, UsageError
+from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.open import LOAD_OPTIONS, load_photos
 
@@ -255,6 +256,7 @@ def _data(asked: Train, resumed) -> dict:
     path = asked.data
     if path is not None and not is_embedded(path):
         path = str(Path(path).absolute())
+        require_text(path)
     given = {"path": path} | {name: getattr(asked.scene, name) for name in LOAD_OPTIONS}
     if resumed is not None:
         known = resumed.read_info()["data"]

@@ -250,3 +250,26 @@ def _with_views(scene, views):
     from dataclasses import replace
 
     return replace(scene, views=views)
+
+
+@pytest.mark.parametrize("where", ["view", "scene", "data", "folder"])
+def test_names_that_are_no_text_are_refused_before_the_training(tmp_path, where):
+    """A run with such a name would be written, and then be read as damaged."""
+    from dataclasses import replace
+
+    from sehdr_warp.runs.config_files import load_config
+    from sehdr_warp.training.train import Training
+
+    scene, data, out = toy_scene(2, 8), {"path": "embedded"}, tmp_path / "run"
+    if where == "view":
+        scene = _with_views(scene, (replace(scene.views[0], name="a\udcff"), *scene.views[1:]))
+    elif where == "scene":
+        scene = replace(scene, name="a\udcff")
+    elif where == "data":
+        data = {"path": "/photos/\udcff"}
+    else:
+        out = tmp_path / "a\udcff"
+    config = load_config("default", {"schedule.iterations": 2, "plan.enabled": False, "response.name": "srgb"})
+    with pytest.raises(InputError, match="is a name that is not UTF-8 text; rename it"):
+        Training(scene, out, config, device="cpu", data=data)
+    assert not [path for path in tmp_path.rglob("*") if path.name != ".lock"]
