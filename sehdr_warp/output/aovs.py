@@ -11,6 +11,7 @@ import numpy as np
 
 from sehdr_warp.errors import SehdrError, did_you_mean
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.wide_camera import pixel_directions
 
 from .exr import Part, as_data
 from .images import as_array
@@ -116,7 +117,9 @@ def data_parts(names: Sequence[str], view: ViewData, header: Mapping[str, Any]) 
 
 
 def _rays(camera: Camera) -> np.ndarray:
-    """Return [H, W, 3] rays in camera axes with length 1 along the camera's own axis."""
+    """Return [H, W, 3] rays in camera axes, 1 long along the camera's own axis; unit vectors for a wide camera."""
+    if not camera.is_pinhole:
+        return np.nan_to_num(pixel_directions(camera))
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2)
 

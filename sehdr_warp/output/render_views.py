@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -208,7 +209,8 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
     """
     scale = height / camera.height
     cx = width / 2 + (camera.cx - camera.width / 2) * scale
-    return Camera(width, height, camera.fx * scale, camera.fy * scale, cx, camera.cy * scale, camera.world_to_camera)
+    intrinsics = {"fx": camera.fx * scale, "fy": camera.fy * scale, "cx": cx, "cy": camera.cy * scale}
+    return replace(camera, width=width, height=height, **intrinsics)
 
 
 def check_cameras(cameras: str | Path) -> None:

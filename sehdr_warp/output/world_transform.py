@@ -9,7 +9,7 @@ import json
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -96,8 +96,7 @@ class WorldTransform:
         pose = np.eye(4)
         pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
         pose[:3, 3] = -pose[:3, :3] @ self.points(camera.position)
-        values = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        return Camera(*values, world_to_camera=pose)
+        return replace(camera, world_to_camera=pose)
 
 
 def world_transform(

@@ -29,6 +29,7 @@ _STEP = 0.08
 """Movement between two frames in parts of the width: neighbors overlap by more than nine tenths."""
 _FEWEST, _MOST = 24, 240  # Frames of a clip
 _LEAST_MOVEMENT = 0.05  # In parts of the width, of a whole clip: less shows no depth
+_LEAST_STEP = 4.0  # Pixels from a reference frame to the next one, at _MOVEMENT_WIDTH
 _MOST_LOOKED_AT = 3000
 _SHARPNESS_WIDTH, _MOVEMENT_WIDTH = 640, 192
 
@@ -55,8 +56,11 @@ def choose_frames(clip: Clip) -> FrameChoice:
         InputError: if the clip has fewer than three frames, or its camera does not move.
     """
     stride = max(1, round(clip.seconds * 30 / _MOST_LOOKED_AT))
-    numbers, sharp, moved = [], [], [0.0]
-    last: np.ndarray | None = None
+    numbers: list[int] = []
+    sharp: list[float] = []
+    moved: list[float] = []
+    reference: np.ndarray | None = None
+    before = 0.0  # Movement up to the reference
     total = 0
     for number, frame in decode(clip):
         total = number + 1
@@ -66,11 +70,14 @@ def choose_frames(clip: Clip) -> FrameChoice:
             _log.info("looking at frame %d", number + 1)
         small = grey(frame, _SHARPNESS_WIDTH)
         tiny = grey(frame, _MOVEMENT_WIDTH)
-        if last is not None:
-            moved.append(moved[-1] + shift(last, tiny))
+        # From a reference some pixels back: a slow camera moves by less than a pixel between frames.
+        reference = tiny if reference is None else reference
+        step = shift(reference, tiny)
+        moved.append(max(before + step, moved[-1] if moved else 0.0))
+        if step * tiny.shape[1] >= _LEAST_STEP:
+            reference, before = tiny, moved[-1]
         numbers.append(number)
         sharp.append(sharpness(small))
-        last = tiny
     if len(numbers) < 3:
         raise InputError(clip.path, f"holds {total} frames that can be decoded", "give a longer clip")
     movement = moved[-1]

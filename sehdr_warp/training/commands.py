@@ -92,7 +92,8 @@ class Train:
     }
 
     data: Annotated[Positional[str | None], tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
-    """Photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF, or a bare folder; `embedded` is a scene to try."""
+    """Photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF, OpenSfM, a bare folder, or a video file; `embedded` is a
+    scene to try."""
     scene: SceneOptions = SceneOptions()
     training: TrainingOptions = TrainingOptions()
     output: OutputOptions = OutputOptions()

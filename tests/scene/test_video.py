@@ -7,12 +7,14 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import Camera, load_scene, look_at
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.names import list_images
 from sehdr_warp.scene.video import codes, decode, open_clip
 from sehdr_warp.scene.video_frames import choose_frames, frames_folder
 
 from .clips import pan, write_clip
+from .panorama_room import light, walls
 
 pytest.importorskip("av")
 
@@ -131,3 +133,30 @@ def test_a_variable_frame_rate(tmp_path):
     write_clip(tmp_path / "a.mp4", pan(40), times=times, codec="libx264", pixels="yuv420p")
     choice = choose_frames(open_clip(tmp_path / "a.mp4"))
     assert choice.total == 40 and choice.movement == pytest.approx(39 * 4 / 128, rel=0.05)
+
+
+def test_an_hlg_clip_of_a_room_becomes_a_scene(tmp_path):
+    """With cameras from structure from motion, the light that was encoded, and Rec.709 by the stream's primaries."""
+    pytest.importorskip("pycolmap")
+    response, painted, frames = response_by_name("colour:ITU-R BT.2100 HLG"), walls(), []
+    for i in range(40):
+        camera = Camera(256, 192, 200, 200, 128, 96, look_at((-0.6 + 0.03 * i, -0.5, 0.1), (0.1, 1, 0)))
+        frames.append(response.encode(0.5 * light(camera, painted)))
+    write_clip(tmp_path / "clip.mov", frames, tags=(18, 9, 9), pixels="yuv420p10le")
+    scene = load_scene(tmp_path / "clip.mov", cache=tmp_path / "cache", max_size=128)
+    assert scene.format == "video" and scene.name == "clip.mov" and scene.response.name == response.name
+    assert any(
+        note.startswith("video: the sharpest ") and "of 40 frames" in note and "HLG" in note for note in scene.notes
+    ), scene.notes
+    assert 15 <= len(scene.views) <= 24 and len(scene.points) > 100
+    np.testing.assert_allclose(scene.color_matrix.sum(1), 1, atol=1e-3)
+    for view in scene.views[::8]:
+        number = int(view.name.removeprefix("frame_"))
+        expected = response.decode(frames[number]).mean((0, 1))
+        found = response.decode(view.codes / 65535)
+        np.testing.assert_allclose(np.asarray(found).mean((0, 1)), expected, rtol=0.05)
+    # The camera went along x.
+    places = np.stack([view.camera.position for view in scene.views])
+    steps = np.diff(places, axis=0)
+    along = np.linalg.svd(places - places.mean(0))[2][0]
+    assert np.abs(steps @ along).sum() > 20 * np.abs(steps - np.outer(steps @ along, along)).sum(0).max()
