@@ -14,7 +14,7 @@ from ..errors import InputError
 from .images import DAMAGED
 
 _OPTIONAL = 1  # Flag: a reader that does not know the opcode may skip it
-_MOST_OPCODES = 4096
+_MOST_OPCODES = 64  # Files have up to a dozen; each may cost a pass over the picture
 _LARGEST_DEGREE = 8
 
 

@@ -26,6 +26,7 @@ _log = logging.getLogger("sehdr_warp.scene")
 
 DEVIATION = 0.05
 """Standard deviation of the logarithm of decoded light: 8 bits of map and photo, and a map of fewer pixels."""
+_HEAD_BYTES = 1 << 18  # In which a file names a second picture: behind EXIF and a profile
 _ISO_JPEG = b"urn:iso:std:iso:ts:21496:-1\0"
 _APPLE_AUX = "urn:com:apple:photo:2020:aux:hdrgainmap"
 _MOST_STOPS = 16.0  # Between white and the largest light; encoders state 1 to 6
@@ -127,7 +128,7 @@ def read_gain_map(path: Path, *, oriented: bool = False) -> GainMap | None:
 def has_gain_map(path: Path) -> bool:
     """Return whether a photo has a gain map that read_gain_map() decodes."""
     with path.open("rb") as file:
-        head = file.read(1 << 16)
+        head = file.read(_HEAD_BYTES)
     marked = (
         b"MPF\0" in head if head[:2] == b"\xff\xd8" else head[4:8] == b"ftyp" and (b"tmap" in head or b"auxC" in head)
     )

@@ -196,14 +196,18 @@ def _places(data: bytes, start: int, end: int) -> dict[int, tuple[int, tuple[tup
         return int.from_bytes(data[at - size : at])
 
     offset_size, length_size, base_size, index_size = sizes
-    found = {}
+    found, total = {}, 0
     for _ in range(take(4 if version == 2 else 2)):
         number = take(4 if version == 2 else 2)
         method = take(2) & 15 if version else 0
         take(2)  # Number of a data reference; 0 is this file.
         base = take(base_size)
         extents = []
-        for _ in range(take(2)):
+        count = take(2)
+        total += count
+        if total > _MOST_ITEMS:
+            raise ValueError(f"{total} parts of items")
+        for _ in range(count):
             if version:
                 take(index_size)
             offset = base + take(offset_size)
