@@ -302,6 +302,10 @@ def _panorama_tables(result: dict) -> Iterable[str]:
     yield markdown_table(result["rows"], COLUMNS["panorama"])
 
 
+def _units_tables(result: dict) -> Iterable[str]:
+    yield markdown_table(result["rows"], COLUMNS["units"])
+
+
 def _captures_tables(result: dict) -> Iterable[str]:
     table, figures = [], ("psnr", "psnr_fitted", "ssim", "lpips", "seconds", "memory", "gaussians")
     for rows in groups(result["rows"], "capture", "method", "iterations").values():
@@ -368,6 +372,7 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "seeds-cpu": _seeds_tables,
     "readings": _readings_tables,
     "captures": _captures_tables,
+    "units": _units_tables,
     "bits": _bits_tables,
     "panorama": _panorama_tables,
     "kernels": _kernel_tables,
