@@ -52,10 +52,12 @@ def edit_json(path, **fields):
 
 
 def edit_view(run, **fields):
+    """Change the first view or its camera, and state the file's hash anew, so that the value itself is checked."""
     values = json.loads((run / "scene.json").read_text())
     for name, value in fields.items():
         (values["views"][0] if name in values["views"][0] else values["views"][0]["camera"])[name] = value
     (run / "scene.json").write_text(json.dumps(values))
+    edit_json(checkpoint_of(run) / "checkpoint.json", run=RunFolder(run).hashes())
 
 
 def resign(run, change):
@@ -73,57 +75,110 @@ def resign(run, change):
     edit_json(folder / "checkpoint.json", **hashes)
 
 
+def remove_value(path, name):
+    path.write_text(json.dumps({key: value for key, value in json.loads(path.read_text()).items() if key != name}))
+
+
+def cut_tensors(run):
+    path = checkpoint_of(run) / "state.safetensors"
+    path.write_bytes(path.read_bytes()[:-9])
+
+
+def shorten_means(tensors):
+    tensors["gaussians.means"] = tensors["gaussians.means"][:3].clone()
+
+
+HASH = "state.safetensors: its SHA-256"
+CHANGED = "scene.json: was changed since its checkpoint was written; put it back as it was, or train again"
 RUNS = {
-    "flipped byte": (lambda run: flip_byte(checkpoint_of(run) / "state.safetensors"), "SHA-256"),
-    "truncated tensors": (
-        lambda run: (path := checkpoint_of(run) / "state.safetensors").write_bytes(path.read_bytes()[:-9]),
-        "SHA-256",
+    "flipped byte": (lambda run: flip_byte(checkpoint_of(run) / "state.safetensors"), HASH),
+    "truncated tensors": (cut_tensors, HASH),
+    "pickle": (lambda run: (checkpoint_of(run) / "state.safetensors").write_bytes(b"\x80\x04."), HASH),
+    "no tensors": (
+        lambda run: (checkpoint_of(run) / "state.safetensors").unlink(),
+        "state.safetensors: file not found",
     ),
-    "pickle": (lambda run: (checkpoint_of(run) / "state.safetensors").write_bytes(b"\x80\x04."), "SHA-256"),
-    "no tensors": (lambda run: (checkpoint_of(run) / "state.safetensors").unlink(), "state.safetensors"),
-    "no values": (lambda run: (checkpoint_of(run) / "checkpoint.json").unlink(), "checkpoint.json"),
-    "other format": (lambda run: edit_json(checkpoint_of(run) / "checkpoint.json", format=9), "format"),
+    "no values": (
+        lambda run: (checkpoint_of(run) / "checkpoint.json").unlink(),
+        "checkpoint.json: file not found; remove this folder to use an older checkpoint, or train again",
+    ),
+    "other format": (
+        lambda run: edit_json(checkpoint_of(run) / "checkpoint.json", format=9),
+        "checkpoint.json: format = 9 is of another version, and this one reads format",
+    ),
     "values without iteration": (
-        lambda run: (path := checkpoint_of(run) / "checkpoint.json").write_text(
-            json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "iteration"})
-        ),
-        "iteration",
+        lambda run: remove_value(checkpoint_of(run) / "checkpoint.json", "iteration"),
+        "checkpoint.json: iteration = ",
     ),
-    "no checkpoint": (lambda run: shutil.rmtree(run / "checkpoints"), "checkpoint"),
-    "tensor missing": (lambda run: resign(run, lambda tensors: tensors.pop("gaussians.means")), "gaussians.means"),
-    "tensor NaN": (lambda run: resign(run, lambda tensors: tensors["gaussians.means"].fill_(float("nan"))), "finite"),
-    "tensor of other shape": (
-        lambda run: resign(
-            run, lambda tensors: tensors.update({"gaussians.means": tensors["gaussians.means"][:3].clone()})
-        ),
-        "checkpoint",
+    "no checkpoint": (
+        lambda run: shutil.rmtree(run / "checkpoints"),
+        "checkpoints: holds no complete checkpoint; train again, or continue with --resume",
     ),
-    "no config": (lambda run: (run / "config.json").unlink(), "config.json"),
-    "config unknown key": (lambda run: edit_json(run / "config.json", speed=3), "speed"),
-    "config wrong type": (lambda run: edit_json(run / "config.json", seed="one"), "seed"),
-    "config a list": (lambda run: (run / "config.json").write_text("[]"), "config.json"),
-    "config nested": (lambda run: (run / "config.json").write_text("[" * 100_000), "config.json"),
-    "run.json empty": (lambda run: (run / "run.json").write_text(""), "run.json"),
-    "run.json nested": (lambda run: (run / "run.json").write_text("[" * 100_000), "run.json"),
-    "run.json binary": (lambda run: (run / "run.json").write_bytes(b"\xff\xfe"), "run.json"),
-    "run.json without response": (lambda run: edit_json(run / "run.json", response=None), "run.json"),
+    "tensor missing": (
+        lambda run: resign(run, lambda tensors: tensors.pop("gaussians.means")),
+        "its tensors do not fit the config ('gaussians.means'); the run is damaged: train again",
+    ),
+    "tensor NaN": (
+        lambda run: resign(run, lambda tensors: tensors["gaussians.means"].fill_(float("nan"))),
+        "state.safetensors: gaussians.means holds values that are not finite",
+    ),
+    "tensor of other shape": (lambda run: resign(run, shorten_means), "its tensors do not fit the config ("),
+    "no config": (lambda run: (run / "config.json").unlink(), "is not a run (no config.json)"),
+    "config unknown key": (
+        lambda run: edit_json(run / "config.json", speed=3),
+        "config.json: unknown field speed = 3, did you mean seed?",
+    ),
+    "config wrong type": (
+        lambda run: edit_json(run / "config.json", seed="one"),
+        "config.json: seed = 'one': input should be a valid integer",
+    ),
+    "config a list": (lambda run: (run / "config.json").write_text("[]"), "config.json: holds a JSON list"),
+    "config nested": (lambda run: (run / "config.json").write_text("[" * 100_000), "config.json: is not valid JSON"),
+    "run.json empty": (lambda run: (run / "run.json").write_text(""), "run.json: file is empty"),
+    "run.json nested": (lambda run: (run / "run.json").write_text("[" * 100_000), "run.json: is not valid JSON"),
+    "run.json binary": (lambda run: (run / "run.json").write_bytes(b"\xff\xfe"), "run.json: is not UTF-8 text"),
+    "run.json without response": (
+        lambda run: edit_json(run / "run.json", response=None),
+        "run.json: response = None: input should be a valid dictionary",
+    ),
     "run of version 0.2": (
         lambda run: edit_json(run / "run.json", format=2, version="0.2.0"),
         "run.json: format = 2 is of sehdr-warp 0.2.0, and this one reads format 3; train again (train PHOTOS --out",
     ),
-    "response damaged": (lambda run: edit_json(run / "run.json", response={"kind": "table"}), "response"),
-    "base exposure zero": (lambda run: edit_json(run / "run.json", base_time=0), "base_time"),
-    "base exposure words": (lambda run: edit_json(run / "run.json", base_time="long"), "base_time"),
+    "response damaged": (
+        lambda run: edit_json(run / "run.json", response={"kind": "table"}),
+        "run.json: response: the stored table curve is damaged",
+    ),
+    "base exposure zero": (
+        lambda run: edit_json(run / "run.json", base_time=0),
+        "run.json: base_time = 0: input should be greater",
+    ),
+    "base exposure words": (
+        lambda run: edit_json(run / "run.json", base_time="long"),
+        "run.json: base_time = 'long': input should be a valid number",
+    ),
     "base exposure NaN": (
         lambda run: edit_json(run / "run.json", base_time=float("nan")),
-        "base_time",
+        "run.json: base_time = nan: input should be a finite number",
     ),
-    "scene.json gone": (lambda run: (run / "scene.json").unlink(), "scene.json"),
-    "scene.json views": (lambda run: edit_json(run / "scene.json", views=3), "scene.json"),
-    "camera NaN": (lambda run: edit_view(run, fx=float("nan")), "scene.json"),
-    "camera huge": (lambda run: edit_view(run, width=10**9, height=10**9), "scene.json"),
-    "exposure zero": (lambda run: edit_view(run, exposure_time=0), "scene.json"),
-    "exposure in words": (lambda run: edit_view(run, exposure_time="short"), "scene.json"),
+    "scene.json gone": (lambda run: (run / "scene.json").unlink(), CHANGED),
+    "scene.json views": (lambda run: edit_json(run / "scene.json", views=3), CHANGED),
+    "camera NaN": (
+        lambda run: edit_view(run, fx=float("nan")),
+        "scene.json: a view is damaged (ValueError('camera fx, fy, cx, cy = [nan,",
+    ),
+    "camera huge": (
+        lambda run: edit_view(run, width=10**9, height=10**9),
+        "scene.json: a view is damaged (ValueError('image size 1000000000 x 1000000000",
+    ),
+    "exposure zero": (
+        lambda run: edit_view(run, exposure_time=0),
+        "scene.json: views.exposure_time = 0: input should be greater than 0",
+    ),
+    "exposure in words": (
+        lambda run: edit_view(run, exposure_time="short"),
+        "scene.json: views.exposure_time = 'short': input should be a valid number",
+    ),
 }
 
 
