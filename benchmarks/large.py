@@ -23,7 +23,7 @@ from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene
 from sehdr_warp.scene.normalization import normalization_of
-from sehdr_warp.training.train import Training
+from sehdr_warp.training.train import create_trainer
 
 from .captures import figures, photographed
 from .gsplat_trainer import GsplatScene, Snapshot, train_gsplat
@@ -68,7 +68,7 @@ def compare(size: Size, photos: int, iterations: int, device: str = "cuda:0") ->
 
 def _train(scene: Scene, config: Config, device: str) -> dict:
     scratch, begun, memory = Path(tempfile.mkdtemp()), 0.0, 0
-    training = Training(scene, scratch / "run", config, device=device)
+    training = create_trainer(scene, scratch / "run", config, device=device)
     for step in training:
         if step.iteration == step.total // WARM_UP:
             training.timed(partial(wait, training.device))

@@ -18,7 +18,9 @@ from .scene import Camera, Scene, View, embedded_scenes, load_cameras, load_scen
 from .scene.stack import calibrate
 from .training.initialization import match_points
 from .training.plan import Plan, make_plan
-from .training.train import Step, Training, train
+from .training.step import Step
+from .training.train import create_trainer, train
+from .training.trainer import Trainer
 
 __all__ = [
     "Camera",
@@ -32,10 +34,11 @@ __all__ = [
     "SehdrError",
     "Splats",
     "Step",
-    "Training",
+    "Trainer",
     "View",
     "calibrate",
     "compare_runs",
+    "create_trainer",
     "differentiable",
     "embedded_scenes",
     "evaluate",

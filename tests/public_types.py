@@ -15,7 +15,7 @@ config = sw.load_config("default")
 assert_type(config, sw.Config)
 assert_type(config.loss.ssim_weight, float)
 
-training = sw.Training(scene, "run", config)
+training = sw.create_trainer(scene, "run", config)
 for step in training:
     assert_type(step, sw.Step)
     assert_type(step.psnr, float)

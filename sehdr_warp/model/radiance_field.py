@@ -16,45 +16,10 @@ from ..rasterizer.activations import opacities_with_penalty
 from ..response import Response
 from ..scene import Camera
 from ..scene.normalization import Normalization
-from ..scene.wide_camera import pixel_directions
+from .camera_tensors import CameraTensors
 from .color_models import color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
-
-
-@dataclass(frozen=True)
-class CameraTensors:
-    """A camera on a device; all tensors float32.
-
-    Attributes:
-        width: Pixels.
-        height: Pixels.
-        world_to_camera: [4, 4].
-        intrinsics: [4] fx, fy, cx, cy.
-        position: [3] world coordinates.
-        directions: [H, W, 3] unit vectors along which the pixels look, world axes; None for a pinhole.
-    """
-
-    width: int
-    height: int
-    world_to_camera: Tensor
-    intrinsics: Tensor
-    position: Tensor
-    directions: Tensor | None = None
-
-    @staticmethod
-    def of(camera: Camera, device: torch.device | str) -> "CameraTensors":
-        """Copy a camera to a device."""
-        values = camera.world_to_camera, camera.intrinsics, camera.position
-        tensors = (torch.tensor(value, dtype=torch.float32, device=device) for value in values)
-        directions = None
-        if not camera.is_pinhole:
-            # Pixels that show nothing do not count; they look along the axis.
-            along = np.nan_to_num(pixel_directions(camera)) @ camera.world_to_camera[:3, :3]
-            unseen = ~along.any(axis=2, keepdims=True)
-            along = np.where(unseen, camera.world_to_camera[2, :3], along)
-            directions = torch.tensor(along, dtype=torch.float32, device=device)
-        return CameraTensors(camera.width, camera.height, *tensors, directions)
 
 
 @dataclass(frozen=True)

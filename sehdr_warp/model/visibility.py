@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from ..scene import Camera
-from .radiance_field import CameraTensors, RadianceField
+from .camera_tensors import CameraTensors
+from .radiance_field import RadianceField
 
 VIEW_SIZE = 320  # Longest side, in pixels, of the views that are counted
 LEAST_WEIGHT = 0.05  # Sum of blending weights, in pixels of such a view, with which it shows a Gaussian

@@ -60,7 +60,7 @@ def load_config(
 
 
 def as_config(config: object) -> Config | None:
-    """Convert any of the forms that Training takes to a Config; None stays None."""
+    """Convert any of the forms that create_trainer() takes to a Config; None stays None."""
     if config is None or isinstance(config, Config):
         return config
     if isinstance(config, str | Path):

@@ -128,9 +128,9 @@ def run_train(asked: Train, argv: Sequence[str]) -> None:
         asked: the options.
         argv: the words of the command line, with which --gpus starts the other ranks.
     """
-    from .ranks import device_of_rank, joined, stated
+    from .ranks import device_of_rank, join_ranks, launched_as
 
-    gpus, place = asked.machine.gpus, stated()
+    gpus, place = asked.machine.gpus, launched_as()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
     if place is None and gpus > 1 and not asked.training.plan_only:
@@ -143,7 +143,7 @@ def run_train(asked: Train, argv: Sequence[str]) -> None:
     elif gpus not in (1, place[1]):
         raise UsageError(f"--gpus {gpus}, but {place[1]} ranks were started; leave it out")
     else:
-        with joined(*place, device_of_rank(place[0], asked.machine.device)) as ranks:
+        with join_ranks(*place, device_of_rank(place[0], asked.machine.device)) as ranks:
             if ranks.leads:
                 _train(asked, ranks)
             else:
@@ -194,16 +194,16 @@ def _train(asked: Train, ranks=None) -> None:
             return
         from ..console import follow
         from ..viewer.live import viewed
-        from .train import Training
+        from .train import create_trainer
 
-        training = Training(
+        trainer = create_trainer(
             scene, out, config, device=device, tensorboard=output.tensorboard, data=data, ranks=ranks, **how
         )
-        if training.iteration >= training.total:
-            log.info("all %d iterations are done: nothing is left to train", training.total)
-        with viewed(training, str(out)) if output.view else nullcontext(training) as steps:
-            follow(steps, training.total)
-    run = training.run
+        if trainer.iteration >= trainer.total:
+            log.info("all %d iterations are done: nothing is left to train", trainer.total)
+        with viewed(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
+            follow(steps, trainer.total)
+    run = trainer.run
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
     print(json.dumps(summary) if output.json else _ending(run.path, summary))
 

@@ -22,8 +22,9 @@ from ..scene.load import sample_photos, select_response_for
 from ..scene.normalization import Normalization, normalization_of
 from ..scene.wide_camera import perspective_views
 from ..splats import read_gaussians
-from .densification import FARTHEST, gaussian_budget
 from .matching import Matcher
+from .strategies import mcmc_cap
+from .strategies.mcmc import MAX_DISTANCE
 
 _log = logging.getLogger(__name__)
 
@@ -142,12 +143,12 @@ def start_points(
 
 
 def within_reach(points: np.ndarray) -> np.ndarray:
-    """Return points [N, 3] of normalized coordinates, those beyond FARTHEST brought back to it along their direction.
+    """Return points [N, 3] of normalized coordinates, with those beyond MAX_DISTANCE moved to it along their direction.
 
     From cameras within the unit ball the direction of such a point changes by less than a degree.
     """
     distances = np.linalg.norm(points, axis=1, keepdims=True)
-    return points * np.minimum(1.0, FARTHEST / np.maximum(distances, 1e-12))
+    return points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distances, 1e-12))
 
 
 def match_points(
@@ -186,7 +187,7 @@ def _matched(matcher: Matcher, count: int, seed: int) -> tuple[np.ndarray, np.nd
 def start_count(config: Config, pixels: int) -> int:
     """How many points a training on photos of so many pixels in all starts from, if the scene has no more."""
     options = config.densification
-    most = gaussian_budget(config, pixels) if options.strategy == "mcmc" else options.cap_max
+    most = mcmc_cap(config, pixels) if options.strategy == "mcmc" else options.cap_max
     return min(most, round(config.model.initial_density * math.sqrt(pixels)))
 
 

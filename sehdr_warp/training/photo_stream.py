@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..model.radiance_field import CameraTensors
+from ..model.camera_tensors import CameraTensors
 from .losses import Target, select_view
 from .targets import PhotoSource, TrainingView, ViewStack
 

@@ -16,9 +16,9 @@ from ..runs.config_files import override_config
 from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS
-from .densification import gaussian_budget
 from .initialization import base_time, start_count
 from .scene_facts import SceneFacts, measure_scene
+from .strategies import mcmc_cap
 from .targets import largest_truth
 
 STEPS_PER_PHOTO = 75
@@ -247,7 +247,7 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
         fields = {"mcmc.cap_density": CPU_BUDGET}
         config = override_config(config, fields, "plan")
     options = config.densification
-    most, density = gaussian_budget(config, facts.pixels), config.mcmc.cap_density
+    most, density = mcmc_cap(config, facts.pixels), config.mcmc.cap_density
     reason = f"densification.cap_max = {options.cap_max}"
     if density:
         reason = f"{density:g} times the square root of {facts.pixels} pixels, below {options.cap_max}"
@@ -329,6 +329,6 @@ def cpu_step_seconds(facts: SceneFacts, config: Config) -> float:
     """About how long a step takes on this machine's CPU, with two thirds of the Gaussians that the training ends with:
     the mean over one that grows for half of its steps."""
     start = max(facts.points, start_count(config, facts.pixels))
-    count = max(start, gaussian_budget(config, facts.pixels))
+    count = max(start, mcmc_cap(config, facts.pixels))
     work = CPU_PIXEL * facts.pixels / facts.photos + CPU_GAUSSIAN * min(count, config.densification.cap_max) / 1.5
     return work / thread_count()

@@ -1,8 +1,8 @@
-"""Processes that train one scene together, each on a GPU of its own (or, with gloo, on the CPU of one machine).
+"""Processes that train one scene together, each on its own GPU (or, with gloo, on the CPU of one machine).
 
-Every rank has all the Gaussians and takes a photo of its own; one sum of all gradients, in one buffer, makes the step
-that each of them then makes alike. Rank 0 leads: it reads the photos and hands them on, decides how the count changes,
-evaluates, writes and prints. The others do steps and say nothing.
+Every rank has all Gaussians and takes its own photo; all gradients, in one buffer, are averaged, so that all ranks
+apply the same step. Rank 0 leads: it reads the photos and shares them, densifies, evaluates, writes and prints. The
+others only run steps.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ import pickle
 import platform
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import partial
@@ -25,63 +25,75 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ..errors import InputError, SehdrError, as_user_error
+from ..model.adam import Adam
+from ..model.gaussians import Gaussians
 from ..parallel import run_interruptibly, thread_count
 from ..scene.photo_file import PhotoFile, can_share, open_shared
+from .strategies import Strategy
 
 log = logging.getLogger(__name__)
 
 TIMEOUT = "SEHDR_RANK_TIMEOUT"
-LONGEST_SILENCE = 600.0  # Seconds that a step of another rank may take; the variable above states others
+LONGEST_SILENCE = 600.0  # Seconds that a step of another rank may take; the environment variable above overrides it
 GO, WAIT, END = 2, 1, 0
-_EVER = timedelta(days=30)  # Of torch's own limits: they end a process with pages of its innards
+_EVER = timedelta(days=30)  # Disables torch's own timeouts, which end a process with long stack traces
 _POLL = 0.1
-ALL_END = "all end; the last checkpoint is whole, --resume goes on from it"
-_LONGEST_WORD = 5.0  # Seconds that the watch may take to say or ask something
-_GRACE = 1.0  # Seconds for whoever knows more about the end of a rank to tell it first
+ENDING = "all ranks end; the last checkpoint is complete, --resume continues from it"
+_LONGEST_WORD = 5.0  # Seconds that the watch may take to end
+_GRACE = 1.0  # Seconds that a rank with a more specific error has to report it first
 
 
 class RanksLost(SehdrError):
-    """Another rank is gone or does not answer."""
+    """Another rank has ended or does not answer."""
 
 
 class Ranks:
-    """The place of this process among those that train together; use joined().
+    """This process among those that train together; use join_ranks().
 
-    rank: its number; count: of all. leads: whether it is rank 0. device: what it trains on.
+    Attributes:
+        store: Key-value store that the ranks broadcast_object.
+        rank: Number of this process.
+        count: Number of processes.
+        device: Device that this process trains on.
+        leads: True for rank 0.
     """
 
     def __init__(self, store: dist.Store, rank: int, count: int, device: torch.device):
+        """Create a rank; init() connects it."""
         self.store, self.rank, self.count, self.device = store, rank, count, device
         self.leads = rank == 0
         self._cuda = device.type == "cuda"
         self._deadline: float | None = None
         self._over = threading.Event()
         self._photos: PhotoFile | None = None
-        stated = os.environ.get(TIMEOUT, "")
-        self._patience = float(stated) if stated.replace(".", "", 1).isdigit() else LONGEST_SILENCE
+        timeout = os.environ.get(TIMEOUT, "")
+        self._patience = float(timeout) if timeout.replace(".", "", 1).isdigit() else LONGEST_SILENCE
 
-    def meet(self) -> None:
-        """Finds the others; raises SehdrError where they run other versions."""
+    def init(self) -> None:
+        """Connect to the other ranks; raise SehdrError if they run other versions."""
         with self._together():
             backend = "nccl" if self._cuda else "gloo"
-            given: dict[str, Any] = {"device_id": self.device} if self._cuda else {}
-            given |= {"store": self.store, "rank": self.rank, "world_size": self.count}
-            begin = partial(dist.init_process_group, backend, timeout=_EVER, **given)
-            run_interruptibly(begin, self._tell_wait)
-            # What hosts say to each other must not wait for their devices.
+            options: dict[str, Any] = {"device_id": self.device} if self._cuda else {}
+            options |= {"store": self.store, "rank": self.rank, "world_size": self.count}
+            begin = partial(dist.init_process_group, backend, timeout=_EVER, **options)
+            run_interruptibly(begin, self._log_wait)
+            # Messages between hosts must not wait for their devices.
             self._hosts = dist.new_group(backend="gloo", timeout=_EVER) if self._cuda else dist.group.WORLD
         self._check_versions()
         self._watcher = threading.Thread(target=self._watch, name="sehdr-warp ranks", daemon=True)
         self._watcher.start()
 
-    def _tell_wait(self) -> None:
+    def _log_wait(self) -> None:
+        """Log that this rank waits for the others."""
         log.info("rank %d of %d waits for the others", self.rank, self.count)
 
-    def agree(self, wanted: int) -> int:
-        """The least that any rank wants of GO, WAIT and END. Rank 0 may take its time before it asks; the others
-        wait."""
+    def all_reduce_min(self, wanted: int) -> int:
+        """Return the smallest of GO, WAIT and END that any rank passes.
+
+        Rank 0 may take its time before it calls this; the others wait.
+        """
         answer = torch.tensor([wanted], dtype=torch.int32)
-        # Of another than rank 0 an answer is due; of rank 0, which may evaluate or be paused, none.
+        # Rank 0 may evaluate or be paused, so only it expects answers in time.
         self._deadline = time.monotonic() + self._patience if self.leads else None
         with self._together():
             dist.all_reduce(answer, dist.ReduceOp.MIN, group=self._hosts)
@@ -89,38 +101,58 @@ class Ranks:
         self._deadline = time.monotonic() + self._patience if agreed == GO else None
         return agreed
 
-    def part(self) -> None:
-        """The end of a training: waits until all have come to it. Leaving breaks off what was sent last."""
-        self.agree(END)
+    def shutdown(self) -> None:
+        """End a training: wait until all ranks have called this, because leaving early breaks off pending transfers."""
+        self.all_reduce_min(END)
         came, until = self.store.add("parted", 1), time.monotonic() + self._patience
         while self.store.add("parted", 0) < -(-came // self.count) * self.count and time.monotonic() < until:
             time.sleep(_POLL / 10)
 
-    def mean(self, buffer: Tensor) -> None:
-        """Replaces a buffer by its mean over the ranks, alike in every bit."""
+    def all_reduce_mean(self, buffer: Tensor) -> None:
+        """Replace a buffer by its all_reduce_mean over the ranks, the same bits on all."""
         with self._together():
             dist.all_reduce(buffer, dist.ReduceOp.AVG if self._cuda else dist.ReduceOp.SUM)
-        if not self._cuda:  # gloo has no means.
+        if not self._cuda:  # gloo has no all_reduce_mean.
             buffer.mul_(1 / self.count)
 
-    def collect(self, totals: list[Tensor]) -> None:
-        """Adds up tensors on rank 0 and leaves zeros on the others: done twice, it changes nothing."""
+    def reduce_to_leader(self, totals: list[Tensor]) -> None:
+        """Sum tensors on rank 0 and zero them on the others, so that a second call changes nothing."""
         for total in totals:
             with self._together():
                 dist.reduce(total, 0)
             if not self.leads:
                 total.zero_()
 
-    def spread(self, tensors: list[Tensor]) -> None:
-        """Replaces tensors by rank 0's; however long that has to do before, the others wait."""
+    def broadcast(self, tensors: list[Tensor]) -> None:
+        """Replace tensors by those of rank 0; the others wait as long as rank 0 needs before it calls this."""
         self._deadline = None
         for tensor in tensors:
             with self._together():
                 dist.broadcast(tensor, 0)
         self._deadline = time.monotonic() + self._patience
 
-    def compare(self, tensors: dict[str, Tensor], iteration: int) -> None:
-        """Raises SehdrError, on all ranks, where their tensors differ in a bit."""
+    def refine_on_leader(
+        self, refine: Callable[[], bool], strategy: Strategy, gaussians: Gaussians, optimizer: Adam
+    ) -> bool:
+        """Refine the Gaussians on rank 0 and send them, with their optimizer state, to the others.
+
+        Returns:
+            What refine() returned on rank 0.
+        """
+        self.reduce_to_leader(list(strategy.state(gaussians.count).values()))
+        changed = self.leads and refine()
+        values = [changed, gaussians.count, bool(strategy.state(gaussians.count))]
+        values = torch.tensor(values, dtype=torch.int64, device=self.device)
+        self.broadcast([values])
+        changed, count, has_statistics = values.tolist()
+        gaussians.resize(count, optimizer)
+        if not has_statistics:
+            strategy.load_state({})
+        self.broadcast([*gaussians.tensors().values(), *optimizer.moments(gaussians.parameters())])
+        return bool(changed)
+
+    def check_equal(self, tensors: dict[str, Tensor], iteration: int) -> None:
+        """Raise SehdrError on all ranks if their tensors differ in any bit."""
         sums = [t.detach().contiguous().view(torch.int32).sum(dtype=torch.int64) for t in tensors.values()]
         own = torch.stack(sums)
         least, most = own.clone(), own.clone()
@@ -131,17 +163,17 @@ class Ranks:
         if different:
             raise SehdrError(
                 f"iteration {iteration}: {different[0]} is no longer the same on all ranks: memory or a GPU is broken, "
-                "or they are of different kinds; --resume goes on from the last checkpoint, --gpus 1 on one"
+                "or they are of different kinds; --resume continues from the last checkpoint, --gpus 1 on one"
             )
 
-    def share(self, value: Any, size: int) -> None:
-        """From rank 0: hands a value of about so many bytes on, whose large arrays all ranks then read in one file."""
+    def broadcast_object(self, value: Any, size: int) -> None:
+        """Send a value of about `size` bytes from rank 0; the ranks read its large arrays from one shared file."""
         self._photos = PhotoFile(size + (1 << 30))
-        # It takes bytes, whatever its stub says.
+        # The store takes bytes, although its stub says str.
         self.store.set("shared", pickle.dumps(self._photos.share(value)))  # pyright: ignore[reportArgumentType]
 
-    def shared(self) -> Any:
-        """On the others: what rank 0 shares, however long it takes to read its photos; None where there is nothing."""
+    def receive_object(self) -> Any:
+        """Receive the value of rank 0's broadcast_object(), however late; None if rank 0 ended without one."""
         while not self.store.check(["shared"]):
             if self.store.check(["ended"]):
                 return None
@@ -149,55 +181,59 @@ class Ranks:
         return open_shared(pickle.loads(self.store.get("shared")))
 
     def ends_first(self) -> bool:
-        """Whether this is the first rank that ends with an error; it alone tells why."""
+        """Return whether this is the first rank that ends with an error; only that one reports it."""
         try:
             return self.store.add("ended", 1) == 1
-        except RuntimeError:  # The store was that of a rank that is gone.
+        except RuntimeError:  # The store belonged to a rank that has ended.
             return True
 
     def notes(self) -> Iterator[str]:
-        """What to know of this machine's GPUs."""
+        """Yield notes about this machine's GPUs."""
         others = range(1, self.count) if self._cuda else ()
         apart = [k for k in others if not torch.cuda.can_device_access_peer(0, k)]
         if apart:
             yield f"GPU {apart[0]} has no access to the memory of GPU 0: gradients go through the host, which is slower"
 
     def close(self) -> None:
-        """The end of a training that all ranks came to."""
+        """Disconnect at the end of a training that all ranks reached."""
         self._over.set()
-        # What still talks to other ranks while the interpreter ends would abort the process.
+        # A thread that still talks to other ranks while the interpreter ends would abort the process.
         self._watcher.join(_LONGEST_WORD)
         self._hosts = None
         dist.destroy_process_group()
 
     def abandon(self) -> None:
-        """The end of this rank where others may wait for ever."""
+        """Stop watching the others, at the end of this rank while others may wait."""
         self._over.set()
 
     @contextmanager
     def _together(self) -> Iterator[None]:
+        """Convert errors of a collective operation to RanksLost."""
         try:
             yield
         except RuntimeError as error:
             time.sleep(_GRACE)
             log.debug("%s", error)
-            raise RanksLost(f"rank {self.rank} of {self.count} lost another, which is gone: {ALL_END}") from error
+            raise RanksLost(f"rank {self.rank} of {self.count} lost another, which has ended: {ENDING}") from error
 
     def _check_versions(self) -> None:
+        """Raise SehdrError if a rank runs other versions of packages."""
         from .. import __version__
 
         own = f"sehdr-warp {__version__} ({_source()}), torch {torch.__version__}, warp {version('warp-lang')}"
         own += f", Python {platform.python_version()}"
-        found: list = [None] * self.count
+        versions: list = [None] * self.count
         with self._together():
-            dist.all_gather_object(found, own, group=self._hosts)
-        other = next((k for k, told in enumerate(found) if told != found[0]), None)
+            dist.all_gather_object(versions, own, group=self._hosts)
+        other = next((k for k, text in enumerate(versions) if text != versions[0]), None)
         if other is not None:
-            raise SehdrError(f"rank {other} runs {found[other]}, rank 0 {found[0]}: install the same on all")
+            raise SehdrError(f"rank {other} runs {versions[other]}, rank 0 {versions[0]}: install the same on all")
 
     def _watch(self) -> None:
-        """Ends this process where another does not answer: what waits for a device or a socket cannot be told
-        otherwise. Rank 0 may be long between steps, but its own watch goes on."""
+        """End this process if another rank does not answer: waits for a device or a socket cannot be interrupted.
+
+        Rank 0 may be long between steps, but its own watch keeps reporting.
+        """
         heard, since, beat = "", time.monotonic(), 0.0
         while not self._over.wait(min(1.0, self._patience / 4)):
             now, deadline = time.monotonic(), self._deadline
@@ -211,21 +247,24 @@ class Ranks:
             if (deadline is not None and now > deadline) or (heard and now - since > self._patience):
                 if self.ends_first():
                     told = "another rank did not answer rank %d of %d for %.0f s (%s): %s"
-                    log.error(told, self.rank, self.count, self._patience, TIMEOUT, ALL_END)
+                    log.error(told, self.rank, self.count, self._patience, TIMEOUT, ENDING)
                 os._exit(1)
 
 
 def _source() -> str:
-    """A short hash of the package's own files: a version that is worked on has one name for many states."""
+    """Return a short hash of the package's own files, because a development version has one name for many states."""
     total = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         total.update(path.read_bytes())
     return total.hexdigest()[:8]
 
 
-def stated() -> tuple[int, int] | None:
-    """Rank and count that a launcher (torchrun, or --gpus) states for this process; None where there is none. Raises
-    SehdrError for ranks on several machines."""
+def launched_as() -> tuple[int, int] | None:
+    """Return rank and count that a launcher (torchrun, or --gpus) sets for this process; None if there is no launcher.
+
+    Raises:
+        SehdrError: For ranks on several machines.
+    """
     try:
         rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
         here = int(os.environ.get("LOCAL_WORLD_SIZE", count))
@@ -237,7 +276,7 @@ def stated() -> tuple[int, int] | None:
 
 
 def device_of_rank(rank: int, device: str | None) -> torch.device:
-    """The device of a rank on a machine: a GPU of its own, or the CPU where that is named or there is no GPU."""
+    """Return the device of a rank: a GPU of its own, or the CPU if that is named or there is no GPU."""
     if device not in (None, "cpu", "cuda"):
         raise InputError(f"device {device}", "is one, and each rank takes its own", "use cpu or cuda, or leave it out")
     if device == "cpu" or (device is None and not torch.cuda.is_available()):
@@ -250,8 +289,8 @@ def device_of_rank(rank: int, device: str | None) -> torch.device:
 
 
 @contextmanager
-def joined(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
-    """Among the ranks for as long as this lasts. An error of any rank ends all of them, and one tells it."""
+def join_ranks(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
+    """Connect this process to the ranks within this block; an error of any rank ends all, and one reports it."""
     if not can_share():
         raise SehdrError("several ranks need Linux, where processes can read one nameless file")
     os.environ.setdefault("SEHDR_THREADS", str(max(1, thread_count() // count)))
@@ -265,7 +304,7 @@ def joined(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
     store = run_interruptibly(_store, lambda: log.info("rank %d of %d waits for the others", rank, count))
     ranks = Ranks(store, rank, count, device)
     try:
-        ranks.meet()
+        ranks.init()
         yield ranks
         ranks.close()
     except BaseException as error:
@@ -280,7 +319,7 @@ def joined(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
 
 
 def _store() -> dist.Store:
-    """Where the ranks meet: a file of --gpus, or torchrun's server."""
+    """Return the store of the ranks: a file of --gpus, or torchrun's server."""
     if path := os.environ.get("SEHDR_RANKS"):
         return dist.FileStore(path, int(os.environ["WORLD_SIZE"]) + 1)
     from torch.distributed.rendezvous import rendezvous
@@ -298,7 +337,7 @@ def _store() -> dist.Store:
 
 
 def _end_soon(error: BaseException) -> None:
-    """Lets nothing that the interpreter tidies up at its end wait for ranks that are gone."""
+    """Prevent cleanup at the interpreter's exit from waiting for ranks that have ended."""
     import atexit
 
     code = 130 if isinstance(error, KeyboardInterrupt) else error.code if isinstance(error, SystemExit) else 1

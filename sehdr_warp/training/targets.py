@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..errors import InputError
-from ..model.radiance_field import CameraTensors
+from ..model.camera_tensors import CameraTensors
 from ..rasterizer.code_residual import CodeScale, code_tensor
 from ..response import Response
 from ..runs.config import LossConfig

@@ -27,7 +27,7 @@ _WAIT = 0.05
 
 
 class LiveTraining(ViewerScene):
-    """A Training, as the one scene of a Viewer and its `training`.
+    """A Trainer, as the one scene of a Viewer and its `training`.
 
     attend() passes on the training's steps. Between them it renders pictures that browsers wait for, for at most SHARE
     of the time, and no longer than that at a stretch unless one picture takes longer. Nothing the training reads is
@@ -35,7 +35,7 @@ class LiveTraining(ViewerScene):
     """
 
     def __init__(self, training: Any, name: str):
-        """Show a Training under a name."""
+        """Show a Trainer under a name."""
         super().__init__(training, name)
         self.paused = self.ended = False
         self._thread: threading.Thread | None = None
@@ -47,7 +47,7 @@ class LiveTraining(ViewerScene):
 
     def __getattr__(self, name: str):
         """Return what the viewer reads of a run from the training."""
-        field = self.run.trainer.field
+        field = self.run.field
         known = {"response": field.response, "base_time": field.base_time, "gaussian_count": field.gaussians.count}
         known |= {"scene_name": self.run.scene.name, "iterations": self.run.iteration, "cameras": self.run.scene.views}
         known |= {"color_matrix": self.run.scene.color_matrix}
@@ -159,7 +159,7 @@ class _Picture:
 
 @contextmanager
 def viewed(training: Any, name: str) -> Iterator[Iterator]:
-    """Serve a page that shows a Training while its steps are made; the context is an iterator of the steps."""
+    """Serve a page that shows a training while its steps are made; the context is an iterator of the steps."""
     live = LiveTraining(training, name)
     photos = {view.name: view for view in training.scene.views}
     with Server(Viewer([live], lambda index: photos, live)) as server:

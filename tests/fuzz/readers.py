@@ -40,7 +40,7 @@ from sehdr_warp.scene.read_folders import read_colmap, read_hdr_nerf_real, read_
 from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms
 from sehdr_warp.splats import USD_SUFFIXES, GaussianArrays, read_gaussians, write_gaussians
 from sehdr_warp.synth.expose import RadianceView
-from sehdr_warp.training.train import Training
+from sehdr_warp.training.train import create_trainer
 from sehdr_warp.training.trainer import Trainer
 from tests.make_scenes import pattern, write_blender, write_colmap, write_llff, write_reinhard
 from tests.output.helpers import camera
@@ -178,7 +178,7 @@ def _read_confidence(folder: Path):
 
 
 def _resume(folder: Path):
-    return Training(toy_scene(2, 8), folder, device="cpu", resume=True)
+    return create_trainer(toy_scene(2, 8), folder, device="cpu", resume=True)
 
 
 def _resign(folder: Path) -> None:

@@ -258,7 +258,7 @@ def test_names_that_are_no_text_are_refused_before_the_training(tmp_path, where)
     from dataclasses import replace
 
     from sehdr_warp.runs.config_files import load_config
-    from sehdr_warp.training.train import Training
+    from sehdr_warp.training.train import create_trainer
 
     scene, data, out = toy_scene(2, 8), {"path": "embedded"}, tmp_path / "run"
     if where == "view":
@@ -271,5 +271,5 @@ def test_names_that_are_no_text_are_refused_before_the_training(tmp_path, where)
         out = tmp_path / "a\udcff"
     config = load_config("default", {"schedule.iterations": 2, "plan.enabled": False, "response.name": "srgb"})
     with pytest.raises(InputError, match="is a name that is not UTF-8 text; rename it"):
-        Training(scene, out, config, device="cpu", data=data)
+        create_trainer(scene, out, config, device="cpu", data=data)
     assert not [path for path in tmp_path.rglob("*") if path.name != ".lock"]

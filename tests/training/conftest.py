@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sehdr_warp.training.train import Training
+from sehdr_warp.training.train import create_trainer
 
 from .toy import VARIANTS, toy_scene, without_truth
 
@@ -31,7 +31,7 @@ def trained(scene, tmp_path_factory):
         folder, config = tmp_path_factory.mktemp("trained"), VARIANTS[variant]
         # What trains without truth trains without any there.
         given = scene if config.loss.uses_hdr else without_truth(scene)
-        for step in Training(given, folder / "run", config, device="cpu", data={"path": "somewhere"}):
+        for step in create_trainer(given, folder / "run", config, device="cpu", data={"path": "somewhere"}):
             if step.iteration == 66:
                 shutil.copytree(folder / "run", folder / "killed")
         return folder / "run"

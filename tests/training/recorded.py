@@ -1,8 +1,8 @@
 """Whole trainings on a GPU, with recorded steps and with launched ones."""
 
 from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.training.held_out import evaluate_views
 from sehdr_warp.training.initialization import choose_response, make_field
-from sehdr_warp.training.train import evaluate_views
 from sehdr_warp.training.trainer import Trainer
 
 
@@ -13,7 +13,7 @@ def train_on_gpu(scene, config, *, recorded: bool = True, iterations: int | None
     replays = 0
     for _ in range(iterations or config.schedule.iterations):
         trainer.step()
-        replays += trainer._recorder is not None and trainer._recorder._key is not None
+        replays += trainer.graphs.captured is not None
     assert trainer.skipped_steps == 0
     return trainer, replays
 

@@ -18,31 +18,31 @@ def run_team(work, folder: Path, *arguments) -> None:
 
 
 def _rank(rank: int, work, folder: Path, arguments: tuple) -> None:
-    from sehdr_warp.training.ranks import joined
+    from sehdr_warp.training.ranks import join_ranks
 
     os.environ |= {"WORLD_SIZE": str(RANKS), "SEHDR_RANKS": str(folder / "meeting"), "SEHDR_RANK_TIMEOUT": "60"}
-    with joined(rank, RANKS, torch.device("cpu")) as ranks:
+    with join_ranks(rank, RANKS, torch.device("cpu")) as ranks:
         work(ranks, folder, *arguments)
 
 
 def train_together(ranks, folder: Path, strategies: list[str], iterations: int) -> None:
     """Trains the toy scene with each strategy; each rank saves its state as <strategy>.<rank>."""
     from sehdr_warp.training.following import follow_leader
-    from sehdr_warp.training.train import Training
+    from sehdr_warp.training.train import create_trainer
 
     from .toy import VARIANTS, toy_scene
 
     for strategy in strategies:
         if ranks.leads:
-            training = Training(toy_scene(), folder / strategy, VARIANTS[strategy], device="cpu", ranks=ranks)
+            training = create_trainer(toy_scene(), folder / strategy, VARIANTS[strategy], device="cpu", ranks=ranks)
             for step in training:
                 if step.iteration >= iterations:
                     training.stop()
-            trainer = training.trainer
+            trainer = training
             ranks.store.delete_key("shared")
         else:
             trainer = follow_leader(ranks)
-        ranks.agree(2)
+        ranks.all_reduce_min(2)
         assert "torch._dynamo" not in sys.modules, "two seconds of every start"
         torch.save(trainer.state(), folder / f"{strategy}.{ranks.rank}")
 
@@ -51,9 +51,9 @@ def differ(ranks, folder: Path) -> None:
     """Ranks whose tensors differ by a bit say so, all of them."""
     from sehdr_warp.errors import SehdrError
 
-    ranks.compare({"means": torch.ones(3)}, 5)
+    ranks.check_equal({"means": torch.ones(3)}, 5)
     try:
-        ranks.compare({"scales": torch.ones(3), "means": torch.tensor([1.0, 1.0 + ranks.rank * 2**-23])}, 5)
+        ranks.check_equal({"scales": torch.ones(3), "means": torch.tensor([1.0, 1.0 + ranks.rank * 2**-23])}, 5)
     except SehdrError as error:
         (folder / f"differ.{ranks.rank}").write_text(str(error))
 
@@ -75,5 +75,5 @@ def fall_silent(ranks, folder: Path) -> None:
     if ranks.leads:
         ranks._patience = 2.0
         logging.getLogger("sehdr_warp").addHandler(logging.FileHandler(folder / "silent"))
-        ranks.agree(2)
+        ranks.all_reduce_min(2)
     time.sleep(60)

@@ -13,7 +13,7 @@ from sehdr_warp.scene.exposure_compensation import ExposureCompensation
 from sehdr_warp.training import compensation
 from sehdr_warp.training.compensation import estimate_compensation, estimates_compensation
 from sehdr_warp.training.matching import LARGEST_SIDE, at_matching_size
-from sehdr_warp.training.train import Training
+from sehdr_warp.training.train import create_trainer
 
 from .wall_and_lamp import WALL, photographed, texture, wall_and_lamp
 
@@ -136,7 +136,7 @@ def test_a_clear_sky_is_no_drift(device):
 def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
     scene, times = drifting()
     scene = replace(scene, color_matrix=2 * np.eye(3))
-    training = Training(scene, tmp_path / "run", SHORT, device="cpu")
+    training = create_trainer(scene, tmp_path / "run", SHORT, device="cpu")
     for step in training:
         if step.iteration == 10:
             training.stop()
@@ -147,7 +147,7 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
     assert (run.color_matrix == scene.color_matrix).all()
     ratios = [view.exposure_time / time for view, time in zip(evened.views, times, strict=True)]
     assert np.ptp(ratios) / np.mean(ratios) < 0.05
-    resumed = Training(scene, tmp_path / "run", resume=True, device="cpu")
+    resumed = create_trainer(scene, tmp_path / "run", resume=True, device="cpu")
     for views in (training.scene.views, resumed.scene.views):
         assert [view.exposure_time for view in views] == pytest.approx([view.exposure_time for view in evened.views])
     for value, known, asked in (("never", False, False), ("unstated", True, False), ("unstated", False, True)):

@@ -11,8 +11,8 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer.plane_sweep import BORDER
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.training.births import born_rows
 from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
+from sehdr_warp.training.seeding import seed_gaussians
 from sehdr_warp.training.targets import training_views
 from sehdr_warp.training.train import train
 
@@ -92,12 +92,12 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
         shown = field.render_train_view(views[0].camera, views[0].exposure_time, degree=0).encoded
     wanted = torch.tensor(200, device=device)
     given = field, matcher, shown, views[0], 0
-    (rows, born), (again, roomy) = (born_rows(*given, wanted, room, seed=3) for room in (200, 300))
+    (rows, born), (again, roomy) = (seed_gaussians(*given, wanted, room, seed=3) for room in (200, 300))
     assert 0 < int(born) < 200 and born == roomy
     rows, again = ({name: values[: int(born)] for name, values in each.items()} for each in (rows, again))
     assert all(torch.equal(values, again[name]) for name, values in rows.items())
     assert all(values.isfinite().all() for values in rows.values())
-    none = born_rows(*given, torch.tensor(0, device=device), 10, seed=3)
+    none = seed_gaussians(*given, torch.tensor(0, device=device), 10, seed=3)
     assert not int(none[1])
     white = rows["harmonics_dc"].amax((1, 2)) == rows["harmonics_dc"].max()
     depth = rows["means"][white, 2]

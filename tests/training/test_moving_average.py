@@ -7,7 +7,7 @@ from sehdr_warp.runs.checkpoint import Checkpoint
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.moving_average import WINDOWS, MovingAverage
-from sehdr_warp.training.train import Training, train
+from sehdr_warp.training.train import create_trainer, train
 
 from .toy import QUICK, load_unscaled
 
@@ -48,7 +48,7 @@ def test_means_begin_when_the_count_stays():
 def test_a_training_that_stops_in_between_ends_in_the_same_bits(scene, tmp_path):
     config = load_unscaled("default", AVERAGED)
     whole = train(scene, tmp_path / "whole", config, device="cpu")
-    training = Training(scene, tmp_path / "parts", config, device="cpu")
+    training = create_trainer(scene, tmp_path / "parts", config, device="cpu")
     for step in training:
         if step.iteration == 30:
             training.stop()

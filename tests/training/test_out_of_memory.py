@@ -22,7 +22,7 @@ CUDA = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3.00 GiB. G
     ],
 )
 def test_the_line_names_gaussians_photo_and_remedy(tmp_path, monkeypatch, place, error, asked):
-    def fails(*arguments):
+    def fails(*arguments, **options):
         raise error
 
     monkeypatch.setattr(Trainer, place, fails)

@@ -63,7 +63,7 @@ def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
         trainer = Trainer(scene, chosen, make_field(scene, chosen, choose_response(scene, chosen), "cuda:0"))
         for _ in range(60):
             trainer.step()
-        assert isinstance(trainer._stack, PhotoStream) == (photos == "memory") and trainer._recorder._key is not None
+        assert isinstance(trainer._source, PhotoStream) == (photos == "memory") and trainer.graphs.captured is not None
         states.append(trainer.state()[0])
     for name, value in states[0].items():
         assert torch.equal(value, states[1][name]), name

@@ -16,10 +16,10 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer import HarmonicsGradients
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.training.densification import make_densification
 from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
 from sehdr_warp.training.plan import gain_of_ranks
 from sehdr_warp.training.ranks import device_of_rank
+from sehdr_warp.training.strategies import make_strategy
 from sehdr_warp.training.train import train
 
 from ..refusals import call
@@ -168,10 +168,10 @@ def test_harmonics_go_as_their_factors():
 
 @pytest.mark.parametrize("photos", [1, 2, 3, 8])
 def test_each_change_happens_once_whatever_the_stride(photos):
-    strategy = make_densification(VARIANTS["default"], 1.0, 1000)
+    strategy = make_strategy(VARIANTS["default"], 1.0, 1000)
     strategy.photos = photos
-    due = [n for n in range(photos, 91, photos) if strategy.changes_at(n)]
-    assert [n // 25 for n in due] == [1, 2, 3] and strategy.start == 20 and strategy.stop == 80
+    due = [n for n in range(photos, 91, photos) if strategy.is_due(n)]
+    assert [n // 25 for n in due] == [1, 2, 3] and (strategy.schedule.start, strategy.schedule.stop) == (20, 80)
 
 
 def test_small_scenes_are_told_that_they_gain_nothing():

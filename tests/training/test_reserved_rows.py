@@ -4,16 +4,18 @@ import pytest
 import torch
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training import densification, graph_capacity, trainer
+from sehdr_warp.training import graph_capacity, training_state
 from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.strategies import base
+from sehdr_warp.training.trainer import Trainer
 
 from .toy import VARIANTS
 
 
 def trained_steps(scene, config, device, reserves):
     """A trainer after 60 steps, and how often its Gaussians moved in how many changes of their number."""
-    training = trainer.Trainer(scene, config, make_field(scene, config, choose_response(scene, config), device))
-    training._reserves, gaussians, moves = reserves, training.field.gaussians, []
+    training = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), device))
+    training.reserves_rows, gaussians, moves = reserves, training.field.gaussians, []
     for _ in range(60):
         count, before = gaussians.count, gaussians.reallocations
         training.step()
@@ -24,8 +26,8 @@ def trained_steps(scene, config, device, reserves):
 
 @pytest.mark.parametrize("variant", ["default", "adc"])
 def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monkeypatch):
-    monkeypatch.setattr(densification, "SPARE", 8.0)  # So few Gaussians become many at once.
-    monkeypatch.setattr(trainer, "MOST_ROOM", 8.0)
+    monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)  # So few Gaussians become many at once.
+    monkeypatch.setattr(training_state, "MAX_RESERVE", 8.0)
     config = override_config(VARIANTS[variant], {"deterministic": True, "schedule.use_cuda_graph": False})
     (plain, all_moved), (roomy, moved) = (trained_steps(scene, config, device, reserves) for reserves in (False, True))
     assert all(all_moved) and not any(moved) and len(moved) == len(all_moved) > 1
@@ -39,14 +41,14 @@ def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monk
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch):
-    monkeypatch.setattr(densification, "SPARE", 8.0)
-    monkeypatch.setattr(trainer, "MOST_ROOM", 8.0)
+    monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)
+    monkeypatch.setattr(training_state, "MAX_RESERVE", 8.0)
     monkeypatch.setattr(graph_capacity, "MIN_HEADROOM", 0.0)
     config = VARIANTS["default"]
-    training = trainer.Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cuda:0"))
+    training = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cuda:0"))
     for _ in range(48):
         training.step()
-    recorded, count = training._recorder._graph, training.field.gaussians.count
+    recorded, count = training.graphs.captured, training.field.gaussians.count
     assert recorded is not None
     torch.cuda.set_sync_debug_mode("error")
     try:
@@ -54,4 +56,4 @@ def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch
             training.step()
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert training.field.gaussians.count > count and training._recorder._graph is recorded
+    assert training.field.gaussians.count > count and training.graphs.captured is recorded

@@ -13,8 +13,9 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
+from sehdr_warp.training.held_out import evaluate_views
 from sehdr_warp.training.initialization import choose_response, make_field
-from sehdr_warp.training.train import Training, evaluate_views, train
+from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 
 from .recorded import check_recorded_like_launched
@@ -53,7 +54,7 @@ def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_
     run = train(scene, tmp_path / "run", config, device="cpu")
     told = caplog.text
     assert ("60 Gaussians are more than the cap of 7" in told) == ("mcmc.cap_density" in options)
-    assert ("60 start points: drawn from" in told) == ("densification.cap_max" in options)
+    assert ("60 start points: 50 of them are used" in told) == ("densification.cap_max" in options)
     count = run.gaussian_count
     assert count == options.get("densification.cap_max", 60) if options else count > 60
 
@@ -185,7 +186,7 @@ def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, va
         with torch.no_grad():  # How a ball is turned shows in no photo: its gradient would be rounding.
             field.gaussians.log_scales += torch.tensor([-0.5, 0.0, 0.5], device=device)
         trainer = Trainer(scene, config, field)
-        trainer._factored = factored
+        trainer.factored = factored
         for _ in range(6):
             trainer.step()
     for name, ours in fields[0].gaussians.tensors().items():
@@ -239,8 +240,8 @@ def test_unknown_device_is_refused(scene, tmp_path):
 
 
 def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, monkeypatch):
-    class BrokenRecorder:
-        def launching(self):
+    class BrokenRunner:
+        def on_capture_stream(self):
             return nullcontext()
 
         def run(self, key, function):
@@ -248,10 +249,10 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
 
     config = quick()
     trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
-    trainer._recorder = BrokenRecorder()
-    monkeypatch.setattr(trainer, "_can_record", lambda *_: trainer.iteration > 1)
+    trainer.graphs._first = BrokenRunner()
+    monkeypatch.setattr(trainer.graphs, "can_capture", lambda *_, **__: trainer.iteration > 1)
     trainer.step()
-    with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.use_cuda_graph=false"):
+    with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.use-cuda-graph=false"):
         trainer.step()
 
 
@@ -286,7 +287,7 @@ def test_held_out_figures_are_told_in_words(scene, tmp_path, logged):
 
 
 def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path):
-    training = Training(scene, tmp_path / "run", quick(), device="cpu")
+    training = create_trainer(scene, tmp_path / "run", quick(), device="cpu")
     seen = []
     for step in training:
         seen.append((step.iteration, step.seconds, step.seconds_left))
@@ -296,7 +297,7 @@ def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path)
     assert [iteration for iteration, *_ in seen] == list(range(1, 13))
     assert seen[0][2] is None and 0 < seen[-1][2] < 78 * (seen[-1][1] - seen[0][1])
     assert training.run.iterations == 12 and not training.run.summary()["finished"]
-    training = Training(scene, tmp_path / "run", device="cpu", resume=True)
+    training = create_trainer(scene, tmp_path / "run", device="cpu", resume=True)
     for step in training:
         if step.iteration == 20:
             training.stop()
@@ -307,15 +308,15 @@ def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path)
 def test_a_config_may_be_a_name_or_fields(scene, tmp_path, config):
     if config == 7:
         with pytest.raises(InputError, match="is int"):
-            Training(scene, tmp_path / "run", config)
+            create_trainer(scene, tmp_path / "run", config)
         return
-    training = Training(scene, tmp_path / "run", config, device="cpu")
+    training = create_trainer(scene, tmp_path / "run", config, device="cpu")
     assert training.total == (700 if config == "demo" else 3)
 
 
 def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
-    training = Training(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
-    training.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
+    training = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
+    training.output.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
     for _ in training:
         pass
     assert "held-out photos scored best at iteration 2 (99.00 dB), now" in caplog.text

@@ -51,7 +51,7 @@ def test_held_out_panoramas_of_a_training_on_panoramas(tmp_path):
 
 
 def test_gradients_of_a_panorama_reach_all_parameters():
-    from sehdr_warp.model.radiance_field import CameraTensors
+    from sehdr_warp.model.camera_tensors import CameraTensors
     from sehdr_warp.training.initialization import make_field
 
     scene = panoramas(4)

@@ -15,7 +15,7 @@ from PIL import Image
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.images import quantize
 from sehdr_warp.output.light_pictures import shown_photo
-from sehdr_warp.training.train import Training, train
+from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.viewer.live import SHARE, LiveTraining, viewed
 
 from ..training.toy import toy_scene
@@ -35,7 +35,7 @@ def ask(address, path, body=None):
 def test_the_result_is_that_without_a_viewer(tmp_path, logged):
     scene = toy_scene()
     alone = train(scene, tmp_path / "alone", CONFIG, device="cpu")
-    training, seen = Training(scene, tmp_path / "seen", CONFIG, device="cpu"), []
+    training, seen = create_trainer(scene, tmp_path / "seen", CONFIG, device="cpu"), []
 
     def look(address):
         camera = scene.views[0].camera.resized(48, 48).to_dict()
@@ -77,7 +77,7 @@ def ask_fails(address):
 def test_a_sensors_colors_are_shown_in_rec709_as_the_run_shows_them(tmp_path, logged):
     matrix = np.array([[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.6, 1.6]])
     scene = replace(toy_scene(), color_matrix=matrix, light_known=True)
-    training = Training(scene, tmp_path / "raw", CONFIG | {"schedule.iterations": 3}, device="cpu")
+    training = create_trainer(scene, tmp_path / "raw", CONFIG | {"schedule.iterations": 3}, device="cpu")
     with viewed(training, "raw") as steps:
         address = re.search(r"http://([^/]*)/", logged[-1])[1]
         for _ in steps:
@@ -154,7 +154,7 @@ def test_an_interrupt_ends_a_pause_and_errors_reach_who_asked():
 
 
 def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
-    training = Training(toy_scene(), tmp_path / "run", CONFIG | {"schedule.iterations": 150}, device="cpu")
+    training = create_trainer(toy_scene(), tmp_path / "run", CONFIG | {"schedule.iterations": 150}, device="cpu")
     served, paused = threading.Event(), threading.Event()
 
     def work():

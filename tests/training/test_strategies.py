@@ -10,8 +10,9 @@ from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.rasterizer.relocation import relocation_sums
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.training import densification
-from sehdr_warp.training.densification import GradientDensification, _draw, make_densification, rotate
+from sehdr_warp.training.strategies import AdcStrategy, Seeds, make_strategy, mcmc
+from sehdr_warp.training.strategies.adc import rotate, sample_half
+from sehdr_warp.training.strategies.mcmc import sample_rows
 
 EXTENT = 2.0
 
@@ -43,24 +44,26 @@ def rendering_with(gradient, visible):
 def adc_strategy(**options):
     values = {"densification.strategy": "adc"}
     values |= {f"densification.{name}": value for name, value in options.items()}
-    return GradientDensification(load_config("default", values), EXTENT, 1)
+    return AdcStrategy.from_config(load_config("default", values), EXTENT)
 
 
 def observe(strategy, gradients):
     """Screen gradients along x, in normalised units for an image 200 wide."""
     gradient = torch.tensor(gradients)[:, None] * torch.tensor([[1 / 100.0, 0.0]])
     strategy.prepare(len(gradients), "cpu")
-    strategy.observe(rendering_with(gradient, torch.ones(len(gradients), dtype=bool)), 200, 100, torch.tensor(1.0))
+    strategy.accumulate(rendering_with(gradient, torch.ones(len(gradients), dtype=bool)), 200, 100, torch.tensor(1.0))
 
 
 def test_statistics_are_means_over_the_photos_that_show_it():
     strategy = adc_strategy()
     gradient = torch.tensor([[3.0, 0.0], [0.0, 4.0]])
     strategy.prepare(2, "cpu")
-    strategy.observe(rendering_with(gradient, torch.tensor([True, True])), 200, 100, torch.tensor(1.0))
-    strategy.observe(rendering_with(gradient * float("nan"), torch.tensor([True, True])), 200, 100, torch.tensor(0.0))
-    strategy.observe(rendering_with(gradient, torch.tensor([True, False])), 200, 100, torch.tensor(1.0))
-    assert strategy.gradient_sum.tolist() == [600.0, 200.0] and strategy.seen.tolist() == [2.0, 1.0]
+    strategy.accumulate(rendering_with(gradient, torch.tensor([True, True])), 200, 100, torch.tensor(1.0))
+    strategy.accumulate(
+        rendering_with(gradient * float("nan"), torch.tensor([True, True])), 200, 100, torch.tensor(0.0)
+    )
+    strategy.accumulate(rendering_with(gradient, torch.tensor([True, False])), 200, 100, torch.tensor(1.0))
+    assert strategy.gradient_sum.tolist() == [600.0, 200.0] and strategy.visible_count.tolist() == [2.0, 1.0]
 
 
 def test_small_are_cloned_and_large_are_split():
@@ -71,7 +74,7 @@ def test_small_are_cloned_and_large_are_split():
     before = gaussians.rows(torch.arange(3))
     strategy = adc_strategy()
     observe(strategy, [1.0, 1.0, 0.0])
-    assert strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
+    assert strategy.refine(600, gaussians, optimizer, torch.Generator().manual_seed(0))
     # Kept: 0 and 2; added: a clone of 0, and two halves of 1.
     assert gaussians.count == 5
     torch.testing.assert_close(gaussians.means[:3].detach(), before["means"][[0, 2, 0]])
@@ -86,12 +89,12 @@ def test_small_are_cloned_and_large_are_split():
 
 
 def test_split_points_are_drawn_from_the_parent():
-    strategy, gaussians = adc_strategy(), cloud(4)
+    gaussians = cloud(4)
     scales = torch.tensor([0.5, 0.01, 0.2])
     quaternion = torch.tensor([0.3, -0.5, 0.7, 0.2])
     gaussians.overwrite({"log_scales": scales.log().expand(4, 3), "quaternions": quaternion.expand(4, 4)})
     parents = torch.zeros(20_000, dtype=torch.long)
-    rows = strategy._half(gaussians, parents, torch.Generator().manual_seed(1))
+    rows = sample_half(gaussians, parents, torch.Generator().manual_seed(1))
     offsets = rows["means"] - gaussians.means[0].detach()
     rotation = rotate(quaternion.expand(3, 4), torch.eye(3)).T
     expected = rotation @ torch.diag(scales**2) @ rotation.T
@@ -101,13 +104,13 @@ def test_split_points_are_drawn_from_the_parent():
 def test_statistics_stay_where_recorded_steps_add_to_them():
     strategy, gaussians = adc_strategy(), cloud(4)
     observe(strategy, [1e-6] * 4)
-    held = strategy.gradient_sum, strategy.seen
+    held = strategy.gradient_sum, strategy.visible_count
     for iteration in (600, 14_900):  # The last change too: steps after it still add.
-        strategy.change(iteration, gaussians, adam(gaussians), torch.Generator().manual_seed(0))
+        strategy.refine(iteration, gaussians, adam(gaussians), torch.Generator().manual_seed(0))
         strategy.prepare(4, "cpu")
-        assert strategy.gradient_sum is held[0] and strategy.seen is held[1] and not torch.cat(held).any()
+        assert strategy.gradient_sum is held[0] and strategy.visible_count is held[1] and not torch.cat(held).any()
     strategy.prepare(6, "cpu")
-    assert strategy.seen.shape == (6,) and strategy.state(5)["seen"].shape == (5,)
+    assert strategy.visible_count.shape == (6,) and strategy.state(5)["seen"].shape == (5,)
 
 
 def test_rotation_is_the_quaternions():
@@ -123,7 +126,7 @@ def test_the_budget_goes_to_the_largest_gradients():
     gaussians.overwrite({"log_scales": torch.full((6, 3), math.log(0.001)), "opacity_logits": torch.zeros(6)})
     strategy = adc_strategy(cap_max=8)
     observe(strategy, [0.1, 0.6, 0.2, 0.5, 0.3, 0.4])
-    strategy.change(600, gaussians, optimizer, torch.Generator())
+    strategy.refine(600, gaussians, optimizer, torch.Generator())
     assert gaussians.count == 8
     torch.testing.assert_close(gaussians.means[6:].detach(), gaussians.means[[1, 3]].detach())
 
@@ -136,10 +139,10 @@ def test_faint_and_oversized_are_pruned():
     gaussians.overwrite({"opacity_logits": logits, "log_scales": scales})
     strategy = adc_strategy()
     observe(strategy, [0.0] * 5)
-    strategy.change(2900, gaussians, optimizer, torch.Generator())
+    strategy.refine(2900, gaussians, optimizer, torch.Generator())
     assert gaussians.count == 4, "only the faint one before the first reset"
     observe(strategy, [0.0] * 4)
-    strategy.change(3100, gaussians, optimizer, torch.Generator())
+    strategy.refine(3100, gaussians, optimizer, torch.Generator())
     assert gaussians.count == 3, "0.3 is more than a tenth of the extent 2.0"
 
 
@@ -148,7 +151,7 @@ def test_opacity_reset():
     optimizer = adam(gaussians)
     gaussians.overwrite({"opacity_logits": torch.logit(torch.tensor([0.9, 0.5, 0.006]))})
     strategy = adc_strategy()
-    strategy.change(3000, gaussians, optimizer, torch.Generator())
+    strategy.refine(3000, gaussians, optimizer, torch.Generator())
     torch.testing.assert_close(gaussians.opacities().detach(), torch.tensor([0.01, 0.01, 0.006]))
     assert (optimizer.state[gaussians.opacity_logits]["exp_avg"] == 0).all()
     assert (optimizer.state[gaussians.means]["exp_avg"] != 0).all()
@@ -158,13 +161,13 @@ def test_opacity_reset():
 def test_nothing_changes_outside_the_schedule(iteration):
     gaussians, strategy = cloud(4), adc_strategy()
     observe(strategy, [1.0] * 4)
-    assert not strategy.change(iteration, gaussians, None, torch.Generator()) and gaussians.count == 4
+    assert not strategy.refine(iteration, gaussians, None, torch.Generator()) and gaussians.count == 4
 
 
 def mcmc_strategy(places=None, *, cap_max=None, **options):
     values = {"densification.strategy": "mcmc"} | {f"mcmc.{name}": value for name, value in options.items()}
     values |= {} if cap_max is None else {"densification.cap_max": cap_max}
-    return make_densification(load_config("default", values), EXTENT, 10**6, places)
+    return make_strategy(load_config("default", values), EXTENT, 10**6, places)
 
 
 def test_relocation_sums_are_equation_9():
@@ -180,7 +183,7 @@ def test_relocation_sums_are_equation_9():
 
 
 def test_relocation_moves_what_veils_a_camera(rooms, monkeypatch):
-    monkeypatch.setattr(densification, "PAIRS", 6)
+    monkeypatch.setattr(mcmc, "DISTANCES_AT_ONCE", 6)
     places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0]])
     gaussians = cloud(8)
     means = torch.tensor([[0.0, 0.0, z] for z in (0.9, 1.1, 2.0, 10.0, 50.0, 91.0, 97.1, 99.1)])
@@ -189,7 +192,7 @@ def test_relocation_moves_what_veils_a_camera(rooms, monkeypatch):
     optimizer = adam(gaussians)
     gaussians.overwrite({"means": means, "log_scales": log_scales, "opacity_logits": torch.zeros(8)})
     strategy = mcmc_strategy(places, prune_near_angle=0.25, growth_rate=0.0, seed_fraction=0.0)
-    assert not strategy.change(600, gaussians, optimizer, torch.Generator())
+    assert not strategy.refine(600, gaussians, optimizer, torch.Generator())
     # More than a quarter of 0.9 from the first camera, and of 2.9 from the second; not of the others.
     moved = (gaussians.means.detach() != means).any(1)
     assert moved.tolist() == [True, False, False, False, False, False, True, False]
@@ -200,7 +203,7 @@ def test_relocation_moves_what_veils_a_camera(rooms, monkeypatch):
 def rooms(request, monkeypatch):
     """Numbers that the device alone knows: read, as on the CPU, or not, as on a GPU."""
     if request.param:
-        monkeypatch.setattr(densification, "_room", lambda number, most: most)
+        monkeypatch.setattr(mcmc, "host_bound", lambda number, most: most)
 
 
 def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
@@ -223,7 +226,7 @@ def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
 
     before, tensors = image(), dict(gaussians.named_parameters())
     # In place: what a recorded step holds of them stays good.
-    assert not mcmc_strategy(growth_rate=0.0).change(600, gaussians, optimizer, generator)
+    assert not mcmc_strategy(growth_rate=0.0).refine(600, gaussians, optimizer, generator)
     assert all(gaussians.get_parameter(name) is parameter for name, parameter in tensors.items())
     after = image()
     assert gaussians.count == 8 and (gaussians.opacities() > 0.005).all()
@@ -233,16 +236,17 @@ def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
     assert (after - before).abs().mean() < 0.05 * before.abs().mean()
 
 
-def born(colors):
-    """Births of Gaussians of these colors at the origin, of which the wanted ones are meant."""
+def seeds(colors):
+    """A seed function that returns Gaussians of these colors at the origin."""
 
-    def rows(wanted, room):
+    def propose(wanted, room):
         made = cloud(len(colors)).tensors()
         given = torch.tensor(colors)[:, None, None].expand(-1, 1, 3)
         made |= {"means": torch.zeros_like(made["means"]), "harmonics_dc": given}
-        return {name: values[:room].contiguous() for name, values in made.items()}, wanted.clamp_max(len(colors))
+        rows = {name: values[:room].contiguous() for name, values in made.items()}
+        return Seeds(rows, wanted.clamp_max(len(colors)))
 
-    return rows
+    return propose
 
 
 @pytest.mark.parametrize(("dead", "colors"), [(6, 3), (2, 8), (0, 4), (9, 1), (10, 4)])
@@ -253,8 +257,8 @@ def test_the_born_come_first_and_take_the_places_of_the_dead(rooms, dead, colors
     gaussians.overwrite({"opacity_logits": logits})
     gone, before = (logits < -5).nonzero()[:, 0].tolist(), gaussians.rows(torch.arange(10))
     strategy = mcmc_strategy(seed_fraction=0.5, growth_rate=0.3)
-    strategy.change(
-        600, gaussians, optimizer, torch.Generator().manual_seed(0), born([10.0 + k for k in range(colors)])
+    strategy.refine(
+        600, gaussians, optimizer, torch.Generator().manual_seed(0), seeds([10.0 + k for k in range(colors)])
     )
     assert gaussians.count == 13
     places = [*gone, 10, 11, 12][: min(colors, (dead + 3) // 2)]
@@ -284,7 +288,7 @@ def test_relocation_does_not_wait_for_a_gpu():
         strategy = mcmc_strategy()
         torch.cuda.set_sync_debug_mode(waited if waited == "error" else "default")
         try:
-            strategy.change(600, gaussians, optimizer, generator)
+            strategy.refine(600, gaussians, optimizer, generator)
         finally:
             torch.cuda.set_sync_debug_mode("default")
         assert gaussians.count == strategy.next_count(600, 100) > 105 and (gaussians.opacities() > 0.004).all()
@@ -295,23 +299,23 @@ def test_relocation_grows_to_the_budget(rooms):
     optimizer = adam(gaussians)
     gaussians.overwrite({"opacity_logits": torch.zeros(100)})
     strategy = mcmc_strategy(cap_max=104)
-    strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
+    strategy.refine(600, gaussians, optimizer, torch.Generator().manual_seed(0))
     assert gaussians.count == 104
-    strategy.change(700, gaussians, optimizer, torch.Generator().manual_seed(0))
+    strategy.refine(700, gaussians, optimizer, torch.Generator().manual_seed(0))
     assert gaussians.count == 104
     # 0.106 Gaussians for each of 1000, the square root of 10^6 pixels.
     strategy = mcmc_strategy(cap_density=0.106)
-    strategy.change(600, gaussians, optimizer, torch.Generator().manual_seed(0))
+    strategy.refine(600, gaussians, optimizer, torch.Generator().manual_seed(0))
     assert gaussians.count == 106
 
 
 @pytest.mark.parametrize("iterations", [300, 1500, 30_000])
 def test_a_training_of_any_length_reaches_its_budget(iterations):
-    strategy = make_densification(load_config("default", {"schedule.iterations": iterations}), EXTENT, 10**6)
-    assert strategy.most == 120_000
+    strategy = make_strategy(load_config("default", {"schedule.iterations": iterations}), EXTENT, 10**6)
+    assert strategy.cap_max == 120_000
     count = 5000
     for iteration in range(1, iterations + 1):
-        if strategy._is_due(iteration):
+        if strategy.is_due(iteration):
             growth = strategy.next_count(iteration, count) / count
             assert iterations < 30_000 or growth <= 1.05 + 1 / count
             count = strategy.next_count(iteration, count)
@@ -324,15 +328,15 @@ def test_noise_comes_with_the_iteration():
         gaussians = cloud(50)
         gaussians.overwrite({"opacity_logits": torch.full((50,), -6.0)})
         before = gaussians.means.detach().clone()
-        mcmc_strategy(noise_lr=1.0).perturb(iteration, gaussians, 1.0)
+        mcmc_strategy(noise_lr=1.0).inject_noise(iteration, gaussians, 1.0)
         moved.append(gaussians.means.detach() - before)
     assert torch.equal(moved[0], moved[1]) and not torch.allclose(moved[0], moved[2])
     still = cloud(50)
-    mcmc_strategy(noise_lr=0.0).perturb(7, still, 1.0)
+    mcmc_strategy(noise_lr=0.0).inject_noise(7, still, 1.0)
     assert torch.equal(still.means, cloud(50).means)
 
 
 def test_draws_follow_the_weights():
-    drawn = _draw(torch.tensor([1.0, 0.0, 3.0]), 40_000, torch.Generator().manual_seed(0))
+    drawn = sample_rows(torch.tensor([1.0, 0.0, 3.0]), 40_000, torch.Generator().manual_seed(0))
     counts = torch.bincount(drawn.rows, minlength=3) / 40_000
     torch.testing.assert_close(counts, torch.tensor([0.25, 0.0, 0.75]), atol=0.01, rtol=0)

@@ -1,0 +1,163 @@
+"""What a training writes to its run folder: evaluations, checkpoints, logs and the summary."""
+
+import logging
+import math
+from typing import Any
+
+import torch
+
+from ..errors import SehdrError
+from ..model.confidence import Evidence, gather_evidence
+from ..model.residual_regions import MAX_LISTED, find_residual_regions, regions_to_dict
+from ..runs.checkpoint import first_not_finite
+from ..runs.config import Config
+from ..runs.run import Run, load_run
+from ..runs.run_writer import RunWriter, write_confidence
+from .held_out import evaluate_views, format_scores, warn_of_overfitting
+from .machine import machine_figures, summary_writer
+from .training_state import TrainingState
+
+log = logging.getLogger(__name__)
+LOGS = 200  # Points of the curves in TensorBoard
+
+
+class RunOutput:
+    """Evaluates, logs and saves a training.
+
+    Attributes:
+        folder: The run folder.
+    """
+
+    def __init__(self, folder: RunWriter, config: Config, *, tensorboard: bool = False):
+        """Prepare to write to a run folder, which need not exist yet."""
+        self.folder = folder
+        total = config.schedule.iterations
+        self._evaluate_at = {config.scaled(n) for n in config.schedule.evaluate_at} | {total}
+        self._checkpoint_every = config.scaled(config.schedule.checkpoint_every)
+        self._log_every = max(1, total // LOGS)
+        self._tensorboard = tensorboard
+        self._writer: Any = None  # Created at the first log, when the run folder has been begun.
+        self._run: Run | None = None
+
+    def run(self, device: torch.device) -> Run:
+        """Return the run as of the newest checkpoint; it is loaded once."""
+        self._run = self._run or load_run(self.folder.path, device=device)
+        return self._run
+
+    def after_step(self, trainer: TrainingState) -> None:
+        """Evaluate held-out views, write a checkpoint and log, each if it is due."""
+        iteration = trainer.iteration
+        evaluate = not self._evaluate_at.isdisjoint(range(iteration - trainer.photos + 1, iteration + 1))
+        save = trainer.came_to(self._checkpoint_every)
+        if evaluate or save:
+            trainer.synchronize()
+        if evaluate and trainer.scene.test_views:
+            self.evaluate(trainer)
+        if save:
+            trainer.gather()
+        if save and iteration < trainer.total:
+            self.checkpoint(trainer)
+        if self._tensorboard and trainer.came_to(self._log_every):
+            figures = {"loss": trainer.timed(lambda: trainer.loss), "psnr": trainer.timed(trainer.psnr)}
+            self._log(trainer, "train", figures | {"gaussians": trainer.field.gaussians.count})
+
+    def evaluate(self, trainer: TrainingState) -> None:
+        """Score the held-out views and append the scores to metrics.jsonl."""
+        scores = evaluate_views(trainer.field, trainer.scene.test_views, trainer.degree)
+        line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3), "split": "test"}
+        line |= {name: round(value, 4) for name, value in scores.items()}
+        self.folder.append_metrics(line | {"gaussians": trainer.field.gaussians.count})
+        self._log(trainer, "test", scores)
+        log.info("iteration %d: %s, after %.1f s", trainer.iteration, format_scores(scores), trainer.seconds)
+
+    def checkpoint(self, trainer: TrainingState) -> None:
+        """Write a checkpoint, unless the training has diverged: the last good one then stays the newest.
+
+        Raises:
+            SehdrError: If a tensor is not finite.
+        """
+        tensors, values = trainer.state()
+        if (name := first_not_finite(tensors)) is not None:
+            raise SehdrError(
+                f"iteration {trainer.iteration}: {name} is not finite and was not saved; --resume goes back to "
+                "the last good checkpoint; if it happens again, lower the learning rates or check photos and cameras"
+            )
+        if trainer.iteration > trainer.first_iteration and not math.isfinite(loss := trainer.loss):
+            message = "iteration %d: the loss is %s; no checkpoint is written, the last one stays"
+            log.warning(message, trainer.iteration, loss)
+            return
+        keep = trainer.config.schedule.keep_checkpoints
+        self.folder.write_checkpoint(tensors, values | {"seconds": trainer.seconds}, kept=keep)
+
+    def finish(self, trainer: TrainingState, *, complete: bool) -> None:
+        """Write the last checkpoint and the summary.
+
+        Args:
+            trainer: The trainer.
+            complete: Whether to measure confidence and report residual regions, too.
+        """
+        evidence = None
+        if trainer.iteration >= trainer.total and trainer.iteration > trainer.first_iteration:
+            evidence = remove_unseen(trainer)
+        self.checkpoint(trainer)
+        if trainer.ranks is not None:
+            trainer.ranks.shutdown()
+        self._write_summary(trainer)
+        warn_of_overfitting(self.folder.read_metrics())
+        if self._writer is not None:
+            self._writer.close()
+        if not complete:
+            return
+        self._run = None
+        run = self.run(trainer.device)
+        evidence = evidence or run.measure_confidence(trainer.scene)
+        run.model.confidence = evidence.confidence()
+        write_confidence(self.folder, evidence, run.checkpoint_hash)
+        self._report_residuals(run, trainer)
+
+    def _write_summary(self, trainer: TrainingState) -> None:
+        """Write summary.json: times, memory and counts."""
+        decisions = self.folder.read_decisions()
+        summary = {
+            "iteration": trainer.iteration,
+            "finished": trainer.iteration >= trainer.total,
+            "plan": {decision["name"]: decision["choice"] for decision in decisions} or None,
+            "train_seconds": round(trainer.seconds, 3),
+            "gaussians": trainer.field.gaussians.count,
+            "skipped_steps": trainer.skipped_steps,
+            "overflowed_steps": trainer.overflowed_steps,
+        }
+        self.folder.write_summary(summary | machine_figures(trainer.device))
+
+    def _report_residuals(self, run: Run, trainer: TrainingState) -> None:
+        """Compare the training photos with the scene, and list the regions that differ in summary and log."""
+        regions = find_residual_regions(run.model, trainer.scene.train_views, degree=run.degree)
+        self.folder.write_summary(run.summary() | {"unexplained": regions_to_dict(regions)})
+        if regions:
+            worst, photos = regions[0], len({region.photo for region in regions})
+            log.warning(
+                "%d regions in %d photos are not explained by the scene; the worst: %s at column %.0f, row %.0f, "
+                "%d pixels %.1f stops %s than the photo (summary.json names %d)",
+                *(len(regions), photos, worst.photo, worst.column, worst.row, worst.pixels, abs(worst.stops)),
+                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MAX_LISTED)),
+            )
+
+    def _log(self, trainer: TrainingState, split: str, figures: dict[str, float]) -> None:
+        """Write figures to TensorBoard, if that is on."""
+        if self._tensorboard:
+            self._writer = self._writer or summary_writer()(str(self.folder.tensorboard))
+            for name, value in figures.items():
+                self._writer.add_scalar(f"{split}/{name}", value, trainer.iteration)
+
+
+def remove_unseen(trainer: TrainingState) -> Evidence:
+    """Remove the Gaussians that no training photo shows; return the evidence of the photos for the others."""
+    views, truth = trainer.scene.train_views, trainer.config.loss.uses_hdr
+    evidence = gather_evidence(trainer.field, views, degree=trainer.degree, truth=truth)
+    count, contributes = trainer.field.gaussians.count, evidence.contributes
+    remaining = int(contributes.sum())
+    if remaining == count or remaining == 0:
+        return evidence
+    trainer.field.gaussians.keep(contributes, trainer.optimizer)
+    log.info("removed %d of %d Gaussians, which no training photo shows", count - remaining, count)
+    return evidence.rows(contributes)

@@ -1,0 +1,37 @@
+"""What the loop of a trainer yields after each step."""
+
+from .training_state import TrainingState
+
+
+class Step:
+    """Values of a training after a step.
+
+    `loss`, `psnr` and `gaussians` are read from the device when they are accessed, until the next step.
+
+    Attributes:
+        iteration: Iterations done.
+        total: Iterations in all.
+        seconds: Duration of the training so far.
+        seconds_left: Estimated time to the end; None after the first step.
+    """
+
+    def __init__(self, trainer: TrainingState):
+        """Take the values of a trainer after a step."""
+        self._trainer = trainer
+        self.iteration, self.total, self.seconds = trainer.iteration, trainer.total, trainer.seconds
+        self.seconds_left: float | None = None
+
+    @property
+    def loss(self) -> float:
+        """Loss of the step."""
+        return self._trainer.timed(lambda: self._trainer.loss)
+
+    @property
+    def psnr(self) -> float:
+        """PSNR of the step's photo, dB."""
+        return self._trainer.timed(self._trainer.psnr)
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians."""
+        return self._trainer.field.gaussians.count

@@ -1,0 +1,39 @@
+"""Densification strategies: how the number of Gaussians changes during training.
+
+"mcmc" is 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al., NeurIPS 2024), "adc" the adaptive
+density control of 3D Gaussian Splatting (Kerbl et al. 2023, section 5.2, with the constants of its code).
+"""
+
+from torch import Tensor
+
+from ...runs.config import Config
+from .adc import AdcStrategy
+from .base import SEED_STRIDE, SeedFunction, Seeds, Strategy
+from .mcmc import McmcStrategy, mcmc_cap
+
+__all__ = [
+    "SEED_STRIDE",
+    "AdcStrategy",
+    "McmcStrategy",
+    "SeedFunction",
+    "Seeds",
+    "Strategy",
+    "make_strategy",
+    "mcmc_cap",
+]
+
+
+def make_strategy(
+    config: Config, extent: float, pixels: int, camera_positions: Tensor | None = None
+) -> AdcStrategy | McmcStrategy:
+    """Create the strategy that config.densification.strategy names.
+
+    Args:
+        config: The config of the training.
+        extent: Extent of the scene, units of the Gaussians' coordinates.
+        pixels: Number of pixels of all training photos.
+        camera_positions: [V, 3] positions of the training cameras.
+    """
+    if config.densification.strategy == "adc":
+        return AdcStrategy.from_config(config, extent)
+    return McmcStrategy.from_config(config, pixels, camera_positions)

@@ -1,0 +1,200 @@
+"""Adaptive density control (3DGS): duplicate and split where image gradients are large, remove, reset opacities."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer
+from ...rasterizer import Rendering
+from ...rasterizer.training_step import add_gradient_statistics
+from ...runs.config import AdcConfig, Config
+from .base import Schedule, SeedFunction, Strategy
+
+SPLIT_SHRINK = 1.6  # Factor by which the two halves of a split are smaller (3DGS: 0.8 times the number of halves)
+MIN_RESET_INTERVAL = 300
+"""Opacities are not reset if resets would be closer together than this: they would not recover in between."""
+
+
+@dataclass
+class AdcStrategy(Strategy):
+    """Adaptive density control.
+
+    Small Gaussians with large image gradients are duplicated and large ones split; transparent and oversized ones are
+    removed. Opacities are reset now and then, so that only what is needed becomes opaque again.
+
+    Attributes:
+        options: Thresholds.
+        extent: Extent of the scene that thresholds of size refer to.
+        reset_every: Iterations between resets.
+        gradient_sum: Sum of the gradients of the projected means, [rows], in normalised screen units.
+        visible_count: Number of photos in that sum, [rows].
+    """
+
+    options: AdcConfig = field(default_factory=AdcConfig)
+    extent: float = 1.0
+    reset_every: int = 3000
+    gradient_sum: Tensor | None = None
+    visible_count: Tensor | None = None
+
+    @staticmethod
+    def from_config(config: Config, extent: float) -> "AdcStrategy":
+        """Create the strategy of a config for a scene of an extent."""
+        return AdcStrategy(
+            schedule=Schedule.from_config(config),
+            cap_max=config.densification.cap_max,
+            prune_opacity=config.densification.prune_opacity,
+            options=config.adc,
+            extent=extent,
+            reset_every=config.scaled(config.adc.reset_every),
+        )
+
+    def needs_gradients(self, iteration: int) -> bool:
+        """Return True until refinement stops."""
+        return iteration < self.schedule.stop
+
+    def prepare(self, rows: int, device: torch.device | str) -> None:
+        """Allocate statistics; those of rows that exist already are copied."""
+        if self.gradient_sum is None or len(self.gradient_sum) != rows:
+            self.gradient_sum = _resized(self.gradient_sum, rows, device)
+            self.visible_count = _resized(self.visible_count, rows, device)
+
+    @torch.no_grad()
+    def accumulate(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
+        """Add the norms of the gradients of the projected means, for the Gaussians that the photo shows."""
+        gradients = rendering.means2d.grad
+        assert gradients is not None and self.gradient_sum is not None and self.visible_count is not None
+        add_gradient_statistics(
+            gradients, rendering.radii, usable, width, height, self.gradient_sum, self.visible_count
+        )
+
+    @torch.no_grad()
+    def refine(
+        self,
+        iteration: int,
+        gaussians: Gaussians,
+        optimizer: Optimizer | None,
+        generator: torch.Generator,
+        seed: SeedFunction | None = None,
+    ) -> bool:
+        """Duplicate, split and remove Gaussians, and reset opacities, if this iteration is due."""
+        changed = False
+        total, count = self.gradient_sum, self.visible_count
+        if self.schedule.is_due(iteration, self.photos) and total is not None and count is not None:
+            changed = True
+            small, large = self._select(gaussians, (total / count.clamp_min(1))[: gaussians.count])
+            added = [self.duplicate(gaussians, small), *self.split(gaussians, large, generator)]
+            added = {name: torch.cat([rows[name] for rows in added]) for name in PARAMETER_NAMES}
+            self.remove(gaussians, optimizer, large, added, oversized=iteration > self.reset_every)
+            # In place, because captured steps add to these tensors.
+            total.zero_()
+            count.zero_()
+        if self._resets(iteration):
+            self.reset_opacities(gaussians, optimizer)
+        return changed
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether this iteration refines or resets opacities."""
+        return self.schedule.is_due(iteration, self.photos) or self._resets(iteration)
+
+    def _resets(self, iteration: int) -> bool:
+        """Return whether opacities are reset at this iteration."""
+        past = iteration % self.reset_every
+        before_stop = iteration - past < self.schedule.stop
+        return past < self.photos and before_stop and self.reset_every >= MIN_RESET_INTERVAL
+
+    def _select(self, gaussians: Gaussians, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """Return masks [N] of the Gaussians to duplicate and of those to split, by their mean gradient [N].
+
+        If the cap leaves room for fewer, those with the largest gradients are selected.
+        """
+        selected = gradient > self.options.grow_grad2d
+        room = self.cap_max - gaussians.count
+        if int(selected.sum()) > room:
+            first = gradient.topk(max(room, 0)).indices
+            selected = torch.zeros_like(selected).index_fill_(0, first, True) & selected
+        small = gaussians.log_scales.amax(1) <= math.log(self.options.grow_scale3d * self.extent)
+        return selected & small, selected & ~small
+
+    @staticmethod
+    def duplicate(gaussians: Gaussians, mask: Tensor) -> dict[str, Tensor]:
+        """Return copies of the Gaussians in a mask [N]."""
+        return gaussians.rows(mask.nonzero()[:, 0])
+
+    @staticmethod
+    def split(gaussians: Gaussians, mask: Tensor, generator: torch.Generator) -> list[dict[str, Tensor]]:
+        """Return two smaller Gaussians, at points sampled from it, for each one in a mask [N]."""
+        parents = mask.nonzero()[:, 0]
+        return [sample_half(gaussians, parents, generator) for _ in range(2)]
+
+    def remove(
+        self,
+        gaussians: Gaussians,
+        optimizer: Optimizer | None,
+        split: Tensor,
+        added: dict[str, Tensor],
+        *,
+        oversized: bool,
+    ) -> None:
+        """Remove split, transparent and, if `oversized`, too large Gaussians, and append new ones.
+
+        Among the new ones, those that would be removed are not appended. If nothing would be left, only split ones are
+        removed.
+        """
+        stays, appended = ~split, added
+        good = stays & self._is_good(gaussians.tensors(), oversized)
+        index = self._is_good(added, oversized).nonzero()[:, 0]
+        if len(index) or bool(good.any()):
+            stays, appended = good, {name: values[index] for name, values in added.items()}
+        if not bool(stays.all()):
+            gaussians.keep(stays, optimizer)
+        if len(appended["means"]):
+            gaussians.append(appended, optimizer)
+
+    def _is_good(self, rows: dict[str, Tensor], oversized: bool) -> Tensor:
+        """Return a mask of rows that are neither transparent nor, if that counts, oversized."""
+        good = torch.sigmoid(rows["opacity_logits"]) >= self.prune_opacity
+        if oversized:
+            good &= rows["log_scales"].amax(1) <= math.log(self.options.prune_scale3d * self.extent)
+        return good
+
+    def reset_opacities(self, gaussians: Gaussians, optimizer: Optimizer | None) -> None:
+        """Lower all opacities to at most twice prune_opacity."""
+        opacity = 2 * self.prune_opacity
+        logits = gaussians.opacity_logits.clamp_max(math.log(opacity / (1 - opacity)))
+        gaussians.overwrite({"opacity_logits": logits}, optimizer=optimizer)
+
+    def state(self, count: int) -> dict[str, Tensor]:
+        """Return the gradient statistics of `count` Gaussians."""
+        statistics = {"gradient_sum": self.gradient_sum, "seen": self.visible_count}
+        return {name: values[:count] for name, values in statistics.items() if values is not None}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue with the statistics of state()."""
+        self.gradient_sum, self.visible_count = state.get("gradient_sum"), state.get("seen")
+
+
+def sample_half(gaussians: Gaussians, parents: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+    """Return one smaller Gaussian for each parent index, at a point sampled from the parent."""
+    rows = gaussians.rows(parents)
+    normal = torch.randn(len(parents), 3, generator=generator, device=parents.device)
+    rows["means"] += rotate(rows["quaternions"], normal * rows["log_scales"].exp())
+    rows["log_scales"] -= math.log(SPLIT_SHRINK)
+    return rows
+
+
+def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate vectors [N, 3] by quaternions [N, 4] (w, x, y, z) of any length but zero."""
+    unit = torch.nn.functional.normalize(quaternions, dim=1)
+    scalar, axis = unit[:, :1], unit[:, 1:]
+    cross = 2 * torch.linalg.cross(axis, vectors)
+    return vectors + scalar * cross + torch.linalg.cross(axis, cross)
+
+
+def _resized(values: Tensor | None, rows: int, device: torch.device | str) -> Tensor:
+    """Return values [rows] that begin with the given ones, and are 0 behind them."""
+    result = torch.zeros(rows, device=device)
+    if values is not None:
+        result[: len(values)] = values[:rows]
+    return result

@@ -1,0 +1,142 @@
+"""The interface of a densification strategy, and the schedule that strategies share."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...model.gaussians import Gaussians, Optimizer
+from ...rasterizer import Rendering
+from ...runs.config import Config
+
+MIN_INTERVAL = 20
+"""Fewest iterations between refinements, however short the training: statistics need several photos."""
+RESERVE_FACTOR = 1.17  # Reserved rows as a multiple of the count: room for three refinements that add a twentieth each
+SEED_STRIDE = 1_000_003  # Distance between the noise seeds of consecutive training seeds; one seed per iteration
+
+
+class Seeds(NamedTuple):
+    """New Gaussians to place.
+
+    Attributes:
+        rows: Tensors [M, ...] as Gaussians.append() takes them; the first `count` rows are to be used.
+        count: int64 [] on the device.
+    """
+
+    rows: dict[str, Tensor]
+    count: Tensor
+
+
+SeedFunction = Callable[[Tensor, int], Seeds]
+"""Returns up to a number of new Gaussians, given as int64 [] on the device and as its upper bound on the host."""
+
+
+@dataclass
+class Schedule:
+    """When a strategy refines, in iterations of this training."""
+
+    start: int
+    stop: int
+    every: int
+
+    @staticmethod
+    def from_config(config: Config) -> "Schedule":
+        """Scale the iteration numbers of a config to its training."""
+        options = config.densification
+        return Schedule(
+            start=config.scaled(options.refine_start_iter),
+            stop=config.scaled(options.refine_stop_iter),
+            every=max(config.scaled(options.refine_every), MIN_INTERVAL),
+        )
+
+    def is_due(self, iteration: int, photos: int) -> bool:
+        """Return whether a step of `photos` iterations that ends at `iteration` came to a refinement."""
+        past = iteration % self.every
+        return past < photos and self.start < iteration - past < self.stop
+
+    def refinements_left(self, iteration: int) -> int:
+        """Return the number of refinements from the one at `iteration` on."""
+        return (self.stop - 1) // self.every - iteration // self.every + 1
+
+    def is_over(self, iteration: int) -> bool:
+        """Return whether no refinement follows after an iteration."""
+        return (max(iteration, self.start) // self.every + 1) * self.every >= self.stop
+
+
+@dataclass
+class Strategy:
+    """A densification strategy; this base class never changes the Gaussians.
+
+    Attributes:
+        schedule: When to refine.
+        cap_max: Largest number of Gaussians.
+        prune_opacity: Gaussians below this opacity are relocated or removed.
+        photos: Iterations of the current step: one for each rank.
+    """
+
+    schedule: Schedule
+    cap_max: int
+    prune_opacity: float
+    photos: int = 1
+
+    def needs_gradients(self, iteration: int) -> bool:
+        """Return whether accumulate() needs the gradients of the projected means at this iteration."""
+        return False
+
+    def prepare(self, rows: int, device: torch.device | str) -> None:
+        """Allocate statistics for `rows` rows, of which the Gaussians are the first."""
+
+    def accumulate(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
+        """Add the screen-space gradients of a step to the statistics.
+
+        Args:
+            rendering: Rendering of the step, after the backward pass.
+            width: Pixels of the image.
+            height: Pixels of the image.
+            usable: Scalar tensor; 0 ignores the step.
+        """
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether refine() does anything at this iteration."""
+        return self.schedule.is_due(iteration, self.photos)
+
+    def refine(
+        self,
+        iteration: int,
+        gaussians: Gaussians,
+        optimizer: Optimizer | None,
+        generator: torch.Generator,
+        seed: SeedFunction | None = None,
+    ) -> bool:
+        """Change the Gaussians and their optimizer state if this iteration is due.
+
+        Args:
+            iteration: Iterations done.
+            gaussians: The Gaussians.
+            optimizer: Their optimizer.
+            generator: Source of random numbers, on the Gaussians' device.
+            seed: Proposes new Gaussians where photos are reproduced worst.
+
+        Returns:
+            True if the number of Gaussians, or any parameter tensor, changed.
+        """
+        return False
+
+    def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
+        """Add noise to the positions after a step of the optimizer."""
+
+    def reserved_rows(self, iteration: int, count: int) -> int:
+        """Return the rows worth reserving for `count` Gaussians and those that later refinements add."""
+        if self.schedule.is_over(iteration):
+            return count
+        return max(count, min(self.cap_max, math.ceil(RESERVE_FACTOR * count)))
+
+    def state(self, count: int) -> dict[str, Tensor]:
+        """Return the statistics of `count` Gaussians for a checkpoint."""
+        return {}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue with the statistics of state()."""

@@ -1,0 +1,228 @@
+"""3DGS-MCMC: relocate dead Gaussians, add new ones up to a cap, and explore by noise on positions."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer
+from ...model.reserved_rows import moments_of
+from ...rasterizer.relocation import SampledRows, clear_rows, copy_rows, count_copies, number_places, share_opacities
+from ...rasterizer.training_step import add_position_noise
+from ...runs.config import Config, McmcConfig
+from .base import SEED_STRIDE, Schedule, SeedFunction, Strategy
+
+MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: each Gaussian then shares with one other on average
+DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
+MAX_NOISE_SIZES = 0.05
+"""Noise moves a Gaussian by at most this many of its standard deviations per step (times a normal number)."""
+MAX_DISTANCE = 100.0
+"""Noise moves no Gaussian farther than this from the origin, in normalized units (1.1 camera radii)."""
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Rows to fill in a refinement: those of the dead Gaussians, then the new ones.
+
+    Attributes:
+        numbers: [N] int32, position of each row in that order; negative for rows that stay.
+        changed: [N] bool, rows whose optimizer state is to be cleared.
+    """
+
+    numbers: Tensor
+    changed: Tensor
+
+
+@dataclass
+class McmcStrategy(Strategy):
+    """3DGS-MCMC.
+
+    Dead Gaussians are relocated to living ones in a way that preserves the image, and the count grows to a cap. Some of
+    the relocated and new Gaussians are seeded where photos are reproduced worst. Noise on the positions of transparent
+    Gaussians explores. There are no gradient statistics and no opacity resets.
+
+    A training that starts with more Gaussians than the cap keeps their number.
+
+    Attributes:
+        options: Options of the strategy.
+        random_seed: Seed of the training.
+        camera_positions: [V, 3] positions of the training cameras, for prune_near_angle.
+    """
+
+    options: McmcConfig = field(default_factory=McmcConfig)
+    random_seed: int = 0
+    camera_positions: Tensor | None = None
+
+    @staticmethod
+    def from_config(config: Config, pixels: int, camera_positions: Tensor | None = None) -> "McmcStrategy":
+        """Create the strategy of a config for training photos of so many pixels in total."""
+        return McmcStrategy(
+            schedule=Schedule.from_config(config),
+            cap_max=mcmc_cap(config, pixels),
+            prune_opacity=config.densification.prune_opacity,
+            options=config.mcmc,
+            random_seed=config.seed,
+            camera_positions=camera_positions,
+        )
+
+    @torch.no_grad()
+    def refine(
+        self,
+        iteration: int,
+        gaussians: Gaussians,
+        optimizer: Optimizer | None,
+        generator: torch.Generator,
+        seed: SeedFunction | None = None,
+    ) -> bool:
+        """Relocate dead Gaussians and add new ones, if this iteration is due.
+
+        Only the device knows how many Gaussians are dead, so all counts stay there.
+        """
+        if not self.is_due(iteration):
+            return False
+        count = gaussians.count
+        added = self.next_count(iteration, count) - count
+        opacities = gaussians.opacities()
+        dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
+        numbers, dead_count = number_places(dead, added)
+        gaussians.resize(count + added, optimizer)
+        places = _Places(numbers, torch.zeros_like(numbers, dtype=torch.bool))
+        seeded = self.place_seeds(gaussians, places, dead_count, added, count, seed)
+        self.relocate(gaussians, places, opacities.masked_fill(dead, 0), seeded, dead_count, generator)
+        if added > 0:
+            self.sample_add(gaussians, places, torch.maximum(dead_count, seeded), dead_count + added, added, generator)
+        moments = [m for p in gaussians.parameters() for m in moments_of(optimizer, p).values()]
+        clear_rows(moments, places.changed)
+        return added > 0
+
+    def next_count(self, iteration: int, count: int) -> int:
+        """Return the count after the refinement at an iteration.
+
+        It grows by growth_rate, or by as much as reaches the cap at the last refinement, at most MAX_GROWTH.
+        """
+        growth = self.options.growth_rate
+        if growth and count < self.cap_max:
+            remaining = self.schedule.refinements_left(iteration)
+            growth = max(growth, min((self.cap_max / count) ** (1 / remaining) - 1, MAX_GROWTH))
+        return max(count, min(self.cap_max, math.ceil((1 + growth) * count)))
+
+    def place_seeds(
+        self,
+        gaussians: Gaussians,
+        places: _Places,
+        dead_count: Tensor,
+        added: int,
+        count: int,
+        seed: SeedFunction | None,
+    ) -> Tensor:
+        """Fill the first places with seeded Gaussians; return their number, int64 []."""
+        fraction, none = self.options.seed_fraction, torch.zeros_like(dead_count)
+        if seed is None or not fraction:
+            return none
+        number = (fraction * (dead_count + added).double()).long()
+        bound = host_bound(number, int(fraction * (count + added)))
+        if not bound:
+            return none
+        rows, seeded = seed(number, bound)
+        values = list(gaussians.tensors().values())
+        rows = [rows[name] for name in PARAMETER_NAMES]
+        copy_rows(values, rows, places.numbers, none, seeded, changed=places.changed)
+        return seeded
+
+    def relocate(
+        self,
+        gaussians: Gaussians,
+        places: _Places,
+        weights: Tensor,
+        first: Tensor,
+        last: Tensor,
+        generator: torch.Generator,
+    ) -> None:
+        """Fill the places [first, last) of dead Gaussians with living ones, sampled by weights [N]."""
+        self._fill(gaussians, places, weights, first, last, len(weights), generator)
+
+    def sample_add(
+        self,
+        gaussians: Gaussians,
+        places: _Places,
+        first: Tensor,
+        last: Tensor,
+        bound: int,
+        generator: torch.Generator,
+    ) -> None:
+        """Fill the places [first, last) of new Gaussians, at most `bound`, with others sampled by opacity."""
+        weights = gaussians.opacities().masked_fill_(places.numbers >= first, 0)
+        self._fill(gaussians, places, weights, first, last, bound, generator)
+
+    def _fill(
+        self,
+        gaussians: Gaussians,
+        places: _Places,
+        weights: Tensor,
+        first: Tensor,
+        last: Tensor,
+        bound: int,
+        generator: torch.Generator,
+    ) -> None:
+        """Copy Gaussians sampled by weights to the places [first, last), at most `bound`.
+
+        The copies and their source share opacity and size so that the image stays (3DGS-MCMC, equation 9).
+        """
+        bound = host_bound((last - first).clamp_min(0), bound)
+        if not bound:
+            return
+        sampled = sample_rows(weights, bound, generator)
+        copies = count_copies(sampled, first, last, places.changed)
+        logits, log_scales = gaussians.opacity_logits.detach(), gaussians.log_scales.detach()
+        share_opacities(logits, log_scales, copies, least=self.prune_opacity)
+        values = list(gaussians.tensors().values())
+        # As in the authors' code, relocated Gaussians keep their Adam state, and only their sources lose it.
+        copy_rows(values, values, places.numbers, first, last, samples=sampled)
+
+    def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
+        """Add noise to positions, larger for transparent Gaussians.
+
+        The seed depends on the iteration only, so that a resumed training adds the same noise.
+        """
+        if self.options.noise_lr:
+            add_position_noise(
+                gaussians.means,
+                gaussians.log_scales,
+                gaussians.quaternions,
+                gaussians.opacity_logits,
+                strength=self.options.noise_lr * means_lr,
+                most_sizes=MAX_NOISE_SIZES,
+                most_distance=MAX_DISTANCE,
+                seed=(self.random_seed * SEED_STRIDE + iteration) % 2**31,
+            )
+
+    def _near_cameras(self, gaussians: Gaussians) -> Tensor:
+        """Return a mask [N] of floaters: Gaussians wider than prune_near_angle times their distance to a camera."""
+        means, cameras = gaussians.means, self.camera_positions
+        if cameras is None or not self.options.prune_near_angle:
+            return torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        exact = "donot_use_mm_for_euclid_dist"
+        parts = means.split(max(1, DISTANCES_AT_ONCE // len(cameras)))
+        nearest = torch.cat([torch.cdist(part, cameras, compute_mode=exact).amin(1) for part in parts])
+        return gaussians.log_scales.amax(1) > torch.log(self.options.prune_near_angle * nearest)
+
+
+def mcmc_cap(config: Config, pixels: int) -> int:
+    """Return the largest number of Gaussians that "mcmc" makes for training photos of so many pixels in total."""
+    most, density = config.densification.cap_max, config.mcmc.cap_density
+    return min(most, int(density * math.sqrt(pixels))) if density else most
+
+
+def host_bound(number: Tensor, bound: int) -> int:
+    """Return an upper bound of a number on the device: on a CPU the number itself; a GPU is not waited for."""
+    return min(bound, int(number)) if number.device.type == "cpu" else bound
+
+
+def sample_rows(weights: Tensor, count: int, generator: torch.Generator) -> SampledRows:
+    """Sample row indices in proportion to weights, with replacement, by bisection of the cumulative sum."""
+    steps = weights.double().cumsum(0)
+    uniform = torch.rand(count, generator=generator, device=weights.device, dtype=torch.float64)
+    # Not 0, which would select the first row whatever its weight.
+    uniform = uniform.clamp_min_(torch.finfo(torch.float64).tiny)
+    return SampledRows(torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(weights) - 1), steps[-1])
