@@ -151,12 +151,20 @@ def read_text(path: Path, limit: int = MAX_FILE_BYTES, errors: str = "strict") -
         raise InputError(path, f"is not UTF-8 text (byte {error.start})", "export the file again") from None
 
 
-def read_lines(path: Path) -> Iterator[str]:
-    """The lines of a file of UTF-8 text, one by one; raises InputError as read_text does, and for a line too long."""
+def read_lines(path: Path, errors: str = "strict") -> Iterator[str]:
+    """Yield the lines of a file of UTF-8 text.
+
+    Args:
+        path: the file.
+        errors: "strict", or "surrogateescape" to keep bytes that are not UTF-8, as Python keeps them in names of files.
+
+    Raises:
+        InputError: as read_text raises it, and for a line that is too long.
+    """
     try:
         if plain_size(path) == 0:
             read_bytes(path)  # It refuses an empty one.
-        with open(path, encoding="utf-8-sig") as file:
+        with open(path, encoding="utf-8-sig", errors=errors) as file:
             while line := file.readline(_MAX_LINE):
                 if len(line) == _MAX_LINE:
                     raise InputError(path, f"has a line of over {_MAX_LINE} characters", "check that this is the file")

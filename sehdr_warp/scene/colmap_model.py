@@ -1,5 +1,6 @@
 """Reader of COLMAP's sparse models, binary and text (https://colmap.github.io/format.html), safe for hostile files."""
 
+import os
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -49,11 +50,47 @@ def find_model(folder: Path) -> Path | None:
     """Return the folder that holds a model's cameras, or None.
 
     Looks for sparse/0, sparse, or a text export (sparse/txt, sparse_txt, sparse_txt/0) in the folder itself, then in
-    its colmap/ and dense/.
+    its colmap/ and dense/. Of several models sparse/0, sparse/1 ... it is the one with the most images.
     """
     names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
     places = (folder / above / name for above in (".", "colmap", "dense") for name in names)
-    return next((p for p in places if any((p / f"cameras{end}").is_file() for end in (".bin", ".txt"))), None)
+    first = next((place for place in places if _is_model(place)), None)
+    if first is None or first.name != "0":
+        return first
+    models = _numbered(first.parent)
+    counts = {model: _image_count(model) for model in models} if len(models) > 1 else {first: 0}
+    return max(counts, key=lambda model: counts[model])
+
+
+def other_models(model: Path) -> list[str]:
+    """Return a note on the models that lie beside the one that is used; none if there are no others."""
+    models = _numbered(model.parent) if model.name.isdecimal() else []
+    if len(models) < 2:
+        return []
+    others = ", ".join(f"{each.name} ({_image_count(each)} images)" for each in models if each != model)
+    place = f"{model.parent.name}/{model.name}"
+    return [f"{place} is used, the largest model ({_image_count(model)} images); not used: {others}"]
+
+
+def _is_model(place: Path) -> bool:
+    return any((place / f"cameras{end}").is_file() for end in (".bin", ".txt"))
+
+
+def _numbered(parent: Path) -> list[Path]:
+    """List the models sparse/0, sparse/1 ... in their order."""
+    places = [place for place in parent.iterdir() if place.name.isdecimal() and _is_model(place)]
+    return sorted(places, key=lambda place: int(place.name))
+
+
+def _image_count(model: Path) -> int:
+    """Return how many images a model lists, 0 if that cannot be read."""
+    try:
+        if (model / "images.bin").is_file():
+            with (model / "images.bin").open("rb") as file:
+                return struct.unpack("<Q", file.read(8))[0]
+        return sum(1 for _ in _image_records(model / "images.txt"))
+    except (OSError, struct.error, InputError):
+        return 0
 
 
 def read_model(folder: Path) -> SparseModel:
@@ -70,9 +107,8 @@ def read_model(folder: Path) -> SparseModel:
             raise InputError(camera_path, f"camera {number} is listed twice", _REMEDY)
         cameras[number] = Lens(*lens, source=camera_path)
     images: dict[str, ModelImage] = {}
-    # In text a line of observations follows each image; it is empty, or missing at the end, where there are none.
-    for pose, number, name in _images_binary(image_path) if binary else _records(image_path, "an image", _image, 2):
-        if not name or len(name.encode("utf-8", "replace")) > MAX_NAME_BYTES:
+    for pose, number, name in _images_binary(image_path) if binary else _image_records(image_path):
+        if not name or len(os.fsencode(name)) > MAX_NAME_BYTES:
             problem = f"image name {name[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes"
             raise InputError(image_path, problem, "rename the image")
         if name in images:
@@ -152,10 +188,7 @@ class _Bytes:
             problem = f"image name at byte {self.position} has no end within {MAX_NAME_BYTES} bytes"
             raise InputError(self.path, problem, _REMEDY)
         raw, self.position = self.data[self.position : end], end + 1
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError:
-            raise InputError(self.path, f"image name {raw[:40]!r} is not UTF-8 text", "rename the image") from None
+        return os.fsdecode(raw)
 
 
 def _cameras_binary(path: Path) -> Iterator[tuple]:
@@ -186,18 +219,48 @@ def _points_binary(path: Path) -> PointCloud:
     return _checked_points(table[:, :3], table[:, 3:] / 255, path)
 
 
-def _records(path: Path, what: str, parse: Callable[[str], tuple], lines_each: int = 1) -> Iterator[tuple]:
+def _records(path: Path, what: str, parse: Callable[[str], tuple]) -> Iterator[tuple]:
     """Parse the lines of a text file except empty ones and comments; ValueError becomes an InputError."""
-    lines = enumerate(read_lines(path), start=1)
-    for number, line in lines:
-        if not line.strip() or line.startswith("#"):
+    for number, line in enumerate(read_lines(path), start=1):
+        if line.strip() and not line.startswith("#"):
+            yield _parsed(path, number, line, what, parse)
+
+
+def _image_records(path: Path) -> Iterator[tuple]:
+    """Parse the images of images.txt.
+
+    A line of observations follows each image. It is empty for an image without any, and missing in files of scripts for
+    known poses: there the next line is an image again.
+    """
+    after_image = False
+    for number, line in enumerate(read_lines(path, "surrogateescape"), start=1):
+        if line.startswith("#"):
             continue
-        try:
-            yield parse(line)
-        except ValueError:
-            raise InputError(path, f"line {number} is not {what}: {line[:60]!r}", _REMEDY) from None
-        if lines_each == 2:
-            next(lines, None)
+        if not line.strip() or (after_image and _is_observations(line)):
+            after_image = False
+        else:
+            yield _parsed(path, number, line, "an image", _image)
+            after_image = True
+
+
+def _is_observations(line: str) -> bool:
+    """Return whether a line is a list of (x, y, point) and not an image: ten fields, the last of which is a name."""
+    fields = line.split()
+    if len(fields) % 3:
+        return False
+    try:
+        for field in (*fields[:30], *fields[-3:]):
+            float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _parsed(path: Path, number: int, line: str, what: str, parse: Callable[[str], tuple]) -> tuple:
+    try:
+        return parse(line)
+    except ValueError:
+        raise InputError(path, f"line {number} is not {what}: {line[:60]!r}", _REMEDY) from None
 
 
 def _camera(line: str) -> tuple:

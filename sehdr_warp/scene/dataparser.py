@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputError
+from .color_encoding import ColorEncoding
 from .lens import Lens
 
 DERIVED_PHOTOS = "reinhard-gamma"
@@ -34,8 +35,11 @@ class ImageRecord:
         mask: its mask file.
         hdr: its file of HDR truth.
         derived: the set has no photos; this one is computed from the truth, and `image` is the truth's file.
-        linear: the photo's codes are proportional to light; they are re-encoded by sRGB's curve.
+        linear: the user says that the photo's codes are proportional to light; they are re-encoded by sRGB's curve.
         gain_map: the photo's light is taken from its gain map and re-encoded by sRGB's curve.
+        encoding: what the photo's file states of its colors; None if it states nothing.
+        light_scale: factor from the values of a float photo to the light of the set, by the times that files state.
+        time_known: False if exposure_time is only a guess, to be replaced by comparing light with other photos.
         oriented: the lens refers to the pixels after EXIF orientation; None decides by the sizes.
     """
 
@@ -51,6 +55,9 @@ class ImageRecord:
     derived: bool = False
     linear: bool = False
     gain_map: bool = False
+    encoding: ColorEncoding | None = None
+    light_scale: float = 1.0
+    time_known: bool = True
     oriented: bool | None = None
 
     @property
@@ -58,6 +65,10 @@ class ImageRecord:
         """The exposure time in seconds, after with_exposure_times() has set it."""
         assert self.exposure_time is not None
         return self.exposure_time
+
+
+UNPLACED = Lens("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5), Path("photos without cameras"))
+"""The lens of photos before structure from motion."""
 
 
 class PointCloud(NamedTuple):

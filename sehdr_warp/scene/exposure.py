@@ -1,112 +1,174 @@
-"""Exposure times: from the set's own files, from EXIF, and the choice of one exposure where a view has several."""
+"""Exposure times: from the set's own files, from EXIF, and the choice of one exposure if a view has several."""
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from ..errors import InputError
 from ..files import read_bytes
 from .dataparser import ImageRecord
-from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
+from .exif import LONGEST, SHORTEST, ExifExposure, are_camera_jpegs, exif_exposure, exif_lens, parse_number
+from .names import bases_of
 
-_EXIF_IFD = 0x8769
-_CAMERA, _LENS = (271, 272), (42036, 37386, 33437)  # Make and model; lens, focal length, f-number
-_EXPOSURE_TIME, _F_NUMBER, _SPEED, _SHUTTER_APEX = 33434, 33437, 34855, 37377
-SHORTEST, LONGEST = 1e-12, 1e12
-"""Seconds: what an exposure time may be."""
-_REMEDY = "correct it, or state every image's seconds in exposures.json"
+__all__ = [
+    "LONGEST",
+    "SHORTEST",
+    "are_camera_jpegs",
+    "choose_exposure",
+    "exif_exposure",
+    "exif_lens",
+    "parse_seconds",
+    "shutter",
+    "with_exposure_times",
+]
+EXPOSURES = "exposures.json"
+_MOST_NAMED = 3
 
 
 def choose_exposure(
     records: Sequence[ImageRecord], index: int | None, source: Path
 ) -> tuple[list[ImageRecord], list[str]]:
-    """One record of each view, and notes.
+    """Choose one photo of each view.
 
-    index: the exposure's number in the file names; None takes the middle one (of an even count the longer).
-    Raises InputError where no view has the number.
+    Args:
+        records: the photos of all exposures.
+        index: the exposure's number in the file names; None takes the middle one (of an even count the longer).
+        source: to name in errors.
+
+    Returns:
+        The photos, and notes.
+
+    Raises:
+        InputError: if no view has the number.
     """
     keys = sorted({record.exposure_key for record in records if record.exposure_key is not None})
-    asked = f"exposure index {index} asked for"
+    request = f"exposure index {index} asked for"
     if not keys:
         if index not in (None, 0):
-            raise InputError(source, f"{asked}, but each view has one exposure", "leave the exposure index out")
+            raise InputError(source, f"{request}, but each view has one exposure", "leave the exposure index out")
         return list(records), []
     chosen, notes = keys[len(keys) // 2] if index is None else index, []
     if chosen not in keys:
-        raise InputError(source, f"{asked}, but the exposures are {keys}", f"choose one of {keys[0]} to {keys[-1]}")
+        raise InputError(source, f"{request}, but the exposures are {keys}", f"choose one of {keys[0]} to {keys[-1]}")
     if index is None and len(keys) > 1:
         notes = [f"each view has {len(keys)} exposures {keys}; took the middle one, index {chosen}"]
-    taken = [record for record in records if record.exposure_key in (None, chosen)]
-    missing = sorted({record.view for record in records} - {record.view for record in taken})
+    selected = [record for record in records if record.exposure_key in (None, chosen)]
+    missing = sorted({record.view for record in records} - {record.view for record in selected})
     if missing:
         notes.append(f"{len(missing)} views without exposure {chosen} were left out: {', '.join(missing[:5])}")
-    return taken, notes
+    return selected, notes
 
 
 def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[ImageRecord], bool, list[str]]:
-    """The records with a time each, whether the times are known, and notes.
+    """Give each photo its exposure time.
 
-    The set's own seconds come first, then `exposures.json` beside the images or in the data folder, then EXIF. An
-    EXIF time counts as t (ISO / ISO_0) (N_0 / N)^2 with the first photo's ISO_0 and f-number N_0, so that photos that
-    differ in sensitivity or aperture keep their ratio of recorded light. With none at all, each is 1 second.
-    Raises InputError for a time that is not positive and finite, and where only some photos state one.
+    The set's own seconds come first, then exposures.json in the data folder or beside the images, then EXIF. An EXIF
+    time counts as t (ISO / ISO_0) (N_0 / N)^2 with the first photo's ISO_0 and f-number N_0, so that photos that differ
+    in sensitivity or aperture keep their ratio of recorded light. If most photos have a time, the others get the
+    geometric mean and `time_known` False: their light is compared with the others' later. If most have none, each is
+    1 second.
+
+    Args:
+        records: the photos.
+        source: the data folder.
+
+    Returns:
+        The photos, whether times are known, and notes.
+
+    Raises:
+        InputError: if exposures.json is damaged or states an impossible time.
     """
-    stated, strange, notes = [record.exposure_time for record in records], [], []
-    if None in stated:
-        listed, strange = _listed_times(records, source)
-        stated = [listed.get(s.image.name) if time is None else time for time, s in zip(stated, records, strict=True)]
-    if set(stated) == {None}:
-        stated, notes = _exif_times(records)
-    notes = [*strange, *notes]
-    times = [float(time) for time in stated if time is not None]
-    for record, time in zip(records, stated, strict=True):
-        if time is None and times:
-            problem = f"exposure time is absent in {len(records) - len(times)} of {len(records)} images"
-            problem += "".join(f" ({note})" for note in strange)
-            raise InputError(record.image, problem, "state all in exposures.json, or strip them all")
+    times, notes = [record.exposure_time for record in records], []
+    if None in times:
+        listed, notes = _listed_times(records, source)
+        times = [
+            listed.get(record.image) if time is None else time for time, record in zip(times, records, strict=True)
+        ]
+    if None in times:
+        unlisted = [record for record, time in zip(records, times, strict=True) if time is None]
+        by_exif, more = _exif_times(unlisted)
+        stated = iter(by_exif)
+        times, notes = [next(stated) if time is None else time for time in times], [*notes, *more]
+    known = [time for time in times if time is not None]
+    for record, time in zip(records, times, strict=True):
         if time is not None and not SHORTEST <= time <= LONGEST:
-            raise InputError(record.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", _REMEDY)
-    if not times:
-        notes.append("no exposure times were found: each view counts as 1 s")
+            remedy = f"correct it, or state every image's seconds in {EXPOSURES}"
+            raise InputError(record.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", remedy)
+    if 2 * len(known) <= len(records):
+        ignored = f"; those of {len(known)} photos are not counted" if known else ""
+        state = "no exposure times were found" if not known else "most photos state no exposure time"
+        notes.append(f"{state}: each view counts as 1 s{ignored}")
         return [replace(record, exposure_time=1.0) for record in records], False, notes
-    shortest, longest = min(times), max(times)
+    shortest, longest = min(known), max(known)
     if longest > shortest * 1.01:
-        stops = math.log2(longest / shortest)
         span = f"{shutter(shortest)} to {shutter(longest)}".replace(" s to", " to")
-        notes.append(f"exposures differ: {span} ({stops:.1f} stops); each view keeps its own")
-    return [replace(record, exposure_time=time) for record, time in zip(records, times, strict=True)], True, notes
+        notes.append(f"exposures differ: {span} ({math.log2(longest / shortest):.1f} stops); each view keeps its own")
+    middle = math.exp(sum(map(math.log, known)) / len(known))
+    timed = [
+        replace(record, exposure_time=middle if time is None else time, time_known=time is not None)
+        for record, time in zip(records, times, strict=True)
+    ]
+    return timed, True, notes
 
 
 def shutter(time: float) -> str:
-    """An exposure time as photographers write it: `1/640 s`, `0.4 s`, `2 s`."""
+    """Return an exposure time as photographers write it: `1/640 s`, `0.4 s`, `2 s`."""
     parts = round(1 / time)
     return f"1/{parts} s" if time < 0.3 and abs(parts * time - 1) < 0.02 else f"{time:.3g} s"
 
 
 def parse_seconds(value, source: Path, field: str) -> float:
-    """A positive, finite number of seconds from JSON, or a text as photographers write it; InputError otherwise."""
-    try:
-        whole, _, parts = str(value).partition("/")
-        seconds = float(whole) / float(parts or 1)
-    except (TypeError, ValueError, OverflowError, ZeroDivisionError):
-        seconds = math.nan
-    if not SHORTEST <= seconds <= LONGEST:
+    """Return the seconds that JSON states as a number or as photographers write them.
+
+    Raises:
+        InputError: if they are not positive and finite.
+    """
+    seconds = parse_number(str(value))
+    if isinstance(value, bool) or seconds is None or not SHORTEST <= seconds <= LONGEST:
         remedy = 'state seconds above zero, such as 0.008 or "1/125"'
         raise InputError(source, f"exposure time of {field!r:.90} is {value!r:.40}", remedy)
     return seconds
 
 
-def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[str, float], list[str]]:
-    """exposures.json, {"file name": seconds} or a list of {"file": ..., "exposure_time": seconds}; and a note, if it
-    names what is not there."""
-    places = (folder / "exposures.json" for folder in (records[0].image.parent, source))
-    path = next((place for place in places if place.is_file()), None)
-    if path is None:
-        return {}, []
+def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, float], list[str]]:
+    """Return the seconds of photos by exposures.json, and notes on names that it could not be matched with.
+
+    The file is {"path": seconds} or a list of {"file": path, "exposure_time": seconds}. Paths are relative to the data
+    folder, to a folder between it and the photos, or to the file's own; a name alone is enough if no two photos share
+    it. The suffix may be left out.
+    """
+    images = list(dict.fromkeys(record.image for record in records))
+    bases = bases_of(images, source)
+    places = dict.fromkeys((source, *reversed(bases), *(image.parent for image in images)))
+    times, notes = {}, []
+    for place in places:
+        if not (place / EXPOSURES).is_file():
+            continue
+        listed = _read_times(place / EXPOSURES)
+        names = _names_of(images, [*bases, place])
+        strange, ambiguous = [], []
+        for name, seconds in listed.items():
+            found = names.get(_plain(name), [])
+            if len(found) == 1:
+                times[found[0]] = seconds
+            elif found:
+                ambiguous.append(
+                    f"{name} ({', '.join(image.relative_to(bases[-1]).as_posix() for image in found[:2])})"
+                )
+            elif not any((base / _plain(name)).is_file() for base in (place, *bases, *{i.parent for i in images})):
+                strange.append(name)
+        if strange:
+            listing = ", ".join(strange[:_MOST_NAMED]) + (" ..." if len(strange) > _MOST_NAMED else "")
+            notes.append(f"{EXPOSURES}: {len(strange)} of its {len(listed)} names belong to no photo: {listing}")
+        if ambiguous:
+            listing = ", ".join(ambiguous[:_MOST_NAMED])
+            notes.append(f"{EXPOSURES}: {len(ambiguous)} names fit several photos, and need their folders: {listing}")
+    return times, notes
+
+
+def _read_times(path: Path) -> Mapping[str, float]:
     try:
         values = json.loads(read_bytes(path, 1 << 24))
         if isinstance(values, list):
@@ -115,81 +177,46 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[str, f
     except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
         problem = f"is not a table of exposure times ({error!r:.80})"
         raise InputError(path, problem, 'write {"file name": seconds, ...}') from None
-    listed = {Path(str(name)).name: parse_seconds(value, path, str(name)) for name, value in entries}
-    folders = {record.image.parent for record in records} | {source}
-    strange = [name for name in listed if not any((folder / name).exists() for folder in folders)]
-    named = ", ".join(strange[:3]) + (" ..." if len(strange) > 3 else "")
-    note = f"{path.name}: {len(strange)} of its {len(listed)} names belong to no photo: {named}"
-    return listed, [note] * bool(strange)
+    return {str(name): parse_seconds(value, path, str(name)) for name, value in entries}
+
+
+def _names_of(images: Sequence[Path], bases: Sequence[Path]) -> dict[str, list[Path]]:
+    """Map each way to name photos to those that it fits: paths below the bases, then names alone."""
+    exact: dict[str, list[Path]] = {}
+    alone: dict[str, list[Path]] = {}
+    for image in images:
+        paths = {image.relative_to(base) for base in bases if image.is_relative_to(base)}
+        for key in {key for path in paths for key in (path.as_posix(), path.with_suffix("").as_posix())}:
+            exact.setdefault(key, []).append(image)
+        for key in {image.name, image.stem}:
+            alone.setdefault(key, []).append(image)
+    return alone | exact
+
+
+def _plain(name: str) -> str:
+    """Return a name with forward slashes and without a leading `./`."""
+    name = name.replace("\\", "/")
+    while name.startswith("./"):
+        name = name[2:]
+    return name
 
 
 def _exif_times(records: list[ImageRecord]) -> tuple[list[float | None], list[str]]:
-    settings = [exif_exposure(record.image) for record in records]
+    exposures = [exif_exposure(record.image) for record in records]
+    timed = [exposure for exposure in exposures if exposure.time is not None]
     notes, factors = [], [1.0] * len(records)
-    for name, place, power in (("ISO", 1, 1.0), ("f-number", 2, -2.0)):
-        values = [value for setting in settings if (value := setting[place]) is not None]
-        if 0 < len(values) < len(records):
+    for name, field, power in (("ISO", "iso", 1.0), ("f-number", "f_number", -2.0)):
+        values = [value for exposure in timed if (value := getattr(exposure, field)) is not None]
+        if 0 < len(values) < len(timed):
             notes.append(f"{name} is not stated for all photos and was not counted")
         elif len(set(values)) > 1:
-            factors = [f * (v / values[0]) ** power for f, v in zip(factors, values, strict=True)]
+            factors = [
+                f * _ratio(exposure, field, values[0]) ** power for f, exposure in zip(factors, exposures, strict=True)
+            ]
             span = f"{min(values):g} to {max(values):g}"
             notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}")
-    return [None if t is None else t * f for (t, _, _), f in zip(settings, factors, strict=True)], notes
+    return [e.time and e.time * f for e, f in zip(exposures, factors, strict=True)], notes
 
 
-def exif_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
-    """Exposure time in seconds, ISO speed and f-number as EXIF states them, None where it does not.
-
-    Raises InputError for an exposure time of zero or one that is not a number, and where the file is no image.
-    """
-    if path.suffix.lower() in HDR_SUFFIXES:
-        return None, None, None
-    try:
-        if path.suffix.lower() in RAW_SUFFIXES:
-            from .linear_photos import raw_exposure
-
-            return raw_exposure(path)
-        with open_image(path) as image:
-            table = exif_of(image).get_ifd(_EXIF_IFD)
-            tags = (_EXPOSURE_TIME, _SHUTTER_APEX, _SPEED, _F_NUMBER)
-            time, apex, speed, aperture = (_number(table.get(tag)) for tag in tags)
-    except PILLOW_ERRORS:
-        return None, None, None
-    if time is None and apex is not None and math.isfinite(apex) and abs(apex) < 64:
-        time = 2.0**-apex
-    if time is not None and not (math.isfinite(time) and time > 0):
-        raise InputError(path, f"EXIF exposure time is {time}", _REMEDY)
-    return time, speed if speed and 0 < speed < 1e9 else None, aperture if aperture and 0 < aperture < 1e4 else None
-
-
-@lru_cache(maxsize=4096)
-def exif_lens(path: Path | None) -> tuple[str, ...]:
-    """What EXIF states of how a photo's corners darken: camera, lens, focal length and f-number; empty where it states
-    none of them, and where there is no such file."""
-    if path is None or path.suffix.lower() in (*HDR_SUFFIXES, *RAW_SUFFIXES) or not path.is_file():
-        return ()
-    try:
-        with open_image(path) as image:
-            first = exif_of(image)
-            table = first.get_ifd(_EXIF_IFD)
-            stated = [first.get(tag) for tag in _CAMERA] + [table.get(tag) for tag in _LENS]
-    except (*PILLOW_ERRORS, InputError):
-        return ()
-    return tuple(map(str, stated)) if set(stated) != {None} else ()
-
-
-def are_camera_jpegs(sources: Sequence[Path | None]) -> bool:
-    """Whether most of the files are a camera's own: JPEGs whose EXIF states an exposure time or f-number."""
-    photos = (path for path in sources if path and path.suffix.lower() in (".jpg", ".jpeg") and path.is_file())
-    made = sum(any(exif_exposure(photo)[::2]) for photo in photos)
-    return 2 * made > len(sources)
-
-
-def _number(value: Any) -> float | None:
-    value = value[0] if isinstance(value, tuple) and value else value
-    try:
-        return float(value)
-    except ZeroDivisionError:
-        return math.nan
-    except (TypeError, ValueError):
-        return None
+def _ratio(exposure: ExifExposure, field: str, first: float) -> float:
+    return (getattr(exposure, field) or first) / first

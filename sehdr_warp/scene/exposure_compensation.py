@@ -174,7 +174,7 @@ def rough_gains(
     Alternates means over photos and over points, with one quadratic vignetting for each lens. Outliers keep their
     weight.
     """
-    light, radius = _lights(views, points, seen, response)
+    light, radius = point_light(views, points, seen, response)
     known, of = np.isfinite(light), lens_groups(views)
     light, square = np.where(known, light, 0.0), radius[..., None] ** 2
     gains, slopes = np.zeros((len(views), 1, 3)), np.zeros(of.max() + 2)  # The last is for photos of no group
@@ -215,7 +215,7 @@ def disagreement(
         gains: divided out first.
         colors: compare white balance alone, which differs less if points do not match exactly.
     """
-    light, radius = _lights(views, points, seen, response)
+    light, radius = point_light(views, points, seen, response)
     light -= _logarithms(gains, views, radius) if gains is not None else 0.0
     if colors:
         light -= light.mean(2, keepdims=True)
@@ -231,7 +231,7 @@ def remaining_vignetting(
     Differences are weighted by how much the vignetting predicts, because few points lie near the centre of one photo
     and near the corner of another. Arguments are those of disagreement().
     """
-    light, radius = _lights(views, points, seen, response)
+    light, radius = point_light(views, points, seen, response)
     predicted = np.where(np.isfinite(light), -_powers(gains, views, radius)[..., None], np.nan)
     light -= _logarithms(gains.parts(vignetting=False), views, radius)
     several = np.isfinite(light).sum(0) > 1
@@ -293,7 +293,7 @@ def fit_gains(
     from scipy.sparse.linalg import lsmr
 
     names = [view.name for view in (*views, *others)]
-    light, radius = _lights((*views, *others), points, seen, response)
+    light, radius = point_light((*views, *others), points, seen, response)
     trained, count, most, of = light[: len(views)], len(points), len(views), lens_groups((*views, *others))
     view, point, channel = np.nonzero(np.isfinite(trained))
     values, lens = trained[view, point, channel], of[view]
@@ -351,7 +351,7 @@ def _radius(view: View, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     return np.hypot(column + 0.5 - width / 2, row + 0.5 - height / 2) / np.hypot(width / 2, height / 2)
 
 
-def _lights(views: Sequence[View], points, seen, response) -> tuple[np.ndarray, np.ndarray]:
+def point_light(views: Sequence[View], points, seen, response) -> tuple[np.ndarray, np.ndarray]:
     """Return _light() of all photos: [V, P, 3], NaN if unknown or not seen, and radii [V, P]."""
     light, radius = zip(*(_light(view, points, response) for view in views), strict=True)
     return np.where(seen[: len(views), :, None], np.stack(light), np.nan), np.stack(radius)

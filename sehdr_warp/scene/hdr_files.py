@@ -1,9 +1,13 @@
-"""Scene-linear pixels from OpenEXR and Radiance files (shared-exponent RGBE; Ward, Graphics Gems II, II.5)."""
+"""Readers of scene-linear images: OpenEXR and Radiance files (shared-exponent RGBE; Ward, Graphics Gems II, II.5).
+
+Colors are linear Rec.709 after reading, whatever primaries the file states. If it states none they are Rec.709's.
+"""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,15 +15,23 @@ from ..errors import InputError
 from ..files import read_bytes
 from ..quiet import silent_output
 from .images import DAMAGED, MAX_PIXELS, check_size, require_file
+from .primaries import REC709, encoding_of_interop_id, matrix_to_rec709
 
-# OpenEXR asks for the memory of all pixels before it reads one. Its ZIP of a single color holds 500 pixels in a byte.
+# OpenEXR allocates all pixels before it reads one. Its ZIP of a single color holds 500 pixels in a byte.
 _MOST_PIXELS_PER_BYTE = 4096
 _REMEDY = "export the image again"
 _MAX_HEADER_BYTES = 1 << 16
+_XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
+_RADIANCE = (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.333, 0.333)
+"""Radiance's default primaries. Files that state them were mostly written by tools that mean Rec.709."""
 
 
 def hdr_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header alone; InputError where it cannot be read or states too many pixels."""
+    """Return (width, height) from the header alone.
+
+    Raises:
+        InputError: if it cannot be read or states too many pixels.
+    """
     if path.suffix.lower() != ".hdr":
         return _exr_window(path, MAX_PIXELS)[1]
     require_file(path)
@@ -29,50 +41,125 @@ def hdr_size(path: Path) -> tuple[int, int]:
     return size
 
 
-def read_hdr(path: Path) -> np.ndarray:
-    """[H, W, 3] float32 scene-linear radiance; negative values are raised to zero.
+def exr_exposure_time(path: Path) -> float | None:
+    """Return the seconds that an OpenEXR file states as `expTime`, None if it states none."""
+    if path.suffix.lower() != ".exr":
+        return None
+    with _exr_file(path, header_only=True) as file:
+        time = file.header().get("expTime")
+    return float(time) if isinstance(time, int | float) and np.isfinite(time) and time > 0 else None
 
-    Raises InputError where the file is missing, damaged or too large, or a value is NaN or infinite (with its place).
+
+def read_hdr(path: Path) -> np.ndarray:
+    """Read scene-linear radiance in Rec.709.
+
+    Negative values as stored are raised to zero; colors outside of Rec.709's gamut keep their negative parts.
+
+    Returns:
+        [H, W, 3] float32.
+
+    Raises:
+        InputError: if the file is missing, damaged or too large, states impossible colors, or a value is NaN or
+            infinite (with its place).
     """
     if path.suffix.lower() == ".hdr":
         hdr_size(path)
-        pixels = _read_radiance(path)
+        pixels, primaries = _read_radiance(path)
     else:
-        channels, _ = read_exr_channels(path)
-        names = next((names for names in ("RGB", "rgb", "YYY", "VVV") if set(names) <= set(channels)), None)
-        if names is None:
-            found = f"has the channels {sorted(channels)[:8]}, not R, G, B"
-            raise InputError(path, found, "export it with color channels")
-        pixels = np.stack([channels[name] for name in names], axis=2)
+        channels, header = read_exr_channels(path)
+        pixels, primaries = _exr_colors(channels, header, path)
     bad = ~np.isfinite(pixels)
     if bad.any():
         row, column, channel = (int(i) for i in np.argwhere(bad)[0])
         place = f"one {'RGB'[channel]} = {pixels[row, column, channel]} at x={column}, y={row}"
         raise InputError(path, f"{int(bad.any(axis=2).sum())} pixels not finite, {place}", _REMEDY)
-    return np.maximum(pixels, 0.0)
+    pixels = np.maximum(pixels, 0.0)
+    try:
+        matrix = matrix_to_rec709(primaries)
+    except ValueError as error:
+        raise InputError(path, str(error), "correct the attribute, or remove it for Rec.709") from None
+    return pixels if np.array_equal(matrix, np.eye(3)) else (pixels @ matrix.T).astype(np.float32)
+
+
+def _exr_colors(
+    channels: Mapping[str, np.ndarray], header: Mapping[str, Any], path: Path
+) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Return [H, W, 3] linear values, and the primaries that they are in."""
+    stated = header.get("chromaticities")
+    primaries = REC709 if stated is None else tuple(map(float, stated))
+    encoding = encoding_of_interop_id(str(header.get("colorInteropID", "")))
+    if encoding.chromaticities is not None:
+        primaries = encoding.chromaticities
+    if {"Y", "RY", "BY"} <= set(channels):
+        return _from_luminance(channels, primaries, path), primaries
+    names = next((names for names in ("RGB", "rgb", "XYZ", "YYY", "VVV") if set(names) <= set(channels)), None)
+    if names is None:
+        found = f"has the channels {sorted(channels)[:8]}, not R, G, B"
+        raise InputError(path, found, "export it with color channels")
+    pixels = np.stack([channels[name] for name in names], axis=2)
+    if names == "XYZ":
+        return pixels, _XYZ
+    return encoding.decode(pixels), primaries
+
+
+def _from_luminance(channels: Mapping[str, np.ndarray], primaries: tuple[float, ...], path: Path) -> np.ndarray:
+    """Return RGB of OpenEXR's luminance and chroma channels: RY = (R - Y) / Y, BY = (B - Y) / Y."""
+    import colour
+
+    places = np.array(primaries, float)
+    try:
+        matrix_to_rec709(primaries)
+        weights = colour.normalised_primary_matrix(places[:6].reshape(3, 2), places[6:])[1]
+    except ValueError as error:
+        raise InputError(path, str(error), "correct the attribute, or remove it for Rec.709") from None
+    luminance = channels["Y"]
+    red, blue = ((channels[name] + 1) * luminance for name in ("RY", "BY"))
+    green = (luminance - weights[0] * red - weights[2] * blue) / weights[1]
+    return np.stack([red, green, blue], axis=2).astype(np.float32)
 
 
 def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict[str, np.ndarray], dict]:
-    """The channels of an OpenEXR file's first part, each [H, W] float32 over the display window, and its header.
+    """Read the channels of an OpenEXR file's first part over the display window, and its header.
 
-    Pixels of the display window outside the data window are 0. Values are as stored: NaN and infinity pass.
-    Raises InputError where the file is missing, damaged, truncated or holds more than max_pixels pixels.
+    Pixels of the display window outside the data window are 0. Subsampled channels are interpolated. Values are as
+    stored: NaN and infinity pass.
+
+    Returns:
+        Channels [H, W] float32 by name, and the header's attributes.
+
+    Raises:
+        InputError: if the file is missing, damaged, truncated or holds more than max_pixels pixels.
     """
     origin, (width, height) = _exr_window(path, max_pixels)
     with _exr_file(path, separate_channels=True) as file:
-        # A file whose pixels end early leaves no part behind instead of raising.
+        # A file whose pixels end early has no parts instead of raising.
         if not file.parts:
             raise InputError(path, "pixel data is damaged or ends early", DAMAGED)
         header = dict(file.header())
-        stored = {name: channel.pixels for name, channel in file.channels().items()}
-    left, top = (int(a) - b for a, b in zip(header["dataWindow"][0], origin, strict=True))
+        stored = {
+            name: (channel.pixels, channel.xSampling, channel.ySampling) for name, channel in file.channels().items()
+        }
+    (low, high) = header["dataWindow"]
+    left, top = (int(a) - b for a, b in zip(low, origin, strict=True))
+    size = tuple(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
     channels = {}
-    for name, pixels in stored.items():
+    for name, (pixels, *sampling) in stored.items():
         if pixels is not None and pixels.ndim == 2:
-            shown = pixels[max(-top, 0) : max(height - top, 0), max(-left, 0) : max(width - left, 0)]
+            if sampling != [1, 1]:
+                pixels = _interpolated(pixels, size[::-1], sampling[::-1])
+            inside = pixels[max(-top, 0) : max(height - top, 0), max(-left, 0) : max(width - left, 0)]
             channels[name] = np.zeros((height, width), np.float32)
-            channels[name][max(top, 0) :, max(left, 0) :][: shown.shape[0], : shown.shape[1]] = shown
+            channels[name][max(top, 0) :, max(left, 0) :][: inside.shape[0], : inside.shape[1]] = inside
     return channels, header
+
+
+def _interpolated(pixels: np.ndarray, shape: tuple[int, ...], sampling: list[int]) -> np.ndarray:
+    """Interpolate a subsampled channel, whose samples lie at every `sampling` rows and columns, bilinearly."""
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = (np.arange(count) / step for count, step in zip(shape, sampling, strict=True))
+    places = np.meshgrid(rows, columns, indexing="ij")
+    return map_coordinates(pixels.astype(np.float32), places, order=1, mode="nearest", output=np.float32)
 
 
 @contextmanager
@@ -88,7 +175,7 @@ def _exr_file(path: Path, **options) -> Iterator:
 
 
 def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The display window's origin and its (width, height)."""
+    """Return the display window's origin and its (width, height)."""
     with _exr_file(path, header_only=True) as file:
         header = file.header()
         windows = [[(int(x), int(y)) for x, y in header[key]] for key in ("displayWindow", "dataWindow")]
@@ -101,10 +188,10 @@ def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int
     return windows[0][0], sizes[0]
 
 
-def _read_radiance(path: Path) -> np.ndarray:
-    """[H, W, 3] float32 linear RGB, scaled by the header's EXPOSURE lines (radiance = pixel / exposure)."""
+def _read_radiance(path: Path) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Return [H, W, 3] float32 radiance (a pixel divided by the header's EXPOSURE lines), and its primaries."""
     data = read_bytes(path)
-    width, height, position, exposure = _radiance_header(data[:_MAX_HEADER_BYTES], path)
+    width, height, position, exposure, primaries = _radiance_header(data[:_MAX_HEADER_BYTES], path)
     rgbe = np.empty((height, width, 4), np.uint8)
     for row in range(height):
         try:
@@ -114,19 +201,17 @@ def _read_radiance(path: Path) -> np.ndarray:
     scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
     pixels = (rgbe[..., :3] + 0.5) * scale[..., None] / exposure
     pixels[rgbe[..., 3] == 0] = 0.0
-    return pixels.astype(np.float32)
+    return pixels.astype(np.float32), primaries
 
 
-def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float]:
-    """Width, height, where the pixels begin, and the product of the exposures."""
+def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float, tuple[float, ...]]:
+    """Return width, height, offset of the pixels, the product of the exposures, and the primaries."""
     if not data.startswith((b"#?RADIANCE", b"#?RGBE")):
         raise InputError(path, "is not a Radiance picture", _REMEDY)
     end = data.find(b"\n\n")
     size = re.compile(rb"-Y (\d{1,6}) \+X (\d{1,6})\n").match(data, end + 2) if end >= 0 else None
     if size is None:
         raise InputError(path, "Radiance header has no '-Y height +X width' line", _REMEDY)
-    if b"32-bit_rle_xyze" in data[:end]:
-        raise InputError(path, "holds XYZ colors, not RGB", "convert it to RGB (ra_xyze -r)")
     try:
         stated = re.findall(rb"^EXPOSURE\s*=\s*([^\s]{1,40})", data[:end], re.MULTILINE)
         exposure = float(np.prod([float(value) for value in stated]))
@@ -134,11 +219,26 @@ def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float]:
         exposure = np.nan
     if not (np.isfinite(exposure) and exposure > 0):
         raise InputError(path, "EXPOSURE is not a positive number", _REMEDY)
-    return int(size[2]), int(size[1]), size.end(), exposure
+    primaries = _XYZ if b"32-bit_rle_xyze" in data[:end] else REC709
+    line = re.search(rb"^PRIMARIES\s*=\s*([^\n]{1,200})", data[:end], re.MULTILINE)
+    if line and primaries is REC709:
+        try:
+            primaries = tuple(float(value) for value in line[1].split())
+        except ValueError:
+            primaries = ()
+        if len(primaries) != 8:
+            raise InputError(path, f"PRIMARIES = {line[1][:60]!r} are not eight numbers", _REMEDY)
+        primaries = REC709 if np.allclose(primaries, _RADIANCE, atol=0.002) else primaries
+    return int(size[2]), int(size[1]), size.end(), exposure, primaries
 
 
 def _read_row(data: bytes, position: int, width: int) -> tuple[np.ndarray, int]:
-    """A row [W, 4], flat or run-length coded, and where the next begins; IndexError or ValueError where damaged."""
+    """Return a row [W, 4], flat or run-length coded, and the offset of the next.
+
+    Raises:
+        IndexError: if the data end early.
+        ValueError: if they are damaged.
+    """
     first = data[position : position + 4]
     if first[:2] != b"\2\2" or first[2] & 0x80 or not 8 <= width < 32768:
         end = position + 4 * width

@@ -1,6 +1,5 @@
 """Masks: which mask file belongs to which photo, and what its values mean."""
 
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +10,7 @@ import numpy as np
 from ..files import contained
 from .dataparser import ImageRecord
 from .images import LDR_SUFFIXES, PHOTO_SUFFIXES, read_ldr
-from .names import natural_key, sibling, without_mask_ending
+from .names import bases_of, natural_key, sibling, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
 _MOST_NAMED = 3
@@ -37,7 +36,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     Raises:
         InputError: if a mask is a link that leads out of the data folder.
     """
-    bases = _bases([record.image for record in records], folder)
+    bases = bases_of([record.image for record in records], folder)
     shared = Counter(
         key for image, view in {(s.image, s.view) for s in records} for key in {image.name, image.stem, view}
     )
@@ -109,13 +108,6 @@ def mask_note(shares: Sequence[float | None]) -> list[str]:
         return []
     out = 100 * (1 - sum(masked) / len(masked))
     return [f"masks: {len(masked)} of {len(shares)} photos have one; they leave out {out:.1f} % of their pixels"]
-
-
-def _bases(images: Sequence[Path], folder: Path) -> list[Path]:
-    """List the folders that names of masks may be relative to: that of all photos, and those above it."""
-    common = Path(os.path.commonpath([image.parent for image in images]))
-    above = [place for place in common.parents if place.is_relative_to(folder)]
-    return [common, *above]
 
 
 def _photo_keys(record: ImageRecord, bases: Sequence[Path], shared: Counter) -> list[str]:

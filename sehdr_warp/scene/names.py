@@ -1,11 +1,14 @@
 """The order of file names, files beside each other, and names of views."""
 
 import itertools
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from ..files import contained
 from .dataparser import ImageRecord
 
 
@@ -32,6 +35,40 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
 def without_mask_ending(stem: str) -> str:
     """Return a stem without the ending by which tools mark masks (`_mask`, `-mask`, `.mask`), if it has one."""
     return re.sub(r"(?<=.)[_.-]masks?$", "", stem, flags=re.IGNORECASE)
+
+
+def find_image(folder: Path, name: str, source: Path) -> Path | None:
+    """Return the image of a name that a data file states, None if it is not there.
+
+    Names written on Windows have backslashes, and names that are not UTF-8 are tried as Latin-1 too.
+
+    Args:
+        folder: of the images.
+        name: as stated; bytes that are not UTF-8 are surrogates, as in names of files.
+        source: the data file.
+
+    Raises:
+        InputError: if the name leads out of the folder.
+    """
+    names = dict.fromkeys((name, name.replace("\\", "/")))
+    with suppress(UnicodeError):
+        latin = os.fsencode(name).decode("latin-1")
+        names |= dict.fromkeys((latin, latin.replace("\\", "/")))
+    with suppress(UnicodeError):
+        names |= {os.fsdecode(name.encode("latin-1")): None}
+    places = [contained(folder, each, source) for each in names]
+    return next((place for place in places if os.path.isfile(place)), None)
+
+
+def bases_of(images: Sequence[Path], folder: Path) -> list[Path]:
+    """List the folders that names of photos may be relative to: that of all photos, and those above it.
+
+    Args:
+        images: files of the photos, at least one.
+        folder: the data folder, which ends the list.
+    """
+    common = Path(os.path.commonpath([image.parent for image in images]))
+    return [common, *(place for place in common.parents if place.is_relative_to(folder))]
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:

@@ -4,6 +4,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from ..errors import InputError
 from ..parallel import prefetch_map
 from .camera import Camera
+from .color_encoding import ColorEncoding
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .gain_map import has_gain_map, light_of, read_gain_map, with_light_above_white
 from .hdr_files import hdr_size, read_hdr
@@ -20,8 +22,9 @@ from .lens import Lens, Undistortion, area_average
 from .linear_photos import float_codes, kind_of, linear_codes
 from .masks import mask_note, read_mask
 from .names import unique_names
+from .photo_checks import fitted_lens, left_out
 from .photo_file import PhotoKeeper
-from .photos import photo_sizes, read_photo
+from .photos import read_photo
 from .types import Scene, View, codes_of
 from .wide_camera import solid_angles
 
@@ -55,11 +58,18 @@ def preprocess(
     quiet = any(record.hdr is not None or kind_of(record.image) != "encoded" for record in dataset.records)
     most = 1 if quiet else _PIXELS_AT_ONCE // max(record.lens.width * record.lens.height for record in dataset.records)
     jobs = ((record, names[i]) for i, record in log_progress("reading views", dataset.records))
-    views = [keeper.store(view) for view in prefetch_map(lambda job: preprocessor.view(*job), jobs, most)]
+    views, problems = [], []
+    for view in prefetch_map(lambda job: preprocessor.view_or_error(*job), jobs, most):
+        if isinstance(view, InputError):
+            problems.append(view)
+        else:
+            views.append(keeper.store(view))
+    damaged = left_out(problems, len(names))
     deque(
         require_content(((view.codes, view.mask) for view in views if view.split == "train"), dataset.folder), maxlen=0
     )
-    notes = *dataset.notes, *mask_note(list(preprocessor.mask_shares.values())), *([keeper.note] if keeper.note else [])
+    masks = mask_note(list(preprocessor.mask_shares.values()))
+    notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
     known = dataset.times_known
     return Scene(dataset.name, dataset.format, tuple(views), points, colors, known, notes, response=response)
@@ -110,15 +120,20 @@ def read_codes(record: ImageRecord, *, oriented: bool = False) -> EncodedImage:
         oriented: turn the pixels as the EXIF orientation says.
     """
     if not record.derived and kind_of(record.image) == "float":
-        return EncodedImage(float_codes(read_hdr(record.image), record.seconds), None)
+        return EncodedImage(float_codes(read_hdr(record.image) * record.light_scale, record.seconds), None)
     if not record.derived:
         photo = read_photo(record.image, oriented=oriented)
+        encoding = record.encoding or ColorEncoding("sRGB")
         if record.gain_map or (kind_of(record.image) == "encoded" and not record.linear and has_gain_map(record.image)):
             gain_map = read_gain_map(record.image, oriented=oriented)
             if record.gain_map:
-                return light_of(photo, gain_map)
-            return photo if gain_map is None else with_light_above_white(photo, gain_map)
-        return EncodedImage(linear_codes(photo.pixels / photo.levels), photo.alpha) if record.linear else photo
+                photo = light_of(photo, gain_map)
+            elif gain_map is not None:
+                photo = with_light_above_white(photo, gain_map)
+        elif record.linear and encoding.light is None:
+            photo = EncodedImage(linear_codes(photo.pixels / photo.levels), photo.alpha)
+            encoding = replace(encoding, curves=(), table=None)
+        return encoding.convert(photo)
     return EncodedImage(codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8), None)
 
 
@@ -129,6 +144,15 @@ class _Preprocessor:
         self._last: tuple[Lens, Undistortion] | None = None
         self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
+
+    def view_or_error(self, record: ImageRecord, name: str) -> View | InputError:
+        """Return the view of a photo, or the error if the photo itself is damaged; raises other errors."""
+        try:
+            return self.view(record, name)
+        except InputError as error:
+            if error.path != str(record.image) or record.derived or record.hdr == record.image:
+                raise
+            return error
 
     def view(self, record: ImageRecord, name: str) -> View:
         lens, oriented = (record.lens, False) if record.derived else fitted_lens(record)
@@ -153,6 +177,8 @@ class _Preprocessor:
             return _shrunk(undistortion.apply(_shrunk(image, working, values)), camera)
 
         hdr = None if record.hdr is None else warped(_read_truth(record.hdr, lens, camera, undistortion is not None))
+        if hdr is not None and record.hdr == record.image:
+            hdr *= np.float32(record.light_scale)
         time, split = record.seconds, record.split or "train"
         stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented)
         self.mask_shares[name] = None if stored is None else float(stored.mean())
@@ -239,28 +265,6 @@ def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarra
         problem = f"HDR truth is {size[0]} x {size[1]}, the photo {lens.width} x {lens.height}"
         raise InputError(path, problem, "render the truth at the photo's size, or remove it")
     return read_hdr(path)
-
-
-def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
-    """Return the lens at the photo's size, and whether the pixels are to be turned as EXIF says.
-
-    COLMAP ignores the EXIF orientation, other tools follow it: the size that agrees with the camera's decides, and the
-    stored orientation wins if both agree. Photos may be smaller than the camera's size by a whole factor (images_2).
-
-    Raises:
-        InputError: if no orientation and factor fits.
-    """
-    lens = record.lens
-    stored, turned = photo_sizes(record.image)
-    choices = [(stored, False), (turned, True)] if record.oriented is None else [(turned, True)]
-    for factor in range(1, 17):
-        for (width, height), oriented in choices:
-            if factor == 1 and (width, height) == (lens.width, lens.height):
-                return lens, oriented
-            if factor > 1 and abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
-                return lens.resized(width, height), oriented
-    problem = f"image is {stored[0]} x {stored[1]}, its camera {lens.width} x {lens.height}"
-    raise InputError(record.image, problem, "use the images that the cameras were solved for")
 
 
 def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:

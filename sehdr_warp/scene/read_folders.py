@@ -2,27 +2,31 @@
 
 import os
 import re
+from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
 from ..files import contained, read_bytes, read_json
-from .colmap_model import SparseModel, find_model, read_model
-from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
+from .colmap_model import SparseModel, find_model, other_models, read_model
+from .dataparser import NO_POINTS, UNPLACED, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
 from .heif import HEIF_SUFFIXES, register_heif
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
-from .linear_photos import color_matrix, one_kind
-from .names import list_images, natural_key, sibling, view_and_exposure
-from .photos import photo_sizes
+from .linear_photos import color_matrix
+from .names import find_image, list_images, natural_key, sibling, view_and_exposure
+from .photo_checks import FEWEST_PHOTOS
 from .sfm import reconstruct
 from .sfm_panorama import are_panoramas, reconstruct_panoramas
 from .stack import refuse_stack
+from .unused_files import unread_kinds
 
-FEWEST_PHOTOS = 3  # A training needs at least as many
+_OTHERS = ("masks", "mask", "hdr", "exr")  # Folders of pictures that are not photos
 # From the full size to reduced copies.
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 # HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
@@ -43,30 +47,54 @@ def read_colmap(folder: Path) -> DataparserOutputs:
     if images is None:
         raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
     records, absent = [], []
+    truth = _TruthFiles(folder, images)
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
-        image = contained(images, entry.name, source)
-        if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
+        image = find_image(images, entry.name, source)
+        if image is not None and image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
             hdr, image = image, photo
-        elif not os.path.isfile(image):  # Also for a name that is not possible as a file name.
+        elif image is None:
             absent.append(entry.name)
             continue
         else:
-            beside = (sibling(folder / name / image.name, HDR_SUFFIXES) for name in ("hdr", "exr"))
-            hdr = next((file for file in beside if file), None)
+            hdr = truth.of(image)
         records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, hdr=hdr))
     if not records:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         raise InputError(images, problem, _REMEDY)
-    notes = ()
+    notes = other_models(source)
     if absent:
-        notes = (f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...",)
-    return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=notes)
+        notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
+    return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))
+
+
+class _TruthFiles:
+    """HDR truth in `hdr/` or `exr/` under the photos' paths, or under their names alone if no two photos share one."""
+
+    def __init__(self, folder: Path, images: Path):
+        self.places = [place for name in ("hdr", "exr") if (place := folder / name).is_dir()]
+        self.images = images
+        files = (file for _, _, names in os.walk(images) for file in names) if self.places else ()
+        self.stems = Counter(Path(file).stem for file in files if Path(file).suffix.lower() in LDR_SUFFIXES)
+
+    def of(self, image: Path) -> Path | None:
+        """Return the truth of a photo, None if it has none."""
+        path = image.relative_to(self.images)
+        names = [path, Path(path.name)] if self.stems[path.stem] <= 1 else [path]
+        files = (sibling(place / name, HDR_SUFFIXES) for name in names for place in self.places)
+        return next((file for file in files if file), None)
 
 
 def is_hdr_gs(folder: Path) -> bool:
-    """Return whether a folder has HDR-GS's synthetic layout."""
-    there = (folder / "exr").is_dir() and (folder / "images").is_dir() and find_model(folder) is not None
-    return there and bool(_exposures_by_view(folder / "images"))
+    """Return whether a folder has HDR-GS's synthetic layout.
+
+    It has exposures of the same views, and truth in exr/ under the views' names: an exr/ of other files beside numbered
+    photos of a COLMAP set does not count.
+    """
+    if not ((folder / "exr").is_dir() and (folder / "images").is_dir() and find_model(folder) is not None):
+        return False
+    exposures = _exposures_by_view(folder / "images")
+    with_truth = sum(sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES) is not None for view in exposures)
+    return bool(exposures) and 2 * with_truth >= len(exposures)
 
 
 def read_hdr_gs(folder: Path) -> DataparserOutputs:
@@ -191,37 +219,76 @@ def _camera(row: np.ndarray, path: Path, name: str) -> tuple[Lens, np.ndarray]:
     return lens, pose_from_camera_to_world(camera_to_world, path, name)
 
 
-def read_photos(folder: Path, cache: Path | str | None = None) -> DataparserOutputs:
-    """Parse bare photos of a folder, or its `images/`: one record for each that structure from motion places."""
+def find_photos(folder: Path) -> DataparserOutputs:
+    """Parse bare photos of a folder, or its `images/`: records without cameras, which place_photos() adds.
+
+    Raises:
+        InputError: if there are none, or too few.
+    """
     places = (place for place in (folder, folder / "images") if place.is_dir())
     found = [list_images(place, PHOTO_SUFFIXES) for place in places]
-    # A lone picture beside `images/` is a cover.
+    # A single picture beside `images/` is a cover.
     photos = next((each for each in found if len(each) > 1), next(filter(None, found), []))
     if not photos:
         if heif := next((file for file in sorted(folder.iterdir()) if file.suffix.lower() in HEIF_SUFFIXES), None):
             register_heif(heif)
-        remedy = "give photos (JPEG, PNG, TIFF, RAW, EXR), a COLMAP set or a transforms.json"
+        remedy = "give photos (JPEG, PNG, TIFF, HEIC, RAW, EXR), a COLMAP set or a transforms.json"
         with suppress(OSError):
-            inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir()]
-            inner = [name for name in inner if list_images(folder / name, PHOTO_SUFFIXES)]
+            inner = _folders_with_photos(folder)
             remedy = f"give one of its folders with photos: {', '.join(inner[:5])}" if inner else remedy
-        raise InputError(folder, "has no photos and no known layout", remedy)
-    kind = one_kind(photos)
-    if len(photos) < 2:
-        raise InputError(photos[0], "is the only photo; one view does not show depth", "add photos from other places")
-    if len(photos) < FEWEST_PHOTOS:
-        problem = f"holds {len(photos)} photos: depth and light cannot be told apart from so few"
-        raise InputError(folder, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
-    for photo in photos:
-        photo_sizes(photo)
+        others = unread_kinds(folder)
+        problem = "has no photos and no known layout" + f"; it holds {others}" * bool(others)
+        raise InputError(folder, problem, remedy)
+    _require_photos(len(photos), photos[0], folder)
+    notes = []
+    if photos[0].parent == folder and (inner := [name for name in _folders_with_photos(folder) if name not in _OTHERS]):
+        notes = [f"photos in folders of it are not read: {', '.join(inner[:5])}"]
+    records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)
+    return DataparserOutputs("photos", tuple(records), notes=tuple(notes))
+
+
+def place_photos(
+    dataset: DataparserOutputs, records: Sequence[ImageRecord], folder: Path, kind: str, cache: Path | str | None
+) -> tuple[DataparserOutputs, list[ImageRecord], list[str]]:
+    """Find the cameras of bare photos by structure from motion.
+
+    Args:
+        dataset: what find_photos returned.
+        records: its usable photos.
+        folder: the data folder.
+        kind: of the photos.
+        cache: see reconstruct().
+
+    Returns:
+        The dataset with its points, the photos that could be placed, and the names of the others.
+
+    Raises:
+        InputError: if the photos are an exposure stack, or of several cameras' sensors, or cannot be placed.
+    """
+    photos = [record.image for record in records]
+    _require_photos(len(photos), photos[0], folder)
     if kind == "raw":
         color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
     found = reconstruct_panoramas(photos, cache) if are_panoramas(photos) else reconstruct(photos, cache)
-    images = sorted(found.model.images, key=lambda image: image.name)
-    files = [photos[int(Path(image.name).stem)] for image in images]
-    records = tuple(
-        ImageRecord(photo.stem, photo, image.lens, image.world_to_camera, oriented=True)
-        for photo, image in zip(files, images, strict=True)
-    )
-    return DataparserOutputs("photos", records, cloud=found.model.cloud, notes=found.notes(photos))
+    cameras = {int(Path(image.name).stem): image for image in found.model.images}
+    placed = [
+        replace(record, lens=image.lens, world_to_camera=image.world_to_camera)
+        for i, record in enumerate(records)
+        if (image := cameras.get(i)) is not None
+    ]
+    lost = [record.image.name for i, record in enumerate(records) if i not in cameras]
+    return replace(dataset, cloud=found.model.cloud, notes=(*dataset.notes, *found.notes(photos))), placed, lost
+
+
+def _require_photos(count: int, first: Path, folder: Path) -> None:
+    if count < 2:
+        raise InputError(first, "is the only photo; one view does not show depth", "add photos from other places")
+    if count < FEWEST_PHOTOS:
+        problem = f"holds {count} photos: depth and light cannot be told apart from so few"
+        raise InputError(folder, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
+
+
+def _folders_with_photos(folder: Path) -> list[str]:
+    inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir() and not place.name.startswith(".")]
+    return [name for name in inner if list_images(folder / name, PHOTO_SUFFIXES)]

@@ -14,7 +14,7 @@ from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecor
 from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
-from .names import sibling
+from .names import find_image, sibling
 from .photos import photo_sizes
 
 _REMEDY = "correct the file or export it again"
@@ -28,20 +28,27 @@ def read_transforms(folder: Path) -> DataparserOutputs:
     else:
         other = "test" if (folder / "transforms_test.json").is_file() else "val"
         files = [(folder / "transforms_train.json", "train"), (folder / f"transforms_{other}.json", "test")]
-    records, cloud = [], NO_POINTS
+    records, absent, cloud = [], [], NO_POINTS
     for path, split in files:
         if split == "test" and not path.is_file():
             continue
         values = read_json(path)
         frames = frames_of(values, path)
         named = _named_splits(values, frames)
-        records += [_frame_shot(folder, path, values, frame, name, split or named.get(name)) for name, frame in frames]
+        for name, frame in frames:
+            record = _frame_record(folder, path, values, frame, name, split or named.get(name))
+            (absent if record is None else records).append(record or name)
         if not len(cloud[0]):
             cloud = _points(folder, path, values)
-    kept, notes = [record for record in records if record.split], ()
-    if 0 < len(kept) < len(records):
-        notes = (f"{len(records) - len(kept)} frames belong to neither the train nor the test split and were left out",)
-    return DataparserOutputs("transforms", tuple(kept or records), "background", cloud=cloud, notes=notes)
+    if not records:
+        raise InputError(
+            folder / _plain(absent[0]), f"image file not found, nor any of {len(absent)} frames", _INCOMPLETE
+        )
+    in_splits, notes = [record for record in records if record.split], _absent_note(absent, len(records))
+    if 0 < len(in_splits) < len(records):
+        count = len(records) - len(in_splits)
+        notes += (f"{count} frames belong to neither the train nor the test split and were left out",)
+    return DataparserOutputs("transforms", tuple(in_splits or records), "background", cloud=cloud, notes=notes)
 
 
 def read_hdr_nerf(folder: Path) -> DataparserOutputs:
@@ -51,7 +58,7 @@ def read_hdr_nerf(folder: Path) -> DataparserOutputs:
     maps `<file_path>_<k>.png` to seconds; truth is in `<split>_hdr/hdr_%03d.exr` by the frame's index. With
     `"photo_response": "reinhard-gamma"` (this package's field) photos are computed from the truth by that curve.
     """
-    records = []
+    records, absent = [], []
     for split in ("train", "test"):
         path, times_path = folder / f"transforms_{split}.json", folder / f"exposure_{split}.json"
         if split == "test" and not path.is_file():
@@ -78,10 +85,12 @@ def read_hdr_nerf(folder: Path) -> DataparserOutputs:
                         ImageRecord(view, image, lens, pose, key, time, split, hdr=hdr, derived=bool(stated))
                     )
             if not present:
-                absent = folder / f"{_plain(name)}_{min(exposures)}.png"
-                raise InputError(absent, "image file not found", _INCOMPLETE)
+                absent.append(f"{_plain(name)}_{min(exposures)}.png")
             records += present
-    return DataparserOutputs("hdr-nerf", tuple(records), "background", cloud=_sparse_points(folder))
+    if not records:
+        raise InputError(folder / absent[0], "image file not found", _INCOMPLETE)
+    notes = _absent_note(absent, len({(record.split, record.view) for record in records}))
+    return DataparserOutputs("hdr-nerf", tuple(records), "background", cloud=_sparse_points(folder), notes=notes)
 
 
 def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
@@ -111,14 +120,32 @@ def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str
     return {name: kept[split] for name, split in named.items() if split in kept}
 
 
-def _frame_shot(folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None) -> ImageRecord:
+def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:
+    """Return a note on frames whose photos are missing.
+
+    Args:
+        absent: names of these frames.
+        count: of frames with a photo.
+    """
+    if not absent:
+        return ()
+    listed = ", ".join(absent[:3]) + (" ..." if len(absent) > 3 else "")
+    return (f"{len(absent)} of {len(absent) + count} frames have no photo and were left out: {listed}",)
+
+
+def _frame_record(
+    folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None
+) -> ImageRecord | None:
+    """Return the photo of a frame, None if there is no such file."""
     image, hdr = contained(folder, name, path), None
     if image.suffix.lower() not in PHOTO_SUFFIXES:
-        # Blender's file_path has no ending; a dot in the stem must not be taken for one.
-        stated = image.with_name(image.name + ".png")
-        image = sibling(stated, LDR_SUFFIXES)
-        if image is None:
-            raise InputError(stated, "image file not found", _INCOMPLETE)
+        # Blender's file_path has no ending; a dot in the stem is not one.
+        image = sibling(image.with_name(image.name + ".png"), LDR_SUFFIXES)
+    else:
+        image = find_image(folder, name, path)
+    if image is None:
+        frame_pose(frame, path, name)
+        return None
     if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
         hdr, image = image, photo
     lens, pose = frame_lens(values, frame, image, path), frame_pose(frame, path, name)

@@ -1,4 +1,4 @@
-"""Exposure stacks: photos of one still scene at several times, and the camera's response that they tell."""
+"""Exposure stacks: photos of one still scene at several times, and the camera's response by them."""
 
 import logging
 import math
@@ -12,10 +12,9 @@ import numpy as np
 from PIL import Image
 
 from ..errors import InputError
-from .dataparser import ImageRecord
+from .dataparser import UNPLACED, ImageRecord
 from .exposure import shutter, with_exposure_times
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
-from .lens import Lens
 from .names import list_images
 
 if TYPE_CHECKING:
@@ -25,26 +24,26 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-# Stops, RMS, from which channels clearly differ from the shared curve; and by which a photo may be off its time.
+# RMS stops from which a channel's curve clearly differs from the shared one, and by which a photo may miss its time.
 CHANNELS_DIFFER, WRONG_TIME = 0.15, 0.25
-# By what photos are plainly a stack: a factor between times, and the ranks' correlation, in thumbnails of this side, of
-# the part of the pixels that both show. Real stacks correlate by 0.98 and more, photos from different places by 0.9.
+# What makes photos a stack: the least factor between times, and the least rank correlation in thumbnails of this side
+# over the pixels that neither clips. Real stacks correlate by 0.98 and more, photos from different places by 0.9.
 LEAST_STEP, LEAST_ALIKE, THUMBNAIL, LEAST_SHOWN, MOST_OF_STACK = 1.4, 0.96, 64, 0.05, 32
 
 
 def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list[Path], Sequence[float]]:
-    """The photos of a folder and their times, as calibrate takes them.
+    """List the photos of a folder and their exposure times.
 
-    Raises InputError for a folder without photos, or where there is not one time for each.
+    Raises:
+        InputError: for a folder without photos, or if there is not one time for each.
     """
     files = list_images(folder, LDR_SUFFIXES) if folder.is_dir() else []
     if not files:
         raise InputError(folder, "is no folder of photos", "give a folder of one scene at several exposure times")
     if times is None:
-        no_lens = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5), folder)
-        records = [ImageRecord(file.stem, file, no_lens, np.eye(4)) for file in files]
+        records = [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in files]
         records, known, notes = with_exposure_times(records, folder)
-        if not known:
+        if not known or not all(record.time_known for record in records):
             raise InputError(folder, "its photos state no exposure times", "give --exposures or an exposures.json")
         for note in notes:
             log.info(note)
@@ -55,21 +54,23 @@ def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list
 
 
 def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
-    """Raises InputError for photos that are plainly an exposure stack: each time differs from the others by a factor,
-    and what one photo shows the next shows at the same places, by ranks of gray in thumbnails."""
+    """Raise InputError if photos are an exposure stack.
+
+    In a stack each time differs from the others by a factor, and photos rank the brightness of places alike.
+    """
     if len(photos) > MOST_OF_STACK or any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
         return
-    no_lens = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5), folder)
     try:
         records, known, _ = with_exposure_times(
-            [ImageRecord(file.stem, file, no_lens, np.eye(4)) for file in photos], folder
+            [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in photos], folder
         )
         records = sorted(records, key=lambda record: record.seconds)
         steps = [b.seconds / a.seconds for a, b in pairwise(records)]
+        known = known and all(record.time_known for record in records)
         if not known or min(steps) < LEAST_STEP or not all(starmap(_alike, pairwise(_thumbnails(records)))):
             return
     except (InputError, *PILLOW_ERRORS):
-        return  # Who reads these photos says what is wrong with them.
+        return  # The readers of these photos report what is wrong with them.
     span = f"{shutter(records[0].seconds)} to {shutter(records[-1].seconds)}"
     problem = f"its {len(photos)} photos are an exposure stack from one place ({span}), which does not show depth"
     command = f"`sehdr-warp calibrate {shlex.quote(str(photos[0].parent))} --out camera.csv`"
@@ -86,7 +87,7 @@ def _thumbnails(records: Sequence[ImageRecord]) -> Iterator[np.ndarray]:
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether thumbnails rank the places alike that neither shows black or white."""
+    """Return whether thumbnails rank the brightness of places alike, except black and white ones."""
     if one.shape != other.shape:
         return False
     shown = (np.minimum(one, other) > 8) & (np.maximum(one, other) < 247)
@@ -105,9 +106,9 @@ def calibrate(
     out: Path | str | None = None,
     overwrite: bool = False,
 ) -> "Response":
-    """The response of the camera that took an exposure stack (Debevec and Malik 1997); exposure 1 is white.
+    """Measure the response of the camera that took an exposure stack (Debevec and Malik 1997); exposure 1 is white.
 
-    What it finds is logged: the residual, channels that clearly differ, photos that are off their times.
+    The residual, channels that clearly differ, and photos that do not fit their times are logged.
 
     Args:
         stack: a folder of photos of one still scene.
@@ -118,7 +119,7 @@ def calibrate(
         overwrite: replace these files.
 
     Raises:
-        InputError: for a stack that tells nothing, with the reason, another suffix, or a file that exists.
+        InputError: if the stack does not determine a curve, for another suffix, or a file that exists.
     """
     from ..files import atomic_path, check_absent
     from ..response.calibration import calibrate_codes
@@ -162,7 +163,7 @@ def _tell(found: "Calibration", files: list[Path], channel: str | None) -> None:
 
 
 def _plot(found: "Calibration", times: Sequence[float], path: Path) -> None:
-    """The curve over its samples: encoded value against stops from white."""
+    """Plot the curve over its samples: encoded value against stops from white."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")

@@ -18,7 +18,7 @@ from ..own_files import is_sealed
 from .dataparser import DataparserOutputs
 from .names import list_images
 from .png16 import png16
-from .read_folders import read_photos
+from .read_folders import find_photos
 from .sfm import file_digest
 from .video import Clip, codes, decode, grey, open_clip, sharpness, shift
 
@@ -148,15 +148,15 @@ def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
 
 
 def read_video(path: Path, cache: Path | str | None = None) -> DataparserOutputs:
-    """Parse a clip: a record for each chosen frame that structure from motion places.
+    """Parse a clip: a record for each chosen frame, without cameras, which place_photos() adds.
 
     Raises:
-        InputError: if the clip cannot be read, its camera does not move, or its frames cannot be placed.
+        InputError: if the clip cannot be read or its camera does not move.
     """
     clip = open_clip(path)
     folder = frames_folder(clip, cache)
     facts = json.loads((folder / "frames.json").read_text())
-    dataset = read_photos(folder, cache)
+    dataset = find_photos(folder)
     kept = len(list_images(folder, (".png",)))
     color = clip.color
     known = f"its response is {color.response}" if color.response else "its response is chosen as for photos"

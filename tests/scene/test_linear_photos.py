@@ -157,12 +157,17 @@ def test_a_set_of_raw_files_becomes_a_scene(tmp_path):
     assert 0.01 < np.mean([(c == 65535).mean() for c in codes]) < 0.6
 
 
-def test_kinds_and_cameras_are_not_mixed(tmp_path):
-    for i in range(2):
-        write_exr(tmp_path / f"{i}.exr", rgb_channels(picture(i)))
-    Image.fromarray(np.zeros((24, 32, 3), np.uint8)).save(tmp_path / "2.png")
-    with pytest.raises(InputError, match=r"2.png: is encoded, and 0.exr is float"):
-        load_scene(tmp_path)
+def test_photos_of_another_kind_than_most_are_left_out(tmp_path):
+    folder = posed(tmp_path, lambda path, i: write_exr(path, rgb_channels(picture(i))), ".exr")
+    values = json.loads((folder / "transforms.json").read_text())
+    odd = values["frames"][1]["file_path"].replace(".exr", ".png")
+    (folder / values["frames"][1]["file_path"]).unlink()
+    Image.fromarray(np.zeros((24, 32, 3), np.uint8)).save(folder / odd)
+    values["frames"][1]["file_path"] = odd
+    (folder / "transforms.json").write_text(json.dumps(values))
+    scene = load_scene(folder)
+    assert len(scene.views) == len(values["frames"]) - 1 and scene.light_known
+    assert any(odd.split("/")[-1] in note and "photos of one set are of one kind" in note for note in scene.notes)
 
 
 def test_raw_photos_of_two_cameras_are_refused_before_they_are_matched(tmp_path, monkeypatch):

@@ -96,8 +96,12 @@ def test_reduced_images_scale_the_camera_and_others_are_refused(tmp_path):
         Image.fromarray(pattern(32, 24, i)).save(tmp_path / "images" / f"{i:03d}.png")
     view = load(tmp_path).views[0]
     assert (view.camera.width, view.camera.fx, view.camera.cy) == (32, 25.0, 12.5)
-    Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / "003.png")
-    with pytest.raises(InputError, match=r"003.png: image is 60 x 48, its camera 64 x 48"):
+    for i in range(3):
+        Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / f"{3 + i:03d}.png")
+    expected = "3 of 6 photos cannot be used and were left out (003.png: image is 60 x 48, its camera 64 x 48; "
+    assert any(note.startswith(expected) for note in load(tmp_path).notes)
+    Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / "000.png")
+    with pytest.raises(InputError, match=r"000.png: image is 60 x 48, its camera 64 x 48"):
         load(tmp_path)
 
 

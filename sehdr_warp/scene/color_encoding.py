@@ -1,0 +1,349 @@
+"""What the file of a photo states of its colors: primaries and transfer function, and their way to linear Rec.709.
+
+ICC profiles (PNG, JPEG, TIFF, WebP), PNG's cICP, gAMA and cHRM, TIFF's chromaticities, EXIF's ColorSpace. A photo whose
+file states nothing is sRGB. Display curves (gamma, sRGB, BT.709) say how a picture is to be shown, not how the camera
+turned light into codes: such photos are converted to sRGB's codes, and their response is still to be found. Linear
+light, PQ, HLG and logarithmic curves are light themselves, and leave nothing to guess.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ..errors import InputError
+from .heif import read_items
+from .icc import converted_to_srgb, read_profile
+from .images import PILLOW_ERRORS, EncodedImage, exif_of
+from .primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
+
+_ADOBE_RGB = (0.640, 0.330, 0.210, 0.710, 0.150, 0.060, 0.3127, 0.3290)
+_ADOBE_GAMMA = 563 / 256
+_LIGHT = {8: "linear light", 9: "log light", 10: "log light", 16: "PQ light", 18: "HLG light"}
+"""Transfer characteristics of ITU-T H.273 that state light."""
+_UNSTATED = (0, 2, 3)  # Code points of ITU-T H.273 that state nothing
+_SAMPLES = 65_536  # Of curves: exact at all codes of 8 and 16 bits
+_PQ_WHITE = 1000.0  # cd/m2 of the code of white, BT.2100's nominal peak; what is brighter is light above white
+_SAME = 0.004  # Linear difference by which curves and primaries may differ and still be sRGB's
+_DEVIATION = 0.02  # Of the logarithm of light that conversion puts above white, by codes of 8 bits
+_BAND_ROWS = 256
+_GREY = ("L", "LA", "La", "I", "I;16", "I;16L", "I;16B", "I;16N")
+_INTEROP = 0xA005, 1  # EXIF's interoperability table, and its index
+_COLOR_SPACE = 0xA001
+_EXIF_IFD = 0x8769
+
+
+@dataclass(frozen=True)
+class ColorEncoding:
+    """How the codes of a photo stand for light, by its file.
+
+    Attributes:
+        name: for the user, such as "Display P3 (ICC profile)".
+        to_rec709: [3, 3] from the primaries of the codes to linear Rec.709; None if they are Rec.709's.
+        curves: decoded values at evenly spaced codes from 0 to 1, by channel; empty for sRGB's curve, or a table.
+        light: what light the codes state ("linear light", "PQ light", ...); None for a display curve.
+        table: ICC profile that LittleCMS applies.
+        problem: what is wrong with the statement, if it is not used.
+    """
+
+    name: str
+    to_rec709: np.ndarray | None = None
+    curves: tuple[np.ndarray, ...] = ()
+    light: str | None = None
+    table: bytes | None = None
+    problem: str | None = None
+
+    @property
+    def is_srgb(self) -> bool:
+        """Whether the codes are sRGB's as they are."""
+        return self.to_rec709 is None and not self.curves and self.table is None
+
+    def to_linear(self, pixels: np.ndarray, above: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Decode codes to linear Rec.709.
+
+        Args:
+            pixels: [H, W, 3] uint8 or uint16.
+            above: [H, W, 3] light above white that is known beside them, 0 elsewhere.
+
+        Returns:
+            [H, W, 3] float32, which may be negative or above 1 outside of Rec.709's gamut, and [H, W, 3] bool, which
+            channels are clipped.
+        """
+        white = np.iinfo(pixels.dtype).max
+        tables = _decoding_tables(self.curves or (srgb_to_linear(np.linspace(0, 1, _SAMPLES)),) * 3, int(white))
+        light = np.stack([table[pixels[..., channel]] for channel, table in enumerate(tables)], axis=-1)
+        clipped = pixels == white
+        if above is not None:
+            light, clipped = np.where(above > 0, above, light), clipped & (above == 0)
+        if self.to_rec709 is not None:
+            light = light @ self.to_rec709.T.astype(np.float32)
+        return light, clipped
+
+    def convert(self, image: EncodedImage) -> EncodedImage:
+        """Return a photo as the codes of a photo in sRGB, of 16 bits if they change.
+
+        Values above white that the primaries or the light give stay known beside the codes.
+        """
+        if self.is_srgb:
+            return image
+        alpha, above, deviation = image.alpha, image.above_white, image.above_white_deviation
+        if self.table is not None:
+            return EncodedImage(converted_to_srgb(image.pixels, self.table), alpha, above, deviation)
+        # Light of a gain map is in sRGB's curve already.
+        curves = () if above is not None else self.curves
+        codes, brighter = encoded_in_bands(image.pixels, above, replace(self, curves=curves).to_linear)
+        if brighter is None:
+            return EncodedImage(codes, alpha)
+        return EncodedImage(codes, alpha, brighter, max(_DEVIATION, deviation))
+
+
+def encoded_in_bands(
+    pixels: np.ndarray,
+    above: np.ndarray | None,
+    to_linear: Callable[[np.ndarray, np.ndarray | None], tuple[np.ndarray, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Encode linear Rec.709 as 16-bit sRGB codes.
+
+    Args:
+        pixels: [H, W, 3] codes; a few rows are converted at a time, because floats take much memory.
+        above: [H, W, 3] light above white that is known beside them, or None.
+        to_linear: returns linear Rec.709 and clipped channels of rows.
+
+    Returns:
+        Codes, white where a channel is clipped, and [H, W, 3] float16 light of unclipped pixels above white, 0
+        elsewhere; None if there is none.
+    """
+    codes, brighter = np.empty(pixels.shape, np.uint16), None
+    for top in range(0, len(pixels), _BAND_ROWS):
+        rows = slice(top, top + _BAND_ROWS)
+        light, clipped = to_linear(pixels[rows], None if above is None else above[rows])
+        encoded = np.rint(65535 * np.clip(linear_to_srgb(light), 0, 1)).astype(np.uint16)
+        encoded[clipped] = 65535
+        codes[rows] = encoded
+        known = (light > 1) & ~clipped
+        if known.any():
+            brighter = np.zeros(pixels.shape, np.float16) if brighter is None else brighter
+            brighter[rows] = np.where(known, light, 0)
+    return codes, brighter
+
+
+def stated_encoding(image: Image.Image) -> ColorEncoding | None:
+    """Return what an opened image states of its colors, None if it states nothing.
+
+    Later statements are ignored: PNG's cICP, the ICC profile, PNG's sRGB, gAMA and cHRM, TIFF's chromaticities, EXIF.
+    A statement that is damaged becomes an encoding with a `problem`, which counts as sRGB.
+    """
+    if image.format == "PNG":
+        cicp = _png_cicp(Path(image.filename))  # pyright: ignore[reportAttributeAccessIssue]
+        if cicp is not None:
+            return _from_cicp(cicp, "cICP")
+    if image.format in ("HEIF", "AVIF"):
+        nclx = _nclx(Path(image.filename))  # pyright: ignore[reportAttributeAccessIssue]
+        if nclx is not None:
+            return nclx
+    if profile := image.info.get("icc_profile"):
+        return encoding_of_profile(bytes(profile), "GRAY" if image.mode in _GREY else "RGB")
+    if image.format == "PNG":
+        return None if "srgb" in image.info else _from_gama(image.info)
+    if image.format == "TIFF":
+        return _from_tiff(image)
+    return _from_exif(image)
+
+
+@lru_cache(maxsize=64)
+def encoding_of_profile(data: bytes, colors: str = "RGB") -> ColorEncoding:
+    """Return the encoding that an ICC profile states.
+
+    Args:
+        data: the profile.
+        colors: of the image, "RGB" or "GRAY"; a grey profile of an image in color is not used.
+    """
+    try:
+        profile = read_profile(data)
+        if profile.colors == "GRAY" and colors != "GRAY":
+            raise ValueError("is of grey, not RGB")
+    except ValueError as error:
+        return ColorEncoding("ICC profile", problem=f"its ICC profile {error}")
+    name = f"{profile.name} (ICC profile)"
+    if profile.cicp is not None:
+        return _from_cicp((*profile.cicp, 1), name)
+    if not profile.curves:
+        return ColorEncoding(name, table=data)
+    return _simplified(name, profile.to_rec709, profile.curves)
+
+
+@lru_cache(maxsize=64)
+def encoding_of_cicp(primaries: int, transfer: int, full_range: bool = True) -> ColorEncoding:
+    """Return the encoding that code points of ITU-T H.273 state, as in PNG, HEIF, AVIF and video."""
+    return _from_cicp((primaries, transfer, int(full_range)), "cICP")
+
+
+def note_of(encodings: dict[str, ColorEncoding | None]) -> list[str]:
+    """Describe for the user what photos state of their colors.
+
+    Args:
+        encodings: by the name of each photo, None for a photo that states nothing.
+    """
+    notes: dict[str, list[str]] = {}
+    for name, encoding in encodings.items():
+        if encoding is not None and encoding.problem:
+            notes.setdefault(f"{encoding.problem}: sRGB is assumed", []).append(name)
+        elif encoding is not None and encoding.light:
+            notes.setdefault(f"state {encoding.light}, {encoding.name}: no response is guessed", []).append(name)
+        elif encoding is not None and not encoding.is_srgb:
+            notes.setdefault(f"are in {encoding.name} and are converted to Rec.709", []).append(name)
+    count = len(encodings)
+    several = {text: f"{names[0]}{' ...' * (len(names) > 1)}" for text, names in notes.items()}
+    return [f"colors: {len(notes[text])} of {count} photos {text} ({named})" for text, named in several.items()]
+
+
+@lru_cache(maxsize=8)
+def _srgb_curve(count: int) -> np.ndarray:
+    return srgb_to_linear(np.linspace(0, 1, count))
+
+
+def _simplified(name: str, matrix: np.ndarray | None, curves: tuple[np.ndarray, ...]) -> ColorEncoding:
+    """Return an encoding by primaries and curves, without those that are sRGB's or linear."""
+    if matrix is not None and np.abs(matrix - np.eye(3)).max() < _SAME:
+        matrix = None
+    if curves and all(np.abs(curve - np.linspace(0, 1, len(curve))).max() < _SAME for curve in curves):
+        return ColorEncoding(name, matrix, (np.linspace(0, 1, _SAMPLES),) * 3, "linear light")
+    if curves and all(np.abs(curve - _srgb_curve(len(curve))).max() < _SAME for curve in curves):
+        curves = ()
+    return ColorEncoding(name, matrix, curves)
+
+
+def _decoding_tables(curves: tuple[np.ndarray, ...], white: int) -> list[np.ndarray]:
+    codes = np.linspace(0, 1, white + 1)
+    same = all(curve is curves[0] for curve in curves)
+    tables = [np.interp(codes, np.linspace(0, 1, len(c)), c).astype(np.float32) for c in curves[: 1 if same else 3]]
+    return tables * 3 if same else tables
+
+
+def _png_cicp(path: Path) -> tuple[int, int, int] | None:
+    """Return primaries, transfer and full range of a PNG's cICP chunk, which Pillow does not read."""
+    with path.open("rb") as file:
+        file.seek(8)
+        while len(head := file.read(8)) == 8:
+            length, kind = struct.unpack(">I4s", head)
+            if kind == b"cICP" and length == 4:
+                primaries, transfer, _, full = file.read(4)
+                return primaries, transfer, full
+            if kind in (b"IDAT", b"PLTE", b"IEND"):
+                return None
+            file.seek(length + 4, 1)
+    return None
+
+
+def _nclx(path: Path) -> ColorEncoding | None:
+    """Return what the primary picture of a HEIF or AVIF file states by code points, unless it has an ICC profile."""
+    try:
+        items = read_items(path)
+        stated = [data for kind, data in items.items[items.primary].properties if kind == "colr"]
+    except (InputError, KeyError):
+        return None
+    codes = [struct.unpack_from(">2H", data, 4) for data in stated if data[:4] == b"nclx" and len(data) >= 8]
+    profile = any(data[:4] in (b"prof", b"rICC") for data in stated)
+    return _from_cicp((*codes[0], 1), "nclx") if codes and (not profile or codes[0][1] in _LIGHT) else None
+
+
+@lru_cache(maxsize=64)
+def _from_cicp(values: tuple[int, int, int], source: str) -> ColorEncoding:
+    primaries, transfer, full = values
+    name = f"{source} {primaries}/{transfer}"
+    try:
+        matrix = None if primaries in _UNSTATED else _h273_matrix(primaries)
+        curve = _h273_curve(13 if transfer in _UNSTATED else transfer)
+    except (KeyError, ValueError):
+        return ColorEncoding(name, problem=f"its {name} is not known")
+    if not full:  # The codes of black and white are 16 / 255 and 235 / 255.
+        codes = np.linspace(0, 1, len(curve))
+        curve = np.interp((255 * codes - 16) / 219, codes, curve)
+    if transfer in _LIGHT:
+        return ColorEncoding(name, matrix, (curve,) * 3, _LIGHT[transfer])
+    return _simplified(name, matrix, (curve,) * 3)
+
+
+def _h273_matrix(primaries: int) -> np.ndarray:
+    from colour.models.rgb import itut_h_273 as h273
+
+    places, white = h273.COLOUR_PRIMARIES_ITUTH273[primaries], h273.CCS_WHITEPOINTS_ITUTH273[primaries]
+    return matrix_to_rec709((*map(float, np.ravel(places)), *map(float, white)))
+
+
+def _h273_curve(transfer: int) -> np.ndarray:
+    """Return samples of the decoding of a transfer characteristic, 1 at white; PQ is 1 at _PQ_WHITE."""
+    import colour.models as models
+
+    decoders: dict[int, Callable[[np.ndarray], Any]] = {
+        4: lambda value: value**2.2,
+        5: lambda value: value**2.8,
+        7: models.eotf_SMPTE240M,
+        8: lambda value: value,
+        9: lambda value: np.where(value > 0, 10 ** (2 * (value - 1)), 0),
+        10: lambda value: np.where(value > 0, 10 ** (2.5 * (value - 1)), 0),
+        13: srgb_to_linear,
+        16: lambda value: models.eotf_ST2084(value) / _PQ_WHITE,
+        17: lambda value: value**2.6,
+        18: models.oetf_inverse_BT2100_HLG,
+    }
+    decoders |= dict.fromkeys((1, 6, 11, 12, 14, 15), models.oetf_inverse_BT709)
+    return np.asarray(decoders[transfer](np.linspace(0, 1, _SAMPLES)), float)
+
+
+def _from_gama(info: dict) -> ColorEncoding | None:
+    """Return what PNG's gAMA and cHRM state; 1 / 2.2 with Rec.709's primaries is how many tools write sRGB."""
+    gamma, places = info.get("gamma"), info.get("chromaticity")
+    if gamma is None and places is None:
+        return None
+    matrix, curves = None, ()
+    if places is not None:
+        white, red, green, blue = (tuple(places[i : i + 2]) for i in range(0, 8, 2))
+        try:
+            matrix = matrix_to_rec709((*red, *green, *blue, *white))
+        except (ValueError, TypeError):
+            return ColorEncoding("cHRM", problem="its cHRM (primaries) spans no colors")
+    if gamma is not None:
+        if not 0.05 < gamma < 20:
+            return ColorEncoding("gAMA", problem=f"its gAMA is {gamma:g}")
+        if abs(gamma * 2.2 - 1) > 0.02:
+            curves = (np.linspace(0, 1, _SAMPLES) ** (1 / gamma),) * 3
+    stated = [f"gAMA {gamma:.5g}"] * (gamma is not None) + ["cHRM"] * (matrix is not None)
+    return _simplified(" and ".join(stated), matrix, curves)
+
+
+def _from_tiff(image: Image.Image) -> ColorEncoding | None:
+    tags = getattr(image, "tag_v2", {})
+    places, white = tags.get(319), tags.get(318)
+    if not places or len(places) != 6:
+        return _from_exif(image)
+    try:
+        white = tuple(map(float, white)) if white and len(white) == 2 else REC709[6:]
+        matrix = matrix_to_rec709((*map(float, places), *white))
+    except (ValueError, TypeError, ZeroDivisionError):
+        return ColorEncoding("TIFF", problem="its PrimaryChromaticities span no colors")
+    return _simplified("primaries of the TIFF", matrix, ())
+
+
+def _from_exif(image: Image.Image) -> ColorEncoding | None:
+    """Return Adobe RGB for EXIF's ColorSpace 2, or for interoperability index R03 (DCF 2.0)."""
+    try:
+        exif = exif_of(image)
+        space = exif.get_ifd(_EXIF_IFD).get(_COLOR_SPACE)
+        if space in (None, 1):
+            return None
+        index = str(exif.get_ifd(_INTEROP[0]).get(_INTEROP[1]) or "").strip("\0 ")
+    except PILLOW_ERRORS:
+        return None
+    return _adobe_rgb() if space == 2 or index == "R03" else None
+
+
+@cache
+def _adobe_rgb() -> ColorEncoding:
+    curve = np.linspace(0, 1, _SAMPLES) ** _ADOBE_GAMMA
+    return ColorEncoding("Adobe RGB (EXIF)", matrix_to_rec709(_ADOBE_RGB), (curve,) * 3)

@@ -1,0 +1,128 @@
+"""EXIF of photos: exposure, lens and camera, as cameras and tools write them."""
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..errors import InputError
+from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
+
+SHORTEST, LONGEST = 1e-12, 1e12
+"""Seconds: what an exposure time may be."""
+_EXIF_IFD = 0x8769
+_CAMERA, _LENS = (271, 272), (42036, 37386, 33437)  # Make and model; lens, focal length, f-number
+_EXPOSURE_TIME, _SHUTTER_APEX = 33434, 37377
+_F_NUMBER, _APERTURE_APEX = 33437, 37378
+_ISO_TAGS = (34855, 34866, 34867, 34865)
+"""PhotographicSensitivity, and what holds the ISO speed above its 16 bits: RecommendedExposureIndex, ISOSpeed,
+StandardOutputSensitivity (EXIF 2.3)."""
+_LARGEST_SHORT = 65535
+
+
+class ExifExposure(NamedTuple):
+    """What EXIF states of an exposure.
+
+    Attributes:
+        time: seconds.
+        iso: ISO speed.
+        f_number: focal length over aperture.
+    """
+
+    time: float | None = None
+    iso: float | None = None
+    f_number: float | None = None
+
+
+def exif_exposure(path: Path) -> ExifExposure:
+    """Read the exposure that a photo states; None for what it does not state, or states as a value that cannot be.
+
+    Times and f-numbers are also read from their APEX tags, from the first IFD, and from text with commas or fractions.
+
+    Raises:
+        InputError: if the file is not an image.
+    """
+    if path.suffix.lower() in HDR_SUFFIXES:
+        return ExifExposure()
+    try:
+        if path.suffix.lower() in RAW_SUFFIXES:
+            from .linear_photos import raw_exposure
+
+            return ExifExposure(*raw_exposure(path))
+        with open_image(path) as image:
+            first = exif_of(image)
+            tables = first.get_ifd(_EXIF_IFD), first
+            numbers = {tag: _stated(tables, tag) for tag in (_EXPOSURE_TIME, _SHUTTER_APEX, _F_NUMBER, _APERTURE_APEX)}
+            speeds = [_stated(tables, tag) for tag in _ISO_TAGS]
+    except PILLOW_ERRORS:
+        return ExifExposure()
+    time = _within(numbers[_EXPOSURE_TIME], SHORTEST, LONGEST)
+    if time is None and (apex := _within(numbers[_SHUTTER_APEX], -64, 64)) is not None:
+        time = 2.0**-apex
+    f_number = _within(numbers[_F_NUMBER], 1e-3, 1e4)
+    if f_number is None and (apex := _within(numbers[_APERTURE_APEX], 1e-3, 64)) is not None:
+        f_number = 2.0 ** (apex / 2)
+    speeds[0] = None if speeds[0] == _LARGEST_SHORT else speeds[0]
+    iso = next((speed for speed in speeds if _within(speed, 1e-3, 1e9) is not None), None)
+    return ExifExposure(time, iso, f_number)
+
+
+@lru_cache(maxsize=4096)
+def exif_lens(path: Path | None) -> tuple[str, ...]:
+    """Return what EXIF states of how a photo's corners darken: camera, lens, focal length and f-number.
+
+    The result is empty if EXIF states none of them, or there is no such file.
+    """
+    if path is None or path.suffix.lower() in (*HDR_SUFFIXES, *RAW_SUFFIXES) or not path.is_file():
+        return ()
+    try:
+        with open_image(path) as image:
+            first = exif_of(image)
+            table = first.get_ifd(_EXIF_IFD)
+            values = [first.get(tag) for tag in _CAMERA] + [table.get(tag) for tag in _LENS]
+    except (*PILLOW_ERRORS, InputError):
+        return ()
+    return tuple(map(str, values)) if set(values) != {None} else ()
+
+
+def are_camera_jpegs(sources: Sequence[Path | None]) -> bool:
+    """Return whether most of the files are JPEGs of a camera: their EXIF states an exposure time or f-number."""
+    photos = (path for path in sources if path and path.suffix.lower() in (".jpg", ".jpeg") and path.is_file())
+    exposures = [exif_exposure(photo) for photo in photos]
+    return 2 * sum(bool(exposure.time or exposure.f_number) for exposure in exposures) > len(sources)
+
+
+def _stated(tables: Iterable[Any], tag: int) -> float | None:
+    """Return the first usable number of a tag in EXIF's own table or, as some tools write it, the first one."""
+    for table in tables:
+        value = table.get(tag)
+        for item in value if isinstance(value, tuple | list) else [value]:
+            number = _number(item)
+            if number is not None and math.isfinite(number):
+                return number
+    return None
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, bytes):
+        value = value.decode("latin-1")
+    if isinstance(value, str):
+        return parse_number(value)
+    try:
+        return float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+
+
+def parse_number(text: str) -> float | None:
+    """Return the number that a text states as photographers write it (`1/125`, `0,008`), None if it is no number."""
+    whole, _, parts = text.strip(" \0s").replace(",", ".").partition("/")
+    try:
+        return float(whole) / float(parts or 1)
+    except (ValueError, ZeroDivisionError, OverflowError):
+        return None
+
+
+def _within(number: float | None, least: float, most: float) -> float | None:
+    return number if number is not None and least <= number <= most else None

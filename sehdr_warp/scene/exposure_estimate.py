@@ -1,0 +1,59 @@
+"""Exposure times of photos that state none, from the light that they share with photos that do."""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from ..response import Response
+from .exposure import LONGEST, SHORTEST, shutter
+from .exposure_compensation import initial_gains, point_light
+from .types import Scene, View
+
+_FEWEST = 20  # Points that photos have to share
+_MOST = 4000  # Points that are compared
+_MOST_VIEWS = 64  # Photos that a photo is compared with
+
+
+def with_estimated_times(scene: Scene, names: Collection[str], response: Response) -> Scene:
+    """Give views without an exposure time the one by which they show the light that the other views show.
+
+    Points of the set are compared in the median over points and views, which hidden points do not move. In a set
+    without points, and for a view that shares too few, all views are taken to show the same median light.
+
+    Args:
+        scene: whose views of unknown time have a guess.
+        names: of these views.
+        response: of the photos.
+    """
+    known = [view for view in scene.views if view.name not in names]
+    views, notes = [], []
+    for view in scene.views:
+        if view.name not in names:
+            views.append(view)
+            continue
+        factor, shared = _factor(view, known, scene.points, response)
+        time = float(np.clip(view.exposure_time * factor, SHORTEST, LONGEST))
+        views.append(replace(view, exposure_time=time))
+        source = f"by {shared} points that other photos show too" if shared else "by its brightness beside the others"
+        notes.append(f"{view.name} states no exposure time: {shutter(time)} {source}")
+    return replace(scene, views=tuple(views), notes=(*scene.notes, *notes))
+
+
+def _factor(view: View, known: list[View], points: np.ndarray, response: Response) -> tuple[float, int]:
+    """Return the factor on a view's time, and the number of points that it is by; 0 if it is by brightness alone."""
+    known = known[:: -(-len(known) // _MOST_VIEWS)]
+    points = points[:: max(1, len(points) // _MOST)]
+    if len(points):
+        seen = np.ones((1 + len(known), len(points)), bool)
+        light, _ = point_light([view, *known], points, seen, response)
+        several = np.isfinite(light[1:]).sum(0) > 0
+        shared = np.isfinite(light[0]) & several
+        count = int(shared.any(1).sum())
+        if count >= _FEWEST:
+            others = np.nanmedian(np.where(shared, light[1:], np.nan)[:, shared.any(1)], axis=0)
+            difference = light[0][shared.any(1)] - others
+            return float(np.exp(np.nanmedian(difference))), count
+    gains = initial_gains([view, *known], response).gains
+    ours = np.log(gains[view.name])
+    return float(np.exp(np.median(ours) - np.median([np.log(gains[other.name]) for other in known]))), 0

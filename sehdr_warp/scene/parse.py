@@ -1,0 +1,207 @@
+"""Parse a data folder of any layout: cameras, files, exposure times and splits, before pixels are decoded."""
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+from ..errors import InputError, did_you_mean
+from .colmap_model import find_model
+from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
+from .exposure import choose_exposure, with_exposure_times
+from .hdr_files import exr_exposure_time
+from .linear_photos import float_time
+from .masks import assign_masks
+from .names import unique_names
+from .photo_checks import usable_photos
+from .read_folders import (
+    find_photos,
+    image_folder,
+    is_hdr_gs,
+    place_photos,
+    read_colmap,
+    read_hdr_gs,
+    read_hdr_nerf_real,
+    read_llff,
+)
+from .read_opensfm import FILE as OPENSFM_FILE
+from .read_opensfm import read_opensfm
+from .read_transforms import read_hdr_nerf, read_transforms
+from .unused_files import unused_notes
+from .video import is_video
+from .video_frames import read_video
+
+_MARK = "transforms_train.json"  # A file of every embedded scene
+_HOLDOUT = 8  # Every eighth view is held out, as LLFF, Mip-NeRF 360 and 3DGS do
+_FEWEST_FOR_TEST = 5  # In smaller sets no view is held out
+
+
+def parse_dataset(
+    path: Path | str,
+    *,
+    exposure_index: int | None = None,
+    holdout: int | None = None,
+    cache: Path | str | None = None,
+    check: Callable[[DataparserOutputs], None] | None = None,
+) -> DataparserOutputs:
+    """Parse cameras, files, exposure times and splits of a data folder; of photos only headers are read.
+
+    Everything that can refuse a set is checked before structure from motion, which takes minutes.
+
+    Args:
+        path: see load_scene.
+        exposure_index: see load_scene.
+        holdout: see load_scene.
+        cache: see load_scene.
+        check: called with the kind of the photos known and cameras not yet found; it may raise InputError.
+
+    Raises:
+        InputError: see load_scene.
+    """
+    if holdout is not None and holdout < 0:
+        raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
+    folder = _folder(path)
+    dataset = read_video(folder, cache) if is_video(folder) else _read(folder)
+    name = str(path) if is_embedded(path) else folder.resolve().name
+    folder = folder if folder.is_dir() else dataset.folder
+    if not dataset.records:
+        raise InputError(folder, "has no views", "check the data folder")
+    records, masks = assign_masks(dataset.records, folder)
+    every = records
+    records, exposures = choose_exposure(records, exposure_index, folder)
+    records, kind, odd = usable_photos(records)
+    records, times_known, times = _with_times(records, kind, folder)
+    dataset = replace(dataset, kind=kind, records=tuple(records), folder=folder, times_known=times_known)
+    if check is not None:
+        check(dataset)
+    unplaced: list[str] = []
+    if records and records[0].lens is UNPLACED:
+        dataset, records, unplaced = place_photos(dataset, records, folder, kind, cache)
+    records, split = _with_splits(records, dataset, holdout)
+    training = sum(record.split == "train" for record in records)
+    if training < 2:
+        found = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
+        raise InputError(folder, f"has {found}; one view does not show depth", "add views from other places")
+    unused = [] if is_embedded(path) or dataset.format == "video" else unused_notes(folder, every, unplaced)
+    notes = (*dataset.notes, *masks, *exposures, *odd, *times, *split, *unused)
+    return replace(dataset, records=tuple(records), notes=notes, name=name)
+
+
+def _with_times(records: list[ImageRecord], kind: str, folder: Path) -> tuple[list[ImageRecord], bool, list[str]]:
+    """Return the photos with an exposure time each, whether times are known, and notes."""
+    if kind != "float" or any(record.exposure_time is not None for record in records):
+        return with_exposure_times(records, folder)
+    time = float_time([record.image for record in records])
+    stated = [exr_exposure_time(record.image) for record in records]
+    known = [each for each in stated if each is not None]
+    if len(known) < len(stated) or max(known) < min(known) * 1.001:
+        note = "float images: their values are taken as light, at no exposure"
+        timed = [replace(record, exposure_time=time, hdr=record.hdr or record.image) for record in records]
+        return timed, True, [note]
+    timed = []
+    for record, each in zip(records, known, strict=True):
+        factor = each / known[0]
+        truth = record.hdr or record.image
+        timed.append(replace(record, exposure_time=time * factor, hdr=truth, light_scale=1 / factor))
+    note = f"float images: their values are light times expTime, {min(known):g} to {max(known):g} s"
+    return timed, True, [note]
+
+
+def _folder(path: Path | str) -> Path:
+    if is_embedded(path):
+        return embedded_folder(str(path))
+    folder = Path(path)
+    if is_video(folder):
+        return folder
+    try:
+        empty = not any(folder.iterdir())
+    except FileNotFoundError:
+        raise InputError(folder, "not found", "give a folder of photos, or 'embedded'") from None
+    except NotADirectoryError:
+        raise InputError(folder, "is not a folder", "give the folder that holds the photos") from None
+    except OSError as error:
+        raise InputError(folder, f"cannot be read ({error.strerror or error})", "check its rights") from None
+    if empty:
+        raise InputError(folder, "folder is empty", "put the photos there")
+    return folder
+
+
+def _read(folder: Path) -> DataparserOutputs:
+    """Parse by the first layout that fits, the most specific one first."""
+
+    def has(*names: str) -> bool:
+        return all((folder / name).is_file() for name in names)
+
+    model = find_model(folder)
+    beside = model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None
+    readers = (
+        (has("transforms_train.json", "exposure_train.json"), read_hdr_nerf),
+        (has("poses_bounds_exps.npy"), read_hdr_nerf_real),
+        (is_hdr_gs(folder), read_hdr_gs),
+        (beside, read_colmap),
+        (has("transforms.json") or has("transforms_train.json"), read_transforms),
+        (model is not None, read_colmap),
+        (has(OPENSFM_FILE), read_opensfm),
+        (has("poses_bounds.npy"), read_llff),
+    )
+    return next((reader for fits, reader in readers if fits), find_photos)(folder)
+
+
+def _with_splits(
+    records: list[ImageRecord], dataset: DataparserOutputs, holdout: int | None
+) -> tuple[list[ImageRecord], tuple[str, ...]]:
+    """Return the photos with a split each, and a note if the set does not state it."""
+    if holdout is None and any(record.split for record in records):
+        return [replace(record, split=record.split or "train") for record in records], ()
+    held_out = _held_out(len(records), holdout, dataset.holdout)
+    records = [replace(record, split="test" if i in held_out else "train") for i, record in enumerate(records)]
+    if not held_out:
+        return records, ("no views are held out for testing",)
+    names = [name for name, record in zip(unique_names(records), records, strict=True) if record.split == "test"]
+    listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    are = "is" if len(names) == 1 else "are"
+    return records, (f"{len(names)} of {len(records)} views {are} held out for testing: {listed}",)
+
+
+def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -> set[int]:
+    """Return the indices of test views: the published protocol's, or the middle of each block, never the last view."""
+    if step == 0 or count < _FEWEST_FOR_TEST:
+        return set()
+    if published is not None:
+        every, offset = step or published[0], published[1]
+        return set(range(min(offset, every - 1), count, every))
+    step = step or _HOLDOUT
+    return set(range(step // 2, count - 1, step)) or {count // 2}
+
+
+def is_embedded(path: Path | str) -> bool:
+    """Return whether this names an embedded scene, known or not, rather than a folder."""
+    return str(path) == "embedded" or str(path).startswith("embedded:")
+
+
+def embedded_scenes() -> tuple[str, ...]:
+    """List the names that load_scene("embedded:NAME") finds: room, and others of a checkout or $SEHDR_SCENES."""
+    return tuple(sorted({path.parent.name for place in _places() for path in place.glob(f"*/{_MARK}")}))
+
+
+def embedded_folder(path: str) -> Path:
+    """Return the folder of `embedded` or `embedded:NAME`.
+
+    Raises:
+        InputError: if it is not here.
+    """
+    name = str(path).partition(":")[2] or "room"
+    if name in embedded_scenes():
+        return next(place / name for place in _places() if (place / name / _MARK).is_file())
+    known = embedded_scenes()
+    present = ", ".join(f"embedded:{each}" for each in known)
+    problem = f"is not here{did_you_mean(name, known)}; present are {present}"
+    raise InputError(path, problem, "get the repository's scenes/ and name it in SEHDR_SCENES")
+
+
+def _places() -> list[Path]:
+    """List the folders of scenes: in the package, in $SEHDR_SCENES, and in scenes/ beside a checkout's package."""
+    package = Path(str(resources.files("sehdr_warp")))
+    stated = os.environ.get("SEHDR_SCENES")
+    return [package / "embedded", *([Path(stated)] if stated else []), package.parent / "scenes"]

@@ -1,0 +1,96 @@
+"""Files beside the photos of a set that are not used: a few lines name them, so that nothing is lost unnoticed."""
+
+import os
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+
+from .dataparser import ImageRecord
+from .heif import HEIF_SUFFIXES, heif_installed
+from .images import PHOTO_SUFFIXES
+from .names import bases_of, natural_key, without_mask_ending
+
+# What tools write beside photos, and nobody takes for one.
+_QUIET = {
+    "", ".txt", ".md", ".rst", ".pdf", ".html", ".license", ".log", ".ini", ".db", ".json", ".csv", ".tsv", ".xml",
+    ".yaml", ".yml", ".toml", ".xmp", ".pp3", ".dop", ".cos", ".thm", ".aae", ".lrv", ".wav", ".m4a", ".kml", ".gpx",
+    ".geo", ".npy", ".npz", ".bin", ".ply", ".obj", ".mtl", ".pt", ".h5", ".pkl", ".psx", ".zip", ".tar", ".gz", ".py",
+    ".sh",
+}  # fmt: skip
+_MOST_NAMED = 3
+_MOST_FILES = 20_000  # Files that are looked at
+
+
+def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collection[str]) -> list[str]:
+    """Describe the files beside the photos that the set does not use.
+
+    Args:
+        folder: the data folder.
+        records: all photos that the set uses or has left out with a note.
+        mentioned: names of further photos that a note names.
+
+    Returns:
+        Notes on photos that are in no view, and on files of kinds that are not read.
+    """
+    images = [record.image for record in records if not record.derived]
+    if not images:
+        return []
+    used = {file for record in records for file in (record.image, record.mask, record.hdr)}
+    files = list(_files_beside(images, folder))
+    names = {name for file in files for name in (file.name, file.stem)}
+    photos, others = [], []
+    for file in files:
+        key = without_mask_ending(file.stem)
+        if file in used or file.name in mentioned or (key != file.stem and key in names):
+            continue
+        suffix = file.suffix.lower()
+        if suffix in PHOTO_SUFFIXES:
+            photos.append(file)
+        elif suffix not in _QUIET:
+            others.append(file)
+    notes = []
+    if photos:
+        place = os.path.commonpath([file.parent for file in photos])
+        said = f"{len(photos)} photos" if len(photos) > 1 else "1 photo"
+        where = Path(place).relative_to(folder).as_posix() if Path(place) != folder else "the folder"
+        notes.append(f"{said} of {where} {'are' if len(photos) > 1 else 'is'} in no view: {_listed(photos)}")
+    if others:
+        notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
+    return notes
+
+
+def unread_kinds(folder: Path) -> str:
+    """Describe the files of a folder that are of kinds that are not read; an empty text if there are none."""
+    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
+    others = [f for f in files if f.suffix.lower() not in _QUIET and f.suffix.lower() not in PHOTO_SUFFIXES]
+    return _by_suffix(others) if others else ""
+
+
+def _by_suffix(files: Sequence[Path]) -> str:
+    """Return counts by suffix, each with its first file, and what HEIC photos need."""
+    kinds: dict[str, list[Path]] = {}
+    for file in files:
+        kinds.setdefault(file.suffix.lower().removeprefix(".").upper(), []).append(file)
+    parts = [f"{len(each)} {kind} ({_listed(each, 1)})" for kind, each in sorted(kinds.items())]
+    needs = any(file.suffix.lower() in HEIF_SUFFIXES for file in files) and not heif_installed()
+    return ", ".join(parts) + ("; HEIC photos need pillow-heif: pip install 'sehdr-warp[phone]'" if needs else "")
+
+
+def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
+    """Yield the files in the folders of the photos, or all below their common folder if it is not the data folder."""
+    common = bases_of(images, folder)[0]
+    deep = common != folder and common.is_relative_to(folder)
+    places = [common] if deep else sorted({image.parent for image in images})
+    seen = 0
+    for place in places:
+        for root, _, names in os.walk(place) if deep else [(place, [], os.listdir(place))]:
+            for name in sorted(names, key=natural_key):
+                seen += 1
+                if seen > _MOST_FILES:
+                    return
+                file = Path(root) / name
+                if not name.startswith(".") and file.is_file():
+                    yield file
+
+
+def _listed(files: Sequence[Path], most: int = _MOST_NAMED) -> str:
+    return ", ".join(file.name for file in files[:most]) + (" ..." if len(files) > most else "")
