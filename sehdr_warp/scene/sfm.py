@@ -28,6 +28,7 @@ from ..own_files import is_sealed
 from ..parallel import run_interruptibly, signals_kept
 from .colmap_model import SparseModel, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
+from .photo_checks import left_out
 from .photos import read_photo
 from .preprocess import log_progress
 
@@ -99,6 +100,8 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
         database = work / "database.db"
         groups: dict[tuple, list[int]] = {}  # One set of intrinsics for a size, a device and a focal length.
         for i, photo in enumerate(photos):
+            if not (work / "images" / image_name(i)).is_file():
+                continue
             groups.setdefault((sizes[i], small[i], _device(photo)), []).append(i)
         for (_, (width, height), device), group in groups.items():
             params = (_focal_prior(device[-1], width, height), width / 2, height / 2, 0.0)
@@ -179,11 +182,26 @@ def image_name(index: int) -> str:
 
 
 def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Write oriented 8-bit copies of at most MAX_SIDE pixels; returns the oriented full sizes and the copies' sizes."""
+    """Write oriented 8-bit copies of at most MAX_SIDE pixels.
+
+    Photos that cannot be decoded have no copy, and a warning names them.
+
+    Returns:
+        The oriented full sizes and the copies' sizes, (0, 0) without a copy.
+
+    Raises:
+        InputError: if most photos cannot be decoded, or none shows anything.
+    """
     folder.mkdir()
-    sizes, small, visible = [], [], False
+    sizes, small, problems, visible = [], [], [], False
     for i, photo in log_progress("reading photos", photos):
-        codes = read_photo(photo, oriented=True).pixels
+        try:
+            codes = read_photo(photo, oriented=True).pixels
+        except InputError as error:
+            problems.append(error)
+            sizes.append((0, 0))
+            small.append((0, 0))
+            continue
         image = Image.fromarray(codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8))
         image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         sizes.append(codes.shape[1::-1])
@@ -191,6 +209,8 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
         values = np.asarray(image)
         visible |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
         image.save(folder / image_name(i), compress_level=1)
+    for note in left_out(problems, len(photos)):
+        _log.warning("%s", note)
     if not visible:
         problem = "the photos are all black or all white"
         raise InputError(photos[0].parent, problem, "expose them so that the scene shows")

@@ -85,7 +85,7 @@ def test_nerfstudio_points_move_with_the_poses(tmp_path):
         ({"frames": [{"file_path": "../up.png"}]}, r"contains '\.\.'"),
         ({"camera_angle_x": "wide"}, "camera_angle_x = 'wide'"),
         ({"camera_angle_x": 4.0}, "no focal length"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "equirectangular photos are 40 x 30"),
         ({"fl_x": -5.0}, "not positive"),
         ({"w": 30, "h": 40}, "image is 40 x 30, its camera 30 x 40"),
     ],
