@@ -1,0 +1,167 @@
+"""Colors of OpenEXR and Radiance files: primaries, interop IDs, luminance and chroma, exposure times."""
+
+import json
+import struct
+
+import colour
+import numpy as np
+import OpenEXR
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.hdr_files import exr_exposure_time, read_hdr
+from tests.make_scenes import pattern, write_blender
+
+RGB = np.array([0.8, 0.2, 0.05], np.float32)
+SPACES = {"lin_ap1_scene": "ACEScg", "lin_ap0_scene": "ACES2065-1", "lin_p3d65_scene": "Display P3",
+          "lin_rec2020_scene": "ITU-R BT.2020", "lin_adobergb_scene": "Adobe RGB (1998)"}  # fmt: skip
+
+
+def write_exr(path, channels, **header):
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, **header}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+    return path
+
+
+def planes(rgb=RGB, shape=(6, 8)):
+    return {name: np.full(shape, value, np.float32) for name, value in zip("RGB", rgb)}
+
+
+def space(name):
+    found = colour.RGB_COLOURSPACES[name].copy()
+    found.use_derived_transformation_matrices(True)
+    return found
+
+
+def rec709(name, rgb=RGB):
+    return np.asarray(rgb, float) @ colour.matrix_RGB_to_RGB(space(name), space("ITU-R BT.709"), "Bradford").T
+
+
+@pytest.mark.parametrize("interop", SPACES)
+def test_primaries_by_chromaticities_and_by_interop_id(tmp_path, interop):
+    found, expected = space(SPACES[interop]), rec709(SPACES[interop])
+    places = tuple(map(float, (*np.ravel(found.primaries), *found.whitepoint)))
+    for header in ({"chromaticities": places}, {"colorInteropID": interop}):
+        read = read_hdr(write_exr(tmp_path / "a.exr", planes(), **header))
+        np.testing.assert_allclose(read[2, 3], expected, rtol=2e-3, atol=1e-4)
+
+
+def test_negative_parts_of_wide_colors_are_kept(tmp_path):
+    read = read_hdr(write_exr(tmp_path / "a.exr", planes((0.0, 1.0, 0.0)), colorInteropID="lin_ap0_scene"))
+    np.testing.assert_allclose(read[0, 0], rec709("ACES2065-1", (0.0, 1.0, 0.0)), rtol=2e-3)
+    assert read[0, 0].min() < -0.1
+
+
+def test_encoded_values_of_an_interop_id(tmp_path):
+    read = read_hdr(write_exr(tmp_path / "a.exr", planes((0.5, 0.5, 0.5)), colorInteropID="srgb_rec709_scene"))
+    assert read[0, 0, 0] == pytest.approx(0.21404, rel=1e-3)
+    read = read_hdr(write_exr(tmp_path / "b.exr", planes((0.5, 0.5, 0.5)), colorInteropID="g22_ap1_scene"))
+    assert read[0, 0, 0] == pytest.approx(0.5**2.2, rel=2e-3)
+
+
+def write_subsampled(path, channels, shape):
+    """An uncompressed file of float channels {name: (values, step)}; the Python module writes none with steps."""
+    height, width = shape
+    names = sorted(channels)
+
+    def attribute(name, kind, data):
+        return f"{name}\0{kind}\0".encode() + struct.pack("<i", len(data)) + data
+
+    listed = b"".join(f"{n}\0".encode() + struct.pack("<iB3xii", 2, 0, channels[n][1], channels[n][1]) for n in names)
+    box = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    head = b"\x76\x2f\x31\x01\2\0\0\0" + attribute("channels", "chlist", listed + b"\0")
+    head += attribute("compression", "compression", b"\0") + attribute("dataWindow", "box2i", box)
+    head += attribute("displayWindow", "box2i", box) + attribute("lineOrder", "lineOrder", b"\0")
+    head += attribute("pixelAspectRatio", "float", struct.pack("<f", 1))
+    head += attribute("screenWindowCenter", "v2f", bytes(8)) + attribute(
+        "screenWindowWidth", "float", struct.pack("<f", 1)
+    )
+    head += b"\0"
+    lines, offsets, place = [], [], len(head) + 8 * height
+    for y in range(height):
+        data = b"".join(
+            channels[n][0][y // channels[n][1]].astype("<f4").tobytes() for n in names if y % channels[n][1] == 0
+        )
+        offsets.append(place)
+        lines.append(struct.pack("<ii", y, len(data)) + data)
+        place += len(lines[-1])
+    path.write_bytes(head + struct.pack(f"<{height}Q", *offsets) + b"".join(lines))
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_luminance_and_chroma(tmp_path, step):
+    rgb = np.stack([np.full((8, 8), value, np.float32) for value in (0.6, 0.3, 0.1)], axis=2)
+    luminance = (rgb @ space("ITU-R BT.709").matrix_RGB_to_XYZ[1]).astype(np.float32)
+    channels = {"Y": (luminance, 1)}
+    for name, values in (("RY", rgb[..., 0]), ("BY", rgb[..., 2])):
+        channels[name] = (values / luminance - 1)[::step, ::step], step
+    write_subsampled(tmp_path / "a.exr", channels, (8, 8))
+    np.testing.assert_allclose(read_hdr(tmp_path / "a.exr"), rgb, rtol=2e-3)
+
+
+def test_xyz_channels(tmp_path):
+    xyz = space("ITU-R BT.709").matrix_RGB_to_XYZ @ RGB
+    read = read_hdr(write_exr(tmp_path / "a.exr", {n: np.full((4, 4), v, np.float32) for n, v in zip("XYZ", xyz)}))
+    assert read.shape == (4, 4, 3) and read[0, 0, 0] > read[0, 0, 1] > read[0, 0, 2]
+
+
+@pytest.mark.parametrize(
+    "places", [(0.1, 0.1, 0.2, 0.2, 0.3, 0.3, 0.3, 0.3), (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3, 0)]
+)
+def test_primaries_that_span_no_colors_are_refused(tmp_path, places):
+    with pytest.raises(InputError, match=r"a.exr: chromaticities .* span no colors"):
+        read_hdr(write_exr(tmp_path / "a.exr", planes(), chromaticities=tuple(map(float, places))))
+
+
+def radiance(path, header):
+    pixels = np.zeros((2, 4, 4), np.uint8)
+    pixels[...] = (200, 50, 12, 128)
+    path.write_bytes(b"#?RADIANCE\n" + header + b"\n\n-Y 2 +X 4\n" + pixels.tobytes())
+    return path
+
+
+def test_primaries_of_radiance(tmp_path):
+    plain = read_hdr(radiance(tmp_path / "a.hdr", b"FORMAT=32-bit_rle_rgbe"))
+    default = b"FORMAT=32-bit_rle_rgbe\nPRIMARIES=0.64 0.33 0.29 0.60 0.15 0.06 0.333 0.333"
+    np.testing.assert_array_equal(read_hdr(radiance(tmp_path / "b.hdr", default)), plain)
+    p3 = b"FORMAT=32-bit_rle_rgbe\nPRIMARIES= .680 .320 .265 .690 .150 .060 .3127 .3290"
+    np.testing.assert_allclose(
+        read_hdr(radiance(tmp_path / "c.hdr", p3))[0, 0], rec709("Display P3", plain[0, 0]), rtol=2e-3
+    )
+    xyz = read_hdr(radiance(tmp_path / "d.hdr", b"FORMAT=32-bit_rle_xyze"))
+    assert xyz[0, 0, 0] > 2 * plain[0, 0, 0]
+    with pytest.raises(InputError, match="PRIMARIES"):
+        read_hdr(radiance(tmp_path / "e.hdr", b"FORMAT=32-bit_rle_rgbe\nPRIMARIES=1 2 x"))
+
+
+def float_set(folder, light, times, stated=True):
+    write_blender(folder, 6, size=(40, 30))
+    values = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(values["frames"]):
+        (folder / "images" / f"r_{i}.png").unlink()
+        frame["file_path"] = f"images/r_{i}.exr"
+        channels = dict(zip("RGB", np.moveaxis(light * times[i], 2, 0).astype(np.float32).copy()))
+        write_exr(folder / frame["file_path"], channels, **({"expTime": times[i]} if stated else {}))
+    (folder / "transforms.json").write_text(json.dumps(values))
+    return folder
+
+
+def test_exposure_times_of_openexr(tmp_path):
+    light = 0.1 + pattern(40, 30) / 255
+    times = [0.01, 0.02, 0.04, 0.01, 0.02, 0.04]
+    scene = load_scene(float_set(tmp_path / "a", light, times), holdout=0)
+    assert any(note == "float images: their values are light times expTime, 0.01 to 0.04 s" for note in scene.notes)
+    assert [view.exposure_time / scene.views[0].exposure_time for view in scene.views] == pytest.approx(
+        [1, 2, 4, 1, 2, 4]
+    )
+    for view in scene.views:
+        np.testing.assert_allclose(view.hdr, light * times[0], rtol=2e-3)
+        decoded = scene.response.decode(view.image.astype(float)) / view.exposure_time
+        np.testing.assert_allclose(decoded, light * times[0], rtol=0.01)
+    same = load_scene(float_set(tmp_path / "b", light, [0.02] * 6), holdout=0)
+    plain = load_scene(float_set(tmp_path / "c", light, [0.02] * 6, stated=False), holdout=0)
+    assert same.views[0].exposure_time == plain.views[0].exposure_time
+    assert exr_exposure_time(tmp_path / "b" / "images" / "r_0.exr") == pytest.approx(0.02)
+    assert exr_exposure_time(tmp_path / "c" / "images" / "r_0.exr") is None
