@@ -41,8 +41,8 @@ COMMANDS = {
         "report": Command("output.commands", "Report", "run_report"),
         "envmap": Command("output.commands", "EnvironmentMap", "run_environment_map"),
         "lights": Command("output.commands", "Lights", "run_lights"),
-        "export": Command("output.commands", "Export", "run_export"),
-        "convert": Command("output.commands", "Convert", "run_convert"),
+        "export": Command("output.splat_commands", "Export", "run_export"),
+        "convert": Command("output.splat_commands", "Convert", "run_convert"),
     },
     "choose and calibrate": {
         "presets": Command("training.commands", "Presets", "run_presets"),

@@ -154,7 +154,9 @@ def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
         "up": up.tolist(),
         "focus": None if focus is None else focus.tolist(),
         "size": size or 1.0,
-        "views": [{"name": entry.name, "split": entry.split, "camera": entry.camera.to_dict()} for entry in entries],
+        "views": [
+            {"name": e.name, "split": e.split, "time": e.exposure_time, "camera": e.camera.to_dict()} for e in entries
+        ],
     }
 
 

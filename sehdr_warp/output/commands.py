@@ -1,11 +1,11 @@
-"""Command lines of `sehdr-warp render`, `report`, `envmap`, `export` and `convert`. torch is imported when they run."""
+"""Command lines of `sehdr-warp render`, `report` and `envmap`. torch is imported when they run."""
 
 import json
 import logging
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from tyro.conf import Positional
 
@@ -13,6 +13,7 @@ from ..arguments import require_positive
 from ..errors import InputError, UsageError
 from ..files import check_absent
 from ..runs.open import load_run_photos_with_confidence, open_run, open_scene
+from .options import WorldOptions, changed_flags
 
 log = logging.getLogger(__name__)
 
@@ -46,19 +47,6 @@ class ViewFileOptions:
     """OpenColorIO config for the previews: a file, or ocio://default."""
     view: str | None = None
     """View of that config, or DISPLAY/VIEW."""
-
-
-@dataclass(frozen=True)
-class WorldOptions:
-    """Coordinates of the files."""
-
-    axes: Literal["upright", "scene"] = "upright"
-    """upright: +Y is up (in PLY -Y, as its viewers expect), the subject is in the middle. scene: the photos' own
-    coordinates."""
-    up: str | None = None
-    """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
-    scale: float | None = None
-    """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +92,7 @@ class Render:
     """cpu or cuda:N; by default the first GPU if there is one."""
     json: bool = False
     """Print the written files as JSON on standard output."""
-    world: WorldOptions = WorldOptions()
+    world: WorldOptions = field(default_factory=WorldOptions)
     pictures: ViewFileOptions = ViewFileOptions()
     film: FilmOptions = FilmOptions()
 
@@ -121,70 +109,6 @@ class Report:
     """The photos, if they have moved since the training."""
     overwrite: bool = False
     """Replace files that exist."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-
-
-@dataclass(frozen=True)
-class SplatFileOptions:
-    """Colors and harmonics of a file of Gaussians."""
-
-    kind: Literal["hdr", "ldr"] | None = None
-    """ldr: the colors of a photo, as viewers show them. hdr: scene-linear radiance. By default hdr for USD, else
-    ldr."""
-    exposure: str | None = None
-    """Exposure of ldr colors: seconds (1/125), stops from the photos' exposure (-2ev) or multiples of it (1/8x)."""
-    degree: int | None = None
-    """Pad the harmonics with zeros up to this degree, for readers that take 3 alone."""
-
-
-@dataclass(frozen=True)
-class EditOptions:
-    """What the file leaves out."""
-
-    crop: str | None = None
-    """Keep only this region, in upright coordinates: sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1."""
-    cut: str | None = None
-    """Leave this region out, written as that of --crop."""
-    min_opacity: float = 1 / 255
-    """Least opacity; below 1/255 no program draws a Gaussian."""
-    min_views: int = 0
-    """Leave out what fewer training cameras show: 2 removes most floaters."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Export:
-    """Write the Gaussians as a file for viewers and other tools, or as a page that shows them in HDR."""
-
-    run: Positional[Path]
-    """Folder of a run, or a file of Gaussians."""
-    out: Path
-    """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD), .html (a page to send), or the
-    small ones .sog, .spz and .compressed.ply."""
-    world: WorldOptions = WorldOptions()
-    edits: EditOptions = EditOptions()
-    merge: tuple[Path, ...] = ()
-    """Further runs or files in the same coordinates, which the file holds as well."""
-    file: SplatFileOptions = SplatFileOptions()
-    cameras: bool = False
-    """Also write <name>.cameras.json beside it, in the form of the reference release of 3D Gaussian Splatting."""
-    overwrite: bool = False
-    """Replace files that exist."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Convert:
-    """Turn a file of Gaussians into one of another kind."""
-
-    source: Positional[Path]
-    """The file: .ply, .glb, .usda, .usdc, .usdz, .sog, .spz or .compressed.ply."""
-    out: Positional[Path]
-    """The file to write; its suffix decides."""
-    file: SplatFileOptions = SplatFileOptions()
-    overwrite: bool = False
-    """Replace a file that exists."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
 
@@ -260,12 +184,6 @@ def run_lights(args: Lights) -> None:
         return
     for path in write_lights(run, args.out, axes=args.axes, up=args.up, overwrite=args.overwrite):
         print(path)
-
-
-def changed_flags(options: Any) -> list[str]:
-    """Return the flags of a dataclass of options whose values are not the default."""
-    names = [field.name for field in fields(options) if getattr(options, field.name) != field.default]
-    return ["--" + name.replace("_", "-") for name in names]
 
 
 def run_environment_map(args: EnvironmentMap) -> None:
@@ -344,59 +262,3 @@ def run_report(args: Report) -> None:
     scene = load_run_photos_with_confidence(run, args.data)
     for path in write_report(run, scene, args.out, overwrite=args.overwrite, evaluation=evaluate(run, scene)):
         print(path)
-
-
-def run_export(args: Export) -> None:
-    """Run `sehdr-warp export`."""
-    from ..splats import check_suffix
-
-    if check_suffix(args.out, ".html") == ".html":
-        from .scene_page import write_scene_page
-
-        if args.cameras or changed_flags(args.file):
-            raise UsageError("a page has its exposure, cameras and harmonics; --out alone goes with .html")
-        print(write_scene_page(open_scene(args.run, args.device), args.out, overwrite=args.overwrite))
-        return
-    flags = {"cameras": args.cameras, "overwrite": args.overwrite}
-    options = {"world": args.world, "edits": args.edits, "merge": args.merge}
-    _export(args.run, args.out, args.file, args.device, **options, **flags)
-
-
-def run_convert(args: Convert) -> None:
-    """Run `sehdr-warp convert`."""
-    from ..splats import check_suffix
-
-    if args.out.suffix.lower() == ".html":
-        raise UsageError(f"{args.out}: pages are written by sehdr-warp export {args.source} --out {args.out}")
-    if args.source.is_dir():
-        raise UsageError(
-            f"{args.source}: is a folder; runs are written by sehdr-warp export {args.source} --out {args.out}"
-        )
-    check_suffix(args.source)
-    _export(args.source, args.out, args.file, args.device, overwrite=args.overwrite)
-
-
-def _export(
-    source: Path,
-    out: Path,
-    options: SplatFileOptions,
-    device: str | None,
-    *,
-    world: WorldOptions | None = None,
-    edits: EditOptions | None = None,
-    merge: tuple[Path, ...] = (),
-    **flags: bool,
-) -> None:
-    from ..model.exposure import exposure_times
-    from ..splats import check_suffix
-    from .export import export
-    from .splat_edits import SplatEdits
-
-    check_suffix(out)  # Before the scene is opened.
-    splat_edits = SplatEdits(**vars(edits)) if edits else SplatEdits(min_opacity=0)
-    run = open_scene(source, device)
-    others = [open_scene(path, device) for path in merge]
-    time = None if options.exposure is None else exposure_times(run.base_time, options.exposure)[0]
-    frame = {"axes": None} if world is None else vars(world)
-    colors = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
-    print(export(run, out, **colors, **frame, edits=splat_edits, merge=others, **flags))

@@ -88,7 +88,7 @@ def export(
     for scene in (run, *merge):
         gaussians = _converted(scene, color_model, time)
         whole.append(gaussians)
-        mask = edits.mask(gaussians, upright.points(gaussians.means), scene)
+        mask = edits.mask(gaussians.opacities, upright.points(gaussians.means), scene)
         parts.append(without_strays(gaussians.rows(mask), training_cameras(scene)))
     gaussians = merged(parts)
     delivered = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)

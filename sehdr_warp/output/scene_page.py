@@ -19,14 +19,22 @@ from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
 from .light_pictures import curve_table, display_gain
+from .splat_edits import SplatEdits, without_strays
+from .world_transform import world_transform
 
 _HALF = float(np.finfo(np.float16).max)
 
 
-def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> Path:
+def write_scene_page(run: Any, path: Path | str, *, edits: SplatEdits | None = None, overwrite: bool = False) -> Path:
     """Write a run as one HTML file that any browser with WebGL2 shows; return the path.
 
     The page has an exposure slider and needs no network. Means are float32, all else half.
+
+    Args:
+        run: From load_run, train or load_splats.
+        path: The file.
+        edits: What the page leaves out; by default Gaussians too faint to be drawn.
+        overwrite: Replace a file that exists.
 
     Raises:
         InputError: If the file exists (unless overwrite), a value is not finite or the scene has no cameras to look
@@ -38,6 +46,9 @@ def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> 
         raise InputError(path, "the scene has no cameras to look from", "export the run, or put cameras.json beside it")
     cameras = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
     gaussians = gaussians_of(run.model, "linear", np.array([camera.position for camera in cameras]))
+    transform = world_transform(run)
+    mask = (edits or SplatEdits()).mask(gaussians.opacities, transform.points(gaussians.means), run)
+    gaussians = without_strays(gaussians.rows(mask), cameras)
     gaussians.require_finite(path)
     harmonics = np.clip(gaussians.harmonics * np.float32(run.base_time), -_HALF, _HALF)
     columns = dict(zip("xyz", gaussians.means.T))
@@ -50,6 +61,7 @@ def write_scene_page(run: Any, path: Path | str, *, overwrite: bool = False) -> 
     columns |= {f"rot_{i}": column for i, column in enumerate(gaussians.unit_quaternions.T)}
     values = np.stack(list(columns.values()))
     facts = facts_of_cameras(run.cameras) | {
+        "up": transform.rotation[1].tolist(),
         "columns": list(columns),
         "base_time": run.base_time,
         "grey": display_gain(run.response),

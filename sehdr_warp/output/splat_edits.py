@@ -102,18 +102,18 @@ class SplatEdits:
         """Whether the file is meant to show something else than the scene."""
         return bool(self.crop or self.cut or self.min_views or self.min_opacity > LEAST_OPACITY)
 
-    def mask(self, gaussians: GaussianArrays, upright_means: np.ndarray, run: Any) -> np.ndarray:
+    def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: Any) -> np.ndarray:
         """Return [N], which Gaussians stay.
 
         Args:
-            gaussians: Of the run, in its order.
+            opacities: [N] of the run's Gaussians, in [0, 1].
             upright_means: [N, 3] their positions in upright coordinates.
             run: The scene, whose training cameras count views.
 
         Raises:
             SehdrError: If none stays, or views are to be counted and the scene has no cameras.
         """
-        steps = {"fainter than min_opacity": gaussians.opacities < self.min_opacity}
+        steps = {"fainter than min_opacity": opacities < self.min_opacity}
         if self.crop:
             steps[f"outside of {self.crop}"] = ~read_region(self.crop).contains(upright_means)
         if self.cut:
@@ -124,7 +124,7 @@ class SplatEdits:
                 raise SehdrError(f"{run.path}: has no training cameras to count views of; leave min_views out")
             views = count_views(run.model, cameras).cpu().numpy()
             steps[f"shown by fewer than {self.min_views} cameras"] = views < self.min_views
-        stays = np.ones(gaussians.count, bool)
+        stays = np.ones(len(opacities), bool)
         for reason, goes in steps.items():
             stays &= ~goes
             if goes.any():

@@ -1,6 +1,7 @@
 """The command line of `sehdr-warp view`. torch is imported when it runs."""
 
 import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -23,6 +24,8 @@ class View:
     """Port; the next free one where it is taken."""
     host: str = "127.0.0.1"
     """Address to serve: this machine alone, or 0.0.0.0 for all that can reach it."""
+    origin: tuple[str, ...] = ()
+    """Address of a proxy before the viewer, such as https://splats.example.org, whose pages may ask it."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
     data: str | None = None
@@ -42,6 +45,9 @@ def run_view(args: View) -> None:
         raise UsageError("view needs RUN, the folder of a run; see sehdr-warp view --help")
     if not 0 <= args.port < 65536:
         raise UsageError(f"--port {args.port}: is no port; give 1 to 65535, or 0 for any")
+    for origin in args.origin:
+        if not re.fullmatch(r"https?://[A-Za-z0-9.-]+(:[0-9]+)?", origin):
+            raise UsageError(f"--origin {origin}: write it as https://NAME or https://NAME:PORT")
     watch = Watch(args.runs, lambda path: open_scene(path, args.device))
 
     @cache
@@ -51,7 +57,7 @@ def run_view(args: View) -> None:
         return {view.name: view for view in load_run_photos(watch.shown[index], args.data).views}
 
     watch.start()
-    with Server(Viewer(watch.shown, photos), args.host, args.port) as server:
+    with Server(Viewer(watch.shown, photos), args.host, args.port, args.origin) as server:
         print(f"{server.url}  (Ctrl-C ends it)", flush=True)
         try:
             server.serve_forever()

@@ -12,6 +12,9 @@ from sehdr_warp.scene import Camera
 
 from ..output.camera_paths import facts_of_cameras
 from ..output.light_pictures import curve_table, display_gain
+from ..output.splat_edits import SplatEdits
+from ..output.world_transform import world_transform
+from .edits import EditedOpacities
 
 MOST_PIXELS = 4096 * 2304
 _HALF_MOST = 65504.0
@@ -32,12 +35,25 @@ class ViewerScene:
         """Show a run under a name."""
         self.run, self.name, self.clipped = run, name, clipped
         self.lock, self.version = threading.Lock(), 0
+        self.opacities, self.shown_count = EditedOpacities(), None
 
     def replace(self, run: Any, clipped: Tensor | None) -> None:
         """Show another run from now on."""
         with self.lock:
             self.run, self.clipped = run, clipped
+            self.opacities, self.shown_count = EditedOpacities(), None
             self.version += 1
+
+    def edit(self, edits: SplatEdits | None) -> None:
+        """Show what edits leave of the scene, or all of it for None; see EditedOpacities.apply."""
+        with self.lock:
+            count = self.opacities.apply(self.run, edits)
+            self.shown_count = None if edits is None else count
+            self.version += 1
+
+    def turned(self) -> None:
+        """Tell pages that up or scale have changed."""
+        self.version += 1
 
     def __getattr__(self, name: str):
         """Return an attribute of the run."""
@@ -79,18 +95,22 @@ class ViewerScene:
 
     def facts(self) -> dict[str, Any]:
         """Return what the page knows of the run, as plain values."""
-        return {
+        transform = world_transform(self) if hasattr(self, "path") else None  # A training has no folder yet.
+        own = {} if transform is None else {"up": transform.rotation[1].tolist(), "upright": transform.matrix.tolist()}
+        facts = {
             "name": self.name,
             "version": self.version,
             "scene": self.scene_name,
-            "gaussians": self.gaussian_count,
+            "gaussians": self.gaussian_count if self.shown_count is None else self.shown_count,
+            "edited": self.shown_count is not None,
             "iterations": self.iterations,
             "response": self.response.name,
             "base_time": self.base_time,
             "grey": display_gain(self.response),
             "curve": curve_table(self.response),
             "clipped": self.clipped is not None,
-        } | facts_of_cameras(self.cameras)
+        }
+        return facts | facts_of_cameras(self.cameras) | own
 
 
 def camera_of(values: dict) -> Camera:
@@ -106,7 +126,7 @@ def camera_of(values: dict) -> Camera:
 
 
 def frame_bytes(camera: Camera, clipped: bool) -> int:
-    """Return the size of a frame in bytes; see Rendering.frame."""
+    """Return the size of a frame in bytes; see ViewerScene.frame."""
     return 2 * (6 if clipped else 5) * camera.width * camera.height
 
 

@@ -29,7 +29,10 @@ from ..output.html import page_file
 from ..output.images import quantize
 from ..output.light_pictures import shown_photo
 from ..output.render_views import render_views
+from ..output.scene_page import write_scene_page
+from .clients import Client, Refusal
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
+from .edits import edits_of, orient
 from .frames import ViewerScene, camera_file, camera_of, frame_bytes
 
 log = logging.getLogger(__name__)
@@ -44,19 +47,9 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' blob: data:; "
-    "frame-ancestors 'none'",
 }
+_POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' blob: data:"
 _LOCAL = ("127.0.0.1", "localhost", "[::1]")
-
-
-class Refusal(Exception):
-    """An error answer: an HTTP status and one line."""
-
-    def __init__(self, status: int, line: str):
-        """Set the status and the line."""
-        self.status = status
-        super().__init__(line)
 
 
 class Viewer:
@@ -88,7 +81,7 @@ class Viewer:
             "/viewer.js": ("text/javascript", page.joinpath("viewer.js").read_text(encoding="utf-8")),
         }
 
-    def get(self, path: str, client: "Client") -> tuple[str, bytes]:
+    def get(self, path: str, client: Client) -> tuple[str, bytes]:
         """Answer a GET: content type and content; raise Refusal."""
         if path in self.files:
             kind, text = self.files[path]
@@ -106,7 +99,7 @@ class Viewer:
             return "image/png", self._photo(path.removeprefix("/photo/"), client)
         raise Refusal(404, "no such page")
 
-    def post(self, path: str, request: dict, client: "Client") -> tuple[str, bytes | memoryview]:
+    def post(self, path: str, request: dict, client: Client) -> tuple[str, bytes | memoryview]:
         """Answer a POST: content type and content; raise Refusal, or the error of a bad request."""
         if path == "/training" and self.training is not None:
             self.training.control(str(request["do"]))
@@ -116,6 +109,13 @@ class Viewer:
             run, camera = self._run(request), camera_of(request["camera"])
             client.reserve(frame_bytes(camera, options["clipped"]))
             return "application/octet-stream", self._on_renderer(client, partial(run.frame, camera, **options))
+        if path in ("/edit", "/orientation") and self.training is None:
+            run = self._run(request)
+            self._on_renderer(
+                client, partial(run.edit, edits_of(request)) if path == "/edit" else partial(orient, run, request)
+            )
+            run.turned()
+            return "application/json", json.dumps(run.facts()).encode()
         if path in ("/path", "/save"):
             cameras = [camera_of(camera) for camera in request["cameras"][:MOST_VIEWS]]
             if not cameras:
@@ -135,7 +135,7 @@ class Viewer:
             if lock.acquire(timeout=_SAVE_END):
                 lock.release()
 
-    def _on_renderer(self, client: "Client", make: Callable[[], Any]) -> Any:
+    def _on_renderer(self, client: Client, make: Callable[[], Any]) -> Any:
         """Return what `make` returns on the thread of the renderer, unless its client has gone by then."""
 
         def call() -> Any:
@@ -156,7 +156,7 @@ class Viewer:
             raise Refusal(404, "no such run")
         return self.runs[index]
 
-    def _photo(self, name: str, client: "Client") -> bytes:
+    def _photo(self, name: str, client: Client) -> bytes:
         """Return the photo of a run and a view by their indices, as PNG."""
         run, _, view = name.partition("/")
         if not (run.isascii() and view.isascii() and run.isdigit() and view.isdigit() and len(name) < 20):
@@ -185,6 +185,9 @@ class Viewer:
             raise Refusal(503, "another save is still being made")
         try:
             with tempfile.TemporaryDirectory() as folder:
+                if kind == "page":
+                    page = self._on_renderer(run.client, partial(write_scene_page, run, Path(folder, "scene.html")))
+                    return "text/html", page.read_bytes()
                 if kind == "film":
                     options = {"ev_ramp": (stops, stops), "exposed": True, "tell": self._tell}
                     return "video/mp4", write_film(run, Path(folder, "film.mp4"), cameras, **options).read_bytes()
@@ -207,22 +210,6 @@ class Viewer:
     def _tell(self, line: str) -> None:
         """Set the line that a page shows while a film is rendered."""
         self.saving = line
-
-
-class Client:
-    """Who asks: what a request may know of its connection."""
-
-    def __init__(self, connections: Connections, connection: Connection):
-        """Set the connection and those beside it."""
-        self._connections, self._connection = connections, connection
-
-    def gone(self) -> bool:
-        """Return whether the client no longer waits for the answer."""
-        return self._connection.gone()
-
-    def reserve(self, size: int) -> None:
-        """Wait for room for an answer of so many bytes; see Connections.reserve."""
-        self._connections.reserve(self._connection, size)
 
 
 class _SavedRun:
@@ -253,9 +240,17 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads, block_on_close, request_queue_size = True, False, 64
 
-    def __init__(self, viewer: Viewer, host: str = "127.0.0.1", port: int = 8080):
-        """Listen on the port, or on the next free one."""
-        self.viewer, self.host = viewer, host
+    def __init__(self, viewer: Viewer, host: str = "127.0.0.1", port: int = 8080, origins: Sequence[str] = ()):
+        """Listen on the port, or on the next free one.
+
+        Args:
+            viewer: What is shown.
+            host: Address to listen on.
+            port: First port to try.
+            origins: Origins of a proxy before this server, such as https://splats.example.org.
+        """
+        self.viewer, self.host, self.origins = viewer, host, tuple(origins)
+        self.security_policy = f"{_POLICY}; frame-ancestors 'self' vscode-webview: {' '.join(self.origins)}".strip()
         self.connections = Connections()
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         for tried in range(port, min(port + PORTS_TRIED, 65536)):
@@ -301,7 +296,9 @@ class Server(ThreadingHTTPServer):
         """Whether a request comes from a page of this server: another site's could reach it by a name of its own."""
         name = re.sub(r":[0-9]*$", "", host)
         own = f"[{self.host}]" if ":" in self.host else self.host
-        return (not _is_local(self.host) or name in (*_LOCAL, own)) and origin in (None, f"http://{host}")
+        proxies = [each.partition("://")[2] for each in self.origins]
+        reached = not _is_local(self.host) or name in (*_LOCAL, own) or host in proxies
+        return reached and origin in (None, f"http://{host}", f"https://{host}", *self.origins)
 
 
 def _is_local(host: str) -> bool:
@@ -319,6 +316,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self._answer(self.server.viewer.get)
+
+    do_HEAD = do_GET
 
     def do_POST(self) -> None:
         self._answer(lambda path, client: self.server.viewer.post(path, self._body(), client))
@@ -344,14 +343,18 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             return
         with connections.answering(connection):
-            self._send(connection, *self._found(partial(find, self.path, Client(connections, connection))))
+            self._send(
+                connection, *self._found(partial(find, self.path.partition("?")[0], Client(connections, connection)))
+            )
 
     def _found(self, find: Callable[[], tuple[str, bytes | memoryview]]) -> tuple[int, str, bytes | memoryview]:
         """Return status, content type and content of an answer."""
         try:
             if not self.server.allowed(self.headers.get("Host", ""), self.headers.get("Origin")):
                 self.close_connection = True
-                raise Refusal(403, "only pages of this server may ask")
+                raise Refusal(
+                    403, "only pages of this server may ask; behind a proxy, start it with --origin https://ITS.NAME"
+                )
             return 200, *find()
         except Refusal as error:
             return error.status, "text/plain", str(error).encode()
@@ -370,10 +373,17 @@ class _Handler(BaseHTTPRequestHandler):
     def _send(self, connection: Connection, status: int, kind: str, content: bytes | memoryview) -> None:
         try:
             self.send_response(status)
-            for name, value in {**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content))}.items():
+            policy = {"Content-Security-Policy": self.server.security_policy}
+            for name, value in {
+                **_HEADERS,
+                **policy,
+                "Content-Type": kind,
+                "Content-Length": str(len(content)),
+            }.items():
                 self.send_header(name, value)
             self.end_headers()
-            connection.send(content)
+            if self.command != "HEAD":
+                connection.send(content)
         except OSError:  # The client has gone, or reads nothing.
             self.close_connection = True
 

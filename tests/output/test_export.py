@@ -5,8 +5,8 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.output.commands import Export, run_export
 from sehdr_warp.output.export import export
+from sehdr_warp.output.splat_commands import Export, run_export
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras
 from sehdr_warp.splats import LOSSY_SUFFIXES, read_gaussians, write_gaussians

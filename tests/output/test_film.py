@@ -9,9 +9,10 @@ from sehdr_warp.cli import parse_command
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.output import film
 from sehdr_warp.output.colorspace import color_space
-from sehdr_warp.output.commands import Convert, FilmOptions, Render, ViewFileOptions, _ramp, run_convert, run_render
+from sehdr_warp.output.commands import FilmOptions, Render, ViewFileOptions, _ramp, run_render
 from sehdr_warp.output.film import encode, write_film
 from sehdr_warp.output.light_pictures import display_gain
+from sehdr_warp.output.splat_commands import Convert, run_convert
 from sehdr_warp.own_files import LIST
 
 from .helpers import AnalyticRun

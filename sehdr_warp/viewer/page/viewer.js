@@ -17,7 +17,7 @@ async function ask(path, body) {
 const over = () => $("training").hidden ? "the server is gone" : "the training has ended; `sehdr-warp view` shows the run";
 
 async function start() {
-  const told = await (await ask("/scene")).json();
+  const told = await (await ask("scene")).json();
   runs = told.runs, facts = runs[0], light = new LightCanvas(picture);
   for (const option of light.gl ? [] : document.querySelectorAll("[data-shaded]")) {
     option.disabled = true;
@@ -31,6 +31,7 @@ async function start() {
     if (runs.length > 1) $("left").add(new Option(run.name, "run" + i));
   });
   $("runRow").hidden = runs.length < 2;
+  $("edit").hidden = $("share").hidden = told.training;
   if (told.training) startTraining();
   else setInterval(renew, 2000);
   useRun(0);
@@ -42,9 +43,9 @@ async function start() {
 async function renew() {
   if (document.hidden) return;
   try {
-    const versions = await (await ask("/versions")).json();
+    const versions = await (await ask("versions")).json();
     if (versions.every((version, i) => version === runs[i].version)) return;
-    const told = await (await ask("/scene")).json(), views = all => JSON.stringify(all.map(run => run.views));
+    const told = await (await ask("scene")).json(), views = all => JSON.stringify(all.map(run => run.views));
     if (views(told.runs) !== views(runs)) return location.reload();  // Another scene
     runs = told.runs;
     useRun(state.run);
@@ -58,6 +59,7 @@ function useRun(index) {
   light.settings.grey = facts.grey;
   $("overlay").querySelector("[value=clipped]").disabled = !facts.clipped;
   state.run = index;
+  measured();
   expose();
 }
 
@@ -84,7 +86,7 @@ async function loadPhoto(index) {
   if (!usesPhoto()) return;
   tell("the photo is being read \u2026");
   try {
-    const blob = await (await ask(`/photo/${state.run}/${index}`)).blob();
+    const blob = await (await ask(`photo/${state.run}/${index}`)).blob();
     const image = await createImageBitmap(blob, {colorSpaceConversion: "none"});
     if (state.photo !== index) return;
     light.putPhoto(image);
@@ -126,7 +128,7 @@ async function load(draft) {
   const scale = draft ? draftScale : 1, width = Math.max(16, Math.round(drawing.width * scale)), height = Math.max(16, Math.round(drawing.height * scale));
   const seen = camera.at(width, height, zoom()), started = performance.now(), clipped = $("overlay").value === "clipped";
   const left = $("left").value, other = left.startsWith("run") ? Number(left.slice(3)) : null;
-  const fetched = async (run, clip) => new Uint16Array(await (await ask("/frame", {run, camera: seen, draft, clipped: clip})).arrayBuffer());
+  const fetched = async (run, clip) => new Uint16Array(await (await ask("frame", {run, camera: seen, draft, clipped: clip})).arrayBuffer());
   const [half, second] = await Promise.all([fetched(state.run, clipped), other === null ? null : fetched(other, false)]);
   const n = width * height, took = performance.now() - started;
   picture.width = width, picture.height = height;  // Shaded at the frame's size: the browser enlarges drafts.
@@ -184,6 +186,7 @@ function frusta() {
   const context = drawing.getContext("2d"), scale = drawing.width / drawn.camera.width;
   context.clearRect(0, 0, drawing.width, drawing.height);
   state.apexes = [];
+  marks();
   if (!$("frusta").checked) return;
   context.lineWidth = 1.2 * (window.devicePixelRatio || 1);
   facts.views.forEach((view, i) => {
@@ -289,9 +292,29 @@ const inside = event => {
   const box = stage.getBoundingClientRect();
   return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
 };
-picture.addEventListener("pointerdown", event => { picture.setPointerCapture(event.pointerId); stage.focus(); state.drag = [event.clientX, event.clientY, 0]; });
+const fingers = new Map();
+picture.addEventListener("pointerdown", event => {
+  picture.setPointerCapture(event.pointerId);
+  stage.focus();
+  fingers.set(event.pointerId, [event.clientX, event.clientY]);
+  state.drag = [event.clientX, event.clientY, 0];
+});
+for (const end of ["pointerup", "pointercancel"]) picture.addEventListener(end, event => fingers.delete(event.pointerId));
+// Two fingers: their distance moves nearer and away, their middle pans.
+function pinch(event) {
+  const before = [...fingers.values()], size = Math.min(stage.clientWidth, stage.clientHeight);
+  fingers.set(event.pointerId, [event.clientX, event.clientY]);
+  const after = [...fingers.values()], apart = ([a, b]) => Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1]));
+  const middle = ([a, b]) => [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], [from, to] = [middle(before), middle(after)];
+  camera.dolly(apart(before) / apart(after));
+  camera.pan((to[0] - from[0]) / size, (to[1] - from[1]) / size);
+  state.drag = [event.clientX, event.clientY, 99];
+  moved();
+}
 picture.addEventListener("pointermove", event => {
   state.pointer = inside(event);
+  if (fingers.size === 2 && fingers.has(event.pointerId)) return pinch(event);
+  if (fingers.has(event.pointerId)) fingers.set(event.pointerId, [event.clientX, event.clientY]);
   if (state.drag && event.buttons) {
     const x = event.clientX - state.drag[0], y = event.clientY - state.drag[1], size = Math.min(stage.clientWidth, stage.clientHeight);
     state.drag = [event.clientX, event.clientY, state.drag[2] + Math.abs(x) + Math.abs(y)];
@@ -305,6 +328,7 @@ picture.addEventListener("pointermove", event => {
 picture.addEventListener("pointerup", event => {
   const still = state.drag && state.drag[2] < 4, ratio = window.devicePixelRatio || 1, box = stage.getBoundingClientRect();
   state.drag = null;
+  if (still && state.picking) return pick(inside(event));
   const near = still && (state.apexes || []).find(([, x, y]) => Math.hypot(x / ratio - event.clientX + box.left, y / ratio - event.clientY + box.top) < 9);
   if (near) jump(near[0]);
 });
@@ -312,24 +336,31 @@ picture.addEventListener("pointerleave", () => { state.pointer = null; probe(); 
 picture.addEventListener("contextmenu", event => event.preventDefault());
 picture.addEventListener("wheel", event => { event.preventDefault(); camera.dolly(Math.exp(Math.sign(event.deltaY) * Math.min(60, Math.abs(event.deltaY)) / 500)); moved(); }, {passive: false});
 picture.addEventListener("dblclick", event => {
-  const depth = light.value("depth", ...inside(event));
-  if (!depth || !(depth[0] > 0)) return;
-  const [u, v] = inside(event), l = lensOf(drawn.camera), d = depth[0];
-  const target = add(add(add(camera.position, camera.right, (u - l[2]) / l[0] * d), camera.down, (v - l[3]) / l[1] * d), camera.forward, d);
-  camera.ahead = d;
+  const target = pointAt(inside(event));
+  if (state.picking || !target) return;
+  camera.ahead = dot(add(target, camera.position, -1), camera.forward);
   const away = add(target, camera.pivot, -1);
   camera.position = add(camera.position, away);
   moved();
 });
-stage.addEventListener("keydown", event => {
+// Keys work at once, without a click into the picture first; what is typed into a field is its own.
+const typing = target => target instanceof Element && target.matches("input, select, textarea");
+document.addEventListener("keydown", event => {
+  if (!facts || typing(event.target) || event.ctrlKey || event.metaKey) return;
   const key = event.key.toLowerCase(), count = facts.views.length;
-  if (event.ctrlKey || event.metaKey) return;
   if ("wasdqe".includes(key)) { if (!state.keys.size) requestAnimationFrame(fly); state.keys.add(key); }
   if (key === "[" || key === "]") { state.stops = bounded(Math.round(3 * state.stops + (key === "]" ? 1 : -1)) / 3); expose(); }
   if (count && (key === "arrowleft" || key === "arrowright")) jump((Number($("view").value) + (key === "arrowright" ? 1 : count - 1)) % count);
 });
-stage.addEventListener("keyup", event => state.keys.delete(event.key.toLowerCase()));
-stage.addEventListener("blur", () => state.keys.clear());
+document.addEventListener("keyup", event => state.keys.delete(event.key.toLowerCase()));
+window.addEventListener("blur", () => state.keys.clear());
+// The surface under a place of the picture, or null.
+function pointAt([u, v]) {
+  const depth = drawn && light.value("depth", u, v);
+  if (!depth || !(depth[0] > 0)) return null;
+  const l = lensOf(drawn.camera), d = depth[0];
+  return add(add(add(camera.position, camera.right, (u - l[2]) / l[0] * d), camera.down, (v - l[3]) / l[1] * d), camera.forward, d);
+}
 let flown = 0;
 function fly(now) {
   const pace = facts.size * 0.5 * Math.min(0.1, flown ? (now - flown) / 1000 : 0.016), on = key => state.keys.has(key) ? pace : 0;
@@ -339,6 +370,76 @@ function fly(now) {
   moved();
   requestAnimationFrame(fly);
 }
+
+// Points that are picked measure lengths, set scale and up, and crop
+const upright = point => { const m = facts.upright; return m ? [0, 1, 2].map(i => dot(m[i].slice(0, 3), point) + m[i][3]) : point; };
+state.points = [], state.region = {};
+function pick(place) {
+  const point = pointAt(place);
+  if (!point) return note("nothing is there to pick");
+  if (state.points.length === 3) state.points = [];
+  state.points.push(point);
+  measured();
+  frusta();
+}
+function measured() {
+  const [a, b] = state.points.map(upright), length = b && Math.hypot(...add(b, a, -1));
+  $("distance").textContent = length ? figure(length) : a ? a.map(figure).join(", ") : "";
+  $("setScale").disabled = state.points.length !== 2;
+  $("setUp").disabled = state.points.length !== 3;
+  $("crop").disabled = $("cut").disabled = state.points.length !== 2;
+  $("undo").disabled = !facts || !facts.edited;
+}
+function marks() {
+  const context = drawing.getContext("2d"), ratio = window.devicePixelRatio || 1, scale = drawing.width / drawn.camera.width;
+  const at = state.points.map(point => project(drawn.camera, point)).filter(Boolean).map(p => p.map(x => x * scale));
+  context.strokeStyle = context.fillStyle = "#fff";
+  context.lineWidth = 1.5 * ratio;
+  context.beginPath();
+  at.forEach(([x, y], i) => i ? context.lineTo(x, y) : context.moveTo(x, y));
+  context.stroke();
+  for (const [x, y] of at) { context.beginPath(); context.arc(x, y, 4 * ratio, 0, 7); context.fill(); }
+}
+const note = text => { $("edited").textContent = text; };
+async function change(path, body, done) {
+  note("\u2026");
+  try {
+    runs[state.run] = await (await ask(path, {run: state.run, ...body})).json();
+    useRun(state.run);
+    state.points = path === "edit" ? state.points : [];
+    measured();
+    note(done());
+    moved();
+  } catch (error) { note(error.message); }
+}
+$("measure").addEventListener("click", () => {
+  state.picking = !state.picking;
+  $("measure").setAttribute("aria-pressed", state.picking);
+  note(state.picking ? "click two points: a length, or a sphere; three: a level floor" : "");
+});
+$("setScale").addEventListener("click", () => {
+  const meters = Number($("meters").value), [a, b] = state.points;
+  if (!(meters > 0)) return note("type the true length in meters first");
+  const scale = meters / Math.hypot(...add(b, a, -1));
+  change("orientation", {scale}, () => `kept: ${figure(scale)} meters for each unit of the scene`);
+});
+$("setUp").addEventListener("click", () => {
+  const [a, b, c] = state.points, normal = unit(cross(add(b, a, -1), add(c, a, -1)));
+  const up = normal.map(x => x * (dot(normal, add(camera.position, a, -1)) < 0 ? -1 : 1));
+  change("orientation", {up}, () => { camera.up = up; return "kept: files are upright by this floor"; });
+});
+for (const name of ["crop", "cut"]) $(name).addEventListener("click", () => {
+  const [a, b] = state.points.map(upright), region = "sphere:" + [...a, Math.hypot(...add(b, a, -1))].map(x => x.toPrecision(5)).join(",");
+  state.region = {...state.region, [name]: region};
+  change("edit", state.region, () => `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.name} --out part.ply`
+    + Object.entries(state.region).map(([flag, text]) => ` --${flag} ${text}`).join(""));
+});
+$("undo").addEventListener("click", () => { state.region = {}; change("edit", {}, () => "all of it is shown"); });
+measured();
+$("asPhoto").addEventListener("click", () => {
+  const view = facts.views[Number($("view").value)];
+  if (view) { state.stops = bounded(Math.log2(view.time / facts.base_time)); expose(); }
+});
 
 // Saving and films
 const filmSize = () => [Math.round(drawing.width / 2) * 2, Math.round(drawing.height / 2) * 2];
@@ -355,19 +456,19 @@ for (const button of document.querySelectorAll("[data-save]")) button.addEventLi
   if (film && state.path.length < 2) return answer("add two views or more first");
   answer("rendering \u2026");
   let watch = film && setInterval(async () => {
-    const told = await ask("/saving").then(said => said.text(), () => "");
+    const told = await ask("saving").then(said => said.text(), () => "");
     if (told && watch) answer(told);
   }, 1000);
   try {
     const body = {run: state.run, kind, evs: $("evs").value, cameras: film ? state.path : [now()], count: film ? counted() : null, stops: state.stops};
-    download(await (await ask("/save", body)).blob(), facts.scene + {exr: ".exr", brackets: "_brackets.zip", film: ".mp4"}[kind]);
+    download(await (await ask("save", body)).blob(), facts.scene + {exr: ".exr", brackets: "_brackets.zip", film: ".mp4", page: ".html"}[kind]);
     answer("saved by your browser");
   } catch (error) { answer(error.message); }
   watch = clearInterval(watch);
 });
 $("addView").addEventListener("click", () => { state.path.push(now()); answer(`${state.path.length} views in the path`); });
 $("clearPath").addEventListener("click", () => { state.path = []; playing = 0; answer(""); });
-const path = async () => (await (await ask("/path", {cameras: state.path, count: counted()})).json()).cameras;
+const path = async () => (await (await ask("path", {cameras: state.path, count: counted()})).json()).cameras;
 $("savePath").addEventListener("click", async () => {
   if (!state.path.length) return answer("add a view first");
   download(new Blob([JSON.stringify({cameras: await path()})], {type: "application/json"}), "path.json");
@@ -390,13 +491,13 @@ $("play").addEventListener("click", async () => {
 // Training
 async function startTraining() {
   $("training").hidden = false;
-  const control = name => ask("/training", {do: name}).catch(error => tell(error.message));
+  const control = name => ask("training", {do: name}).catch(error => tell(error.message));
   $("pause").addEventListener("click", () => control($("pause").textContent === "Pause" ? "pause" : "resume"));
   $("step").addEventListener("click", () => control("step"));
   let last = -1, ended = false;
   while (!ended) {
     try {
-      const t = await (await ask("/training")).json();
+      const t = await (await ask("training")).json();
       if (t.iteration === undefined) throw new Error("not yet");
       ended = t.ended;
       $("progress").textContent = `${t.iteration} of ${t.total} \u00b7 loss ${t.loss.toFixed(4)} \u00b7 ${t.psnr.toFixed(1)} dB \u00b7 ${counts(t.gaussians)} Gaussians`

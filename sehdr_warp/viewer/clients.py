@@ -1,0 +1,28 @@
+"""What a request knows of who asks, and the answer to one that is refused."""
+
+from .connections import Connection, Connections
+
+
+class Refusal(Exception):
+    """An error answer: an HTTP status and one line."""
+
+    def __init__(self, status: int, line: str):
+        """Set the status and the line."""
+        self.status = status
+        super().__init__(line)
+
+
+class Client:
+    """Who asks: what a request may know of its connection."""
+
+    def __init__(self, connections: Connections, connection: Connection):
+        """Set the connection and those beside it."""
+        self._connections, self._connection = connections, connection
+
+    def gone(self) -> bool:
+        """Return whether the client no longer waits for the answer."""
+        return self._connection.gone()
+
+    def reserve(self, size: int) -> None:
+        """Wait for room for an answer of so many bytes; see Connections.reserve."""
+        self._connections.reserve(self._connection, size)
