@@ -36,9 +36,9 @@ def main() -> None:
 
 
 def room_views(data: Path):
-    """Yield [L, S, S, 3] for every third view of the rendered rooms, whose lights are in files of their own."""
+    """Yield [L, S, S, 3] for each view of the rendered rooms, whose lights are in files of their own."""
     for folder in sorted(data.glob("room*/groups")):
-        for first in sorted(folder.glob(f"*_{LIGHTS[0]}.exr"))[::3]:
+        for first in sorted(folder.glob(f"*_{LIGHTS[0]}.exr")):
             stem = first.name.removesuffix(f"{LIGHTS[0]}.exr")
             yield np.stack([half_size(read_hdr(folder / f"{stem}{light}.exr"), ROOM_SIZE) for light in LIGHTS])
 

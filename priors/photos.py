@@ -13,6 +13,7 @@ from .panoramas import Pack
 SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
 MOST_CLIPPED, LEAST_CLIPPED = 0.7, 5e-4  # Shares of a photo's pixels
 ROOM_SHARE = 0.35  # Of the photos of a training
+PAGE_SHARE = 0.2  # Of the photos, those with a white surface that is no lamp
 PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
 LEVELS = 255
 
@@ -121,6 +122,8 @@ class Camera:
         first = (torch.rand(count, 1, generator=self.generator, device=self.device) < 0.5) | plain
         white = torch.where(first, by_share, torch.minimum(by_middle, most)).clamp_min(1e-12)
         exposure = radiance / white[:, :, None, None]
+        if not plain:
+            exposure = self._with_pages(exposure)
         truth = exposure.clamp_min(1).log2()
         seen = exposure
         if not plain:
@@ -138,6 +141,26 @@ class Camera:
         if not plain:
             decoded = decoded ** (2 ** self._uniform(count, -0.2, 0.2))
         return Photos(decoded, clipped, truth * clipped)
+
+    def _with_pages(self, exposure: Tensor) -> Tensor:
+        """Return exposures [B, 3, S, S], some with a sheet, a wall or snow that is lit to about white, not a lamp."""
+        count, size = len(exposure), exposure.shape[-1]
+        place = (torch.arange(size, device=self.device) + 0.5) / size
+        across = place[None, :] - self._uniform(count, 0, 1)[:, 0]
+        down = place[:, None] - self._uniform(count, 0, 1)[:, 0]
+        turn = self._uniform(count, 0, math.pi)[:, 0]
+        u, v = turn.cos() * across + turn.sin() * down, turn.cos() * down - turn.sin() * across
+        half_width, half_height = (2.0 ** self._uniform(count, -4.5, 1)[:, 0] for _ in range(2))
+        used = self._uniform(count, 0, 1)[:, 0] < PAGE_SHARE
+        inside = ((u.abs() < half_width) & (v.abs() < half_height) & used)[:, None]
+        slope = self._uniform(count, -0.4, 0.4)[:, 0]
+        light = self._uniform(count, 0.7, 1.5) * torch.exp(slope * u / half_width.clamp_min(0.1))[:, None]
+        grain = torch.randn(exposure.shape, generator=self.generator, device=self.device)
+        light = light * torch.exp(self._uniform(count, 0, 0.06) * grain)
+        # Lines of text, on half of them
+        lines = (torch.sin(v / half_height * self._uniform(count, 20, 90)[:, 0]) > 0.6)[:, None]
+        light = torch.where(lines & (self._uniform(count, 0, 1) < 0.5), 0.5 * light, light)
+        return torch.where(inside, light, exposure)
 
     def _jpeg(self, encoded: Tensor) -> Tensor:
         """Return a part of the photos as a JPEG of random quality leaves them, without subsampling of color."""

@@ -5,6 +5,7 @@ image with respect to that Gaussian's feature, so one backward pass per view gat
 the uncertainty of the pixel's light in stops; see pixel_uncertainty.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -55,22 +56,25 @@ class Evidence:
         return torch.exp2(-self.stops) * self.seen / (self.seen + HALF_CONFIDENCE_PIXELS)
 
 
-def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tuple[Tensor, Tensor]:
+def pixel_uncertainty(
+    photo: Tensor, exposure: Tensor, response: Response, deviation: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Return the uncertainty of the light at a photo's pixels, in stops, and the clipped fraction of each pixel.
 
     The uncertainty is the mean over channels of
 
         unclipped channel   |log2(exposure / decoded value)|, the misfit, plus a quarter of the width of its 8-bit
-        code's
-                            interval in stops (the mean distance from its middle), at most 1
-        clipped channel     the stops by which the exposure falls short of white, plus CLIPPED_STOPS if all channels are
-                            clipped, else PARTLY_CLIPPED_STOPS
+                            code's interval in stops (the mean distance from its middle), at most 1
+        clipped channel     the stops by which the exposure falls short of white, plus, if all channels are clipped, the
+                            deviation of the estimate of its light, or CLIPPED_STOPS without an estimate; else
+                            PARTLY_CLIPPED_STOPS
         black channel       the stops by which the exposure is above half a code, plus 1
 
     Args:
         photo: [H, W, 3] encoded, in [0, 1].
         exposure: [H, W, 3] exposure E dt of the rendered scene.
         response: The camera response.
+        deviation: [H, W, 3] stops, of estimates of clipped light; infinite where there is none.
 
     Returns:
         Two tensors [H, W].
@@ -85,14 +89,21 @@ def pixel_uncertainty(photo: Tensor, exposure: Tensor, response: Response) -> tu
     misfit = torch.where(black, (lifted / half_code).log2(), misfit).clamp_max(MAX_STOPS)
     low, high = (response.decode((photo + offset).clamp(0, 1)) for offset in (-HALF_CODE, HALF_CODE))
     rounding = ((high.clamp_min(1e-12) / low.clamp_min(1e-12)).log2() / 4).clamp(0, 1)
-    unknown = torch.where(clipped.all(2, keepdim=True), CLIPPED_STOPS, PARTLY_CLIPPED_STOPS).expand_as(photo)
+    guess = photo.new_full((1, 1, 3), CLIPPED_STOPS) if deviation is None else deviation
+    guess = torch.where(guess.isfinite(), guess.clamp_max(MAX_STOPS), CLIPPED_STOPS)
+    unknown = torch.where(clipped.all(2, keepdim=True), guess, PARTLY_CLIPPED_STOPS).expand_as(photo)
     stops = misfit + torch.where(clipped, unknown, rounding)
     return stops.mean(2), clipped.to(photo).mean(2)
 
 
 @torch.no_grad()
 def gather_evidence(
-    field: RadianceField, views: Sequence[View], *, degree: int | None = None, truth: bool = False
+    field: RadianceField,
+    views: Sequence[View],
+    *,
+    degree: int | None = None,
+    truth: bool = False,
+    estimates: Sequence[Tensor] | None = None,
 ) -> Evidence:
     """Gather the evidence of photos for the Gaussians of a field.
 
@@ -102,6 +113,7 @@ def gather_evidence(
         degree: Highest SH degree, by default all.
         truth: The field was trained on HDR truth. If a view has it, it replaces the photo: nothing is clipped and the
             misfit is the whole uncertainty.
+        estimates: Of the views' clipped light, as clipped_light_energy() takes them.
     """
     device = field.gaussians.means.device
     total = torch.zeros(field.gaussians.count, 3, device=device)
@@ -118,7 +130,9 @@ def gather_evidence(
             stops = (exposure.clamp_min(1e-9) / observed.clamp_min(1e-9)).log2().abs().clamp_max(MAX_STOPS).mean(2)
             clipped = torch.zeros_like(stops)
         else:
-            stops, clipped = pixel_uncertainty(torch.tensor(view.image, device=device), exposure, field.response)
+            photo = torch.tensor(view.image, device=device)
+            deviation = None if estimates is None else _deviation(estimates[index].to(device), photo)
+            stops, clipped = pixel_uncertainty(photo, exposure, field.response, deviation)
             weight = weight + (RESIDUAL_WEIGHT - 1) * high_residual_mask(view, exposure, field.response)
         if view.mask is not None:
             weight = weight * torch.tensor(view.mask, device=device)
@@ -129,6 +143,15 @@ def gather_evidence(
     seen = total[:, 0].clamp_min(0)
     means = total[:, 1:] / seen.clamp_min(1e-12)[:, None]
     return Evidence(seen, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1), peak)
+
+
+def _deviation(estimates: Tensor, photo: Tensor) -> Tensor:
+    """Return the deviation [H, W, 3], stops, of estimates [h, w, 6] at the pixels of a photo; infinite for none."""
+    rows, columns = (
+        torch.arange(size, device=photo.device) * coarse // size
+        for size, coarse in zip(photo.shape[:2], estimates.shape[:2], strict=True)
+    )
+    return 1 / (math.log(2) * estimates[rows][:, columns, 3:].to(photo))
 
 
 def _blending_weights(field: RadianceField, view: View) -> Tensor:

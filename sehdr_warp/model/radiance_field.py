@@ -259,10 +259,8 @@ class RadianceField(nn.Module):
             antialiased=self.antialiased,
             **({"near_plane": beyond / self.normalization.unit} if beyond else {}),
         )
-        clipped = None
-        if shares is not None:
-            clipped = (image[..., -1] / image[..., :3].mean(2).clamp_min(1e-30)).clamp(0, 1)
-            image = image[..., :-1]
+        clipped = None if shares is None else image[..., -1] / image[..., :3].mean(2).clamp_min(1e-30)
+        image = image if shares is None else image[..., :-1]
         alpha, colors = 1 - transmittance, image[..., :3]
         colors = self.response.decode(colors.clamp(0, 1)) if encoded else colors
         distance, *confidence = (_unpremultiply(image[..., i], alpha) for i in range(3, image.shape[2]))

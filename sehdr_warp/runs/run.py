@@ -25,6 +25,7 @@ from ..scene.normalization import Normalization
 from ..splats import read_gaussians
 from .checkpoint import Checkpoint, under
 from .config import Config
+from .light_estimates import light_estimates
 from .run_folder import CameraEntry, RunFolder
 from .run_writer import write_confidence
 
@@ -229,7 +230,10 @@ class Run(_Rendered):
         HDR truth counts only if it was trained on."""
         truth = self.config.loss.uses_hdr
         views = self.normalize_photos(scene).train_views
-        evidence = gather_evidence(self.model, views, degree=self.degree, truth=truth)
+        estimates = None
+        if not (truth or self.model.color_model.encoded):
+            estimates = light_estimates(views, self.model.response, self.config.loss, self.device)
+        evidence = gather_evidence(self.model, views, degree=self.degree, truth=truth, estimates=estimates)
         self.model.confidence = evidence.confidence()
         return evidence
 

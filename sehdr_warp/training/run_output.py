@@ -11,6 +11,7 @@ from ..model.confidence import Evidence, gather_evidence
 from ..model.residual_regions import MAX_LISTED, find_residual_regions, regions_to_dict
 from ..runs.checkpoint import first_not_finite
 from ..runs.config import Config
+from ..runs.light_estimates import light_estimates
 from ..runs.run import Run, load_run
 from ..runs.run_writer import RunWriter, write_confidence
 from .held_out import evaluate_views, format_scores, warn_of_overfitting
@@ -153,7 +154,11 @@ class RunOutput:
 def remove_unseen(trainer: TrainingState) -> Evidence:
     """Remove the Gaussians that no training photo shows; return the evidence of the photos for the others."""
     views, truth = trainer.scene.train_views, trainer.config.loss.uses_hdr
-    evidence = gather_evidence(trainer.field, views, degree=trainer.degree, truth=truth)
+    estimates, field = None, trainer.field
+    if not (truth or field.color_model.encoded):
+        estimates = light_estimates(views, field.response, trainer.config.loss, field.gaussians.means.device)
+    options = {"degree": trainer.degree, "truth": truth, "estimates": estimates}
+    evidence = gather_evidence(field, views, **options)
     count, contributes = trainer.field.gaussians.count, evidence.contributes
     remaining = int(contributes.sum())
     if remaining == count or remaining == 0:

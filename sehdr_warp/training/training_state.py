@@ -13,11 +13,11 @@ from ..model.radiance_field import RadianceField
 from ..rasterizer.code_residual import CodeScale
 from ..runs.checkpoint import under
 from ..runs.config import Config
+from ..runs.light_estimates import light_estimates
 from ..scene import Scene
 from . import optimizer as adam
 from .graph_capacity import GraphCapacity
 from .initialization import make_matcher, scene_extent
-from .light_estimates import light_estimates
 from .losses import INTERVALS_FROM, compares_exposures
 from .matching import Matcher
 from .moving_average import MovingAverage

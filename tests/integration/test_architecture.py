@@ -44,13 +44,12 @@ ALLOWED = {
     },
     "viewer": ANY | {"runs", "scene", "output"},
     "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.names", "output.charts"},
-    "runs": ANY | {"scene", "response", "model", "splats", "output.notebook"},
+    "runs": ANY | {"scene", "response", "prior", "model", "splats", "output.notebook"},
     "training": ANY
     | {
         "runs",
         "scene",
         "response",
-        "prior",
         "model",
         "rasterizer",
         "splats",

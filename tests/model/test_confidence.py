@@ -1,5 +1,7 @@
 """Confidence: what a photo leaves in doubt, and what gathers on the Gaussians that are seen in it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -114,3 +116,25 @@ def test_the_map_is_the_mean_of_what_is_seen(device):
     assert float(shown[6, 7]) == pytest.approx(0.9, abs=1e-4) and float(shown[6, 12]) == pytest.approx(0.2, abs=1e-4)
     assert bool((shown[alpha <= 1e-3] == 0).all()) and bool((alpha <= 1e-3).any())
     assert not [name for name in model.state_dict() if "confidence" in name]
+
+
+def test_doubt_of_clipped_light_is_the_deviation_of_its_estimate():
+    photo, exposure = torch.ones(1, 4, 3), torch.full((1, 4, 3), 8.0)
+    photo[0, 3, 1:] = 0.5
+    deviation = torch.tensor([0.4, torch.inf, 50.0, 0.4])[None, :, None].expand(1, 4, 3)
+    stops, _ = pixel_uncertainty(photo, exposure, SRGB, deviation)
+    assert stops[0, :3].tolist() == pytest.approx([0.4, CLIPPED_STOPS, MAX_STOPS])
+    # Other channels say more of a pixel that clips in part than an estimate does.
+    assert stops[0, 3] == pixel_uncertainty(photo, exposure, SRGB)[0][0, 3]
+
+
+def test_estimates_of_views_reach_the_confidence_of_what_they_show():
+    model = field()
+    shown = replace(view(model), codes=np.full((12, 20, 3), 255, np.uint8))
+    sure, unsure = torch.zeros(2, 3, 5, 6, dtype=torch.float16)
+    sure[..., 3:], unsure[..., 3:] = 8.0, 0.8
+    high, low, none = (
+        gather_evidence(model, [shown], estimates=e).stops[0] for e in ([sure], [unsure], [torch.zeros_like(sure)])
+    )
+    assert low - high == pytest.approx((1 / 0.8 - 1 / 8) / np.log(2), rel=1e-2)
+    assert none == gather_evidence(model, [shown]).stops[0]

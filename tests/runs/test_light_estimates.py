@@ -8,8 +8,8 @@ import torch
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import LossConfig
+from sehdr_warp.runs.light_estimates import light_estimates
 from sehdr_warp.scene import Camera, View
-from sehdr_warp.training.light_estimates import light_estimates
 from sehdr_warp.training.targets import photo_source
 
 SRGB = response_by_name("srgb")

@@ -1,4 +1,4 @@
-"""Estimates of the light of clipped pixels, which hold a training where photos are a lower bound alone."""
+"""Estimates of the light of clipped pixels: they hold a training, and say how sure its light is."""
 
 from collections.abc import Sequence
 
@@ -7,8 +7,8 @@ from torch import Tensor
 
 from ..prior import coarse_size, combined_estimates, load_prior
 from ..response import Response
-from ..runs.config import LossConfig
 from ..scene import View
+from .config import LossConfig
 
 
 @torch.no_grad()
