@@ -109,14 +109,12 @@ class Clip:
         size: (width, height) of a frame, upright.
         seconds: its length as the file states it; 0 if it does not.
         color: what the stream states.
-        spherical: whether the file says that frames are equirectangular.
     """
 
     path: Path
     size: tuple[int, int]
     seconds: float
     color: VideoColor
-    spherical: bool = False
 
 
 def is_video(path: Path) -> bool:
@@ -141,9 +139,7 @@ def open_clip(path: Path) -> Clip:
         check_size(path, width, height)
         size = (height, width) if _rotation(frame) % 180 else (width, height)
         seconds = float(container.duration or 0) / 1e6
-        kinds = {str(getattr(data.type, "name", data.type)).upper() for data in frame.side_data}
-        spherical = "SPHERICAL" in kinds or size[0] == 2 * size[1]
-        return Clip(path, size, seconds, _color(container, stream, frame), spherical)
+        return Clip(path, size, seconds, _color(container, stream, frame))
 
 
 def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
