@@ -1,4 +1,4 @@
-"""A trained scene, loaded from the folder of its training or from a file of Gaussians."""
+"""A trained scene, loaded from its run folder or from a file of Gaussians."""
 
 import logging
 from dataclasses import replace
@@ -32,11 +32,17 @@ from .run_writer import write_confidence
 log = logging.getLogger(__name__)
 
 
-class _Rendered:
-    """What a RadianceField with harmonics up to `degree` looks like from cameras.
+class _RenderedScene:
+    """A RadianceField as a scene to render, with SH degree `degree`.
 
-    color_matrix: [3, 3] from the field's colors to linear Rec.709, where it was trained on a sensor's own; else None.
-    Radiance is Rec.709; simulated photos are in the colors of the photos.
+    Radiance is linear Rec.709; simulated photos have the colors of the photos.
+
+    Attributes:
+        model: The radiance field.
+        degree: SH degree to render with.
+        base_time: Exposure time of the photos, seconds.
+        color_matrix: [3, 3] from the field's colors to linear Rec.709, if it was trained on sensor RGB; else None.
+        photo_gains: Exposure compensation of the training photos, if there was one.
     """
 
     model: RadianceField
@@ -47,62 +53,60 @@ class _Rendered:
 
     @property
     def device(self) -> torch.device:
+        """Device of the Gaussians."""
         return self.model.gaussians.means.device
 
     def normalize_photos(self, scene: Scene) -> Scene:
-        """The scene as it was trained on: without what the camera changed between its photos, if that was found."""
+        """Return a scene with the exposure compensation that the run was trained with."""
         return scene if self.photo_gains is None else self.photo_gains.normalize_photos(scene, self.model.response)
 
     @property
     def gaussian_count(self) -> int:
+        """Number of Gaussians."""
         return self.model.gaussians.count
 
     def render(self, camera: Camera) -> RenderedView:
-        """HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
+        """Render HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
         return as_rec709(self.model.render(camera, degree=self.degree), self.color_matrix, self.base_time)
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float, **more: Any
     ) -> Surroundings:
-        """Return what is seen along unit directions [H, W, 3] from a position [3].
-
-        more: other options of RadianceField.render_directions().
-        """
+        """Render along unit directions [H, W, 3] from a position [3]; see RadianceField.render_directions."""
         rays = torch.tensor(directions, dtype=torch.float32, device=self.device)
         options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree, **more}
         surroundings = self.model.render_directions(position, rays, **options)
         return replace(surroundings, hdr=self.in_rec709(surroundings.hdr))
 
     def in_rec709(self, hdr: Tensor) -> Tensor:
-        """[..., 3] radiance in linear Rec.709 of radiance in the colors that the scene was trained in."""
+        """Convert radiance [..., 3] from the colors that the scene was trained in to linear Rec.709."""
         return hdr if self.color_matrix is None else rec709_of(hdr, self.color_matrix, self.base_time)
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:
-        """[H, W, 3] in [0, 1]: the simulated photo of exposure_time seconds, by default the base exposure."""
+        """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base exposure."""
         return self.model.render_ldr(camera, exposure_time, degree=self.degree)
 
     def render_confidence(self, camera: Camera) -> Tensor | None:
-        """[H, W] in [0, 1]: how far the photos vouch for what a camera sees; None where that was not measured."""
+        """Render the confidence [H, W] in [0, 1] of what a camera sees; None if it was not measured."""
         return self.model.render_confidence(camera)
 
     def clipped_share(self) -> Tensor | None:
-        """[N] in [0, 1]: which share of the values that show a Gaussian were clipped; None where not measured."""
+        """Return the fraction [N] of clipped values that show each Gaussian; None if it was not measured."""
         return None
 
     def render_clipped(self, camera: Camera) -> Tensor | None:
-        """[H, W] in [0, 1]: which share of the values that show what a camera sees were clipped; None where that was
-        not measured."""
+        """Render the fraction [H, W] of clipped values behind what a camera sees; None if it was not measured."""
         share = self.clipped_share()
         return None if share is None else self.model.render_mean(camera, share)
 
 
-class Splats(_Rendered):
+class Splats(_RenderedScene):
     """A file of Gaussians as a scene to render, re-expose and export. Its response is sRGB.
 
     Attributes:
-        path: of the file.
-        model: the RadianceField.
-        base_time: seconds, as the file states it, else 1.
+        path: The file.
+        model: The radiance field.
+        base_time: Exposure time that the file states, seconds; else 1.
         cameras: Views listed in a `<stem>.cameras.json` beside the file, as export writes it, or in a cameras.json, as
             the reference release of 3D Gaussian Splatting writes it; else none.
         world_matrix: [4, 4] from the scene's own coordinates to the file's, if the file states it; else None.
@@ -117,20 +121,21 @@ class Splats(_Rendered):
         cameras: tuple[CameraEntry, ...],
         world_matrix: np.ndarray | None = None,
     ):
+        """Wrap a field; load_splats() reads files."""
         self.path, self.model, self.cameras, self.world_matrix = path, model, cameras, world_matrix
         self.response, self.base_time, self.degree = model.response, model.base_time, model.gaussians.degree
         self.scene_name = path.stem
 
 
 def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Splats:
-    """The scene in a file of Gaussians.
+    """Load the scene in a file of Gaussians.
 
     Args:
-        path: PLY, glTF (.glb) or OpenUSD (.usda, .usdc, .usdz).
+        path: PLY, glTF (.glb) or OpenUSD (.usda, .usdc, .usdz), or another format of sehdr_warp.splats.
         device: "cpu", "cuda:0", ...
 
     Raises:
-        InputError: where the file, or the cameras.json beside it, is missing, damaged or of another kind.
+        InputError: If the file, or the cameras.json beside it, is missing, damaged or of another kind.
     """
     path = Path(path)
     gaussians = read_gaussians(path)
@@ -147,25 +152,26 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
     return Splats(path, model, cameras, gaussians.world_matrix)
 
 
-class Run(_Rendered):
+class Run(_RenderedScene):
     """A trained scene.
 
     Attributes:
-        path: its folder.
-        folder: the same, as who reads and writes it.
-        config: the choices it was trained with.
-        model: the RadianceField, on `device`.
-        cameras: the views of the scene, in its order.
-        response: the camera's curve.
-        base_time: seconds.
-        iterations: how far the training was.
-        train_seconds: how long it took.
-        degree: of the harmonics.
-        checkpoint_hash: of the tensors.
-        data: where the photos were, for load_scene; may be empty.
+        path: The run folder.
+        folder: The same as a RunFolder.
+        config: Options of the training.
+        model: The radiance field, on `device`.
+        cameras: Views of the scene, in its order.
+        response: Camera response.
+        base_time: Exposure time of the photos, seconds.
+        iterations: Iterations of the training.
+        train_seconds: Duration of the training.
+        degree: SH degree.
+        checkpoint_hash: Hash of the tensors.
+        data: Arguments of load_scene() for the photos; may be empty.
     """
 
     def __init__(self, folder: RunFolder, config: Config, model: RadianceField, info: dict, values: dict):
+        """Wrap the parts of a run; load_run() reads them."""
         self.folder, self.path = folder, folder.path
         self.config, self.model = config, model
         self.response: Response = model.response
@@ -182,11 +188,13 @@ class Run(_Rendered):
         self.photo_gains = photo_gains(info)
 
     def _repr_html_(self) -> str:
+        """Return HTML for notebooks."""
         from ..output.notebook import run_html  # A notebook asks the run itself for its HTML.
 
         return run_html(self)
 
     def clipped_share(self) -> Tensor | None:
+        """Return the fraction [N] of clipped values that show each Gaussian; None if it was not measured."""
         if self.model.confidence is None:
             return None
         clipped = self.folder.read_clipped()
@@ -214,20 +222,22 @@ class Run(_Rendered):
         return [replace(light, radiance=pair[0], lower_bound=pair[1]) for light, pair in pairs]
 
     def metrics(self) -> list[dict]:
-        """The evaluations made during training, as in metrics.jsonl."""
+        """Return the evaluations during the training, as in metrics.jsonl."""
         return self.folder.read_metrics()
 
     def summary(self) -> dict:
-        """Times, memory and counts of the training; empty if it has not ended."""
+        """Return times, memory and counts of the training; empty if it has not ended."""
         return self.folder.read_summary()
 
     def decisions(self) -> list[dict]:
-        """What the run's plan decided: name, choice, reason and fields of each; none without a plan."""
+        """Return the decisions of the run's plan: name, choice, reason and fields of each; empty without a plan."""
         return self.folder.read_decisions()
 
     def measure_confidence(self, scene: Scene) -> Evidence:
-        """What the training photos of a scene say of the Gaussians; the model has their confidence from then on. Their
-        HDR truth counts only if it was trained on."""
+        """Measure the confidence of the Gaussians' light on the training photos of a scene, and set it in the model.
+
+        HDR truth of the photos counts only if the run was trained on it.
+        """
         truth = self.config.loss.uses_hdr
         views = self.normalize_photos(scene).train_views
         estimates = None
@@ -239,14 +249,14 @@ class Run(_Rendered):
 
 
 def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
-    """The trained scene in a run folder, from its newest complete checkpoint.
+    """Load the trained scene in a run folder, from its newest complete checkpoint.
 
     Args:
-        path: the folder.
+        path: Run folder.
         device: "cpu", "cuda:0", ...
 
     Raises:
-        InputError: naming file and field, if the folder is no run, or has no usable checkpoint.
+        InputError: With file and field, if the folder is not a run, or has no usable checkpoint.
     """
     folder = RunFolder(path)
     folder.require()
@@ -260,17 +270,17 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
 
 
 def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, base_time: float) -> RenderedView:
-    """A view of a field in linear Rec.709. matrix: Scene.color_matrix, None where the field's colors are these."""
+    """Convert a view to linear Rec.709; `matrix` is Scene.color_matrix, None if the field's colors are these."""
     return rendered if matrix is None else replace(rendered, hdr=rec709_of(rendered.hdr, matrix, base_time))
 
 
 def photo_gains(info: dict) -> ExposureCompensation | None:
-    """What run.json says of the photos' gains."""
+    """Return the exposure compensation that run.json contains, if any."""
     return ExposureCompensation.from_dict(stored) if (stored := info.get("photo_gains")) else None
 
 
 def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:
-    """The RadianceField that a checkpoint holds, on the CPU; raises InputError if tensors are missing or do not fit."""
+    """Return the RadianceField of a checkpoint, on the CPU; raises InputError if tensors are missing or do not fit."""
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
         normalization = Normalization.from_dict(info.get("normalization"))
@@ -313,7 +323,7 @@ def assemble_field(
 
 
 def ensure_confidence(run: Run, scene: Scene) -> None:
-    """Measures the confidence of a run that has none, and keeps it in the folder where that can be written to."""
+    """Measure the confidence of a run that has none, and save it if the folder can be written to."""
     if run.model.confidence is not None or not scene.train_views:
         return
     log.info("measuring confidence on the training photos")

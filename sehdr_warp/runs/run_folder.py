@@ -74,6 +74,7 @@ class RunFolder:
     """
 
     def __init__(self, path: Path | str):
+        """Name the files of a run; nothing is read or written."""
         self.path = Path(path)
         self.config, self.scene, self.info, self.plan, self.summary = (
             self.path / f"{name}.json" for name in ("config", "scene", "run", "plan", "summary")

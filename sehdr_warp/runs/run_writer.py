@@ -43,6 +43,7 @@ class RunWriter(RunFolder):
     """
 
     def __init__(self, path: Path | str):
+        """Name the files of a run; lock() and begin() create them."""
         super().__init__(path)
         self._lock = FileLock(self.path / _LOCK, thread_local=False)
         self._lock_identity: tuple[int, int] | None = None

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """"""
+    """Which photos to train on, and how to read them."""
 
     response: str | None = None
     """Camera response: a name of `sehdr-warp responses`, a file, auto (the default) or learned."""
@@ -39,7 +39,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """"""
+    """What to train, and for how long."""
 
     preset: str | None = None
     """A name of `sehdr-warp presets` or a TOML file. (default: default, or what --resume continues)"""
@@ -53,7 +53,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """"""
+    """What to write and show."""
 
     out: Path | None = None
     """Folder for the run."""
@@ -71,7 +71,7 @@ class OutputOptions:
 
 @dataclass(frozen=True)
 class MachineOptions:
-    """"""
+    """What to train on."""
 
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
@@ -153,7 +153,7 @@ def run_train(asked: Train, argv: Sequence[str]) -> None:
 
 
 def _run_as_rank(words: list[str]) -> None:
-    """The command line of these words, as any process of it begins."""
+    """Run a command line in the process of a rank."""
     from ..cli import main
     from ..process import prepare
 
@@ -162,6 +162,7 @@ def _run_as_rank(words: list[str]) -> None:
 
 
 def _train(asked: Train, ranks=None) -> None:
+    """Train or resume a run, or print a plan, on this rank."""
     from ..runs.device import pick_device
     from ..runs.run_writer import RunWriter
 
@@ -184,7 +185,7 @@ def _train(asked: Train, ranks=None) -> None:
     given = {"method": options.method, "candidates": options.candidates, "photos": photos}
     if out is not None:
         _check_truth(data, config)
-    with nullcontext() if out is None or device.type != "cpu" else _kernels_ahead(config):
+    with nullcontext() if out is None or device.type != "cpu" else _precompiling(config):
         scene = load_photos(data, response=options.name, **given)
         if out is None:
             from .plan import make_plan
@@ -209,7 +210,7 @@ def _train(asked: Train, ranks=None) -> None:
 
 
 def _check_truth(data: Mapping, config) -> None:
-    """Refuses photos without the HDR truth that the loss needs before a response is chosen for them."""
+    """Raise InputError if photos lack HDR truth that the loss needs, before a response is selected for them."""
     from ..scene.load import parse_dataset
     from ..scene.names import unique_names
     from .targets import check_truth
@@ -224,8 +225,8 @@ def _check_truth(data: Mapping, config) -> None:
     check_truth(capture.name, views, config.loss)
 
 
-def _kernels_ahead(config):
-    """Compiles what a training by this config will launch, as far as it can be told."""
+def _precompiling(config):
+    """Return a context that compiles, in the background, the kernels that a training will launch."""
     from ..rasterizer.precompile import precompiled, training_kernels
 
     plain = config.model.tone_map == "pixel" and not config.fusion.enabled
@@ -234,7 +235,7 @@ def _kernels_ahead(config):
 
 
 def run_presets(asked: Presets) -> None:
-    """Prints every preset with its purpose and cost."""
+    """Print every preset with its purpose and cost."""
     names, purpose = configs.preset_names(), configs.preset_purpose
     rows = {name: {"purpose": purpose(name), "cost": _cost(configs.load_config(name))} for name in names}
     lines = (f"{name:<14}{row['purpose']}\n{'':<14}{row['cost']}" for name, row in rows.items())
@@ -242,7 +243,7 @@ def run_presets(asked: Presets) -> None:
 
 
 def run_config(asked: ShowConfig) -> None:
-    """Prints a config."""
+    """Print a config."""
     from ..runs.run_folder import RunFolder
 
     folder = RunFolder(asked.which)
@@ -251,7 +252,7 @@ def run_config(asked: ShowConfig) -> None:
 
 
 def _data(asked: Train, resumed) -> dict:
-    """What load_scene takes: as it is given, or else as the RunFolder that is resumed has it."""
+    """Return the arguments of load_scene() of the command line, or else of the run that is resumed."""
     from ..scene import is_embedded
 
     path = asked.data
@@ -270,7 +271,7 @@ def _data(asked: Train, resumed) -> dict:
 
 
 def _config(asked: Train, resumed):
-    """The preset's config, or that of the RunFolder that is resumed, with what the command line names in it."""
+    """Return the config of the preset, or of the run that is resumed, with the fields of the command line."""
     options = asked.training
     shortcuts = {"response.name": asked.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}
     named = {path: value for path, value in shortcuts.items() if value is not None}
@@ -285,7 +286,7 @@ def _config(asked: Train, resumed):
 
 
 def _cost(config) -> str:
-    """How much work a training by a config is, in words."""
+    """Describe the amount of work of a training."""
     planned = "as many steps as the photos deserve, up to" if config.plan.enabled else "steps:"
     parts = {
         f"{planned} {config.schedule.iterations}": True,
@@ -298,7 +299,7 @@ def _cost(config) -> str:
 
 
 def _ending(path: Path, summary: dict) -> str:
-    """What was made, and what to type next."""
+    """Return the lines that end a training: its result, and what to type next."""
     from .held_out import format_scores
 
     told = [figures for line in summary["metrics"] if (figures := format_scores(line))]

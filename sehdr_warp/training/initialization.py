@@ -1,4 +1,4 @@
-"""The field a training starts from: the scene's points and those matched between its photos."""
+"""The field that a training starts from: response, points of the scene and points matched between photos."""
 
 import logging
 import math
@@ -28,16 +28,16 @@ from .strategies.mcmc import MAX_DISTANCE
 
 _log = logging.getLogger(__name__)
 
-MOST_DEPTHS = 100_000  # Points that tell how far away things are
-FEWEST_POINTS = 20  # With fewer, points are drawn too, FEWEST_DRAWN or more
-FEWEST_DRAWN = 5000
+MOST_DEPTHS = 100_000  # Largest number of points that the range of depths is estimated from
+FEWEST_POINTS = 20  # With fewer points, random ones are added, at least FEWEST_RANDOM
+FEWEST_RANDOM = 5000
 DEPTH_RANGE = (0.5, 3.0)
-"""Depths of drawn points in units of the distance to where the cameras look. Nearer ones stay as veils before the
-cameras: on the embedded room a start at 0.15 costs 14 dB."""
+"""Depths of random points in units of the cameras' focus. Nearer ones remain as floaters before the cameras: on the
+embedded room, 0.15 in place of 0.5 costs 14 dB."""
 
 
 def base_time(scene: Scene) -> float:
-    """dt_1: the median exposure time of the training photos, seconds."""
+    """Return dt_1, the median exposure time of the training photos, seconds."""
     return float(np.median([view.exposure_time for view in scene.train_views]))
 
 
@@ -47,8 +47,11 @@ def scene_extent(scene: Scene) -> float:
 
 
 def choose_response(scene: Scene, config: Config) -> Response:
-    """The response that the config names; "learned": one to be learned; "auto": the one that the scene was developed
-    with, if it was chosen as the config asks, else the one that fits its views best."""
+    """Return the response that the config names.
+
+    "learned" is a new ToneMapper. "auto" is the response of the scene, if it was selected as the config asks, else the
+    one that fits the photos best.
+    """
     options = config.response
     if scene.light_known and scene.response is not None:
         return scene.response
@@ -127,8 +130,14 @@ def start_gaussians(
 def start_points(
     scene: Scene, config: Config, matcher: Callable[[], Matcher], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 3] points to start from and their encoded colors [N, 3]: the scene's and, up to model.initial_density, those
-    matched between its photos; where they are too few, points drawn where several cameras look."""
+    """Return points to start from.
+
+    They are the scene's points and, up to model.initial_density, points matched between its photos; if they are too
+    few, also random points that several cameras see.
+
+    Returns:
+        [N, 3] points and their encoded colors [N, 3].
+    """
     points, colors = scene.points, scene.point_colors
     wanted = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
     if wanted > len(points):
@@ -137,7 +146,7 @@ def start_points(
         _log.info("%d points matched between the photos", len(found[0]))
     points = within_reach(points)
     if len(points) < FEWEST_POINTS:
-        drawn = random_points(scene, max(wanted, FEWEST_DRAWN), rng)
+        drawn = random_points(scene, max(wanted, FEWEST_RANDOM), rng)
         points, colors = (np.concatenate(both) for both in zip((points, colors), drawn, strict=True))
     return points, colors
 
@@ -159,19 +168,19 @@ def match_points(
     device: torch.device | str = "cpu",
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the surfaces that the training photos show.
+    """Find points of the surfaces that the training photos show.
 
-    A plane sweep (Collins 1996) for pixels all over the photos; those have a depth on which photos agree.
+    A plane sweep (Collins 1996) for pixels all over the photos finds the depth of those on which photos agree.
 
     Args:
-        scene: of load_scene.
-        count: about how many pixels are looked at; of N of them a depth is found.
-        response: by which photos of differing exposure are compared, None for the scene's own.
+        scene: A scene from load_scene().
+        count: Approximate number of pixels to match; N of them succeed.
+        response: Response by which photos of different exposure are compared; None for that of the scene.
         device: "cpu", "cuda:0", ...
-        seed: of the choice of pixels.
+        seed: Seed of the choice of pixels.
 
     Returns:
-        [N, 3] places, and their encoded colors [N, 3] in [0, 1].
+        [N, 3] points, and their encoded colors [N, 3] in [0, 1].
     """
     normalization = normalization_of(scene)
     response = response or scene.response or response_by_name("srgb")
@@ -180,19 +189,20 @@ def match_points(
 
 
 def _matched(matcher: Matcher, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Match about `count` pixels; return points [N, 3] and colors [N, 3]."""
     found = matcher.match(matcher.pixels(count, np.random.default_rng(seed)))
     return found.points.double().cpu().numpy(), found.colors.cpu().numpy()
 
 
 def start_count(config: Config, pixels: int) -> int:
-    """How many points a training on photos of so many pixels in all starts from, if the scene has no more."""
+    """Return the number of points to start from, for photos with `pixels` pixels in total, if the scene has no more."""
     options = config.densification
     most = mcmc_cap(config, pixels) if options.strategy == "mcmc" else options.cap_max
     return min(most, round(config.model.initial_density * math.sqrt(pixels)))
 
 
 def make_matcher(scene: Scene, response: Response, device: torch.device | str) -> Matcher:
-    """Of the training views, with depths around those of the scene's points or of where the cameras look."""
+    """Create a matcher of the training views, with depths around those of the points or of the cameras' focus."""
     views = perspective_views(scene.train_views)
     points = scene.points[:: -(-len(scene.points) // MOST_DEPTHS) or 1]
     homogeneous = np.c_[points, np.ones(len(points))]
@@ -203,7 +213,7 @@ def make_matcher(scene: Scene, response: Response, device: torch.device | str) -
 
 
 def check_views(scene: Scene) -> None:
-    """Raises InputError for a scene without views enough, or whose photos say nothing about light."""
+    """Raise InputError for a scene with too few views, or whose photos are all black or white."""
     views = scene.train_views
     if len(views) < 2:
         remedy = "a scene needs at least two photos from different places"
@@ -215,9 +225,15 @@ def check_views(scene: Scene) -> None:
 
 
 def random_points(scene: Scene, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Up to `count` points [N, 3] where at least two training cameras look, and their mean encoded colors [N, 3].
+    """Return up to `count` random points that at least two training cameras see, and their mean encoded colors.
 
-    Drawn along the cameras' rays, uniform in inverse depth. Raises SehdrError if no two cameras share what they see.
+    They are sampled along the cameras' rays, uniform in inverse depth.
+
+    Returns:
+        [N, 3] points and colors [N, 3].
+
+    Raises:
+        SehdrError: If no two cameras see the same place.
     """
     views = scene.train_views
     distance, found, total = focus_distance(views), [], 0
@@ -235,8 +251,10 @@ def random_points(scene: Scene, count: int, rng: np.random.Generator) -> tuple[n
 
 
 def focus_distance(views: tuple[View, ...]) -> float:
-    """The median distance from the cameras to the point nearest to all their axes; where they do not look at a common
-    point, twice the spread of the cameras. World units, positive."""
+    """Return the median distance from the cameras to the point nearest to all their axes, world units, positive.
+
+    If they do not look at a common point, it is twice the spread of the cameras.
+    """
     origins = np.stack([view.camera.position for view in views])
     axes = np.stack([view.camera.world_to_camera[2, :3] for view in views])
     spread = float(np.linalg.norm(origins - origins.mean(0), axis=1).max())
@@ -247,7 +265,7 @@ def focus_distance(views: tuple[View, ...]) -> float:
 
 
 def points_on_rays(views, count: int, distance: float, rng: np.random.Generator) -> np.ndarray:
-    """[N, 3] points in front of the cameras, uniform over views, pixels and inverse depth, DEPTH_RANGE away."""
+    """Return [N, 3] points in front of the cameras, uniform over views, pixels and inverse depth within DEPTH_RANGE."""
     near, far = (factor * distance for factor in DEPTH_RANGE)
     chosen = rng.integers(len(views), size=count)
     across, depth = rng.random((count, 2)), 1 / rng.uniform(1 / far, 1 / near, count)
@@ -262,8 +280,10 @@ def points_on_rays(views, count: int, distance: float, rng: np.random.Generator)
 
 
 def pixels_of(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row and column [P] of the pixels that points [P, 3] fall on, and whether the view shows them; occlusion is not
-    known and not considered."""
+    """Return row and column [P] of the pixels that points [P, 3] project to, and whether the view contains them.
+
+    Occlusion is not considered.
+    """
     camera = view.camera
     local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.nan)
@@ -274,7 +294,7 @@ def pixels_of(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray, n
 
 
 def colors_in_views(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """How many photos show each point [N], and the mean of their encoded values there [N, 3]."""
+    """Return how many photos contain each point [N], and the mean of their encoded values there [N, 3]."""
     seen, total = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
         row, column, inside = pixels_of(points, view)
@@ -284,6 +304,6 @@ def colors_in_views(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.nda
 
 
 def sizes_of(scene: Scene, gaussians: int | None = None) -> tuple[int, int, int]:
-    """Gaussians, by default as many as there are points, and width and height of the largest photo."""
+    """Return the number of Gaussians, by default that of the points, and width and height of the largest photo."""
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     return len(scene.points) if gaussians is None else gaussians, camera.width, camera.height

@@ -1,4 +1,4 @@
-"""Points of the surfaces that photos show, found by comparing photos: a plane sweep for pixels chosen one by one."""
+"""Points of the surfaces that photos show: a plane sweep (Collins 1996) for individually chosen pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,28 +14,33 @@ from ..response import Response
 from ..scene import Camera, View, codes_of
 
 LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels
-PLANES = 48, 256  # Fewest and most depths that are tried; within these they are a pixel of parallax apart
-WORST_COST = 0.05  # A match whose encoded colors differ by more, in the mean, is none
-MARGIN = 1.3, 0.004  # Depths whose costs are below so many times the least, and so much, are as good
-FEW, WIDEST = 6, 1.2  # Depths that are as good are so few, or within this factor, or nothing is known
-LEAST_COSINE = 0.5  # Of the angle between the axes of two photos that are compared
+PLANES = 48, 256  # Smallest and largest number of depths to try; within these they are a pixel of parallax apart
+WORST_COST = 0.05  # Largest mean difference of encoded colors of a match
+MARGIN = 1.3, 0.004  # Depths with costs below this multiple of the least, plus this, count as equally good
+FEW, WIDEST = 6, 1.2  # A match needs at most this many equally good depths, or all within this factor
+LEAST_COSINE = 0.5  # Smallest cosine between the axes of two photos that are compared
 FLAT, STEEPEST, WHITE = 0.5, 4.0, 250
 """Of a pixel's chance to be chosen: gradients count up to STEEPEST times their mean, a code from WHITE on as much, and
 FLAT is added."""
-PROBES = 1500  # Pixels that tell how far away things are
-FEWEST_FOUND = 50  # With fewer of them found, the range is guessed
-RANGE = 0.1, 30.0  # Depths at which they are looked for, and where nothing is found GUESS, in units of the focus
-GUESS = 0.25, 8.0
-SLACK = 0.6, 2.0  # Around the range of those found
-ALIKE = 0.05  # Photos whose exposures differ by less, in stops, are compared as they are
+PROBES = 1500  # Pixels that are matched to estimate the range of depths
+FEWEST_FOUND = 50  # With fewer matches of these, the range is GUESS
+RANGE = 0.1, 30.0  # Range of depths to try for the probes, in units of the focus
+GUESS = 0.25, 8.0  # Range of depths without enough matches, in units of the focus
+SLACK = 0.6, 2.0  # Factors that extend the range of the matches
+ALIKE = 0.05  # Photos whose exposures differ by fewer stops are compared as they are
 CHUNK = 1 << 20  # Costs held at one time
 
 
 @dataclass(frozen=True)
 class Matches:
-    """points: [M, 3] world coordinates; colors: [M, 3] in [0, 1], encoded as the photos that show them; footprints: [M]
-    what a pixel of the photo covers there, world units; views: [M] int64, of which photo. The others are float32; all
-    on the matcher's device."""
+    """Matched points, on the matcher's device.
+
+    Attributes:
+        points: [M, 3] float32 world coordinates.
+        colors: [M, 3] float32 encoded values in [0, 1] of the photo.
+        footprints: [M] float32 size that a pixel of the photo covers there, world units.
+        views: [M] int64 index of the photo.
+    """
 
     points: Tensor
     colors: Tensor
@@ -44,15 +49,19 @@ class Matches:
 
 
 class Matcher:
-    """Finds depths for pixels of posed photos.
-
-    views: two or more. response: by which photos of differing exposure are made comparable. focus: about how far away
-        things are, world units.
-    """
+    """Finds the depth of pixels of posed photos by comparing photos."""
 
     def __init__(self, views: Sequence[View], response: Response, focus: float, device: torch.device | str):
+        """Prepare photos for matching and estimate the range of depths.
+
+        Args:
+            views: Two or more views.
+            response: Response by which photos of different exposure are made comparable.
+            focus: Approximate distance of the scene, world units.
+            device: Torch device.
+        """
         base = float(np.median([view.exposure_time for view in views]))
-        tables = [_as_if(view.exposure_time / base, response) for view in views]
+        tables = [_exposure_table(view.exposure_time / base, response) for view in views]
         matchable = prefetch_map(lambda given: _matchable(*given), zip(views, tables, strict=True), len(views))
         self._images, cameras = zip(*matchable, strict=True)
         self._cameras, self._masks = cameras, [view.mask for view in views]
@@ -70,25 +79,34 @@ class Matcher:
         self._set_depths(1 / np.linspace(1 / far, 1 / near, planes))
 
     def _set_depths(self, depths: np.ndarray) -> None:
+        """Set the depths [D] to try."""
         self._depths = torch.tensor(depths, dtype=torch.float32, device=self.device)
 
     def pixels(self, count: int, rng: np.random.Generator) -> Tensor:
-        """[about count, 3] int32: view, column and row of pixels all over the photos, one for each square of equal
-        size, drawn by their gradients and light: edges can be matched, and lamps are small."""
+        """Choose about `count` pixels, one from each square of equal size, by gradients and brightness.
+
+        Edges can be matched, and lamps are small.
+
+        Returns:
+            [about count, 3] int32 view, column and row.
+        """
         side = max(1.0, (sum(image.shape[0] * image.shape[1] for image in self._images) / count) ** 0.5)
         photos = zip(self._images, self._masks, strict=True)
-        chances = prefetch_map(lambda photo: _chances(*photo), photos, len(self._images))
-        chosen = [_one_for_each_square(chance, side, rng, index) for index, chance in enumerate(chances)]
+        chances = prefetch_map(lambda photo: _probabilities(*photo), photos, len(self._images))
+        chosen = [_sample_squares(chance, side, rng, index) for index, chance in enumerate(chances)]
         return torch.from_numpy(np.concatenate(chosen).astype(np.int32)).to(self.device)
 
     def size(self, index: int) -> tuple[int, int]:
-        """Width and height at which a photo is matched."""
+        """Return width and height at which a photo is matched."""
         height, width = self._images[index].shape[:2]
         return width, height
 
     def near(self, others: Sequence[Camera]) -> np.ndarray:
-        """[V + len(others), V] bool: which photos were taken near each photo, and then near each of the other cameras,
-        and look the same way: the photo itself, and its neighbors."""
+        """Return which photos are near each photo, and each of the other cameras, and look the same way.
+
+        Returns:
+            [V + len(others), V] bool; a photo is near itself.
+        """
         neighbors = _neighbors((*self._cameras, *others), self._cameras)
         near = np.eye(len(neighbors), len(self._cameras) + 1, dtype=bool)
         np.put_along_axis(near, neighbors, True, 1)  # -1 is the last.
@@ -96,40 +114,43 @@ class Matcher:
 
     @torch.no_grad()
     def match(self, pixels: Tensor) -> Matches:
-        """The points that pixels [N, 3] show, of those whose depth the photos agree on."""
+        """Return the points that pixels [N, 3] show, for those whose depth the photos agree on."""
         depth = self._depths_of(pixels)
         return self._matches(pixels[depth > 0], depth[depth > 0])
 
     @torch.no_grad()
     def match_each(self, pixels: Tensor) -> tuple[Matches, Tensor]:
-        """The points that pixels [N, 3] show, and [N] whether the photos agree on a depth of theirs: otherwise a point
-        is none. Nothing waits for the device."""
+        """Return a point for each of the pixels [N, 3], and a mask [N] of those whose depth the photos agree on.
+
+        Does not wait for the device.
+        """
         depth = self._depths_of(pixels)
         return self._matches(pixels, depth), depth > 0
 
     def _depths_of(self, pixels: Tensor) -> Tensor:
+        """Return the depths [N] of pixels, in chunks."""
         parts = [self._depth(part) for part in pixels.split(max(1, CHUNK // len(self._depths)))]
         return torch.cat(parts) if parts else self._depths[:0]
 
     def _matches(self, pixels: Tensor, depth: Tensor) -> Matches:
+        """Return the points of pixels [N, 3] at depths [N]."""
         return Matches(*matched_points(self._photos, self._poses, pixels, depth), pixels[:, 0].long())
 
     def _depth(self, pixels: Tensor) -> Tensor:
-        """[N] depths of pixels, between planes; 0 where none is to be trusted."""
+        """Return the depths [N] of pixels, between planes; 0 if none is reliable."""
         costs = matching_costs(self._photos, pixels, self._depths.expand(len(pixels), -1))
         return trusted_depths(costs, self._depths, worst=WORST_COST, margin=MARGIN, few=FEW, widest=WIDEST)
 
 
-def _as_if(ratio: float, response: Response) -> np.ndarray | None:
-    """[256] what the codes of a photo that was exposed `ratio` times as long would else have been; None: the same."""
+def _exposure_table(ratio: float, response: Response) -> np.ndarray | None:
+    """Return the codes [256] that a photo would have at 1 / ratio of its exposure; None if nothing changes."""
     if response.learnable or abs(np.log2(ratio)) <= ALIKE:
         return None
     return codes_of(response.encode(response.decode(np.linspace(0, 1, 256)) / ratio), 8)
 
 
 def at_matching_size(view: View) -> View:
-    """A photo that is larger than those that are matched, at their size and of 8 bits; another as it is. A mask stays
-    as large as it was."""
+    """Return a view reduced to 8 bits and the size for matching; smaller ones as they are. A mask keeps its size."""
     if max(view.camera.width, view.camera.height) <= LARGEST_SIDE:
         return view
     codes, camera = _matchable(view, None)
@@ -137,7 +158,7 @@ def at_matching_size(view: View) -> View:
 
 
 def _matchable(view: View, table: np.ndarray | None) -> tuple[np.ndarray, Camera]:
-    """A photo of 8 bits at the size for matching, its codes looked up in a table, and its camera."""
+    """Return the codes of a photo in 8 bits at the size for matching, mapped by a table, and its camera."""
     codes, camera = view.codes, view.camera
     if codes.dtype != np.uint8:
         codes = codes_of(view.image, 8)
@@ -149,8 +170,8 @@ def _matchable(view: View, table: np.ndarray | None) -> tuple[np.ndarray, Camera
     return codes, camera
 
 
-def _chances(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """[H, W] how likely each pixel is to be chosen, up to a factor; 0 where it cannot be matched or does not count."""
+def _probabilities(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """Return [H, W] the probability of each pixel to be chosen, up to a factor; 0 if it cannot be matched."""
     grey = image.astype(np.float32).mean(2)
     chance = np.zeros_like(grey)
     if min(grey.shape) < 2 * BORDER + 2:
@@ -166,8 +187,8 @@ def _chances(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     return chance
 
 
-def _one_for_each_square(chance: np.ndarray, side: float, rng: np.random.Generator, view: int) -> np.ndarray:
-    """[N, 3] view, column, row: from each square of a photo one pixel, drawn in proportion to its chance."""
+def _sample_squares(chance: np.ndarray, side: float, rng: np.random.Generator, view: int) -> np.ndarray:
+    """Return [N, 3] view, column and row: one pixel from each square of a photo, sampled by its probability."""
     # The largest power u^(1 / chance) of a uniform u is drawn so (Efraimidis and Spirakis 2006).
     with np.errstate(divide="ignore"):
         key = np.log(rng.random(chance.shape, np.float32)) / chance
@@ -179,7 +200,7 @@ def _one_for_each_square(chance: np.ndarray, side: float, rng: np.random.Generat
 
 
 def _neighbors(cameras: Sequence[Camera], others: Sequence[Camera]) -> np.ndarray:
-    """[V, NEIGHBORS] the nearest of others, elsewhere, that look the same way, -1 where there are no more."""
+    """Return [V, NEIGHBORS] the nearest other cameras that look the same way; -1 if there are fewer."""
     positions, others_positions = (np.stack([camera.position for camera in given]) for given in (cameras, others))
     axes, others_axes = (np.stack([camera.world_to_camera[2, :3] for camera in given]) for given in (cameras, others))
     distance = np.linalg.norm(positions[:, None] - others_positions, axis=2)
@@ -189,7 +210,7 @@ def _neighbors(cameras: Sequence[Camera], others: Sequence[Camera]) -> np.ndarra
 
 
 def _parallax(cameras: Sequence[Camera], neighbors: np.ndarray, near: float, far: float) -> float:
-    """Pixels that the nearest and the farthest depth are apart in a neighbor, in the median; 0 without neighbors."""
+    """Return the median parallax in pixels between the nearest and the farthest depth; 0 without neighbors."""
     positions = np.stack([camera.position for camera in cameras])
     focal = np.array([camera.fx for camera in cameras])
     apart = np.linalg.norm(positions[:, None] - positions[neighbors], axis=2) * focal[:, None]

@@ -1,8 +1,8 @@
-"""Adam over the Gaussians and the fusion, with 3DGS's learning rates.
+"""Adam over the Gaussians, the fusion and a learned response, with 3DGS's learning rates.
 
-Where a step is made of a batch of B photos, rates are multiplied by the square root of B, and the moments' decays
-raised to the power of B: gradients of photos are taken as independent, so that B photos move a parameter about as far,
-and with the same variance, as B steps of one do (the rule of Grendel-GS, ICLR 2025, for 3D Gaussians).
+For steps of B photos, learning rates are multiplied by the square root of B, and the decays of the moments are raised
+to the power of B: gradients of photos count as independent, so that B photos move a parameter about as far, and with
+the same variance, as B steps of one photo (the rule of Grendel-GS, ICLR 2025, for 3D Gaussians).
 """
 
 import math
@@ -19,13 +19,23 @@ from ..rasterizer.training_step import judge_step, norms
 from ..runs.checkpoint import under
 from ..runs.config import Config
 
-TURNS = 2  # Parts of the higher harmonics, three quarters of all numbers, that a GPU steps in turn: memory is slow
-IN_TURN_FROM = 4000  # Steps of a training that is as good by that: shorter ones lack them
+# Higher harmonics are 3/4 of all parameters and the Adam step is bandwidth-bound, so on a GPU only every second part of
+# them is updated per step.
+TURNS = 2
+IN_TURN_FROM = 4000  # Steps of the shortest training to which TURNS applies; shorter ones lose quality
 
 
 def make_optimizer(field: RadianceField, config: Config, extent: float, batch: int = 1) -> Adam:
-    """One named group for each parameter of the Gaussians, one for the fusion, one for a learned response. On a GPU
-    counters and rates live on the device, so that steps can be recorded in a CUDA graph. batch: photos in a step."""
+    """Create an optimizer with a named group for each parameter of the Gaussians, the fusion and a learned response.
+
+    On a GPU, counters and learning rates are tensors on the device, so that steps can be captured as CUDA graphs.
+
+    Args:
+        field: The field to train.
+        config: Options of the training.
+        extent: Extent of the scene, in whose units the learning rate of the means is.
+        batch: Photos in a step.
+    """
     device = field.gaussians.means.device
     rates = {name: getattr(config.optimizer, name) for name in PARAMETER_NAMES}
     rates["means"] *= extent
@@ -43,14 +53,14 @@ def make_optimizer(field: RadianceField, config: Config, extent: float, batch: i
 
 
 def means_rate(config: Config, extent: float, iteration: int, batch: int = 1) -> float:
-    """The learning rate of the positions at an iteration: exponential from `means` to `means_final`, times extent."""
+    """Return the learning rate of the means: exponential from `means` to `means_final`, times extent."""
     rates = config.optimizer
     part = min(iteration / config.schedule.iterations, 1.0)
     return math.sqrt(batch) * extent * rates.means * (rates.means_final / rates.means) ** part
 
 
 def set_means_rate(optimizer: Adam, rate: float) -> None:
-    """Sets the learning rate of the positions for the next step."""
+    """Set the learning rate of the means for the next step."""
     group = optimizer.param_groups[PARAMETER_NAMES.index("means")]
     if isinstance(group["lr"], Tensor):
         group["lr"].fill_(rate)
@@ -68,24 +78,47 @@ def guarded_step(
     pairs: Tensor | None = None,
     live: Tensor | None = None,
 ) -> Tensor:
-    """One step of Adam, or none if the loss or a gradient is not finite or the rendering was incomplete; decided on the
-    device, without waiting for it. A scalar float tensor: 1 if the step was made, else 0. tally, pairs: as of
-    judge_step(); live: as of Adam.step()."""
+    """Run one step of Adam, unless the loss or a gradient is not finite or the rendering was incomplete.
+
+    The decision is applied on the device, without waiting for it.
+
+    Args:
+        optimizer: The optimizer.
+        loss: Scalar loss.
+        incomplete: Scalar bool, whether the rendering lacked intersections.
+        harmonics: Gradients of the harmonics in factored form.
+        tally: As in judge_step().
+        pairs: As in judge_step().
+        live: As in Adam.step().
+
+    Returns:
+        A scalar float tensor: 1 if the step was applied, else 0.
+    """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.by_values]
-    skipped, made = judge_step(loss, norms(gradients), incomplete, tally, pairs)
-    optimizer.step(skipped, made, harmonics, live)
-    return made
+    skipped, applied = judge_step(loss, norms(gradients), incomplete, tally, pairs)
+    optimizer.step(skipped, applied, harmonics, live)
+    return applied
 
 
 class FlatGradients:
-    """The gradients of all parameters of an optimizer in one buffer, which ranks exchange; those of harmonics as their
-    factors where they come so. Behind them two numbers of the step: its loss, and whether its rendering was incomplete.
+    """The gradients of all parameters of an optimizer in one buffer, which ranks exchange.
 
-    place: of this rank among `count`. factored: whether the gradients of harmonics come as their factors.
+    Behind them are two numbers of the step: its loss, and whether its rendering was incomplete.
+
+    Attributes:
+        buffer: The buffer.
     """
 
     def __init__(self, optimizer: Adam, place: int, count: int, *, factored: bool):
+        """Allocate the buffer.
+
+        Args:
+            optimizer: The optimizer.
+            place: Number of this rank.
+            count: Number of ranks.
+            factored: Whether gradients of the harmonics are exchanged in factored form.
+        """
         groups = {group["name"]: group["params"] for group in optimizer.param_groups}
         self.all = _parameters(optimizer)
         self.parameters = [
@@ -101,34 +134,37 @@ class FlatGradients:
         self.buffer = torch.zeros(sum(sizes) + 2, device=self._means.device)
         *parts, self.numbers = self.buffer.split([*sizes, 2])
         self._views = [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
-        self._given: Sequence[int] = ()
+        self._with_gradient: Sequence[int] = ()
         self._degree: int | None = None
 
     def fits(self, optimizer: Adam) -> bool:
-        """Whether these are still the optimizer's parameters."""
+        """Return whether the optimizer still has the same parameters."""
         return all(ours is theirs for ours, theirs in zip(self.all, _parameters(optimizer), strict=True))
 
     @torch.no_grad()
-    def take(self, loss: Tensor, incomplete: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
-        """Moves the parameters' gradients into the buffer, with a step's numbers."""
-        self._given = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
-        given = [self.parameters[k].grad for k in self._given]
-        torch._foreach_copy_([self._views[k] for k in self._given], given)
+    def collect(self, loss: Tensor, incomplete: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
+        """Move the parameters' gradients to the buffer, with the numbers of the step."""
+        self._with_gradient = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        gradients = [self.parameters[k].grad for k in self._with_gradient]
+        torch._foreach_copy_([self._views[k] for k in self._with_gradient], gradients)
         self._degree = None
         if harmonics is not None:
-            # The others' places are zero: the sum over the ranks gathers all.
+            # The slots of other ranks are zero, so that the sum over the ranks gathers all.
             by_values, positions = (part.zero_() for part in self._views[-2:])
             by_values[self._place], positions[self._place] = harmonics.by_values[0], harmonics.positions[0]
             self._degree = harmonics.degree
         self.numbers[0] = loss.detach()
         self.numbers[1] = torch.zeros_like(loss) if incomplete is None else incomplete.to(loss.dtype)
-        for k in self._given:
+        for k in self._with_gradient:
             self.parameters[k].grad = None
 
-    def give(self) -> tuple[Tensor, Tensor, HarmonicsGradients | None]:
-        """The buffer's parts as the gradients of the parameters that had one; loss, incomplete [] bool, and what the
-        harmonics' gradients are the product of. To be called on the mean over the ranks."""
-        for k in self._given:
+    def distribute(self) -> tuple[Tensor, Tensor, HarmonicsGradients | None]:
+        """Set the parameters' gradients to the buffer, after it was averaged over the ranks.
+
+        Returns:
+            Loss, whether a rendering was incomplete ([] bool), and the factored gradients of the harmonics.
+        """
+        for k in self._with_gradient:
             self.parameters[k].grad = self._views[k]
         harmonics = None
         if self._degree is not None:
@@ -138,12 +174,16 @@ class FlatGradients:
 
 
 def _parameters(optimizer: Adam) -> list[Tensor]:
+    """Return all parameters of an optimizer."""
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
 def optimizer_tensors(optimizer: Adam, batch: int = 1) -> dict[str, Tensor]:
-    """Adam's state as named tensors, `<group>.<index>.<key>`, for a checkpoint. Steps count photos there, of which one
-    makes `batch`: a training may go on with another."""
+    """Return Adam's state as named tensors, `<group>.<index>.<key>`, for a checkpoint.
+
+    Step counts are in photos, so that a training can continue with another number of ranks; `batch` is the photos of a
+    step.
+    """
     states = {prefix: optimizer.state.get(parameter, {}) for prefix, parameter in _named(optimizer)}
     return {
         f"{prefix}{key}": value * batch if key == "step" and batch > 1 else value
@@ -153,7 +193,7 @@ def optimizer_tensors(optimizer: Adam, batch: int = 1) -> dict[str, Tensor]:
 
 
 def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: int = 1) -> None:
-    """Takes up what optimizer_tensors gave."""
+    """Continue from optimizer_tensors()."""
     for prefix, parameter in _named(optimizer):
         if state := under(tensors, prefix):
             optimizer.state[parameter] = {
@@ -164,6 +204,7 @@ def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: i
 
 
 def _named(optimizer: Adam) -> Iterator[tuple[str, Tensor]]:
+    """Yield a name prefix and a parameter for each parameter of an optimizer."""
     for group in optimizer.param_groups:
         for index, parameter in enumerate(group["params"]):
             yield f"{group['name']}.{index}.", parameter

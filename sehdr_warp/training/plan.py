@@ -1,4 +1,4 @@
-"""The plan of a training: what its scene does not need, decided before it begins, each with a reason in figures."""
+"""The plan of a training: what its scene does not need, each decision with a reason in figures."""
 
 import json
 import math
@@ -25,33 +25,41 @@ STEPS_PER_PHOTO = 75
 """Iterations for each photo. With 300, held-out photos of real captures lose up to 2.6 dB and gain at most 0.3 dB: the
 scene fits what moved between the photos and what their poses do not explain."""
 FEWEST_ITERATIONS = 4000
-CPU_SECONDS = 60.0  # What a training on a CPU may take, as far as CPU_FEWEST allows
+CPU_SECONDS = 60.0  # Duration of a training on a CPU, if CPU_FEWEST iterations take no longer
 CPU_FEWEST = 1000
-WIDEST = 0.12  # mcmc.prune_near_angle where cameras look all around
-CPU_BUDGET = 60.0  # Of densification, where time is short: twice as many Gaussians gain less than twice the steps
-RATES_FOR = 30_000  # The steps that 3DGS made its learning rates for
-HASTE, MOST_HASTE = 0.22, 2.5  # Shorter trainings learn faster by this power of what is missing, so much at most
-HASTY_PHOTOS = 40  # Of more, each shows too little of the scene: 10 to 21 photos gain, 52 and 84 lose
+WIDEST = 0.12  # mcmc.prune_near_angle if cameras look all around
+CPU_BUDGET = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
+RATES_FOR = 30_000  # Length of the trainings that 3DGS's learning rates are for
+HASTE, MOST_HASTE = 0.22, 2.5  # Learning rates of shorter trainings grow with this power, up to this factor
+HASTY_PHOTOS = 40  # Largest number of photos for that: scenes with 10 to 21 photos gain, with 52 and 84 lose
 HASTY = "means", "means_final", "log_scales", "opacity_logits", "harmonics_rest"
 CPU_PIXEL, CPU_GAUSSIAN = 1.0e-6, 1.5e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
 STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 4.7e-4, 1e-11, 3.2e-9
-"""What a recorded step takes on one H200: for itself, each pixel, each Gaussian."""
-NUMBERS, RANK_NUMBERS = 11, 3  # That ranks exchange of a Gaussian: its own, and for each of them what its light pulls
+"""Duration of a captured step on one H200: fixed part, per pixel, per Gaussian."""
+NUMBERS, RANK_NUMBERS = 11, 3  # Floats per Gaussian in the all-reduce: 11, plus 3 color gradients per rank
 EXCHANGE_SECONDS, NUMBER_SECONDS = 1.5e-4, 2.3e-11
-"""What two H200 take beyond that to agree and to begin an exchange, and for each number of the gradients."""
-START_SECONDS = 10.0  # What more processes take to start, about
-REACH = 2.0**16  # Brackets farther from the photos' exposure are black or white in all pixels of 8 bits
+"""Additional duration on two H200: to start the all-reduce, and per float of the gradients."""
+START_SECONDS = 10.0  # Approximate duration to start more processes
+REACH = 2.0**16  # Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
-DRIFT = 3.0  # Stops of brightness between photos from which exposure is taken to have changed unsaid
+DRIFT = 3.0  # Stops of brightness between photos that suggest an exposure that changed without being stated
 
 Choice = tuple[dict[str, object], str, str]
-"""What a rule decides: fields of the config and their values, the choice in words, and the figures it rests on."""
+"""Result of a rule: fields of the config with their values, the choice in words, and the figures it rests on."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """name: of RULES; the rest: see Choice. told: it gets a line though it changes no field."""
+    """A decision of the plan.
+
+    Attributes:
+        name: Name of the rule.
+        fields: Fields of the config that change, with their values.
+        choice: The choice in words.
+        reason: The figures it rests on.
+        told: Whether it is logged although it changes no field.
+    """
 
     name: str
     fields: dict[str, object]
@@ -62,13 +70,13 @@ class Decision:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a training does, and why.
+    """The options of a training for a scene, and why.
 
     Attributes:
-        config: ready to be trained.
-        facts: what was found out of scene and device.
-        decisions: in the order of RULES.
-        kept: fields that a decision would have changed and the user had given.
+        config: Config to train with.
+        facts: Figures of the scene.
+        decisions: Decisions in the order of RULES.
+        kept: Fields that a decision would have changed, but the user had set.
     """
 
     config: Config
@@ -77,48 +85,49 @@ class Plan:
     kept: dict[str, object]
 
     def with_decision(self, decision: Decision) -> "Plan":
-        """The plan with one more decision, made after it."""
+        """Return the plan with one more decision."""
         return replace(self, decisions=(*self.decisions, decision))
 
     def to_dict(self) -> dict:
-        """Plain values, for plan.json and --json."""
+        """Return plain values for plan.json and --json."""
         decisions = [asdict(decision) for decision in self.decisions]
         return {"decisions": decisions, "kept": self.kept, "facts": asdict(self.facts)}
 
     def table(self) -> str:
-        """All decisions as lines: what, which values, and why."""
+        """Return all decisions as lines: name, choice, reason and values."""
         name, choice = (max(len(getattr(row, column)) for row in self.decisions) for column in ("name", "choice"))
         lines = []
         for row in self.decisions:
             lines.append(f"{row.name:{name}}  {row.choice:{choice}}  {row.reason}")
             if row.fields:
-                lines.append(f"{'':{name}}  {'':{choice}}  -> {', '.join(_stated(row.fields))}")
-        return "\n".join([*lines, *(f"kept as given: {line}" for line in _stated(self.kept))])
+                lines.append(f"{'':{name}}  {'':{choice}}  -> {', '.join(_format_fields(row.fields))}")
+        return "\n".join([*lines, *(f"kept as given: {line}" for line in _format_fields(self.kept))])
 
     def lines(self) -> list[str]:
-        """One line for each decision that changes something, and for each field that stays."""
+        """Return a line for each decision that changes something, and for each field that the user set."""
         made = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.told]
         evened = any(row.name == "photo-gains" and row.told for row in self.decisions)
         if self.facts.drift >= DRIFT and not evened:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             made.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
-        return made + [f"plan: {line}, as given" for line in _stated(self.kept)]
+        return made + [f"plan: {line}, as given" for line in _format_fields(self.kept)]
 
 
-def _stated(fields: dict) -> list[str]:
+def _format_fields(fields: dict) -> list[str]:
+    """Format fields with their values."""
     return [f"{path} = {json.dumps(value)}" for path, value in fields.items()]
 
 
 def make_plan(scene: Scene, config: Config, device: str | torch.device | None = None) -> Plan:
-    """Decides what a scene's training can leave out.
+    """Decide what the training of a scene can leave out.
 
     Args:
-        scene: of load_scene.
-        config: what is asked for; fields in config.plan.keep stay.
-        device: what it is to be trained on.
+        scene: A scene from load_scene().
+        config: Requested options; fields in config.plan.keep do not change.
+        device: Device to train on.
 
     Raises:
-        InputError: for a scene that no plan makes sense for, and for kept values that the scene contradicts.
+        InputError: For a scene that cannot be trained, and for fields in plan.keep that the scene contradicts.
     """
     device = pick_device(device)
     facts = measure_scene(scene, config.seed)
@@ -136,8 +145,13 @@ def make_plan(scene: Scene, config: Config, device: str | torch.device | None = 
 
 
 def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Config, Plan | None]:
-    """The config to train a scene with, and its plan where config.plan asks for one; without, the fields in plan.keep
-    are checked against the scene all the same. Raises InputError as make_plan does."""
+    """Return the config to train a scene with, and its plan if config.plan.enabled.
+
+    Without a plan, fields in plan.keep are checked against the scene all the same.
+
+    Raises:
+        InputError: As in make_plan().
+    """
     if config.plan.enabled:
         plan = make_plan(scene, config, device)
         return plan.config, plan
@@ -146,8 +160,15 @@ def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Conf
 
 
 def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: torch.device) -> str:
-    """What to expect of a training of so many Gaussians, on so many photos one by one, each of so many pixels, on
-    `count` ranks."""
+    """Return a log line about the expected speed of a training on several ranks.
+
+    Args:
+        count: Number of ranks.
+        gaussians: Number of Gaussians.
+        pixels: Pixels of a photo.
+        photos: Iterations of the training.
+        device: Device of this rank.
+    """
     if device.type == "cpu":
         shared = f"{count} processes share this machine's {thread_count() * count} threads"
         return f"plan: ranks: {shared}: no faster than one"
@@ -161,7 +182,7 @@ def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: 
 
 
 def check_scene(scene: Scene, facts: SceneFacts) -> None:
-    """Raises InputError for a scene that no training can make sense of."""
+    """Raise InputError for a scene that no training can work with."""
     if facts.photos < FEWEST_PHOTOS:
         problem = f"{facts.photos} training photos: depth and light cannot be told apart from so few"
         raise InputError(scene.name, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
@@ -174,7 +195,7 @@ def check_scene(scene: Scene, facts: SceneFacts) -> None:
 
 
 def check_fields(scene: Scene, config: Config) -> None:
-    """Raises InputError, with both values, for fields in plan.keep, which the user gave, that the scene contradicts."""
+    """Raise InputError, with both values, for fields in plan.keep, set by the user, that the scene contradicts."""
     given, points = config.plan.keep, len(scene.points)
 
     def refuse(path: str, problem: str, remedy: str) -> None:
@@ -265,8 +286,7 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
 
 
 def _is_short_of_time(facts: SceneFacts, config: Config, device: torch.device) -> bool:
-    """Whether a CPU lacks time for the fewest steps of a GPU, by mcmc to more than CPU_BUDGET, and nobody asked
-    for as many."""
+    """Return whether a CPU lacks time for FEWEST_ITERATIONS of mcmc, unless the user set as many."""
     options, steps = config.densification, config.schedule.iterations
     if device.type != "cpu" or options.strategy != "mcmc" or config.mcmc.cap_density <= CPU_BUDGET:
         return False
@@ -322,12 +342,15 @@ RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {
     "rates": _rates,
     "confidence": _confidence,
 }
-"""What a plan decides, in this order."""
+"""The rules of a plan, in order."""
 
 
 def cpu_step_seconds(facts: SceneFacts, config: Config) -> float:
-    """About how long a step takes on this machine's CPU, with two thirds of the Gaussians that the training ends with:
-    the mean over one that grows for half of its steps."""
+    """Return the approximate duration of a step on this machine's CPU.
+
+    It is that of two thirds of the final number of Gaussians: the mean over a training that grows for half of its
+    steps.
+    """
     start = max(facts.points, start_count(config, facts.pixels))
     count = max(start, mcmc_cap(config, facts.pixels))
     work = CPU_PIXEL * facts.pixels / facts.photos + CPU_GAUSSIAN * min(count, config.densification.cap_max) / 1.5

@@ -1,4 +1,4 @@
-"""What a plan knows of a scene: figures of its photos and cameras, found in a second or so."""
+"""Figures of a scene's photos and cameras for the plan, measured in about a second."""
 
 import math
 from dataclasses import dataclass
@@ -11,27 +11,36 @@ from ..scene.linear_photos import kind_of
 from ..scene.wide_camera import perspective_views
 from .initialization import focus_distance, pixels_of, points_on_rays
 
-PROBES = 2000  # Places at which overlap and visibility are measured
-FEWEST_POINTS = 100  # With fewer sparse points places along the cameras' rays serve as probes
-MOST_PIXELS = 250_000  # Of a photo, looked at
-MOST_VIEWS = 64  # Photos that codes are read from, evenly spread; geometry is of all
+PROBES = 2000  # Number of places at which overlap and visibility are measured
+FEWEST_POINTS = 100  # With fewer sparse points, places along the cameras' rays are the probes
+MOST_PIXELS = 250_000  # Largest number of pixels that are read from a photo
+MOST_VIEWS = 64  # Largest number of photos whose codes are read; cameras are read of all
 MOST_GAZE, MOST_AHEAD = 0.3, 0.75
-"""Below both, cameras look all around: eight captures of things, rooms and grounds have 0.5 to 1 of the first, and maps
-from within 0.1; of the second things have nearly 1."""
+"""Cameras look all around if both figures are below these. Eight captures of objects, rooms and grounds have 0.5 to 1
+of the first, maps from within a place 0.1; objects have nearly 1 of the second."""
 
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """Figures of a scene's training views; parts are of 1.
+    """Figures of a scene's training views; fractions are of 1.
 
-    pixels: of all photos together. from_camera: whether a camera made the files. truths: photos with HDR truth.
-    points: sparse points. seen: mean number of photos whose field of view holds a probe.
-    overlap: part of the probes, or of places along the cameras' rays if that is more, that two photos show.
-    clipped, black: part of the pixels with a channel at white, with all at 0. contrast: deviation of all codes.
-    light_known: the photos hold light itself: RAW, linear, float. unclipped: they are float pictures, with all of it.
-    gaze: length of the mean viewing direction: 1 where all look the same way. ahead: part of the cameras that look
-    towards the middle of all.
-    drift: stops, about, between the darkest and the brightest photo's median where no exposure times are known; else 0.
+    Attributes:
+        photos: Number of photos.
+        pixels: Pixels of all photos.
+        from_camera: Whether a camera wrote the files.
+        truths: Number of photos with HDR truth.
+        points: Number of sparse points.
+        seen: Mean number of photos whose field of view contains a probe.
+        overlap: Fraction of the probes, or of places along the cameras' rays if that is more, that two photos contain.
+        clipped: Fraction of pixels with a channel at white.
+        black: Fraction of pixels with all channels at 0.
+        contrast: Standard deviation of all encoded values.
+        drift: Approximate stops between the darkest and the brightest photo's median if no exposure times are known;
+            else 0.
+        gaze: Length of the mean viewing direction: 1 if all cameras look the same way.
+        ahead: Fraction of the cameras that look towards the middle of all.
+        light_known: Whether the photos hold light itself: RAW, linear, float.
+        unclipped: Whether they are float pictures without clipping.
     """
 
     photos: int
@@ -52,12 +61,12 @@ class SceneFacts:
 
     @property
     def around(self) -> bool:
-        """Whether the cameras look all around from within, as those of a room do, and not at a thing from its sides."""
+        """True if cameras look all around from within, as in a room, and not at an object from its sides."""
         return self.gaze < MOST_GAZE and self.ahead < MOST_AHEAD
 
 
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
-    """The facts of a scene with at least one training view; takes a second or so, draws its probes from a seed."""
+    """Measure a scene with at least one training view; `seed` is that of the probes."""
     photos, views = scene.train_views, perspective_views(scene.train_views)
     rng = np.random.default_rng(seed)
     probes = drawn = points_on_rays(views, PROBES, focus_distance(views), rng)
@@ -88,8 +97,10 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
 
 
 def _codes(view: View) -> tuple[float, float, float, float, float]:
-    """Parts of the pixels that are clipped and black, the means of the encoded values and of their squares, and the
-    median's light in stops, by a gamma of 2.2; of a photo of more than MOST_PIXELS, on a grid."""
+    """Return statistics of a photo: clipped and black fractions, mean, mean square, and the median's light in stops.
+
+    The mean is of encoded values, the light by a gamma of 2.2. A photo of more than MOST_PIXELS is sampled on a grid.
+    """
     step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
     image = encoded_values(view.codes[::step, ::step])
     clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
@@ -98,7 +109,7 @@ def _codes(view: View) -> tuple[float, float, float, float, float]:
 
 
 def _gaze(poses: np.ndarray) -> tuple[float, float]:
-    """SceneFacts.gaze and .ahead of cameras [V, 4, 4]."""
+    """Return SceneFacts.gaze and .ahead of cameras [V, 4, 4]."""
     forward = poses[:, 2, :3]
     places = -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
     inwards = np.einsum("vi,vi->v", places.mean(axis=0) - places, forward)

@@ -255,7 +255,7 @@ class Trainer(TrainingState):
             values = harmonics_gradients[0].contiguous()
             harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, self.degree)
         if self.ranks is not None:
-            self._flat_gradients().take(loss, rendering.overflow, harmonics)
+            self._flat_gradients().collect(loss, rendering.overflow, harmonics)
         return Gradients(loss.detach(), image.detach(), rendering, watched, harmonics)
 
     def apply_gradients(self, gradients: Gradients) -> Tensor:
@@ -263,7 +263,7 @@ class Trainer(TrainingState):
         rendering, loss, harmonics = gradients.rendering, gradients.loss, gradients.harmonics
         incomplete = rendering.overflow
         if self._flat is not None:
-            loss, incomplete, harmonics = self._flat.give()
+            loss, incomplete, harmonics = self._flat.distribute()
         applied = adam.guarded_step(
             self.optimizer,
             loss,

@@ -140,10 +140,10 @@ def test_gradients_go_through_one_buffer():
     for name in ("means", "opacity_logits"):
         parameter = getattr(field.gaussians, name)
         given[name] = parameter.grad = torch.randn_like(parameter)
-    flat.take(torch.tensor(2.0), torch.tensor(True))
+    flat.collect(torch.tensor(2.0), torch.tensor(True))
     assert flat.fits(optimizer) and field.gaussians.means.grad is None
     flat.buffer.mul_(0.5)
-    loss, incomplete, harmonics = flat.give()
+    loss, incomplete, harmonics = flat.distribute()
     assert harmonics is None and loss == 1 and bool(incomplete) and field.gaussians.quaternions.grad is None
     for name, gradient in given.items():
         assert torch.equal(getattr(field.gaussians, name).grad, gradient / 2)
@@ -158,9 +158,9 @@ def test_harmonics_go_as_their_factors():
     seen = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
     for flat, harmonics in zip(ranks, seen, strict=True):
         means.grad = torch.ones_like(means)
-        flat.take(torch.tensor(2.0), None, harmonics)
+        flat.collect(torch.tensor(2.0), None, harmonics)
     ranks[1].buffer.copy_(torch.stack([flat.buffer for flat in ranks]).mean(0))
-    _, _, harmonics = ranks[1].give()
+    _, _, harmonics = ranks[1].distribute()
     assert harmonics.degree == 1 and ranks[1].buffer.numel() < 4 * count * means.numel() + 11 * len(means)
     assert torch.allclose(harmonics.by_values, torch.cat([one.by_values for one in seen]) / count)
     assert torch.allclose(harmonics.positions, torch.cat([one.positions for one in seen]))
