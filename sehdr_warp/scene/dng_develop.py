@@ -62,9 +62,10 @@ def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorL
     samples = 3 if pattern is None else 1
     stored = np.asarray(raw.raw_image)
     stored = stored.reshape(*stored.shape[:2], -1)[:, :, :samples]
+    height, width, found = stored.shape
+    stored = stored[: dng.size[1], : dng.size[0]]  # LibRaw may pad to whole tiles.
     if stored.shape != (dng.size[1], dng.size[0], samples):
-        height, width = stored.shape[:2]
-        problem = f"its tags state {dng.size[0]} x {dng.size[1]} pixels, LibRaw decodes {width} x {height}"
+        problem = f"its tags state {dng.size[0]} x {dng.size[1]} pixels, LibRaw decodes {width} x {height} of {found}"
         raise InputError(path, problem, DAMAGED)
     cell = 1 if pattern is None else len(pattern)
     if dng.opcodes[0]:
@@ -176,9 +177,9 @@ def _cropped(image: np.ndarray, dng: DngRaw) -> np.ndarray:
     from scipy.ndimage import map_coordinates
 
     (width, height), (left, top, *_) = dng.sizes[0], dng.crop
-    whole = dng.scale == (1.0, 1.0) and left == int(left) and top == int(top)
-    if whole:
-        return np.ascontiguousarray(image[int(top) : int(top) + height, int(left) : int(left) + width])
+    if dng.scale == (1.0, 1.0):
+        left, top = min(round(left), image.shape[1] - width), min(round(top), image.shape[0] - height)
+        return np.ascontiguousarray(image[top : top + height, left : left + width])
     across = left + (np.arange(width) + 0.5) / dng.scale[0] - 0.5
     down = top + (np.arange(height) + 0.5) / dng.scale[1] - 0.5
     result = np.empty((height, width, image.shape[2]), np.float32)
