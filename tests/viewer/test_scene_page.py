@@ -60,7 +60,7 @@ def test_refusals(run, tmp_path):
     (tmp_path / "mine.html").write_text("mine")
     with pytest.raises(InputError, match="exists already"):
         write_scene_page(run, tmp_path / "mine.html")
-    with pytest.raises(UsageError, match="--out alone"):
+    with pytest.raises(UsageError, match="without effect on a page"):
         run_export(Export(run=run.path, out=tmp_path / "new.html", cameras=True))
     cameras, run.cameras = run.cameras, ()
     with pytest.raises(InputError, match="no cameras"):
