@@ -96,7 +96,8 @@ def load_scene(
     if dataset.kind == "encoded" and str(response) == "linear":
         dataset = as_linear(dataset)
         curve = "auto" if dataset.kind == "linear" else response_by_name("linear")
-    if dataset.kind == "encoded" and str(curve) in ("auto", CURVES["gain-map"]):
+    # A run states the curve of its codes, by which its photos are loaded again.
+    if dataset.kind == "encoded" and (str(curve) == "auto" or str(response) == CURVES["gain-map"]):
         dataset = as_gain_mapped(dataset)
     matrix, light_known = dataset.color_matrix, dataset.kind != "encoded"
     if light_known:

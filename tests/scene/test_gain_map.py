@@ -198,6 +198,8 @@ def test_a_set_with_gain_maps_has_their_light(tmp_path):
     found = np.where(white, view.light_above_white, linear(view.codes))
     assert (view.light_above_white[~white] == 0).all() and white.mean() > 0.2
     assert_light(found, light)
+    again = load_scene(tmp_path, response=scene.response.name)  # As a run does that goes on.
+    np.testing.assert_array_equal(again.views[0].codes, view.codes)
 
 
 def test_a_named_response_keeps_the_codes_and_has_the_light_of_white_ones(tmp_path):
