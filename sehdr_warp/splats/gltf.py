@@ -5,6 +5,7 @@ Scales are linear, opacities in [0, 1], rotations (x y z w); COLOR_0 is what vie
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,52 +75,106 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 
 
 def read_glb(path: Path) -> GaussianArrays:
-    """Read the one primitive with the extension, with display colors in sRGB."""
+    """Read the primitives with the extension, with display colors in sRGB, moved by the nodes that show them.
+
+    Other nodes, such as cameras and lights, may have any transform.
+    """
     described, binary = _chunks(path)
     try:
-        meshes = [(mesh, each) for mesh in described["meshes"] for each in mesh["primitives"]]
-        primitives = [(mesh, each) for mesh, each in meshes if EXTENSION in each.get("extensions", {})]
-        if len(primitives) != 1:
-            problem = f"has {len(primitives)} primitives with {EXTENSION}, not one"
-            raise InputError(path, problem, "export one scene of Gaussians")
-        mesh, primitive = primitives[0]
-        attributes = primitive["attributes"]
-        extension = primitive["extensions"][EXTENSION]
-        for key, known in (("colorSpace", _SPACE), ("kernel", "ellipse")):
-            if extension.get(key) != known:
-                problem = f"its {key} is {extension.get(key)!r:.60}, not {known}"
-                raise InputError(path, problem, "export it as display colors in sRGB, of ellipses")
-        if any({"matrix", "translation", "rotation", "scale"} & set(node) for node in described.get("nodes", [])):
-            raise InputError(path, "moves its Gaussians by a node's transform", "bake the transform into the Gaussians")
-
-        def values(name: str, columns: int) -> np.ndarray:
-            if name not in attributes:
-                raise InputError(path, f"has no attribute {name}", "export it by the ratified extension")
-            return _accessor(described, binary, attributes[name], columns)
-
-        names = (name for name in attributes if name.startswith(f"{EXTENSION}:SH_DEGREE_"))
-        degree = degree_of(sum(1 for _ in names), path)
-        means, scales = values("POSITION", 3), values(f"{EXTENSION}:SCALE", 3)
-        quaternions = np.roll(values(f"{EXTENSION}:ROTATION", 4), 1, axis=1)
-        opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
-        harmonics = np.stack([values(name, 3) for name in _harmonic_names(degree)], axis=1)
-        extras = mesh.get("extras", {})
-        base_time = float(extras.get("base_exposure_time", 1.0))
-        world_matrix = read_matrix(extras.get("world_matrix"), path)
+        parts = []
+        for number, matrix in _shown_meshes(described, path):
+            mesh = described["meshes"][number]
+            for primitive in mesh["primitives"]:
+                if EXTENSION in primitive.get("extensions", {}):
+                    gaussians = _primitive(described, binary, mesh, primitive, path)
+                    parts.append(gaussians if np.allclose(matrix, np.eye(4)) else _moved(gaussians, matrix, path))
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
+    if not parts:
+        raise InputError(path, f"has no primitive with {EXTENSION}", "export Gaussians by the ratified extension")
+    return _joined(parts)
+
+
+def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path: Path) -> GaussianArrays:
+    attributes, extension = primitive["attributes"], primitive["extensions"][EXTENSION]
+    for key, known in (("colorSpace", _SPACE), ("kernel", "ellipse")):
+        if extension.get(key) != known:
+            problem = f"its {key} is {extension.get(key)!r:.60}, not {known}"
+            raise InputError(path, problem, "export it as display colors in sRGB, of ellipses")
+
+    def values(name: str, columns: int) -> np.ndarray:
+        if name not in attributes:
+            raise InputError(path, f"has no attribute {name}", "export it by the ratified extension")
+        return _accessor(described, binary, attributes[name], columns)
+
+    names = (name for name in attributes if name.startswith(f"{EXTENSION}:SH_DEGREE_"))
+    degree = degree_of(sum(1 for _ in names), path)
+    opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
+    extras = mesh.get("extras", {})
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
+        log_scales = np.log(values(f"{EXTENSION}:SCALE", 3))
+        logits = np.log(opacities) - np.log1p(-opacities)
     return GaussianArrays(
-        means=means,
+        means=values("POSITION", 3),
         log_scales=log_scales,
-        quaternions=quaternions,
+        quaternions=np.roll(values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
         opacity_logits=logits,
-        harmonics=harmonics,
+        harmonics=np.stack([values(name, 3) for name in _harmonic_names(degree)], axis=1),
         color_model="display",
-        base_time=base_time,
-        world_matrix=world_matrix,
+        base_time=float(extras.get("base_exposure_time", 1.0)),
+        world_matrix=read_matrix(extras.get("world_matrix"), path),
     )
+
+
+def _shown_meshes(described: dict, path: Path) -> list[tuple[int, np.ndarray]]:
+    """Return the mesh and the world transform of each node with a mesh; of a file without nodes all meshes, unmoved."""
+    nodes = described.get("nodes", [])
+    parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
+    shown = []
+    for number, node in enumerate(nodes):
+        if "mesh" not in node:
+            continue
+        matrix, above = _node_matrix(node), number
+        for _ in nodes:
+            if above not in parents:
+                break
+            above = parents[above]
+            matrix = _node_matrix(nodes[above]) @ matrix
+        else:
+            raise InputError(path, "has nodes that hold each other", _DAMAGED)
+        shown.append((node["mesh"], matrix))
+    return shown or [(number, np.eye(4)) for number in range(len(described["meshes"]))]
+
+
+def _node_matrix(node: dict) -> np.ndarray:
+    """Return the local transform [4, 4] of a node, whose matrix is stored by columns."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    if "rotation" in node:
+        from scipy.spatial.transform import Rotation
+
+        matrix[:3, :3] = Rotation.from_quat(np.array(node["rotation"], np.float64)).as_matrix()
+    matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64)
+    return matrix
+
+
+def _moved(gaussians: GaussianArrays, matrix: np.ndarray, path: Path) -> GaussianArrays:
+    stretch = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if not (np.isfinite(matrix).all() and stretch[2] > 0 and stretch[0] < 1.001 * stretch[2]):
+        raise InputError(path, "stretches its Gaussians by a node's transform", "bake the transform into the Gaussians")
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        raise InputError(path, "mirrors its Gaussians by a node's transform", "bake the transform into the Gaussians")
+    return replace(gaussians.transformed(matrix), world_matrix=gaussians.world_matrix)
+
+
+def _joined(parts: list[GaussianArrays]) -> GaussianArrays:
+    """Return the Gaussians of several primitives as one, of the largest degree among them."""
+    degree = max(part.degree for part in parts)
+    padded = [part.padded(degree) for part in parts]
+    names = "means", "log_scales", "quaternions", "opacity_logits", "harmonics"
+    return replace(padded[0], **{name: np.concatenate([getattr(part, name) for part in padded]) for name in names})
 
 
 def _harmonic_names(degree: int) -> list[str]:

@@ -2,10 +2,13 @@
 
 Attributes: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..3(K-1)-1 (all coefficients of red, then of green, then of
 blue), opacity (logit), scale_0..2 (logarithm), rot_0..3 (w x y z). The color model and the base exposure time are
-`comment sehdr:...` lines of the header; a file without them holds display colors.
+`comment sehdr:...` lines of the header; a file without them holds display colors. Two more habits are read: the
+smoothing filter of Mip-Splatting (filter_3D), and the comment `SplatRenderMode: mip` of gsplat, nerfstudio and Brush.
 """
 
+import io
 import json
+import logging
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +20,8 @@ from ..files import atomic_path, plain_size
 from .arrays import LONGEST_TIME, SHORTEST_TIME, GaussianArrays, degree_of, read_matrix
 from .compressed_ply import unpack_ply
 
+log = logging.getLogger(__name__)
+_MIP = "SplatRenderMode: mip"
 _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
 _GROUPS = ("x y z", "scale_0 scale_1 scale_2", "rot_0 rot_1 rot_2 rot_3", "opacity", "f_dc_0 f_dc_1 f_dc_2")
@@ -45,6 +50,7 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     if gaussians.world_matrix is not None:
         facts["world_matrix"] = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
     comments = [f"sehdr:{name} {value}" for name, value in facts.items()]
+    comments += [_MIP] * gaussians.compensated
     with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
 
@@ -54,11 +60,11 @@ def read_ply(path: Path) -> GaussianArrays:
 
     Compressed PLY is recognized by its properties, whatever the file's name.
     """
-    from plyfile import PlyData, PlyParseError
+    from plyfile import PlyParseError
 
     _check_header(path)
     try:
-        read = PlyData.read(str(path), mmap="r")
+        read = _read(path)
         vertex = read["vertex"]
         names = {each.name for each in vertex.properties}
         if "packed_position" in names:
@@ -73,11 +79,15 @@ def read_ply(path: Path) -> GaussianArrays:
             raise InputError(path, f"its {whole[0]} is of whole numbers", "export 3D Gaussians as an uncompressed PLY")
         rest = sorted((n for n in names if re.fullmatch(r"f_rest_\d{1,4}", n)), key=lambda name: int(name[7:]))
         degree_of(1 + len(rest) / 3, path)
-        groups = (*(group.split() for group in _GROUPS), rest)
+        filtered = ["filter_3D"] if "filter_3D" in names else []
+        groups = (*(group.split() for group in _GROUPS), rest, filtered)
         columns = [_columns([np.asarray(vertex[name], np.float32) for name in group]) for group in groups]
     except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise InputError(path, f"cannot be read as PLY ({error!s:.120})", _DAMAGED) from None
-    means, log_scales, quaternions, opacity, constant, higher = columns
+    means, log_scales, quaternions, opacity, constant, higher, smoothing = columns
+    if smoothing.size:
+        log_scales, opacity = _smoothed(log_scales, opacity, smoothing)
+        log.info("%s: its 3D smoothing filter (filter_3D) is fused into sizes and opacities", path)
     higher = higher.reshape(len(means), 3, len(rest) // 3).swapaxes(1, 2)
     harmonics = np.concatenate([constant[:, None], higher], axis=1)
     facts = _facts(read.comments, path)
@@ -90,7 +100,36 @@ def read_ply(path: Path) -> GaussianArrays:
         color_model=facts.color_model,
         base_time=facts.base_time,
         world_matrix=facts.world_matrix,
+        compensated=facts.compensated,
     )
+
+
+def _read(path: Path):
+    """Return plyfile's data of a file; header letters that are not ASCII are replaced, as plyfile refuses them."""
+    from plyfile import PlyData
+
+    head, end, _ = _start(path).partition(b"end_header")
+    if head.isascii() or not end:
+        return PlyData.read(str(path), mmap="r")
+    data = bytearray(path.read_bytes())
+    data[: len(head)] = bytes(byte if byte < 128 else ord("?") for byte in head)
+    return PlyData.read(io.BytesIO(data))
+
+
+def _smoothed(log_scales: np.ndarray, logits: np.ndarray, smoothing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fuse Mip-Splatting's 3D smoothing filter (Yu et al. 2024, section 5.1) into sizes and opacities.
+
+    Args:
+        log_scales: [N, 3].
+        logits: [N, 1] of the opacities.
+        smoothing: [N, 1] standard deviation of the filter in scene units.
+    """
+    variances = np.exp(2 * log_scales.astype(np.float64))
+    wide = variances + np.square(smoothing.astype(np.float64))
+    ratio = np.sqrt(np.prod(variances / wide, axis=1, keepdims=True))
+    with np.errstate(divide="ignore"):
+        opacities = ratio / (1 + np.exp(-logits.astype(np.float64)))
+        return (0.5 * np.log(wide)).astype(np.float32), np.log(opacities / (1 - opacities)).astype(np.float32)
 
 
 def _columns(columns: list[np.ndarray]) -> np.ndarray:
@@ -137,6 +176,7 @@ class _Facts(NamedTuple):
     color_model: str
     base_time: float
     world_matrix: np.ndarray | None
+    compensated: bool = False
 
 
 def _facts(comments: list[str], path: Path) -> _Facts:
@@ -152,4 +192,11 @@ def _facts(comments: list[str], path: Path) -> _Facts:
         raise InputError(
             path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a time of {SHORTEST_TIME} to {LONGEST_TIME} s"
         )
-    return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path))
+    compensated = any(re.fullmatch(r"SplatRenderMode:\s*mip", line.strip(), re.IGNORECASE) for line in comments)
+    if compensated:
+        log.warning(
+            "%s: was trained with opacity compensation (%s): renderers without it, such as this one and most viewers, "
+            "show its small Gaussians too bright; PLY keeps the mark, other formats cannot",
+            *(path, _MIP),
+        )
+    return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path), compensated)

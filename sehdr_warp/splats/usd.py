@@ -136,14 +136,20 @@ def usd_arrays(path: Path) -> dict[str, Any]:
         "count": 1,
         "space": str(Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) or ""),
         "matrix": np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())),
-        "degree": int(splat.GetRadianceSphericalHarmonicsDegreeAttr().Get()),
+        "degree": int(_value(splat.GetRadianceSphericalHarmonicsDegreeAttr()) or 0),
         "world_matrix": np.array(world.Get()).T if (world := prim.GetAttribute(_WORLD_MATRIX)) else np.eye(4),
         "base_time": float(prim.GetAttribute(_BASE_TIME).Get()) if prim.HasAttribute(_BASE_TIME) else 1.0,
     }
     for name in ("positions", "scales", "orientations", "opacities", _HARMONICS):
-        for value in filter(None, (prim.GetAttribute(each).Get() for each in (f"{name}h", name))):
+        for value in filter(None, (_value(prim.GetAttribute(each)) for each in (f"{name}h", name))):
             stored[name] = np.array(value, np.float32)
     return stored
+
+
+def _value(attribute: Any) -> Any:
+    """Return an attribute's value, at its first time if it is authored at times alone."""
+    value = attribute.Get()
+    return attribute.Get(pxr("Usd").TimeCode.EarliestTime()) if value is None else value
 
 
 def _array(kind: str, values: np.ndarray):

@@ -1,0 +1,120 @@
+"""What a set holds and does not use is named: frames, models, photos, kinds of files; and names that tools write."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene.colmap_model import find_model
+from sehdr_warp.scene.parse import parse_dataset
+from tests.make_scenes import load, pattern, write_blender, write_colmap
+
+
+def said(scene, word):
+    return [note for note in scene.notes if word in note]
+
+
+def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
+    write_colmap(tmp_path)
+    for name in ("a.png", "b.jpg"):
+        Image.fromarray(pattern(64, 48)).save(tmp_path / "images" / name)
+    for name in ("clip.xyz", "clip2.xyz", "film.mov", "notes.txt", ".hidden.gif", "IMG.xmp"):
+        (tmp_path / "images" / name).write_bytes(b"x")
+    scene = load(tmp_path)
+    assert said(scene, "in no view") == ["2 photos of images are in no view: a.png, b.jpg"]
+    assert said(scene, "not read") == [
+        "not used, as files of kinds that are not read: 1 MOV (film.mov), 2 XYZ (clip2.xyz ...)"
+    ]
+    (tmp_path / "plain").mkdir()
+    write_colmap(tmp_path / "plain")
+    assert not said(load(tmp_path / "plain"), "in no view") and not said(load(tmp_path / "plain"), "not read")
+
+
+def test_kinds_that_are_not_read_are_named_if_there_is_nothing_else(tmp_path):
+    for i in range(3):
+        (tmp_path / f"{i}.gif").write_bytes(b"GIF89a")
+    with pytest.raises(InputError, match=r"has no photos and no known layout; it holds 3 GIF \(0.gif ...\)"):
+        load(tmp_path)
+
+
+def test_the_largest_model_is_used_and_the_others_are_named(tmp_path):
+    write_colmap(tmp_path, 9, binary=True)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "1")
+    write_colmap(tmp_path / "few", 3)
+    shutil.move(tmp_path / "few" / "sparse" / "0", tmp_path / "sparse" / "0")
+    assert find_model(tmp_path) == tmp_path / "sparse" / "1"
+    scene = load(tmp_path)
+    assert len(scene.views) == 9
+    assert "sparse/1 is used, the largest model (9 images); not used: 0 (3 images)" in scene.notes
+
+
+@pytest.mark.parametrize("lines", ["blank", "none", "mixed", "observations"])
+def test_images_with_and_without_lines_of_observations(tmp_path, lines):
+    write_colmap(tmp_path, 10)
+    path = tmp_path / "sparse" / "0" / "images.txt"
+    images = [line for line in path.read_text().splitlines() if line.endswith(".png")]
+    second = {"blank": lambda i: "\n", "none": lambda i: "", "mixed": lambda i: "\n" * (i % 2),
+              "observations": lambda i: "1.5 2.5 -1 3.25 4 7\n"}[lines]  # fmt: skip
+    path.write_text("# comment\n" + "".join(f"{line}\n{second(i)}" for i, line in enumerate(images)))
+    assert len(load(tmp_path).views) == 10
+
+
+def test_frames_without_photos_are_left_out_and_named(tmp_path):
+    """As in the published fox set: 17 of 67 frames have no photo."""
+    write_blender(tmp_path, 9)
+    for i in (1, 4, 8):
+        (tmp_path / "images" / f"r_{i}.png").unlink()
+    scene = load(tmp_path)
+    assert len(scene.views) == 6
+    assert "3 of 9 frames have no photo and were left out: ./images/r_1, ./images/r_4, ./images/r_8" in scene.notes
+    for file in (tmp_path / "images").iterdir():
+        file.unlink()
+    with pytest.raises(InputError, match="image file not found, nor any of 9 frames"):
+        load(tmp_path)
+
+
+def test_an_exr_folder_beside_numbered_photos_is_not_hdr_gs(tmp_path):
+    write_colmap(tmp_path, name="IMG_{:03d}.png")
+    (tmp_path / "exr").mkdir()
+    (tmp_path / "exr" / "probe.exr").write_bytes(b"x")
+    assert parse_dataset(tmp_path).format == "colmap"
+
+
+def test_times_and_truth_are_by_path(tmp_path):
+    import OpenEXR
+
+    write_colmap(tmp_path, name="cam{}/0000.png")
+    (tmp_path / "exposures.json").write_text(
+        json.dumps({f"cam{i}/0000.png": 0.01 * 2**i for i in range(5)} | {"cam5\\0000": "0,32"})
+    )
+    (tmp_path / "hdr" / "cam3").mkdir(parents=True)
+    plane = np.full((48, 64), 2, np.float32)
+    for place in (tmp_path / "hdr" / "cam3" / "0000.exr", tmp_path / "hdr" / "0000.exr"):
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, {"R": plane, "G": plane, "B": plane}).write(str(place))
+    scene = load(tmp_path, holdout=0)
+    assert [view.exposure_time for view in scene.views] == pytest.approx([0.01 * 2**i for i in range(6)])
+    assert [view.hdr is not None for view in scene.views] == [False, False, False, True, False, False]
+    (tmp_path / "exposures.json").write_text(json.dumps({"0000.png": 0.01}))
+    scene = load(tmp_path, holdout=0)
+    assert not scene.exposure_times_known
+    (note,) = said(scene, "exposures.json")
+    assert note.startswith("exposures.json: 1 names fit several photos, and need their folders: 0000.png (images/cam0/")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names are bytes on POSIX alone")
+@pytest.mark.parametrize("binary", [False, True])
+def test_names_of_windows_and_in_latin_1(tmp_path, binary):
+    write_colmap(tmp_path, 6, name="cam/{:03d}.png", binary=binary)
+    path = tmp_path / "sparse" / "0" / f"images.{'bin' if binary else 'txt'}"
+    content = path.read_bytes().replace(b"cam/000.png", b"cam\\000.png").replace(b"001.png", b"\xe901.png")
+    path.write_bytes(content)
+    images = os.fsencode(tmp_path / "images" / "cam")
+    os.rename(images + b"/001.png", images + b"/\xe901.png")
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6 and not said(scene, "missing")
+    os.rename(images + b"/\xe901.png", images + "/é01.png".encode())
+    assert len(load(tmp_path, holdout=0).views) == 6

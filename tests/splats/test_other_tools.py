@@ -1,0 +1,174 @@
+"""Splat files as other tools write them: smoothing filters, marks, comments, nodes of glTF, times of OpenUSD."""
+
+import json
+import logging
+import re
+import struct
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.splats import read_gaussians, write_gaussians
+from sehdr_warp.splats.arrays import GaussianArrays
+
+NAMES = [
+    "x",
+    "y",
+    "z",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    "scale_0",
+    "scale_1",
+    "scale_2",
+    "rot_0",
+    "rot_1",
+    "rot_2",
+    "rot_3",
+]
+
+
+def arrays(count=5, degree=1, color_model="display"):
+    rng = np.random.default_rng(count)
+    normal = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    return GaussianArrays(
+        normal(count, 3), normal(count, 3) - 2, normal(count, 4), normal(count), normal(count, (degree + 1) ** 2, 3),
+        color_model, 1.0,
+    )  # fmt: skip
+
+
+def write_ply(path, comments=(), **more):
+    names = [*NAMES, *more]
+    table = np.zeros(3, [(name, "<f4") for name in names])
+    table["rot_0"], table["opacity"] = 1, 2
+    table["scale_0"], table["scale_1"], table["scale_2"] = np.log([0.002, 0.02, 0.001])
+    for name, value in more.items():
+        table[name] = value
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    lines += ["element vertex 3", *(f"property float {name}" for name in names), "end_header", ""]
+    path.write_bytes("\n".join(lines).encode("latin-1") + table.tobytes())
+    return path
+
+
+def test_the_smoothing_filter_is_fused(tmp_path):
+    read = read_gaussians(write_ply(tmp_path / "a.ply", filter_3D=0.01))
+    sizes = np.array([0.002, 0.02, 0.001])
+    wide = np.hypot(sizes, 0.01)
+    np.testing.assert_allclose(np.exp(read.log_scales), [wide] * 3, rtol=1e-5)
+    expected = 1 / (1 + np.exp(-2)) * np.prod(sizes / wide)
+    np.testing.assert_allclose(read.opacities, expected, rtol=1e-4)
+    plain = read_gaussians(write_ply(tmp_path / "b.ply", filter_3D=0))
+    np.testing.assert_allclose(np.exp(plain.log_scales), [sizes] * 3, rtol=1e-5)
+
+
+def test_the_mark_of_opacity_compensation_is_kept_and_warned_of(tmp_path, caplog):
+    comments = ["Exported from Brush", "SplatRenderMode: mip"]
+    read = read_gaussians(write_ply(tmp_path / "a.ply", comments))
+    assert read.compensated and "SplatRenderMode: mip" in caplog.text
+    write_gaussians(tmp_path / "b.ply", read)
+    assert b"comment SplatRenderMode: mip\n" in (tmp_path / "b.ply").read_bytes()
+    caplog.clear()
+    other = read_gaussians(write_ply(tmp_path / "c.ply", ["SplatRenderMode: default"]))
+    assert not other.compensated and not caplog.records
+    write_gaussians(tmp_path / "d.ply", other)
+    assert b"SplatRenderMode" not in (tmp_path / "d.ply").read_bytes()
+
+
+def test_comments_in_any_encoding(tmp_path):
+    read = read_gaussians(write_ply(tmp_path / "a.ply", ["Müller, 5 \xb5m", "SplatRenderMode: mip"]))
+    assert read.count == 3 and read.compensated
+
+
+def rewrite(path, change):
+    """A .glb with its description changed."""
+    data = path.read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    described = json.loads(data[20 : 20 + length])
+    change(described)
+    text = json.dumps(described).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    head = struct.pack("<5I", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    path.write_bytes(head + text + rest)
+    return path
+
+
+def test_identity_nodes_cameras_and_lights_do_not_matter(tmp_path):
+    write_gaussians(tmp_path / "a.glb", arrays())
+    expected = read_gaussians(tmp_path / "a.glb")
+
+    def change(described):
+        described["nodes"] = [
+            {"children": [1, 2], "matrix": np.eye(4).ravel().tolist()},
+            {"mesh": 0, "translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]},
+            {"camera": 0, "translation": [1, 2, 3]},
+        ]
+        described["scenes"] = [{"nodes": [0]}]
+
+    read = read_gaussians(rewrite(tmp_path / "a.glb", change))
+    np.testing.assert_array_equal(read.means, expected.means)
+
+
+def test_transforms_of_nodes_move_gaussians(tmp_path):
+    write_gaussians(tmp_path / "a.glb", arrays())
+    before = read_gaussians(tmp_path / "a.glb")
+
+    def change(described):
+        described["nodes"] = [{"children": [1], "scale": [2, 2, 2]},
+                              {"mesh": 0, "translation": [1, 0, 0], "rotation": [0, 0, 1, 0]}]  # fmt: skip
+        described["scenes"] = [{"nodes": [0]}]
+
+    read = read_gaussians(rewrite(tmp_path / "a.glb", change))
+    np.testing.assert_allclose(read.means, 2 * (before.means * [-1, -1, 1] + [1, 0, 0]), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(read.log_scales, before.log_scales + np.log(2), rtol=1e-5)
+
+    def stretch(described):
+        described["nodes"][1]["scale"] = [1, 2, 1]
+
+    with pytest.raises(InputError, match="stretches its Gaussians by a node's transform"):
+        read_gaussians(rewrite(tmp_path / "a.glb", stretch))
+
+    def cycle(described):
+        described["nodes"] = [{"children": [1], "mesh": 0}, {"children": [0]}]
+
+    with pytest.raises(InputError, match="nodes that hold each other"):
+        read_gaussians(rewrite(tmp_path / "a.glb", cycle))
+
+
+def test_several_primitives_are_one_scene(tmp_path):
+    write_gaussians(tmp_path / "a.glb", arrays(degree=2))
+    before = read_gaussians(tmp_path / "a.glb")
+
+    def change(described):
+        first = described["meshes"][0]["primitives"][0]
+        second = json.loads(json.dumps(first))
+        second["attributes"] = {
+            n: v for n, v in second["attributes"].items() if "DEGREE_1" not in n and "DEGREE_2" not in n
+        }
+        points = {"mode": 0, "attributes": {"POSITION": first["attributes"]["POSITION"]}}
+        described["meshes"][0]["primitives"] = [first, second, points]
+
+    read = read_gaussians(rewrite(tmp_path / "a.glb", change))
+    assert read.count == 2 * before.count and read.degree == 2
+    np.testing.assert_array_equal(read.harmonics[before.count :, 0], before.harmonics[:, 0])
+    assert not read.harmonics[before.count :, 1:].any()
+
+
+def test_values_of_openusd_at_times_alone(tmp_path):
+    pytest.importorskip("pxr")
+    write_gaussians(tmp_path / "a.usda", arrays(color_model="linear"))
+    text = (tmp_path / "a.usda").read_text()
+    sampled = re.sub(
+        r"(point3f\[\] positions) = (\[.*?\])", r"\1.timeSamples = { 3: \2, 5: [(0, 0, 0)] }", text, flags=re.DOTALL
+    )
+    assert sampled != text
+    (tmp_path / "b.usda").write_text(sampled)
+    np.testing.assert_allclose(read_gaussians(tmp_path / "b.usda").means, read_gaussians(tmp_path / "a.usda").means)
+
+
+def test_the_filter_is_told(tmp_path, caplog):
+    with caplog.at_level(logging.INFO):
+        read_gaussians(write_ply(tmp_path / "a.ply", filter_3D=0.01))
+    assert "filter_3D" in caplog.text
