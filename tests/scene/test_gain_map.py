@@ -12,6 +12,7 @@ from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
 from sehdr_warp.scene.images import read_ldr
 
 from .gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
+from .test_color_encoding import icc_profile
 
 HEIGHT, WIDTH = 96, 128
 STOPS = 2.5
@@ -221,3 +222,19 @@ def test_a_gain_map_is_turned_with_its_photo(tmp_path):
     photo = light_of(read_ldr(tmp_path / "a.jpg", oriented=True), read_gain_map(tmp_path / "a.jpg", oriented=True))
     found = np.where(photo.pixels == 65535, photo.above_white, linear(photo.pixels))
     assert_light(found, np.rot90(light))
+
+
+def test_light_of_a_display_p3_photo_ends_in_rec709(tmp_path):
+    """A profile states the primaries of photo and map; its curve is that of sRGB."""
+    colour = pytest.importorskip("colour")
+    light, base, gain = pair(channels=3)
+    profile = icc_profile("Display P3")
+    frames = [{"file_path": f"{i}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
+    for i in range(3):
+        write_jpeg_pair(tmp_path / f"{i}.jpg", base, gain, [iso_segment(channels=3)], icc_profile=profile)
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
+    view = load_scene(tmp_path).views[0]
+    spaces = colour.RGB_COLOURSPACES
+    matrix = colour.matrix_RGB_to_RGB(spaces["Display P3"], spaces["sRGB"])
+    found = np.where(view.codes == 65535, view.light_above_white, linear(view.codes))
+    assert_light(found, light @ matrix.T, channels=3)
