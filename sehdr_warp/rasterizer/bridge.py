@@ -147,7 +147,7 @@ class _ProgramFunction(torch.autograd.Function):
         device = next((gradient.device for gradient in upstream if gradient is not None), None)
         if device is None:
             return (None,) * (2 + len(needed))
-        gradients: dict[int, Tensor] = {place: torch.zeros_like(saved[place]) for place in ctx.between}
+        gradients: dict[int, Any] = {place: torch.zeros_like(saved[place]) for place in ctx.between}
         for place, (shape, dtype) in enumerate(ctx.argument_likes):
             if needed[place]:
                 gradients[place] = torch.zeros(shape, dtype=dtype, device=device)
@@ -163,9 +163,9 @@ class _ProgramFunction(torch.autograd.Function):
         return None, None, *(gradients.get(place) if need else None for place, need in enumerate(needed))
 
 
-def _launch_adjoint(forward: _Launch, saved: Sequence[Tensor | None], gradients: dict[int, Tensor]) -> None:
+def _launch_adjoint(forward: _Launch, saved: Sequence[Tensor | None], gradients: dict[int, Any]) -> None:
     kernel, dim, inputs, outputs = forward
-    values = [saved[value] if isinstance(value, _Place) else value for value in inputs]
+    values: list[Any] = [saved[value] if isinstance(value, _Place) else value for value in inputs]
     by_value = [gradients.get(v) if isinstance(v, _Place) else None for v in (*inputs, *outputs)]
     if all(gradient is None for gradient in by_value):
         return

@@ -42,7 +42,7 @@ def torch_operation(function: Callable[P, T]) -> Callable[P, T]:
     name = function.__name__
 
     @wraps(function)
-    def operation(*args: P.args, **kwargs: P.kwargs) -> T:
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
         if _transforms_are_active():
             raise NotImplementedError(f"{name}() does not support torch.func; use torch.autograd")
         if forward_ad._current_level >= 0 and any(map(_has_tangent, (*args, *kwargs.values()))):
@@ -51,11 +51,13 @@ def torch_operation(function: Callable[P, T]) -> Callable[P, T]:
             return _without_autocast(function, args, kwargs)
         return function(*args, **kwargs)
 
+    operation: Any = call
     if set_code_exec_strategy is None or _FrameExecStrategy is None or _FrameAction is None:
-        return torch.compiler.disable(operation)
+        disabled: Any = torch.compiler.disable(operation)
+        return disabled
     # What torch.compiler.disable() does, without its import of Dynamo, which takes two seconds.
-    operation._torchdynamo_disable = True  # pyright: ignore[reportFunctionMemberAccess]
-    operation._torchdynamo_disable_msg = "it launches Warp kernels"  # pyright: ignore[reportFunctionMemberAccess]
+    operation._torchdynamo_disable = True
+    operation._torchdynamo_disable_msg = "it launches Warp kernels"
     set_code_exec_strategy(operation.__code__, _FrameExecStrategy(_FrameAction.SKIP, _FrameAction.SKIP))
     return operation
 
@@ -86,5 +88,6 @@ def keeps_graph() -> bool:
 
     If not, what a node holds beside its saved tensors can be freed: a further backward pass is refused by torch.
     """
-    ask = getattr(torch._C._autograd, "_get_current_graph_task_keep_graph", None)
+    autograd: Any = getattr(torch._C, "_autograd", None)
+    ask = getattr(autograd, "_get_current_graph_task_keep_graph", None)
     return True if ask is None else ask()

@@ -40,6 +40,11 @@ def test_own_kernel():
     assert abs(example("own_kernel")["main"]() - 0.35) < 0.005
 
 
+def test_pose_refinement():
+    before, after = example("pose_refinement")["main"](steps=80, size=48)
+    assert after < 0.1 * before
+
+
 def test_relighting(tmp_path):
     pytest.importorskip("mitsuba")
     error = example("relighting")["main"](tmp_path, views=12, size=24, samples=8, iterations=60)

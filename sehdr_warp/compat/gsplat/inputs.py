@@ -122,7 +122,7 @@ class Inputs(NamedTuple):
             return tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :])
 
         values = means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds
-        return Inputs(*map(flat, values), by_camera)  # pyright: ignore[reportArgumentType]
+        return Inputs(*map(flat, values), by_camera)  # pyright: ignore[reportCallIssue]
 
     def views(self) -> Iterator[View]:
         """Yield the inputs of each camera, batch by batch."""

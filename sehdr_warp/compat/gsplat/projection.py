@@ -74,6 +74,7 @@ def project_gaussians(
         if covars is None:
             assert quats is not None and scales is not None
             covars, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        assert covars is not None
         projected = _project_covariances(
             means, covars, opacities, viewmat, K, width, height, eps2d, culling.near_plane, antialiased, camera_model
         )

@@ -132,7 +132,7 @@ def rasterization(
         ]
         batch, cameras = tuple(means.shape[:-2]), viewmats.shape[-3]
         splats = JoinedSplats.of(projected, packed, (*batch, cameras))
-        means2d = splats.means2d
+        means2d = splats.all.means2d
         if absgrad and means2d.requires_grad:
             means2d.absgrad = torch.zeros_like(means2d)  # pyright: ignore[reportAttributeAccessIssue]
         images, alphas = [], []
@@ -160,7 +160,7 @@ def rasterization(
 
 def _store(splats: JoinedSplats, rows: Any) -> Callable[[Tensor], None]:
     """Return what writes a view's absolute gradients to its rows of means2d.absgrad."""
-    absgrad = splats.by_view(splats.means2d.absgrad)  # pyright: ignore[reportAttributeAccessIssue]
+    absgrad = splats.by_view(splats.all.means2d.absgrad)  # pyright: ignore[reportAttributeAccessIssue]
 
     def store(absolute: Tensor) -> None:
         absgrad[rows] = absolute

@@ -21,11 +21,7 @@ class ViewSplats(NamedTuple):
 class JoinedSplats(NamedTuple):
     """The 2D Gaussians of all views in joined tensors: [..., C, N, ...], or packed [nnz, ...]."""
 
-    means2d: Tensor
-    conics: Tensor
-    depths: Tensor
-    opacities: Tensor
-    extents: Tensor
+    all: ProjectedGaussians
     view_ids: Tensor | None
     gaussian_ids: Tensor | None
     splits: list[int]
@@ -34,29 +30,31 @@ class JoinedSplats(NamedTuple):
     def of(views: list[ProjectedGaussians], packed: bool, shape: tuple[int, ...]) -> "JoinedSplats":
         """Join the views, whose axes are `shape`. The gradient of the joined means2d then holds every view's."""
         if not packed:
-            joined = (torch.stack(each).unflatten(0, shape) for each in zip(*views, strict=True))
-            return JoinedSplats(*joined, None, None, [])
+            joined = ProjectedGaussians(*(torch.stack(each).unflatten(0, shape) for each in zip(*views, strict=True)))
+            return JoinedSplats(joined, None, None, [])
         rows = [(view.extents > 0).all(1).nonzero()[:, 0] for view in views]
-        joined = (
-            torch.cat([tensor[mine] for tensor, mine in zip(each, rows, strict=True)])
-            for each in zip(*views, strict=True)
+        joined = ProjectedGaussians(
+            *(
+                torch.cat([tensor[mine] for tensor, mine in zip(each, rows, strict=True)])
+                for each in zip(*views, strict=True)
+            )
         )
         counts = [len(mine) for mine in rows]
         device = views[0].means2d.device
         view_ids = torch.arange(len(views), device=device).repeat_interleave(torch.tensor(counts, device=device))
-        return JoinedSplats(*joined, view_ids, torch.cat(rows), counts)
+        return JoinedSplats(joined, view_ids, torch.cat(rows), counts)
 
     def by_view(self, tensor: Tensor) -> Tensor:
         """Return a joined tensor with one axis of views, or as it is if packed."""
-        return tensor if self.gaussian_ids is not None else tensor.flatten(0, self.depths.ndim - 2)
+        return tensor if self.gaussian_ids is not None else tensor.flatten(0, self.all.depths.ndim - 2)
 
     def of_view(self, place: int) -> ViewSplats:
         """Return the Gaussians of one view."""
         start = sum(self.splits[:place])
         rows: Any = place if self.gaussian_ids is None else slice(start, start + self.splits[place])
-        tensors = (self.by_view(each)[rows] for each in (self.means2d, self.conics, self.depths, self.opacities))
+        projected = ProjectedGaussians(*(self.by_view(tensor)[rows] for tensor in self.all))
         # A copy of the extents, because rendering sets some to 0 in place.
-        projected = ProjectedGaussians(*tensors, self.by_view(self.extents)[rows].clone())
+        projected = projected._replace(extents=projected.extents.clone())
         return ViewSplats(projected, rows, None if self.gaussian_ids is None else self.gaussian_ids[rows])
 
 
@@ -96,16 +94,16 @@ def make_meta(splats: JoinedSplats, shape: tuple[int, ...], size: tuple[int, int
     width, height = size
     cameras, images = shape[-1], math.prod(shape)
     tile_width, tile_height = -(-width // tile_size), -(-height // tile_size)
-    view_ids, radii = splats.view_ids, splats.extents.ceil().int()
+    view_ids, radii = splats.view_ids, splats.all.extents.ceil().int()
 
     def compute_intersections() -> None:
-        means2d, depths = splats.by_view(splats.means2d), splats.by_view(splats.depths)
+        means2d, depths = splats.by_view(splats.all.means2d), splats.by_view(splats.all.depths)
         counts, isect_ids, flatten_ids = isect_tiles(
             means2d, splats.by_view(radii), depths, tile_size, tile_width, tile_height, image_ids=view_ids
         )
         offsets = isect_offset_encode(isect_ids, images, tile_width, tile_height)
         meta.update(
-            tiles_per_gauss=counts.reshape(splats.depths.shape),
+            tiles_per_gauss=counts.reshape(splats.all.depths.shape),
             isect_ids=isect_ids,
             flatten_ids=flatten_ids,
             isect_offsets=offsets.unflatten(0, shape),
@@ -116,10 +114,10 @@ def make_meta(splats: JoinedSplats, shape: tuple[int, ...], size: tuple[int, int
         camera_ids=None if view_ids is None else view_ids % cameras,
         gaussian_ids=splats.gaussian_ids,
         radii=radii,
-        means2d=splats.means2d,
-        depths=splats.depths,
-        conics=splats.conics,
-        opacities=splats.opacities,
+        means2d=splats.all.means2d,
+        depths=splats.all.depths,
+        conics=splats.all.conics,
+        opacities=splats.all.opacities,
         tile_width=tile_width,
         tile_height=tile_height,
         tiles_per_gauss=compute_intersections,
