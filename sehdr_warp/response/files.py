@@ -10,7 +10,7 @@ from ..apart import mat_arrays, read_apart
 from ..errors import InputError, SehdrError, nearest
 from ..files import read_json, read_text
 from .curve import Response
-from .table import TabulatedResponse
+from .table import ChannelResponse, TabulatedResponse
 
 MAX_BYTES = 64 * 2**20  # Of a text file; all of DoRF has 5 MB.
 
@@ -21,7 +21,8 @@ def response_from_file(path: Path, selector: str | None = None) -> Response:
     201_CRF_data.mat and dorfCurves.txt (DoRF; exposures and values normalized to [0, 1]): an index from 0, or a
     curve's name where the file holds names. emor.txt (f = f0 + sum c_i h_i) and invemor.txt (the same for the inverse):
     coefficients c_1,c_2,... separated by commas, none for the mean curve. CSV or text: two columns, exposure and value,
-    an optional line of headings, `#` comments. JSON: {"exposures": [...], "values": [...]} or Response.to_dict's.
+    or four, exposure, red, green and blue; an optional line of headings, `#` comments. JSON: {"exposures": [...],
+    "values": [...]} or Response.to_dict's.
 
     Raises InputError for a file that is missing, too large, of another content, or whose curve cannot be used.
     """
@@ -170,11 +171,15 @@ def _text_curve(path: Path, text: str) -> Response:
         cells = re.split(r"[\s,;]+", line.partition("#")[0].strip(" \t,;"))
         if cells == [""]:
             continue
-        if len(cells) != 2:
-            raise InputError(path, f"line {number} has {len(cells)} columns", "give two: exposure and value")
+        if len(cells) not in (2, 4) or (rows and len(cells) != len(rows[0])):
+            remedy = "give two, exposure and value, or four, exposure, red, green and blue"
+            raise InputError(path, f"line {number} has {len(cells)} columns", remedy)
         try:
             rows.append([float(cell) for cell in cells])
         except ValueError:
             if rows:  # Else these are headings.
-                raise InputError(path, f"line {number} is {line.strip()[:40]!r}", "give two numbers") from None
+                raise InputError(path, f"line {number} is {line.strip()[:40]!r}", "give numbers alone") from None
+    if rows and len(rows[0]) == 4:
+        exposures, *values = np.array(rows).T
+        return ChannelResponse(path.stem, [exposures] * 3, values, source=str(path))
     return TabulatedResponse(path.stem, *np.array(rows).reshape(-1, 2).T, source=str(path))

@@ -100,6 +100,52 @@ class TabulatedResponse(Response, kind="table"):
         return cls(values["name"], values["exposures"], values["values"], notes=tuple(values["notes"]))
 
 
+class ChannelResponse(TabulatedResponse, kind="channels"):
+    """A response whose channels differ, through the samples of one curve for each.
+
+    Photos are brought to the curve of green when they are read (to_shared), so that one curve describes them from there
+    on; as a curve this is green's.
+
+    Attributes:
+        curves: the responses of red, green and blue.
+    """
+
+    def __init__(self, name: str, exposures, values, *, notes: tuple[str, ...] = (), source: str | None = None):
+        """Prepare the curves.
+
+        Args:
+            name: of the response.
+            exposures: [3, K], as of TabulatedResponse.
+            values: [3, K] of red, green and blue.
+            notes: on repairs.
+            source: to name in errors.
+
+        Raises:
+            InputError: as TabulatedResponse does, for any channel.
+        """
+        pairs = zip(exposures, values, ("red", "green", "blue"), strict=True)
+        self.curves = tuple(TabulatedResponse(f"{name}:{c}", x, y, source=source) for x, y, c in pairs)
+        repairs = tuple(note for curve in self.curves for note in curve.notes)
+        super().__init__(name, exposures[1], values[1], source=source)
+        self.notes = (*notes, *repairs)
+
+    def to_shared(self, codes: np.ndarray) -> np.ndarray:
+        """Return [H, W, 3] uint16 codes by green's curve of the light that codes stand for; white stays white."""
+        white, shared = int(np.iinfo(codes.dtype).max), np.empty(codes.shape, np.uint16)
+        for channel, curve in enumerate(self.curves):
+            light = curve.decode(np.arange(white + 1, dtype=np.float64) / white)
+            table = np.rint(65535 * np.clip(self.encode(light), 0, 1)).astype(np.uint16)
+            table[white] = 65535
+            shared[..., channel] = table[codes[..., channel]]
+        return shared
+
+    def to_dict(self):
+        """Return plain values for JSON."""
+        columns = [curve.to_dict() for curve in self.curves]
+        stored = {key: [column[key] for column in columns] for key in ("exposures", "values")}
+        return {"kind": "channels", "name": self.name, **stored, "notes": list(self.notes)}
+
+
 def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
     """Increasing samples from exposure 0 to the clip point, and what had to be repaired."""
     _check(exposures, values, source)

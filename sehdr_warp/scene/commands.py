@@ -35,8 +35,8 @@ class Calibrate:
     """CSV file for the curve, for --response; a plot goes beside it (.png)."""
     exposures: str | None = None
     """Times in the order of the files' names, such as 1/500,1/125,1/30."""
-    channel: Literal["red", "green", "blue"] | None = None
-    """One channel alone; by default one curve for all three."""
+    channel: Literal["red", "green", "blue", "each"] | None = None
+    """One channel alone, or a curve for each; by default one curve for all three."""
     overwrite: bool = False
     """Replace files that exist."""
 

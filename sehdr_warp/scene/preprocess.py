@@ -188,6 +188,8 @@ class _Preprocessor:
             return View(name, codes, camera, time, split, mask, hdr, record.image)
         encoded = read_codes(record, oriented=oriented)
         codes, alpha, above = encoded.pixels, encoded.alpha, encoded.above_white
+        to_shared = getattr(self.response, "to_shared", None)  # Of a response whose channels differ
+        codes = codes if to_shared is None else to_shared(codes)
         masks = [] if undistortion is None or undistortion.inside is None else [_shrunk(undistortion.inside, camera)]
         if stored is not None:
             masks.append(warped(stored))

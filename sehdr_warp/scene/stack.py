@@ -20,12 +20,14 @@ from .names import list_images
 if TYPE_CHECKING:
     from ..response import Response
     from ..response.calibration import Calibration
+    from ..response.table import ChannelResponse
 
 log = logging.getLogger(__name__)
 
 
 # RMS stops from which a channel's curve clearly differs from the shared one, and by which a photo may miss its time.
 CHANNELS_DIFFER, WRONG_TIME = 0.15, 0.25
+CSV_ROWS = 1024  # Of a file with a column for each channel
 # What makes photos a stack: the least factor between times, and the least rank correlation in thumbnails of this side
 # over the pixels that neither clips. Real stacks correlate by 0.98 and more, photos from different places by 0.9.
 LEAST_STEP, LEAST_ALIKE, THUMBNAIL, LEAST_SHOWN, MOST_OF_STACK = 1.4, 0.96, 64, 0.05, 32
@@ -114,7 +116,7 @@ def calibrate(
         stack: a folder of photos of one still scene.
         times: seconds, in the order of the files' names; by default exposures.json's, or EXIF's (which counts ISO and
             f-number too).
-        channel: "red", "green" or "blue" alone; by default one curve for all three.
+        channel: "red", "green" or "blue" alone, or "each" for a curve of each; by default one curve for all three.
         out: a CSV file for the curve, which `response_by_name` reads; a plot goes beside it, with the suffix .png.
         overwrite: replace these files.
 
@@ -122,7 +124,7 @@ def calibrate(
         InputError: if the stack does not determine a curve, for another suffix, or a file that exists.
     """
     from ..files import atomic_path, check_absent
-    from ..response.calibration import calibrate_codes
+    from ..response.calibration import CHANNELS, calibrate_codes
 
     folder = Path(stack)
     paths = [] if out is None else [Path(out), Path(out).with_suffix(".png")]
@@ -134,18 +136,45 @@ def calibrate(
     name = folder.name if out is None else Path(out).stem
     photos = [read_ldr(file).pixels for file in files]
     try:
-        found = calibrate_codes(photos, times, channel=channel, name=name)
+        channels = CHANNELS if channel == "each" else (channel,)
+        found = [calibrate_codes(photos, times, channel=each, name=name) for each in channels]
     except InputError as error:
         raise InputError(folder, *error.args[0].split(": ", 1)[1].split("; ", 1)) from None
-    _tell(found, files, channel)
+    for calibration in found:
+        _tell(calibration, files, channel)
+    response = found[0].response if len(found) == 1 else _joined(name, found)
     if paths:
         with atomic_path(paths[1], overwrite) as picture:
             _plot(found, times, picture)
         with atomic_path(paths[0], overwrite) as table:
-            rows = zip(found.response.decode(np.arange(256) / 255), range(256), strict=True)
-            lines = [f"{exposure:.9g},{code / 255:.9g}" for exposure, code in rows]
-            table.write_text("\n".join(["exposure,value", *lines, ""]), encoding="utf-8")
-    return found.response
+            table.write_text("\n".join([*_rows(response), ""]), encoding="utf-8")
+    return response
+
+
+def _joined(name: str, found: Sequence["Calibration"]) -> "ChannelResponse":
+    """Return the channels' curves as one response, in which equal middle codes are neutral (Debevec and Malik)."""
+    from ..response.table import ChannelResponse
+
+    codes = np.arange(256) / 255
+    exposures = [calibration.response.decode(codes) for calibration in found]
+    exposures = [each * (exposures[1][128] / each[128]) for each in exposures]
+    return ChannelResponse(name, exposures, [codes] * 3)
+
+
+def _rows(response: "Response") -> Iterator[str]:
+    """Yield the lines of a CSV file: a row for each code, or of four columns at even steps of log exposure."""
+    curves = getattr(response, "curves", None)
+    if curves is None:
+        yield "exposure,value"
+        for code, exposure in enumerate(response.decode(np.arange(256) / 255)):
+            yield f"{exposure:.9g},{code / 255:.9g}"
+        return
+    darkest = min(float(curve.decode(np.array([1 / 255]))[0]) for curve in curves) / 4
+    brightest = max(curve.clip_exposure for curve in curves)
+    exposures = np.r_[0.0, np.geomspace(darkest, brightest, CSV_ROWS)]
+    yield "exposure,red,green,blue"
+    for row in zip(exposures, *(curve.encode(exposures) for curve in curves), strict=True):
+        yield ",".join(f"{number:.9g}" for number in row)
 
 
 def _tell(found: "Calibration", files: list[Path], channel: str | None) -> None:
@@ -155,28 +184,33 @@ def _tell(found: "Calibration", files: list[Path], channel: str | None) -> None:
     spread = {name: value for name, value in zip(CHANNELS, found.channel_spread, strict=True) if value == value}
     if channel is None and max(spread.values(), default=0.0) > CHANNELS_DIFFER:
         said = ", ".join(f"{name} {value:.2f}" for name, value in spread.items())
-        log.warning("the channels' curves differ from the shared one, stops: %s; --channel takes one alone", said)
+        log.warning("the channels' curves differ from the shared one, stops: %s; --channel each keeps them", said)
     for file, off in zip(files, found.photo_offsets, strict=True):
         if abs(off) > WRONG_TIME:
             side = "brighter" if off > 0 else "darker"
             log.warning("%s is %.2f stops %s than its time says", file.name, abs(off), side)
 
 
-def _plot(found: "Calibration", times: Sequence[float], path: Path) -> None:
-    """Plot the curve over its samples: encoded value against stops from white."""
+def _plot(found: Sequence["Calibration"], times: Sequence[float], path: Path) -> None:
+    """Plot the curves over their samples: encoded value against stops from white."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    exposures, values = found.samples.T
+    exposures, values = np.concatenate([calibration.samples for calibration in found]).T
     axes.plot(np.log2(exposures), values * 255, ".", color="#9aa4ae", markersize=2, label="samples", rasterized=True)
     codes = np.arange(1, 256)
-    axes.plot(np.log2(found.response.decode(codes / 255)), codes, color="#0072b2", linewidth=1.8, label="response")
+    colors = ("#c0392b", "#2e8b57", "#0072b2") if len(found) == 3 else ("#0072b2",)
+    labels = ("red", "green", "blue") if len(found) == 3 else ("response",)
+    for calibration, color, label in zip(found, colors, labels, strict=True):
+        stops = np.log2(calibration.response.decode(codes / 255))
+        axes.plot(stops, codes, color=color, linewidth=1.8, label=label)
     axes.set(xlabel="exposure, stops from white", ylabel="8-bit code", ylim=(0, 260))
     axes.set_xlim(left=max(axes.get_xlim()[0], -14))
     axes.grid(color="#e1e4e8", linewidth=0.8)
     span = f"{len(times)} photos over {math.log2(max(times) / min(times)):.1f} stops"
-    title = f"{found.response.name}: {span}, residual {found.residual:.3f} stops"
+    residual = max(calibration.residual for calibration in found)
+    title = f"{found[0].response.name}: {span}, residual {residual:.3f} stops"
     axes.set_title(title, loc="left", fontsize=10)
     axes.legend(frameon=False, loc="upper left", markerscale=4)
     figure.savefig(path, dpi=140, facecolor="white", format="png")

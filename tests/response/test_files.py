@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.response import response_by_name, responses_in_file
+from sehdr_warp.response import Response, response_by_name, responses_in_file
 from sehdr_warp.response.table import FLAT_TILT, TabulatedResponse
 
 
@@ -183,3 +184,43 @@ def test_any_table_becomes_an_invertible_curve_or_an_input_error(rows):
     encoded = curve.encode(np.linspace(0, curve.clip_exposure * 1.5, 500))
     assert (np.diff(encoded) >= -1e-12).all() and encoded.min() >= 0 and encoded.max() <= 1
     np.testing.assert_allclose(curve.encode(decoded), wanted, atol=1e-6)
+
+
+def channel_csv(path):
+    """Three gammas as a table of four columns."""
+    exposures = np.r_[0.0, np.geomspace(1e-4, 1, 400)]
+    rows = np.column_stack([exposures, *(exposures ** (1 / gamma) for gamma in (1.8, 2.2, 2.6))])
+    path.write_text("exposure,red,green,blue\n" + "\n".join(",".join(map(str, row)) for row in rows))
+    return path
+
+
+def test_a_curve_for_each_channel(tmp_path):
+    response = response_by_name(str(channel_csv(tmp_path / "camera.csv")))
+    codes = np.repeat(np.arange(0, 256, 5, dtype=np.uint8)[:, None, None], 3, axis=2)
+    shared = response.to_shared(codes)
+    assert shared.dtype == np.uint16 and (shared[-1] == 65535).all()
+    light = response.decode(shared / 65535)
+    for channel, gamma in enumerate((1.8, 2.2, 2.6)):
+        np.testing.assert_allclose(light[2:, 0, channel], (codes[2:, 0, 0] / 255) ** gamma, rtol=5e-3)
+    again = Response.from_dict(json.loads(json.dumps(response.to_dict())))
+    np.testing.assert_array_equal(again.to_shared(codes), shared)
+    (tmp_path / "bad.csv").write_text("0,0,0\n1,1,1\n")
+    with pytest.raises(InputError, match="has 3 columns; give two, exposure and value, or four"):
+        response_by_name(str(tmp_path / "bad.csv"))
+
+
+def test_photos_of_a_camera_whose_channels_differ(tmp_path):
+    """A grey scene comes out grey, in the light of the camera's own curves."""
+    from tests.make_scenes import load, write_colmap
+
+    write_colmap(tmp_path)
+    light = np.tile(np.linspace(0.02, 0.9, 64)[None, :, None], (48, 1, 3))
+    codes = np.stack([light[..., c] ** (1 / gamma) for c, gamma in enumerate((1.8, 2.2, 2.6))], axis=2)
+    for i in range(6):
+        Image.fromarray((codes * 255).round().astype(np.uint8)).save(tmp_path / "images" / f"{i:03d}.png")
+    scene = load(tmp_path, response=str(channel_csv(tmp_path / "camera.csv")))
+    for size in (None, 32):
+        scene = load(tmp_path, response=scene.response, max_size=size)
+        seen = scene.response.decode(scene.views[0].image.astype(float))
+        row = seen[seen.shape[0] // 2, 4:-4:8]
+        np.testing.assert_allclose(row, row[:, 1:2].repeat(3, 1), rtol=0.03)

@@ -60,3 +60,24 @@ def test_a_stack_from_one_place_is_told_before_it_is_matched(tmp_path):
 def test_other_photos_are_matched(tmp_path, times, shift):
     with pytest.raises(Matched):
         load_scene(write_photos(tmp_path / "photos", times, shift))
+
+
+def test_a_curve_for_each_channel_is_calibrated(tmp_path):
+    from sehdr_warp.response import response_by_name
+    from sehdr_warp.scene.stack import calibrate
+
+    rng = np.random.default_rng(0)
+    light = 2.0 ** rng.uniform(-8, 0, (60, 80, 1)).repeat(3, 2)
+    (tmp_path / "stack").mkdir()
+    for k in range(6):
+        exposure = np.clip(light * 2.0 ** (k - 1), 0, 1)
+        codes = np.stack([exposure[..., c] ** (1 / gamma) for c, gamma in enumerate((1.8, 2.2, 2.6))], axis=2)
+        Image.fromarray((255 * codes).round().astype(np.uint8)).save(tmp_path / "stack" / f"{k}.png")
+    calibrate(tmp_path / "stack", times=[2.0**k for k in range(6)], channel="each", out=tmp_path / "camera.csv")
+    response = response_by_name(str(tmp_path / "camera.csv"))
+    codes = np.array([40, 80, 200], np.uint8)[:, None, None].repeat(3, 2)
+    for channel, gamma in enumerate((1.8, 2.2, 2.6)):
+        stops = np.diff(np.log2(response.curves[channel].decode(codes[:, 0, 0] / 255)))
+        np.testing.assert_allclose(stops, gamma * np.diff(np.log2([40, 80, 200])), atol=0.08)
+    grey = response.decode(response.to_shared(np.full((1, 1, 3), 128, np.uint8)) / 65535)
+    assert np.ptp(grey) < 0.02 * grey.mean()
