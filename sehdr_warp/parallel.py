@@ -13,6 +13,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import TypeVar
 
+from .limits import processor_limit
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 WAITING_NOTICE = 5.0
@@ -21,11 +23,16 @@ _LOOK_EVERY = 0.1
 
 
 def thread_count() -> int:
-    """Return the threads to use on the CPU: SEHDR_THREADS if set, else the processors this process may run on."""
+    """Return the threads to use on the CPU.
+
+    SEHDR_THREADS if it is set, else the processors that this process may run on, and no more than the CPU quota of its
+    container or batch job.
+    """
     requested = os.environ.get("SEHDR_THREADS", "")
     if requested.isdigit() and int(requested) > 0:
         return int(requested)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    return min(count, processor_limit() or count)
 
 
 def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], ahead: int) -> Iterator[Result]:

@@ -22,6 +22,7 @@ import numpy as np
 
 from ..caches import usable, user_cache
 from ..errors import InputError
+from ..limits import memory_left
 from .types import View
 
 _LARGE = 1 << 14  # Bytes; smaller arrays are pickled
@@ -208,9 +209,8 @@ def available_memory() -> int:
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         found.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
-    with suppress(OSError, ValueError):  # Of a container.
-        most, used = (int(Path(f"/sys/fs/cgroup/memory.{name}").read_text()) for name in ("max", "current"))
-        found.append(max(0, most - used))
+    if (left := memory_left()) is not None:
+        found.append(left)
     return min(found)
 
 

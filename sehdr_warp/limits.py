@@ -1,0 +1,106 @@
+"""Limits of containers and batch jobs: memory and processors by cgroups (versions 1 and 2) and by Slurm."""
+
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+PROC, MOUNT = Path("/proc"), Path("/sys/fs/cgroup")
+_NO_LIMIT = 1 << 60  # Bytes; version 1 states a number of about 2^63 if there is no limit
+
+
+def memory_left(proc: Path = PROC, mount: Path = MOUNT, environment: Mapping[str, str] | None = None) -> int | None:
+    """Return the bytes that this process may still take by the limits of its cgroups and its Slurm job.
+
+    File pages that the kernel would give up are not counted as used.
+
+    Args:
+        proc: where the kernel describes processes.
+        mount: where cgroups are mounted.
+        environment: None is that of the process.
+
+    Returns:
+        Bytes, at least 0; None without a limit.
+    """
+    environment = os.environ if environment is None else environment
+    left = [
+        limit - max(0, used - _number(group / "memory.stat", field))
+        for group, names, field in _memory_groups(proc, mount)
+        if (limit := _number(group / names[0])) < _NO_LIMIT and (used := _number(group / names[1])) < _NO_LIMIT
+    ]
+    if (job := _slurm_memory(environment)) is not None:
+        left.append(job - _resident(proc))
+    return max(0, min(left)) if left else None
+
+
+@cache
+def processor_limit(proc: Path = PROC, mount: Path = MOUNT) -> int | None:
+    """Return the processors that the CPU quotas of the cgroups and a Slurm job leave, rounded up; None without one."""
+    limits = []
+    for version, group in _groups(proc, mount, "cpu"):
+        with suppress(OSError, ValueError, ZeroDivisionError):
+            if version == 2:
+                quota, period = (group / "cpu.max").read_text().split()
+            else:
+                quota, period = ((group / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+            if float(quota) > 0:  # ValueError for "max"; -1 is none in version 1.
+                limits.append(float(quota) / float(period))
+    stated = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    if stated.isdigit() and int(stated) > 0:
+        limits.append(float(stated))
+    return max(1, math.ceil(min(limits))) if limits else None
+
+
+def _groups(proc: Path, mount: Path, controller: str) -> Iterator[tuple[int, Path]]:
+    """Yield version and folder of each cgroup with a controller that this process is in, up to the root."""
+    with suppress(OSError, ValueError):
+        for line in (proc / "self" / "cgroup").read_text().splitlines():
+            number, controllers, path = line.split(":", 2)
+            if number == "0" and not controllers:
+                version, roots = 2, (mount, mount / "unified")
+            elif controller in controllers.split(","):
+                version, roots = 1, (mount / controllers, mount / controller)
+            else:
+                continue
+            below = Path(path.lstrip("/"))
+            for root in roots:
+                for place in (
+                    below,
+                    *below.parents,
+                ):  # In a container the path may be the host's
+                    if (root / place).is_dir():
+                        yield version, root / place
+
+
+def _memory_groups(proc: Path, mount: Path) -> Iterator[tuple[Path, tuple[str, str], str]]:
+    names = {1: ("memory.limit_in_bytes", "memory.usage_in_bytes"), 2: ("memory.max", "memory.current")}
+    for version, group in _groups(proc, mount, "memory"):
+        yield group, names[version], "total_inactive_file" if version == 1 else "inactive_file"
+
+
+def _number(path: Path, field: str | None = None) -> int:
+    """Return the number in a file, or that of a field in lines of field and number; a missing limit is _NO_LIMIT."""
+    try:
+        text = path.read_text()
+        if field is None:
+            return int(text)
+        return next(int(line.split()[1]) for line in text.splitlines() if line.startswith(f"{field} "))
+    except (OSError, ValueError, StopIteration, IndexError):
+        return _NO_LIMIT if field is None else 0
+
+
+def _slurm_memory(environment: Mapping[str, str]) -> int | None:
+    """Return the bytes that a Slurm job asked for on this machine, which Slurm states in megabytes."""
+    with suppress(KeyError, ValueError):
+        return int(environment["SLURM_MEM_PER_NODE"]) << 20 or None
+    with suppress(KeyError, ValueError):
+        return (int(environment["SLURM_MEM_PER_CPU"]) * int(environment["SLURM_CPUS_ON_NODE"])) << 20 or None
+    return None
+
+
+def _resident(proc: Path) -> int:
+    with suppress(OSError, ValueError, IndexError, AttributeError):
+        return int((proc / "self" / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
