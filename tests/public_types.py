@@ -1,10 +1,12 @@
 """What type checkers see of the public names: pyright reads this file strictly, and nothing runs it."""
 
-from typing import assert_type
+from typing import Any, assert_type
 
 import torch
 
 import sehdr_warp as sw
+from sehdr_warp.compat.gsplat import DefaultStrategy, rasterization
+from sehdr_warp.rasterizer import Program
 
 scene = sw.load_scene("photos", max_size=800)
 assert_type(scene, sw.Scene)
@@ -32,3 +34,15 @@ assert_type(sw.ssim(image, image), torch.Tensor)
 assert_type(sw.spherical_harmonics(0, image, image, image[0]), torch.Tensor)
 assert_type(sw.response_by_name("srgb"), sw.Response)
 assert_type(sw.response_names(), dict[str, str])
+
+
+@sw.differentiable
+def attenuate(program: Program, radiance: torch.Tensor, *, density: float) -> torch.Tensor:
+    return program.write(radiance.shape)
+
+
+assert_type(attenuate(image, density=0.5), torch.Tensor)
+colors, alphas, meta = rasterization(image, image, image, image[0], image, image, image, 64, 48, absgrad=True)
+assert_type(colors, torch.Tensor)
+strategy = DefaultStrategy(absgrad=True)
+assert_type(strategy.initialize_state(scene_scale=1.0), dict[str, Any])

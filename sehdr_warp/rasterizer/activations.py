@@ -30,19 +30,24 @@ class _BoundedExponential(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values, bound):
         values = values.detach().contiguous()
-        made = torch.empty_like(values)
-        launch(exposures_kernel(warp_scalar(values.dtype)), values.numel(), values.view(-1), bound, made.view(-1))
+        exponentials = torch.empty_like(values)
+        launch(
+            exposures_kernel(warp_scalar(values.dtype)), values.numel(), values.view(-1), bound, exponentials.view(-1)
+        )
         ctx.bound = bound
-        ctx.save_for_backward(values, made)
-        return made
+        ctx.save_for_backward(values, exponentials)
+        return exponentials
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, upstream):
-        values, made = ctx.saved_tensors
+        values, exponentials = ctx.saved_tensors
         result = torch.empty_like(values)
-        kernel, given = exposures_adjoint_kernel(warp_scalar(values.dtype)), (values.view(-1), ctx.bound, made.view(-1))
-        launch(kernel, values.numel(), *given, upstream, result.view(-1))
+        kernel, inputs = (
+            exposures_adjoint_kernel(warp_scalar(values.dtype)),
+            (values.view(-1), ctx.bound, exponentials.view(-1)),
+        )
+        launch(kernel, values.numel(), *inputs, upstream, result.view(-1))
         return result, None
 
 
@@ -73,6 +78,6 @@ class _Opacities(torch.autograd.Function):
     def backward(ctx, by_opacities, by_mean):
         (opacities,) = ctx.saved_tensors
         result = torch.empty_like(opacities)
-        kernel, given = opacities_adjoint_kernel(warp_scalar(opacities.dtype)), (opacities, ctx.weight, ctx.live)
-        launch(kernel, len(opacities), *given, by_opacities, by_mean, result)
+        kernel, inputs = opacities_adjoint_kernel(warp_scalar(opacities.dtype)), (opacities, ctx.weight, ctx.live)
+        launch(kernel, len(opacities), *inputs, by_opacities, by_mean, result)
         return result, None, None

@@ -56,10 +56,10 @@ def _fit(arguments: Iterable[tuple[Any, tuple[int | str, ...]]]) -> bool:
             dtype, device = value.dtype, value.device
         elif value.dtype != dtype or value.device != device:
             return False
-        given = value.shape
-        if len(given) != len(shape):
+        actual = value.shape
+        if len(actual) != len(shape):
             return False
-        for size, expected in zip(given, shape, strict=True):
+        for size, expected in zip(actual, shape, strict=True):
             if size != expected and (isinstance(expected, int) or sizes.setdefault(expected, size) != size):
                 return False
     return dtype in (torch.float32, torch.float64)

@@ -28,9 +28,9 @@ def code_tensor(codes: np.ndarray, device: torch.device | str) -> Tensor:
 
 def code_values(codes: Tensor) -> Tensor:
     """Return the encoded values in [0, 1], float32, of code_tensor()'s codes."""
-    found = codes.int() & 0xFFFF if codes.dtype == torch.int16 else codes
+    integers = codes.int() & 0xFFFF if codes.dtype == torch.int16 else codes
     # By a tensor: torch's division by a number on a GPU is a product with its reciprocal, which rounds differently.
-    return found / torch.full((), float(WHITE[codes.dtype]), device=codes.device)
+    return integers / torch.full((), float(WHITE[codes.dtype]), device=codes.device)
 
 
 @dataclass(frozen=True)
@@ -79,32 +79,32 @@ def check_codes(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | 
     shape = image.shape if index is None else (codes.shape[0], *image.shape)
     levels = WHITE.get(codes.dtype, 0) + 1
     if codes.shape != shape or (levels, 3) != scale.table.shape or scale.table.dtype != image.dtype:
-        given = (
+        problem = (
             f"codes are {codes.dtype} {list(codes.shape)} with a table of {scale.table.dtype} {list(scale.table.shape)}"
         )
-        raise ValueError(f"{given}, expected uint8 or int16 {list(shape)} with three {image.dtype} for each code")
+        raise ValueError(f"{problem}, expected uint8 or int16 {list(shape)} with three {image.dtype} for each code")
 
 
 def residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """code_residual()'s two of a contiguous image, and the derivatives of the first by it, [H, W, 3], with no graph."""
-    seen, slopes, truth = (torch.empty_like(image) for _ in range(3))
+    prediction, slopes, target = (torch.empty_like(image) for _ in range(3))
     if index is None:
         codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
     law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.mu else (0.0, 0.0)
     kernel = code_residual_kernel(warp_scalar(image.dtype), CODES[codes.dtype], scale.mu > 0)
     photos = codes.contiguous().view(len(codes), -1)
-    launch(kernel, image.numel(), image, photos, index, scale.table, *law, seen, slopes, truth)
-    return seen, truth, slopes
+    launch(kernel, image.numel(), image, photos, index, scale.table, *law, prediction, slopes, target)
+    return prediction, target, slopes
 
 
 class _CodeResidual(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, codes, scale, index):
-        seen, truth, slopes = residual(image.detach().contiguous(), codes, scale, index)
+        prediction, target, slopes = residual(image.detach().contiguous(), codes, scale, index)
         ctx.save_for_backward(slopes)
-        ctx.mark_non_differentiable(truth)
-        ctx.set_materialize_grads(False)  # of truth there is none, and no zeros are wanted in its place
-        return seen, truth
+        ctx.mark_non_differentiable(target)
+        ctx.set_materialize_grads(False)  # of target there is none, and no zeros are wanted in its place
+        return prediction, target
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -65,8 +65,8 @@ class _Fusion(torch.autograd.Function):
         exposedness, outputs = torch.empty_like(by_channel), torch.empty_like(by_channel)
         results = encoded.new_empty(count, 3)
         kernels = fusion_kernels(warp_scalar(encoded.dtype))
-        given = by_channel, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION, *_flat(weights)
-        launch(kernels.perceptrons, by_channel.shape, *given, exposedness, outputs)
+        inputs = by_channel, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION, *_flat(weights)
+        launch(kernels.perceptrons, by_channel.shape, *inputs, exposedness, outputs)
         launch(kernels.mix, results.shape, by_channel, exposedness, outputs, brackets, scale, results)
         ctx.save_for_backward(by_channel, log_sigma, *weights, exposedness, outputs, results)
         ctx.numbers = brackets, scale
@@ -86,8 +86,8 @@ class _Fusion(torch.autograd.Function):
         mixed = encoded, exposedness, outputs, brackets, scale, results, gradients.contiguous()
         launch(kernels.mix_adjoint, results.shape, *mixed, by_exposedness, by_output)
         units = 3, -(-encoded.shape[1] // POINTS_PER_THREAD), weights[0].shape[2]
-        given = encoded, exposedness, by_output, *learned, POINTS_PER_THREAD
-        launch(kernels.unit_adjoint, units, *given, *_flat(by_weights))
+        inputs = encoded, exposedness, by_output, *learned, POINTS_PER_THREAD
+        launch(kernels.unit_adjoint, units, *inputs, *_flat(by_weights))
         points = encoded, exposedness, by_exposedness, by_output, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION
         launch(kernels.point_adjoint, encoded.shape, *points, *learned, by_log_sigma)
         return None, by_log_sigma.sum(1), *by_weights, None

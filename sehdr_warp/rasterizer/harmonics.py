@@ -42,15 +42,15 @@ def spherical_harmonics(
         TypeError: for what is no tensor.
         ValueError: for a degree out of range, and for shapes, dtypes or devices that do not fit.
     """
-    given: dict[str, Any] = {"means": (means, ("N", 3))}
+    arguments: dict[str, Any] = {"means": (means, ("N", 3))}
     if isinstance(coefficients, tuple | list) and len(coefficients) == 2:
-        given |= {
+        arguments |= {
             "coefficients[0]": (coefficients[0], ("N", 1, 3)),
             "coefficients[1]": (coefficients[1], ("N", "K", 3)),
         }
     else:
-        given |= {"coefficients": (coefficients, ("N", "K", 3))}
-    check_tensors(**given, camera_position=(camera_position, (3,)))
+        arguments |= {"coefficients": (coefficients, ("N", "K", 3))}
+    check_tensors(**arguments, camera_position=(camera_position, (3,)))
     degree = integer("degree", degree, 0, MAX_DEGREE)
     whole = isinstance(coefficients, Tensor)
     constant, rest = (coefficients[:, :1], coefficients[:, 1:]) if whole else coefficients
@@ -88,11 +88,11 @@ class HarmonicsGradients:
 
     def by_coefficients(self, like: Tensor, start: int) -> Tensor:
         """Return the gradients [N, K, 3], like a tensor of that shape, by the coefficients from number `start` on."""
-        made = torch.empty_like(like)
-        if made.numel():
-            kernel = coefficient_adjoint_kernel(warp_scalar(made.dtype), made.shape[1])
-            launch(kernel, made.numel(), self.basis, self.by_values, start, made.view(-1))
-        return made
+        gradients = torch.empty_like(like)
+        if gradients.numel():
+            kernel = coefficient_adjoint_kernel(warp_scalar(gradients.dtype), gradients.shape[1])
+            launch(kernel, gradients.numel(), self.basis, self.by_values, start, gradients.view(-1))
+        return gradients
 
 
 class _Evaluation(torch.autograd.Function):
@@ -104,7 +104,7 @@ class _Evaluation(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, degree, constant, rest, means, camera_position):
-        scalar, given, values = (
+        scalar, inputs, values = (
             warp_scalar(means.dtype),
             (constant, rest, means, camera_position),
             torch.empty_like(means),
@@ -113,9 +113,9 @@ class _Evaluation(torch.autograd.Function):
         turning = writes_turns(means.device) and any(ctx.needs_input_grad[3:])
         turns = means.new_empty(len(means) if turning else 0, 3, 3)
         if writes_turns(means.device):
-            launch(channels_kernel(scalar, degree, turning), 3 * len(means), *given, values, turns)
+            launch(channels_kernel(scalar, degree, turning), 3 * len(means), *inputs, values, turns)
         else:
-            launch(harmonics_kernel(scalar, degree), len(means), *given, values)
+            launch(harmonics_kernel(scalar, degree), len(means), *inputs, values)
         ctx.degree, ctx.turning = degree, turning
         ctx.save_for_backward(constant, rest, means, camera_position, turns)
         return values
@@ -128,18 +128,18 @@ class _Evaluation(torch.autograd.Function):
         by_constant, by_rest, by_means, by_camera = ctx.needs_input_grad[1:]
         # On the CPU a thread takes a Gaussian with all of its coefficients.
         together = not writes_turns(gradient.device) and (by_constant or by_rest)
-        made = [torch.empty_like(part) if together else None for part in (constant, rest)]
+        by_parts = [torch.empty_like(part) if together else None for part in (constant, rest)]
         mean_gradients = torch.empty_like(means)
         if ctx.turning:
             launch(turns_adjoint_kernel(scalar), len(means), turns, gradient, mean_gradients)
         elif by_means or by_camera or together:
             kernel = harmonics_adjoint_kernel(scalar, degree, together)
-            launch(kernel, len(means), rest, means, position, gradient, mean_gradients, *made)
+            launch(kernel, len(means), rest, means, position, gradient, mean_gradients, *by_parts)
         if not together and (by_constant or by_rest):
             factors = HarmonicsGradients(gradient[None], position[None], means, degree)
-            made = [factors.by_coefficients(part, start) for start, part in enumerate((constant, rest))]
+            by_parts = [factors.by_coefficients(part, start) for start, part in enumerate((constant, rest))]
         by_position = -mean_gradients.sum(0) if by_camera else None
-        return None, *made, mean_gradients if by_means else None, by_position
+        return None, *by_parts, mean_gradients if by_means else None, by_position
 
 
 def writes_turns(device: torch.device) -> bool:

@@ -56,6 +56,6 @@ class _Interpolation(torch.autograd.Function):
         table, positions = ctx.saved_tensors
         copies = 1 if table.device.type == "cpu" else interpolation.COPIES
         by_position, by_node = torch.empty_like(positions), table.new_zeros(copies, *table.shape)
-        given = table, ctx.low, 1.0 / ctx.step, positions, gradients.contiguous()
-        launch(interpolation.interpolate_adjoint, positions.shape, *given, by_position, by_node)
+        inputs = table, ctx.low, 1.0 / ctx.step, positions, gradients.contiguous()
+        launch(interpolation.interpolate_adjoint, positions.shape, *inputs, by_position, by_node)
         return by_node.sum(0), None, None, by_position

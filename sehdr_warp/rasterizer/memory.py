@@ -60,14 +60,14 @@ def failed_allocation(error: BaseException) -> str | None:
     says_so = re.search(r"can't allocate memory|[Ff]ailed to allocate|out of memory", text)
     if isinstance(error, OutOfMemory) or not (isinstance(error, kinds) or says_so):
         return None
-    found = re.search(r"allocate (\d[\d.]*) ?(bytes|[KMGT]iB)", text)
-    if found is None:
+    match = re.search(r"allocate (\d[\d.]*) ?(bytes|[KMGT]iB)", text)
+    if match is None:
         return "some memory"
-    count, unit = float(found[1]), found[2]
+    count, unit = float(match[1]), match[2]
     for larger, size in (("GiB", 1 << 30), ("MiB", 1 << 20)):
         if unit == "bytes" and count >= size:
             return f"{count / size:.2f} {larger}"
-    return f"{found[1]} {unit}"
+    return f"{match[1]} {unit}"
 
 
 class oom_context:

@@ -43,8 +43,10 @@ class _PhotoLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, codes, scale, index, weights, clipped, estimates):
         image = image.detach().contiguous()
-        seen, truth, slopes = residual(image, codes, scale, index)
-        terms, gradient = distance_terms(seen, truth, *weights, wanted=ctx.needs_input_grad[0], slopes=slopes)
+        prediction, target, slopes = residual(image, codes, scale, index)
+        terms, gradient = distance_terms(
+            prediction, target, *weights, needs_gradient=ctx.needs_input_grad[0], slopes=slopes
+        )
         if clipped:
             add_clipped_light(image, codes, scale.white, clipped, index, None, estimates, terms, gradient)
         ctx.save_for_backward(*(() if gradient is None else (gradient,)))

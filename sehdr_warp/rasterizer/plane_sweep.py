@@ -39,7 +39,7 @@ class PhotoSet:
         starts = np.cumsum([0, *(photo.shape[0] * photo.shape[1] for photo in photos)])
         codes = np.zeros((starts[-1], 4), np.uint8)
         np.concatenate([photo.reshape(-1, 3) for photo in photos], out=codes[:, :3])
-        given = {
+        arrays = {
             "codes": codes,
             "offsets": starts[:-1].astype(np.int64),
             "sizes": np.array([[camera.width, camera.height] for camera in cameras], np.int32),
@@ -47,7 +47,7 @@ class PhotoSet:
             "neighbors": np.ascontiguousarray(neighbors, np.int32),
             "between": (poses[neighbors] @ back[:, None]).astype(np.float32),
         }
-        return PhotoSet(**{name: torch.from_numpy(values).to(device) for name, values in given.items()})
+        return PhotoSet(**{name: torch.from_numpy(values).to(device) for name, values in arrays.items()})
 
 
 @torch.no_grad()
@@ -89,6 +89,6 @@ def matched_points(photos: PhotoSet, poses: Tensor, pixels: Tensor, depths: Tens
     """
     points, colors = (depths.new_empty(len(depths), 3) for _ in range(2))
     footprints = torch.empty_like(depths)
-    given = photos.codes, photos.offsets, photos.sizes, photos.intrinsics, poses, pixels.contiguous(), depths
-    launch(plane_sweep.place_matches, len(depths), *given, points, colors, footprints)
+    inputs = photos.codes, photos.offsets, photos.sizes, photos.intrinsics, poses, pixels.contiguous(), depths
+    launch(plane_sweep.place_matches, len(depths), *inputs, points, colors, footprints)
     return points, colors, footprints

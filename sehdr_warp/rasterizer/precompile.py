@@ -86,8 +86,8 @@ def precompiled(kernels: Sequence[Any], modules: Sequence[str] = ()) -> Iterator
             log.debug("not all could be loaded ahead", exc_info=True)
 
     # Not daemons: what compiles while the interpreter ends would abort the process.
-    given = (fused, modules), ([kernel for kernel in kernels if kernel not in fused], ())
-    workers = [threading.Thread(target=work, args=each, name="sehdr-warp ahead") for each in given]
+    shares = (fused, modules), ([kernel for kernel in kernels if kernel not in fused], ())
+    workers = [threading.Thread(target=work, args=each, name="sehdr-warp ahead") for each in shares]
     for worker in workers:
         worker.start()
     try:

@@ -11,7 +11,7 @@ from .warp_launch.launching import launch
 
 @torch.no_grad()
 def sample_residual_pixels(
-    shown: Tensor,
+    rendered: Tensor,
     codes: Tensor,
     index: Tensor | None,
     mask: Tensor | None,
@@ -26,20 +26,20 @@ def sample_residual_pixels(
     Returns [K, 3] int32 (view, column, row) of the photo at another size (width, height), each BORDER from its edge,
     and [K] bool, whether each is meant.
 
-    shown: [H, W, 3] encoded, float32, clamped to [0, 1]. codes, index: as of code_residual(). mask: [H, W, 1] float32,
-    by which errors are multiplied. uniform: [K] float64 in [0, 1), random numbers of the draws.
+    rendered: [H, W, 3] encoded, float32, clamped to [0, 1]. codes, index: as of code_residual(). mask: [H, W, 1]
+    float32, by which errors are multiplied. uniform: [K] float64 in [0, 1), random numbers of the draws.
     """
-    height, width, _ = shown.shape
+    height, width, _ = rendered.shape
     if index is None:
         codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
-    weights = torch.empty(height * width, dtype=torch.float64, device=shown.device)
+    weights = torch.empty(height * width, dtype=torch.float64, device=rendered.device)
     photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
-    told = shown.contiguous().view(-1, 3), photos, index, float(WHITE[codes.dtype]), mask, least
-    launch(kernels.error_weights_kernel(CODES[codes.dtype]), len(weights), *told, weights)
+    inputs = rendered.contiguous().view(-1, 3), photos, index, float(WHITE[codes.dtype]), mask, least
+    launch(kernels.error_weights_kernel(CODES[codes.dtype]), len(weights), *inputs, weights)
     steps = weights.cumsum(0)
     places = torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(steps) - 1)
-    pixels = torch.empty(len(places), 3, dtype=torch.int32, device=shown.device)
-    meant = torch.empty(len(places), dtype=torch.bool, device=shown.device)
+    pixels = torch.empty(len(places), 3, dtype=torch.int32, device=rendered.device)
+    meant = torch.empty(len(places), dtype=torch.bool, device=rendered.device)
     resized = size[0] / width, size[1] / height, *size, BORDER
     launch(kernels.sampled_pixels, len(places), places, steps[-1], width, view, *resized, pixels, meant)
     return pixels, meant

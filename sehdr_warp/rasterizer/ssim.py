@@ -70,17 +70,17 @@ def distance_terms(
     b: Tensor,
     distance_weight: float,
     dissimilarity_weight: float,
-    wanted: bool,
+    needs_gradient: bool,
     slopes: Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return the terms whose total() is image_distance() of contiguous images, and if wanted their derivatives.
+    """Return the terms whose total() is image_distance() of contiguous images, and if needs_gradient their derivatives.
 
     Derivatives [H, W, C] are by the variable of which `a` has the slopes, or by `a` itself.
     """
     weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
     terms, derivatives = _compare(a, b, weights)
     # Made at once: it takes a fifth of the memory of what it is made of.
-    return terms, _gradient(a, b, derivatives, unit_gradient(a), weights, slopes) if wanted else None
+    return terms, _gradient(a, b, derivatives, unit_gradient(a), weights, slopes) if needs_gradient else None
 
 
 class _Similarity(torch.autograd.Function):
@@ -138,8 +138,8 @@ def _gradient(
     """scale, and with weights slopes, times the gradient by `a`, [H, W, C], of the sum of what _compare() gives."""
     result = torch.empty_like(a)
     if patches.in_patches(a.device):
-        given = derivatives, a.flatten(1), b.flatten(1), scale, None if slopes is None else slopes.flatten(1)
-        _launch_patches("gradient", a, weights, *given, *(weights or (0.0, 0.0)), result.flatten(1))
+        inputs = derivatives, a.flatten(1), b.flatten(1), scale, None if slopes is None else slopes.flatten(1)
+        _launch_patches("gradient", a, weights, *inputs, *(weights or (0.0, 0.0)), result.flatten(1))
     else:
         _gradient_in_runs(a, b, derivatives, scale, weights, slopes, result)
     return result

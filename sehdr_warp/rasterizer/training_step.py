@@ -45,18 +45,18 @@ def norms(gradients: Sequence[Tensor]) -> Tensor:
     if gradients[0].device.type == "cuda":
         return _nonfinite_by_kernel(gradients)
     with torch_threads(gradients[0].device):  # They are sums, but nobody asks how large.
-        found = torch._foreach_norm(list(gradients))  # pyright: ignore[reportPrivateImportUsage]
-    return torch.stack(found)
+        result = torch._foreach_norm(list(gradients))  # pyright: ignore[reportPrivateImportUsage]
+    return torch.stack(result)
 
 
 def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
-    found = gradients[0].new_zeros(1)
+    result = gradients[0].new_zeros(1)
     flat = [gradient.reshape(-1) for gradient in gradients if gradient.numel()]
     for start in range(0, len(flat), kernels.CHECKED_AT_ONCE):
-        given = flat[start : start + kernels.CHECKED_AT_ONCE]
-        nothing = [found[:0]] * (kernels.CHECKED_AT_ONCE - len(given))
-        launch(kernels.find_nonfinite, max(map(len, given)), *given, *nothing, found)
-    return found
+        group = flat[start : start + kernels.CHECKED_AT_ONCE]
+        nothing = [result[:0]] * (kernels.CHECKED_AT_ONCE - len(group))
+        launch(kernels.find_nonfinite, max(map(len, group)), *group, *nothing, result)
+    return result
 
 
 def differentiate(loss: Tensor) -> None:
@@ -137,15 +137,15 @@ def adam_steps(
 def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, live=None) -> None:
     nothing, live = [skipped.view(1)[:0]] * 6, _live(live, skipped)
     for start in range(0, len(steps), kernels.AT_ONCE):
-        given = steps[start : start + kernels.AT_ONCE]
-        told = []
-        for parameter, gradient, first_moment, second_moment, step, rate, _ in given:
+        group = steps[start : start + kernels.AT_ONCE]
+        arguments = []
+        for parameter, gradient, first_moment, second_moment, step, rate, _ in group:
             flat = (tensor.view(-1) for tensor in (parameter, first_moment, second_moment))
-            told += [gradient.view(-1), step.view(1), _rate(rate, skipped).view(1), *flat]
-        told += nothing * (kernels.AT_ONCE - len(given))
-        most = max(step.parameter.numel() for step in given)
-        widths = [step.width for step in given] + [0] * (kernels.AT_ONCE - len(given))
-        launch(kernels.update_by_adam, most, skipped.view(1), live, *widths, *_numbers(betas), epsilon, *told)
+            arguments += [gradient.view(-1), step.view(1), _rate(rate, skipped).view(1), *flat]
+        arguments += nothing * (kernels.AT_ONCE - len(group))
+        most = max(step.parameter.numel() for step in group)
+        widths = [step.width for step in group] + [0] * (kernels.AT_ONCE - len(group))
+        launch(kernels.update_by_adam, most, skipped.view(1), live, *widths, *_numbers(betas), epsilon, *arguments)
 
 
 @torch.no_grad()
@@ -194,15 +194,15 @@ def _numbers(betas: tuple[float, float]) -> tuple[float, ...]:
 
 @torch.no_grad()
 def add_gradient_statistics(
-    gradients: Tensor, radii: Tensor, usable: Tensor, width: int, height: int, gradient_sum: Tensor, seen: Tensor
+    gradients: Tensor, radii: Tensor, usable: Tensor, width: int, height: int, gradient_sum: Tensor, visits: Tensor
 ) -> None:
-    """Add the lengths of gradients [N, 2] by the projected centres to gradient_sum [N], and 1 to seen [N].
+    """Add the lengths of gradients [N, 2] by the projected centres to gradient_sum [N], and 1 to visits [N].
 
     Lengths are in normalised screen units (the screen is 2 wide). Only Gaussians with radii [N] above 0 count, and
     nothing is added if the scalar usable is 0. width, height: of the image in pixels. All float32 on one device.
     """
-    given = gradients.contiguous(), radii, usable, width / 2, height / 2
-    launch(kernels.add_gradient_statistics, len(radii), *given, gradient_sum, seen)
+    inputs = gradients.contiguous(), radii, usable, width / 2, height / 2
+    launch(kernels.add_gradient_statistics, len(radii), *inputs, gradient_sum, visits)
 
 
 @torch.no_grad()

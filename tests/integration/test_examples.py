@@ -41,7 +41,7 @@ def test_own_kernel():
 
 
 def test_pose_refinement():
-    before, after = example("pose_refinement")["main"](steps=80, size=48)
+    before, after = example("pose_refinement")["main"](steps=120, size=48)
     assert after < 0.1 * before
 
 

@@ -28,10 +28,10 @@ _MODULE = re.compile(r"wp_.*_[0-9a-f]{7}")
 
 def select_folder() -> None:
     """Give Warp a cache folder that can be written to; called before wp.init()."""
-    stated = os.environ.get("WARP_CACHE_PATH")
-    if wp.config.kernel_cache_dir or (stated is None and not sys.platform.startswith("linux")):
+    configured = os.environ.get("WARP_CACHE_PATH")
+    if wp.config.kernel_cache_dir or (configured is None and not sys.platform.startswith("linux")):
         return
-    folder = user_cache("warp") if stated is None else Path(stated)
+    folder = user_cache("warp") if configured is None else Path(configured)
     if folder is None or not usable(folder):
         wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="sehdr-kernels-")
         atexit.register(shutil.rmtree, wp.config.kernel_cache_dir, ignore_errors=True)
@@ -54,12 +54,12 @@ def discard_damaged() -> None:
 
 
 def _lines(cache: Path) -> set[bytes]:
-    found = set()
+    lines = set()
     for module in (path for path in cache.glob("wp_*") if _MODULE.fullmatch(path.name)):
         for file in module.iterdir():
             with suppress(OSError):  # Another process may be at work here.
-                found.add(hash_line(file, f"{module.name}/{file.name}"))
-    return found
+                lines.add(hash_line(file, f"{module.name}/{file.name}"))
+    return lines
 
 
 def _keep(cache: Path) -> None:
