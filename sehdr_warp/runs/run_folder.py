@@ -32,7 +32,7 @@ from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS
 from .checkpoint import Checkpoint, read_checkpoint
 from .config import Config
-from .config_files import config_from_dict
+from .config_files import config_from_dict, override_config
 from .photo_signatures import changed_photos, photo_signature
 from .values import (
     FORMAT,
@@ -79,6 +79,8 @@ class RunFolder:
         self.config, self.scene, self.info, self.plan, self.summary = (
             self.path / f"{name}.json" for name in ("config", "scene", "run", "plan", "summary")
         )
+        # Set after the training began: more iterations, and up and scale for its files.
+        self.extension, self.orientation = self.path / "extension.json", self.path / "orientation.json"
         self.metrics = self.path / "metrics.jsonl"
         self.checkpoints = self.path / "checkpoints"
         self.confidence = self.path / "confidence.safetensors"
@@ -100,6 +102,7 @@ class RunFolder:
     def refuse_links(self) -> None:
         """Raise InputError if anything of a run in this folder is a link, whose target is not the run's."""
         files = (self.config, self.scene, self.info, self.plan, self.summary, self.metrics, self.confidence)
+        files += (self.extension, self.orientation)
         for path in (*files, self.checkpoints, self.tensorboard, *(self.path / n for n in (".lock", NEW, READY))):
             refuse_links(path, self.path)
         for folder in (*self._checkpoint_folders(), self.path / NEW, self.path / READY):
@@ -136,9 +139,15 @@ class RunFolder:
         }
 
     def read_config(self) -> Config:
-        """Return the config of the training."""
+        """Return the config of the training, with the iterations that it was extended to."""
         self.read_info()
-        return config_from_dict(self._read(self.config, read_object), self.config)
+        config = config_from_dict(self._read(self.config, read_object), self.config)
+        if not self.extension.is_file():
+            return config
+        iterations = self._read(self.extension, read_object).get("iterations")
+        if not isinstance(iterations, int) or iterations < config.schedule.iterations:
+            raise InputError(self.extension, f"iterations = {iterations!r:.40} cannot be", REMEDY)
+        return override_config(config, {"schedule.iterations": iterations})
 
     def read_info(self) -> dict:
         """Return the values of run.json; see RunValues."""

@@ -161,7 +161,8 @@ class RunWriter(RunFolder):
             _refuse_foreign(folder)
         with writing(self.path):
             if new.is_dir():
-                for name in ("summary", "metrics", "confidence", "plan", "scene", "info", "config"):
+                parts = ("summary", "metrics", "confidence", "plan", "extension", "orientation")
+                for name in (*parts, "scene", "info", "config"):
                     getattr(self, name).unlink(missing_ok=True)
                 for checkpoint in self._checkpoint_folders():
                     remove_checkpoint(checkpoint)
@@ -182,6 +183,11 @@ class RunWriter(RunFolder):
 
     def _is_empty(self) -> bool:
         return not {path.name for path in self.path.iterdir()} - {_LOCK}
+
+    def extend(self, iterations: int) -> None:
+        """Set more iterations for a training that goes on; its config and checkpoints stay as they are."""
+        self._hold()
+        write_json(self.extension, {"iterations": iterations}, ours=True)
 
     def write_summary(self, values: dict) -> None:
         """Write times, memory and counts of the training; see SummaryValues."""

@@ -195,6 +195,7 @@ def _train(asked: Train, ranks=None) -> None:
             return
         from ..console import follow
         from ..viewer.live import viewed
+        from .advice import advice
         from .train import create_trainer
 
         trainer = create_trainer(
@@ -206,7 +207,8 @@ def _train(asked: Train, ranks=None) -> None:
             follow(steps, trainer.total)
     run = trainer.run
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
-    print(json.dumps(summary) if output.json else _ending(run.path, summary))
+    hints = advice(run.path, summary, len(trainer.scene.train_views)) if summary.get("finished") else []
+    print(json.dumps(summary | {"advice": hints}) if output.json else "\n".join([_ending(run.path, summary), *hints]))
 
 
 def _check_truth(data: Mapping, config) -> None:

@@ -159,8 +159,11 @@ def _resume(
     """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run."""
     folder.lock()
     info, saved = folder.read_info(), folder.read_config()
+    extended = None
     if config is not None:
         _check_same_config(config, saved, folder)
+        if config.schedule.iterations > saved.schedule.iterations:
+            extended = override_config(saved, {"schedule.iterations": config.schedule.iterations})
     folder.check_same_scene(scene)
     checkpoint = folder.newest_checkpoint()
     if checkpoint is None:
@@ -168,6 +171,7 @@ def _resume(
     field = field_from_checkpoint(checkpoint, saved, info).to(device)
     gains = photo_gains(info)
     scene = scene if gains is None else gains.normalize_photos(scene, field.response)
+    before, saved = saved.schedule.iterations, extended or saved
     output = RunOutput(folder, saved, tensorboard=tensorboard)
     trainer = Trainer(scene, saved, field, ranks=ranks, output=output)
     try:
@@ -175,6 +179,10 @@ def _resume(
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
         problem = f"its state does not fit ({error!r:.120})"
         raise InputError(checkpoint.path, problem, "remove it, or train again") from None
+    if extended is not None:
+        folder.extend(trainer.total)
+        text = "the schedule is stretched from %d to %d iterations: rates and densification are those of the longer one"
+        log.info(text, before, trainer.total)
     folder.rewind_metrics(trainer.iteration)
     trainer.seconds = checkpoint.values["seconds"]
     return trainer
@@ -188,6 +196,8 @@ def _check_same_config(config: Config, saved: Config, folder: RunWriter) -> None
         config = override_config(config, fields | {"plan.enabled": False})
     for path, _ in config_fields():
         old, new = attrgetter(path)(saved), attrgetter(path)(config)
+        if path == "schedule.iterations" and new > old:
+            continue  # The training goes on with a longer schedule.
         if old != new:
             problem = f"{path} = {old!r}, but {new!r} was asked for"
             raise InputError(folder.config, problem, "resume with the run's own config, or train anew")

@@ -1,0 +1,47 @@
+from pathlib import Path
+
+from sehdr_warp.runs.run import load_run
+from sehdr_warp.training.advice import advice
+from sehdr_warp.training.train import train
+
+from .toy import toy_scene
+
+
+def summary(decibels, regions=0, stops=2.0):
+    """A training of 90 iterations with evaluations spread evenly over it."""
+    step = 90 // len(decibels)
+    metrics = [{"iteration": (i + 1) * step, "split": "test", "psnr_ldr": value} for i, value in enumerate(decibels)]
+    worst = [{"photo": f"p{i}", "stops": stops} for i in range(min(regions, 20))]
+    return {"iteration": 90, "metrics": metrics, "unexplained": {"regions": regions, "photos": 3, "worst": worst}}
+
+
+def test_a_training_that_still_gains_is_told_to_go_on():
+    [line] = advice(Path("runs/my run"), summary([20, 22, 23, 24]), 50)
+    assert line.endswith("sehdr-warp train --resume --out 'runs/my run' --iterations 180") and "2.0 dB" in line
+
+
+def test_photos_that_hold_no_more_are_named():
+    [line] = advice(Path("r"), summary([20, 26, 25, 24]), 12)
+    assert "2.0 dB better at iteration 44" in line and "12 photos" in line
+
+
+def test_few_photos_and_movement():
+    assert "photos are few" in advice(Path("r"), summary([20, 21, 21.05]), 8)[0]
+    [line] = advice(Path("r"), summary([28, 28, 28], regions=100), 10)
+    assert "masks/PHOTO.png" in line and "p0, p1, p2, ..." in line
+    assert advice(Path("r"), summary([28, 28, 28], regions=100, stops=-1.1), 10) == []  # Blur
+    assert advice(Path("r"), summary([28, 28, 28]), 100) == []
+    assert advice(Path("r"), {"iteration": 9, "metrics": []}, 3) == []
+
+
+def test_a_finished_run_goes_on_with_more_iterations(tmp_path, logged):
+    config = {"schedule.iterations": 24, "plan.enabled": False}
+    train(toy_scene(), tmp_path / "run", config, device="cpu")
+    first = load_run(tmp_path / "run").metrics()
+    run = train(toy_scene(), tmp_path / "run", config | {"schedule.iterations": 48}, device="cpu", resume=True)
+    assert run.iterations == 48 and run.summary()["finished"] and run.summary()["iteration"] == 48
+    assert load_run(tmp_path / "run").config.schedule.iterations == 48
+    assert any("stretched from 24 to 48 iterations" in line for line in logged)
+    assert [line["iteration"] for line in run.metrics()][: len(first)] == [line["iteration"] for line in first]
+    # Without a config it is the longer training that is resumed, which has ended.
+    assert train(toy_scene(), tmp_path / "run", device="cpu", resume=True).iterations == 48
