@@ -106,7 +106,7 @@ def _header(run: Any, scene: Scene) -> Markup:
         "photos trained on": len(scene.train_views),
         "photos held out": len(scene.test_views),
         "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
-        "exposure" if run.photo_gains is None else "exposure, gains counted in": span.replace(" s to", " to"),
+        "exposure" if run.exposure_compensation is None else "exposure, gains counted in": span.replace(" s to", " to"),
         "response": run.response.name,
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,

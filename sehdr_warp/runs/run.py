@@ -42,14 +42,14 @@ class _RenderedScene:
         degree: SH degree to render with.
         base_time: Exposure time of the photos, seconds.
         color_matrix: [3, 3] from the field's colors to linear Rec.709, if it was trained on sensor RGB; else None.
-        photo_gains: Exposure compensation of the training photos, if there was one.
+        exposure_compensation: Exposure compensation of the training photos, if there was one.
     """
 
     model: RadianceField
     degree: int
     base_time: float
     color_matrix: np.ndarray | None = None
-    photo_gains: ExposureCompensation | None = None
+    exposure_compensation: ExposureCompensation | None = None
 
     @property
     def device(self) -> torch.device:
@@ -58,7 +58,11 @@ class _RenderedScene:
 
     def normalize_photos(self, scene: Scene) -> Scene:
         """Return a scene with the exposure compensation that the run was trained with."""
-        return scene if self.photo_gains is None else self.photo_gains.normalize_photos(scene, self.model.response)
+        return (
+            scene
+            if self.exposure_compensation is None
+            else self.exposure_compensation.normalize_photos(scene, self.model.response)
+        )
 
     @property
     def gaussian_count(self) -> int:
@@ -185,7 +189,7 @@ class Run(_RenderedScene):
         self.scene_name: str = info["scene"]
         if info.get("color_matrix"):
             self.color_matrix = np.array(info["color_matrix"], np.float64)
-        self.photo_gains = photo_gains(info)
+        self.exposure_compensation = exposure_compensation(info)
 
     def _repr_html_(self) -> str:
         """Return HTML for notebooks."""
@@ -274,9 +278,9 @@ def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, base_time: floa
     return rendered if matrix is None else replace(rendered, hdr=rec709_of(rendered.hdr, matrix, base_time))
 
 
-def photo_gains(info: dict) -> ExposureCompensation | None:
+def exposure_compensation(info: dict) -> ExposureCompensation | None:
     """Return the exposure compensation that run.json contains, if any."""
-    return ExposureCompensation.from_dict(stored) if (stored := info.get("photo_gains")) else None
+    return ExposureCompensation.from_dict(stored) if (stored := info.get("exposure_compensation")) else None
 
 
 def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:

@@ -141,7 +141,7 @@ class RunWriter(RunFolder):
         if scene.color_matrix is not None:
             info["color_matrix"] = scene.color_matrix.tolist()
         if gains is not None:
-            info["photo_gains"] = gains.to_dict()
+            info["exposure_compensation"] = gains.to_dict()
         with atomic_folder(self.path / NEW, ours=True) as beside:
             new = RunWriter(beside)
             if plan is not None:

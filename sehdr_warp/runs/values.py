@@ -74,7 +74,7 @@ class RunValues(Values):
     response: dict[str, Any]
     normalization: NormalizationValues | None = None
     color_matrix: Annotated[list[_Row], _Three] | None = None
-    photo_gains: GainValues | None = None
+    exposure_compensation: GainValues | None = None
 
 
 class CheckpointValues(Values):

@@ -165,6 +165,7 @@ def _train(asked: Train, ranks=None) -> None:
     """Train or resume a run, or print a plan, on this rank."""
     from ..runs.device import pick_device
     from ..runs.run_writer import RunWriter
+    from .hdr_truth import check_dataset_truth
 
     output, resumed = asked.output, None
     out, how = output.out, {"resume": output.resume, "overwrite": output.overwrite}
@@ -184,7 +185,7 @@ def _train(asked: Train, ranks=None) -> None:
     photos = {"device": "memory"}.get(config.schedule.photo_cache, config.schedule.photo_cache)
     given = {"method": options.method, "candidates": options.candidates, "photos": photos}
     if out is not None:
-        _check_truth(data, config)
+        check_dataset_truth(data, config)
     with nullcontext() if out is None or device.type != "cpu" else _precompiling(config):
         scene = load_photos(data, response=options.name, **given)
         if out is None:
@@ -209,22 +210,6 @@ def _train(asked: Train, ranks=None) -> None:
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
     hints = advice(run.path, summary, len(trainer.scene.train_views)) if summary.get("finished") else []
     print(json.dumps(summary | {"advice": hints}) if output.json else "\n".join([_ending(run.path, summary), *hints]))
-
-
-def _check_truth(data: Mapping, config) -> None:
-    """Raise InputError if photos lack HDR truth that the loss needs, before a response is selected for them."""
-    from ..scene.load import parse_dataset
-    from ..scene.names import unique_names
-    from .targets import check_truth
-
-    mended = config.plan.enabled and not config.loss.hdr_weight  # A plan leaves out what compares brackets with truth.
-    if not config.loss.uses_hdr or mended:
-        return
-    known = {name: data.get(name) for name in ("exposure_index", "holdout")}
-    capture = parse_dataset(data["path"], **known)
-    named = zip(unique_names(capture.records), capture.records, strict=True)
-    views = [(name, record.hdr is not None) for name, record in named if record.split == "train"]
-    check_truth(capture.name, views, config.loss)
 
 
 def _precompiling(config):

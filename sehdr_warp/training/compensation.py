@@ -134,7 +134,7 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     def no_drift(matcher: Matcher) -> Compensation:
         least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
         reason = "do not contradict the stated times" if stated else f"differ by less than {least}"
-        return Compensation(None, matcher, Decision("photo-gains", {}, "none", f"matched points {reason}"))
+        return Compensation(None, matcher, Decision("exposure-compensation", {}, "none", f"matched points {reason}"))
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=tuple(prefetch_map(at_matching_size, views, RESIZED_AT_ONCE)))
@@ -223,4 +223,4 @@ def _decision(gains: ExposureCompensation, parts: Parts, stated: bool) -> Decisi
         figures.append(f"{gains.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
     choice = f"taken out of the photos{over if stated else ''}"
-    return Decision("photo-gains", {}, choice, f"matched points differ by {', '.join(figures)}", told=True)
+    return Decision("exposure-compensation", {}, choice, f"matched points differ by {', '.join(figures)}", told=True)

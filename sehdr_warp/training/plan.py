@@ -16,10 +16,10 @@ from ..runs.config_files import override_config
 from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS
+from .hdr_truth import largest_hdr_truth
 from .initialization import base_time, start_count
 from .scene_facts import SceneFacts, measure_scene
 from .strategies import mcmc_cap
-from .targets import largest_truth
 
 STEPS_PER_PHOTO = 75
 """Iterations for each photo. With 300, held-out photos of real captures lose up to 2.6 dB and gain at most 0.3 dB: the
@@ -106,7 +106,7 @@ class Plan:
     def lines(self) -> list[str]:
         """Return a line for each decision that changes something, and for each field that the user set."""
         made = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.told]
-        evened = any(row.name == "photo-gains" and row.told for row in self.decisions)
+        evened = any(row.name == "exposure-compensation" and row.told for row in self.decisions)
         if self.facts.drift >= DRIFT and not evened:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             made.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
@@ -212,7 +212,7 @@ def check_fields(scene: Scene, config: Config) -> None:
                 problem = f"{time:.3g} s is {time / base:.3g} times the photos' {base:.3g} s"
                 refuse("fusion.exposures", problem, f"stay within 1/{REACH:.0f} and {REACH:.0f} times")
     if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given):
-        largest_truth(scene, config.loss)
+        largest_hdr_truth(scene, config.loss)
     if "densification.cap_max" in given and config.densification.cap_max < points:
         remedy = f"use {points} or more, or leave the field out"
         refuse("densification.cap_max", f"the scene starts from {points} points", remedy)

@@ -8,15 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..errors import InputError
 from ..model.camera_tensors import CameraTensors
 from ..rasterizer.code_residual import CodeScale, code_tensor
 from ..response import Response
-from ..runs.config import LossConfig
-from ..scene import Scene, View
+from ..scene import View
 from .losses import Target, code_scale, select_view
-
-_TRUTH_REMEDY = "take a scene with HDR truth, or a preset that needs none"
 
 
 @dataclass(frozen=True)
@@ -100,47 +96,6 @@ class ViewStack:
         names = "mask", "exposure_truth", "estimates"
         parts = {name: None if (v := getattr(self.targets, name)) is None else take(v) for name in names}
         return TrainingView(camera, time, replace(self.targets, **parts))
-
-
-def largest_truth(scene: Scene, loss: LossConfig) -> float:
-    """Return the largest radiance in the HDR truth of the training views inside masks; 1.0 if the loss needs none.
-
-    Raises:
-        InputError: With scene and field, if truth that the loss needs is missing or black.
-    """
-    check_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], loss)
-    if not loss.uses_hdr:
-        return 1.0
-    truths = [(view.hdr, view.mask) for view in scene.train_views if view.hdr is not None]
-    counted = (hdr if mask is None else hdr[mask > 0] for hdr, mask in truths)
-    largest = max((float(radiance.max()) for radiance in counted if radiance.size), default=0.0)
-    if not largest > 0:
-        problem = f"the HDR truth that {_truth_field(loss)} needs is black in every training view"
-        raise InputError(scene.name, problem, _TRUTH_REMEDY)
-    return largest
-
-
-def check_truth(scene: str, views: Sequence[tuple[str, bool]], loss: LossConfig) -> None:
-    """Raise InputError, with scene and field, if HDR truth that the loss needs is missing.
-
-    Args:
-        scene: Name of the scene.
-        views: For each training view its name and whether it has HDR truth.
-        loss: The loss.
-    """
-    if not loss.uses_hdr:
-        return
-    if not any(known for _, known in views):
-        problem = f"no training view has the HDR truth that {_truth_field(loss)} needs"
-        raise InputError(scene, problem, _TRUTH_REMEDY)
-    if loss.ldr_weight == 0 and (lacking := next((name for name, known in views if not known), None)):
-        problem = f"view {lacking} lacks the HDR truth that {_truth_field(loss)} needs where loss.ldr_weight = 0.0"
-        raise InputError(scene, problem, _TRUTH_REMEDY)
-
-
-def _truth_field(loss: LossConfig) -> str:
-    """Return the field of the loss that needs HDR truth, with its value."""
-    return f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
 
 
 def training_views(

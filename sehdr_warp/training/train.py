@@ -14,18 +14,18 @@ from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
 from ..runs.device import pick_device
-from ..runs.run import Run, field_from_checkpoint, photo_gains
+from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
 from ..scene import Scene
 from ..scene.normalization import normalization_of
 from .compensation import estimate_compensation, estimates_compensation
 from .following import send_training, several_ranks_notes
+from .hdr_truth import check_scene_truth
 from .initialization import choose_response, make_field, make_matcher, sizes_of
 from .machine import Stopwatch, summary_writer
 from .plan import apply_plan
 from .ranks import Ranks
 from .run_output import RunOutput
-from .targets import check_truth
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ def _begin(
     watch = Stopwatch()
     normalized = normalization_of(scene).scene(scene)
     config, plan = apply_plan(normalized, config, device)
-    check_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], config.loss)
+    check_scene_truth(scene, config.loss)
     response = choose_response(scene, config)
     matcher, gains = cache(partial(make_matcher, normalized, response, device)), None
     compensated = scene
@@ -169,7 +169,7 @@ def _resume(
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, with --overwrite")
     field = field_from_checkpoint(checkpoint, saved, info).to(device)
-    gains = photo_gains(info)
+    gains = exposure_compensation(info)
     scene = scene if gains is None else gains.normalize_photos(scene, field.response)
     before, saved = saved.schedule.iterations, extended or saved
     output = RunOutput(folder, saved, tensorboard=tensorboard)

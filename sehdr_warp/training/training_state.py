@@ -17,6 +17,7 @@ from ..runs.light_estimates import light_estimates
 from ..scene import Scene
 from . import optimizer as adam
 from .graph_capacity import GraphCapacity
+from .hdr_truth import largest_hdr_truth
 from .initialization import make_matcher, scene_extent
 from .losses import INTERVALS_FROM, compares_exposures
 from .matching import Matcher
@@ -27,7 +28,7 @@ from .ranks import Ranks
 from .step_graphs import StepGraphs
 from .step_values import StepResult
 from .strategies import make_strategy
-from .targets import TrainingView, ViewStack, largest_truth, photo_source
+from .targets import TrainingView, ViewStack, photo_source
 from .wide_views import has_wide_views
 
 T = TypeVar("T")
@@ -86,7 +87,7 @@ class TrainingState:
 
         # If exposures are compared, the loss does not need the encoded photo.
         self._encoded = not compares_exposures(config.loss, field)
-        self._largest_truth = largest_truth(scene, config.loss) * field.base_time
+        self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
         self._source: ViewStack | PhotoStream | Sequence[TrainingView] | None = None
         self._scale = CodeScale(torch.empty(0))
         self._widened = False

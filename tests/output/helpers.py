@@ -50,7 +50,7 @@ class AnalyticRun:
     """Stands for a trained run: a sky whose radiance depends on the viewing direction, six decades of it."""
 
     response = GammaResponse()
-    base_time, color_matrix, photo_gains = 0.5, None, None
+    base_time, color_matrix, exposure_compensation = 0.5, None, None
     scene_name = "sky"
     iterations = 7
     path = "runs/sky"

@@ -79,7 +79,7 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
 
 def test_exposures_that_gains_changed_are_marked(tmp_path, monkeypatch):
     assert "<li>exposure<b>" in page(tmp_path)
-    monkeypatch.setattr(AnalyticRun, "photo_gains", object())
+    monkeypatch.setattr(AnalyticRun, "exposure_compensation", object())
     assert "<li>exposure, gains counted in<b>" in page(tmp_path / "gains")
 
 

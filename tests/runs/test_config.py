@@ -73,7 +73,7 @@ def test_every_field_is_documented_and_read(path, item):
     sources = [
         p.read_text().split("    def scaled")[-1]
         for room in ("runs", "training", "model")
-        for p in (PACKAGE / room).glob("*.py")
+        for p in (PACKAGE / room).rglob("*.py")
     ]
     assert any(name in source for source in sources for name in names), f"{path} is never read"
 

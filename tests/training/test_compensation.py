@@ -141,7 +141,7 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
         if step.iteration == 10:
             training.stop()
     run = load_run(tmp_path / "run")
-    decision = next(made for made in run.decisions() if made["name"] == "photo-gains")
+    decision = next(made for made in run.decisions() if made["name"] == "exposure-compensation")
     assert "out of the photos" in decision["choice"] and "stops" in decision["reason"]
     evened = run.normalize_photos(scene)
     assert (run.color_matrix == scene.color_matrix).all()

@@ -120,7 +120,7 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
     for known, told in ((False, 1), (True, 0)):
         plan = make_plan(replace(drifting, exposure_times_known=known), config_of())
-        found = plan.with_decision(Decision("photo-gains", {}, "taken out of the photos", "", told=True))
+        found = plan.with_decision(Decision("exposure-compensation", {}, "taken out of the photos", "", told=True))
         for given, count in ((plan, told), (found, 0)):
             lines = [line for line in given.lines() if "no exposure times" in line and "exposures.json" in line]
             assert len(lines) == count
@@ -245,7 +245,7 @@ def test_values_that_the_scene_contradicts_are_refused_with_both(scene, changes,
 def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):
     config = config_of(schedule__iterations=12, plan__keep=["schedule.iterations"])
     run = train(scene, tmp_path / "run", config, device="cpu")
-    assert [decision["name"] for decision in run.folder.read_decisions()] == [*RULES, "photo-gains"]
+    assert [decision["name"] for decision in run.folder.read_decisions()] == [*RULES, "exposure-compensation"]
     assert run.config == make_plan(scene, config).config
     assert run.summary()["plan"]["brackets"] == "plain scaling"
     # Asking again for the same plan resumes; without one the old plan goes with the old run.

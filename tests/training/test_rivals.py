@@ -14,9 +14,9 @@ from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.runs.config_files import load_config, override_config, preset_names
+from sehdr_warp.training.hdr_truth import largest_hdr_truth
 from sehdr_warp.training.initialization import choose_response, make_field
 from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
-from sehdr_warp.training.targets import largest_truth
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
@@ -88,7 +88,7 @@ def test_photos_of_no_weight_teach_nothing(scene):
 
 @pytest.mark.parametrize("preset", ["truth", "hdr-gs-truth", "paper-truth"])
 def test_a_scene_without_truth_is_refused_by_name_and_field(scene, tmp_path, preset, monkeypatch):
-    for work in ("choose_response", "find_gains", "make_field"):
+    for work in ("choose_response", "estimate_compensation", "make_field"):
         monkeypatch.setattr(f"sehdr_warp.training.train.{work}", lambda *_: pytest.fail("worked for nothing"))
     field = "loss.hdr_truth = true" if preset == "paper-truth" else "loss.hdr_weight = "
     with pytest.raises(InputError, match=f"^toy: no training view has the HDR truth that {field}"):
@@ -118,8 +118,8 @@ def test_the_largest_truth_is_that_of_training_views_where_they_count(scene):
         dataclasses.replace(view, hdr=hdr, mask=mask if view.split == "train" else None)
         for view, hdr in zip(scene.views, bright, strict=True)
     ]
-    assert largest_truth(dataclasses.replace(scene, views=tuple(views)), loss) == pytest.approx(train_max)
-    assert largest_truth(scene, LossConfig()) == 1.0
+    assert largest_hdr_truth(dataclasses.replace(scene, views=tuple(views)), loss) == pytest.approx(train_max)
+    assert largest_hdr_truth(scene, LossConfig()) == 1.0
 
 
 def test_a_learned_tone_mapper_starts_as_hdr_gs_does(scene):
