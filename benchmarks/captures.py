@@ -88,7 +88,7 @@ def compare(
     forget_peaks(torch.device(device))
     run = train(scene, scratch / "run", load_config("default", {"seed": seed}), device=device)
     figures_of_run = {"iterations": run.iterations, "seconds": run.train_seconds, "gaussians": run.gaussian_count}
-    figures_of_run["below_best"] = max(line["psnr_ldr"] for line in run.metrics()) - run.metrics()[-1]["psnr_ldr"]
+    figures_of_run["best"] = max(line["psnr_ldr"] for line in run.metrics())
     add("sehdr-warp", run.response, lambda view: photographed(run, view), **figures_of_run)
     shutil.rmtree(scratch)
     response, normalized = choose_response(scene, load_config("default")), normalization_of(scene)

@@ -307,12 +307,13 @@ def _units_tables(result: dict) -> Iterable[str]:
 
 
 def _captures_tables(result: dict) -> Iterable[str]:
-    table, figures = [], ("psnr", "psnr_fitted", "ssim", "lpips", "seconds", "memory", "gaussians")
+    table, figures = [], ("psnr", "best", "psnr_fitted", "ssim", "lpips", "seconds", "memory", "gaussians")
     for rows in groups(result["rows"], "capture", "method", "iterations").values():
-        means = {name: fmean(row[name] for row in rows) for name in figures}
+        measured = [name for name in figures if all(row.get(name) is not None for row in rows)]
+        means = {name: fmean(row[name] for row in rows) for name in measured}
         spread = stdev(row["psnr"] for row in rows) if len(rows) > 1 else None
-        counts = {"gaussians": round(means["gaussians"]), "seeds": len(rows), "spread": spread}
-        table.append({**rows[0], **means, **counts})
+        means["gaussians"] = round(means["gaussians"])
+        table.append(dict.fromkeys(figures) | {**rows[0], **means, "seeds": len(rows), "spread": spread})
     yield markdown_table(table, COLUMNS["captures"])
 
 
