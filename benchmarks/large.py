@@ -75,7 +75,7 @@ def _train(scene: Scene, config: Config, device: str) -> dict:
             begun = training.seconds
         memory = held_memory(training.device) or 0
     row = {"method": "sehdr-warp", "gaussians": training.run.gaussian_count, "seconds": training.seconds - begun}
-    row["tests"] = [[line["iteration"], line["psnr_ldr"]] for line in training.folder.read_metrics()]
+    row["tests"] = [[line["iteration"], line["psnr_ldr"]] for line in training.run.metrics()]
     row |= {"memory": memory} | _means(lambda view: photographed(training.run, view), scene, device)
     shutil.rmtree(scratch)
     return row

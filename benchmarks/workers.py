@@ -114,7 +114,7 @@ def _time_steps(ranks: Ranks | None, size: Size, device: torch.device, repetitio
         wait(device)
         mean = (time.perf_counter() - started) * 1e3 / (STEPS * repetitions)
         whole = amortized(trainer, step)["amortized_ms"]
-        trainer.settle()  # Raises where the ranks are not alike.
+        trainer.gather()  # Raises an error if the Gaussians of the ranks differ.
     return {"photo_ms": mean / photos, "amortized_ms": whole / photos, "repetitions": STEPS * repetitions}
 
 

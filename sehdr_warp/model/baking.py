@@ -8,6 +8,7 @@ rendered images of the scene (refine).
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -145,7 +146,7 @@ def _in_rec709(native: Colors, matrix: np.ndarray, base_time: float) -> Colors:
 
 def _stored(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
     """Return the Gaussians in the field's own colors, and their conversion to radiance (None if they are exposures)."""
-    tensors = {name: value.cpu().numpy() for name, value in field.gaussians.tensors().items()}
+    tensors: dict[str, Any] = {name: value.cpu().numpy() for name, value in field.gaussians.tensors().items()}
     harmonics = np.concatenate([tensors.pop("harmonics_dc"), tensors.pop("harmonics_rest")], axis=1)
     name = field.color_model.name
     gaussians = GaussianArrays(**tensors, harmonics=harmonics, color_model=name, base_time=field.base_time)

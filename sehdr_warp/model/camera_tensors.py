@@ -42,4 +42,4 @@ class CameraTensors:
             unseen = ~along.any(axis=2, keepdims=True)
             along = np.where(unseen, camera.world_to_camera[2, :3], along)
             directions = torch.tensor(along, dtype=torch.float32, device=device)
-        return CameraTensors(camera.width, camera.height, *tensors, directions)
+        return CameraTensors(camera.width, camera.height, *tensors, directions)  # pyright: ignore[reportCallIssue]

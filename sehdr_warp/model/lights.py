@@ -93,7 +93,7 @@ def find_lights(
     cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
     sums = [_view_sums(field, camera, degree) for camera in cameras]
     pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
-    mean = flux / angles.clamp_min(1e-20)[:, None]
+    mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]
     member = (clipped > CLIPPED) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
     members = member.nonzero()[:, 0]
     if not len(members):

@@ -136,12 +136,12 @@ def render_views(
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
         bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if bracketed else None
         tone_map = look or shared_tone_map(run, [camera for _, camera in views])
-        for index, (name, camera) in enumerate(views, start=1):
-            rendered, confidence = run.render(camera), run.render_confidence(camera)
+        for index, (name, view_camera) in enumerate(views, start=1):
+            rendered, confidence = run.render(view_camera), run.render_confidence(view_camera)
             hdr = as_array(rendered.hdr)
             if confidence is None and index == 1:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            camera_in_file = transform.camera(camera)
+            camera_in_file = transform.camera(view_camera)
             depth = as_array(rendered.depth) * np.float32(transform.scale)
             header = brackets.header(name, exposure, camera_in_file, worldMatrix=describe(transform))
             channels = rgb_channels(from_rec709(hdr, colorspace) * exposure)
@@ -149,7 +149,7 @@ def render_views(
             if confidence is not None:
                 channels["confidence"] = as_array(confidence)
             parts = [Part(channels, header, "rgba" if aovs else "")]
-            parts += data_parts(aovs, ViewData(run, camera, camera_in_file, channels["A"], depth), header)
+            parts += data_parts(aovs, ViewData(run, view_camera, camera_in_file, channels["A"], depth), header)
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
             write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
@@ -93,7 +93,7 @@ def run_export(args: Export) -> None:
         return
     flags = {"cameras": args.cameras, "overwrite": args.overwrite}
     options = {"world": args.world, "edits": args.edits, "merge": args.merge}
-    _export(args.run, args.out, args.file, args.device, **options, **flags)
+    _export(args.run, args.out, args.file, args.device, **options, **flags)  # pyright: ignore[reportArgumentType]
 
 
 def run_convert(args: Convert) -> None:
@@ -119,7 +119,7 @@ def _export(
     world: WorldOptions | None = None,
     edits: EditOptions | None = None,
     merge: tuple[Path, ...] = (),
-    **flags: bool,
+    **flags: Any,
 ) -> None:
     from ..model.exposure import exposure_times
     from ..splats import check_suffix
@@ -131,6 +131,6 @@ def _export(
     run = open_scene(source, device)
     others = [open_scene(path, device) for path in merge]
     time = None if options.exposure is None else exposure_times(run.base_time, options.exposure)[0]
-    frame = {"axes": None} if world is None else vars(world)
-    colors = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
+    frame: dict[str, Any] = {"axes": None} if world is None else vars(world)
+    colors: dict[str, Any] = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
     print(export(run, out, **colors, **frame, edits=splat_edits, merge=others, **flags))

@@ -38,7 +38,7 @@ class Box:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return [N] whether points [N, 3] are inside."""
-        return ((points >= self.low) & (points <= self.high)).all(axis=1)
+        return ((points >= self.low) & (points <= self.high)).all(axis=1)  # pyright: ignore[reportReturnType]
 
 
 @dataclass(frozen=True)

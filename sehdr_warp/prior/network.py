@@ -29,7 +29,7 @@ class LightNetwork(nn.Module):
         self.up = nn.ModuleList(_Block(a + b, b) for a, b in zip(below, reversed(widths), strict=True))
         self.out = nn.Conv2d(widths[0], 6, 1)
         nn.init.zeros_(self.out.weight)
-        nn.init.constant_(self.out.bias, 0.5)
+        nn.init.constant_(self.out.bias, 0.5)  # pyright: ignore[reportArgumentType]
 
     def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean and the deviation of log2 excess over white.

@@ -157,7 +157,7 @@ class _ProgramFunction(torch.autograd.Function):
             if place in gradients:  # The adjoint of a later launch adds to it, and torch's own must stay as it is.
                 gradients[place] += gradient
             else:
-                gradients[place] = kernel_layout(gradient)
+                gradients[place] = kernel_layout(gradient)  # pyright: ignore[reportArgumentType]
         for each in reversed(ctx.launches):
             _launch_adjoint(each, saved, gradients)
         return None, None, *(gradients.get(place) if need else None for place, need in enumerate(needed))
@@ -170,7 +170,7 @@ def _launch_adjoint(forward: _Launch, saved: Sequence[Tensor | None], gradients:
     if all(gradient is None for gradient in by_value):
         return
     pairs = zip(values, by_value, strict=False)
-    shared = any(gradient is not None and len(tensor) != dim for tensor, gradient in pairs)
+    shared = any(gradient is not None and tensor is not None and len(tensor) != dim for tensor, gradient in pairs)
     ranges = single_range(dim) if shared and isinstance(dim, int) else None
     launch(kernel, dim, *values, *(None,) * len(outputs), gradients=by_value, ranges=ranges)
 

@@ -248,7 +248,7 @@ class _Polar:
 
 def _fix_vignette_radial(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
     terms = reader.array("f8", 5)
-    squared = _Polar.of(*reader.take("2d"), image.shape).squared
+    squared = _Polar.of(*reader.take("2d"), image.shape).squared  # pyright: ignore[reportCallIssue]
     image *= np.polynomial.polynomial.polyval(squared, [1.0, *terms]).astype(np.float32)[..., None]
     return image
 
@@ -256,7 +256,7 @@ def _fix_vignette_radial(reader: _Reader, image: np.ndarray, cell: int) -> np.nd
 def _warp_rectilinear(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
     (planes,) = reader.take("I")
     terms = reader.array("f8", 6 * planes).reshape(-1, 6)
-    polar = _Polar.of(*reader.take("2d"), image.shape)
+    polar = _Polar.of(*reader.take("2d"), image.shape)  # pyright: ignore[reportCallIssue]
 
     def moved(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         squared, right, down = polar.squared, polar.right, polar.down
@@ -271,7 +271,7 @@ def _warp_rectilinear(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarr
 def _warp_fisheye(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
     (planes,) = reader.take("I")
     terms = reader.array("f8", 4 * planes).reshape(-1, 4)
-    polar = _Polar.of(*reader.take("2d"), image.shape)
+    polar = _Polar.of(*reader.take("2d"), image.shape)  # pyright: ignore[reportCallIssue]
 
     def moved(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         radius = np.sqrt(polar.squared)

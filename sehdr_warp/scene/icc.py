@@ -8,6 +8,7 @@ import io
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def read_profile(data: bytes) -> IccProfile:
     if len(data) > _MOST_BYTES:
         raise ValueError(f"has {len(data)} bytes")
     try:
-        profile = ImageCms.ImageCmsProfile(io.BytesIO(data)).profile
+        profile: Any = ImageCms.ImageCmsProfile(io.BytesIO(data)).profile
         name = (profile.profile_description or "").strip() or "an unnamed profile"
         colors = profile.xcolor_space.strip()
     except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError):
@@ -66,7 +67,7 @@ def read_profile(data: bytes) -> IccProfile:
         raise ValueError(f"is of {colors}, not RGB")
     try:
         tags = _tags(data)
-        cicp = tuple(tags[b"cicp"][8:10]) if len(tags.get(b"cicp", b"")) >= 12 else None
+        cicp = (tags[b"cicp"][8], tags[b"cicp"][9]) if len(tags.get(b"cicp", b"")) >= 12 else None
         if colors == "GRAY":
             return IccProfile(name, colors, None, (_curve(tags[b"kTRC"]),) * 3, cicp, data)
         if b"A2B0" in tags and cicp is None:
@@ -82,7 +83,7 @@ def read_profile(data: bytes) -> IccProfile:
         raise ValueError("has primaries that span no colors")
     if any(not np.isfinite(curve).all() or np.ptp(curve) <= 0 or curve[-1] <= curve[0] for curve in curves):
         raise ValueError("has a curve that does not rise")
-    return IccProfile(name, colors, matrix, curves, cicp, data)
+    return IccProfile(name, colors, matrix, curves, cicp, data)  # pyright: ignore[reportArgumentType]
 
 
 def converted_to_srgb(pixels: np.ndarray, data: bytes) -> np.ndarray:

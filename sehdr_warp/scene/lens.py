@@ -76,7 +76,7 @@ class Lens:
     def focal(self) -> tuple[float, float]:
         """Focal lengths (fx, fy) in pixels; of a panorama pixels per radian."""
         if self.model == _SPHERE:
-            return (self.width / (2 * np.pi),) * 2
+            return (self.width / (2 * np.pi),) * 2  # pyright: ignore[reportReturnType]
         return (self.params[0], self.params[0]) if self.model in _ONE_FOCAL else (self.params[0], self.params[1])
 
     @property

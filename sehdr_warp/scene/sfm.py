@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -295,7 +296,7 @@ def _map(database: Path, work: Path, count: int, source: Path):
         output = work / f"model{int(patient)}"
         output.mkdir()
         with quiet_colmap():
-            place = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
+            place: Any = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
             models = run_interruptibly(partial(place, next_image_callback=next_image))
         candidates = [*([] if best is None else [best]), *models.values()]
         best = max(candidates, key=lambda model: model.num_reg_images(), default=None)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -165,9 +166,8 @@ def _map_rigs(database: Path, work: Path, count: int, source: Path):
         output = work / f"model{int(patient)}"
         output.mkdir()
         with quiet_colmap():
-            models = run_interruptibly(
-                partial(pycolmap.incremental_mapping, database, work / "images", output, options)
-            )
+            place: Any = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
+            models = run_interruptibly(place)
         candidates = [*([] if best is None else [best]), *models.values()]
         best = max(candidates, key=lambda model: model.num_reg_frames(), default=None)
         if best is not None and best.num_reg_frames() == count:

@@ -153,6 +153,7 @@ def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
     """
     import av
 
+    errors: Any = av.error  # pyright: ignore[reportAttributeAccessIssue]
     number = -1
     with _container(clip.path) as container:
         stream = _stream(container, clip.path)
@@ -163,7 +164,7 @@ def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
                 frames = packet.decode()
             except StopIteration:
                 return
-            except (av.error.EOFError, av.error.InvalidDataError) as error:
+            except (errors.EOFError, errors.InvalidDataError) as error:
                 if isinstance(error, EOFError) or number < 0:
                     return
                 _log.warning("%s: is damaged or ends early behind frame %d", clip.path, number + 1)
@@ -223,7 +224,7 @@ def _container(path: Path) -> Any:
         for stream in container.streams.video:
             stream.thread_type = "AUTO"
         return container
-    except (OSError, av.error.FFmpegError, ValueError) as error:
+    except (OSError, av.error.FFmpegError, ValueError) as error:  # pyright: ignore[reportAttributeAccessIssue]
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(path, f"cannot be read as video ({reason:.80})", _REMEDY) from None
 

@@ -104,7 +104,7 @@ def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
     folder = user_cache("sehdr-warp") if stated is None else Path(stated)
     if folder is None or not usable(folder):
         if cache is not None:
-            raise InputError(folder, "the frames cannot be kept there", "name a folder that can be written")
+            raise InputError(cache, "the frames cannot be kept there", "name a folder that can be written")
         folder = _temporary()
     place = folder / named
     if place.is_dir() and is_sealed(place):

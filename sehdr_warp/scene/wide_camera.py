@@ -127,7 +127,7 @@ def faces_of(view: View, size: int | None = None) -> list[View]:
             continue
         wrap = camera.projection == "equirectangular"
         stored = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="wrap") if wrap else image
-        rows, columns = np.where(shown[..., None], places, 0).transpose(2, 0, 1)
+        rows, columns = np.where(shown[..., None], places, 0).transpose(2, 0, 1)  # pyright: ignore[reportIndexIssue]
         at = np.stack([rows, columns + wrap])
         codes = np.stack([map_coordinates(stored[..., c], at, order=1, mode="nearest") for c in range(3)], axis=2)
         counted = shown.astype(np.float32)

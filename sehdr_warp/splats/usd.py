@@ -120,7 +120,7 @@ def read_usd(path: Path) -> GaussianArrays:
         harmonics=harmonics,
         color_model="linear",
         base_time=float(stored["base_time"]),
-        world_matrix=None if np.array_equal(matrix, np.eye(4)) else matrix,
+        world_matrix=None if np.array_equal(matrix, np.eye(4)) else matrix,  # pyright: ignore[reportArgumentType]
     )
 
 

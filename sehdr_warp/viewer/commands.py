@@ -54,7 +54,7 @@ def run_view(args: View) -> None:
     def photos(index: int) -> dict:
         if not isinstance(watch.shown[index].run, Run):
             raise InputError(args.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
-        return {view.name: view for view in load_run_photos(watch.shown[index], args.data).views}
+        return {view.name: view for view in load_run_photos(watch.shown[index].run, args.data).views}
 
     watch.start()
     with Server(Viewer(watch.shown, photos), args.host, args.port, args.origin) as server:

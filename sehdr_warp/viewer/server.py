@@ -270,7 +270,7 @@ class Server(ThreadingHTTPServer):
 
     def process_request(self, request, client_address) -> None:
         """Start a thread for a connection, unless there are too many."""
-        if not self.connections.add(request):
+        if not self.connections.add(request):  # pyright: ignore[reportArgumentType]
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
@@ -280,7 +280,7 @@ class Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.connections.remove(request)
+            self.connections.remove(request)  # pyright: ignore[reportArgumentType]
 
     def server_close(self) -> None:
         """Close all connections and end the work for them."""
