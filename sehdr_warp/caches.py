@@ -1,4 +1,4 @@
-"""Where a program keeps what it can make again."""
+"""Folders for what the program can make again."""
 
 import os
 import tempfile
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def usable(folder: Path) -> bool:
-    """Whether files can be made in a folder, which is made where it is missing."""
+    """Return whether files can be made in a folder, which is made if it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -16,6 +16,6 @@ def usable(folder: Path) -> bool:
 
 
 def user_cache(name: str) -> Path | None:
-    """The user's folder for what a program can make again; None where there is no home."""
+    """Return the user's folder for what the program can make again; None if there is no home."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return None if home.startswith("~") else Path(home) / name

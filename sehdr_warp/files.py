@@ -1,8 +1,8 @@
-"""Files: written whole or not at all, and read within bounds, under names that stay in their folder.
+"""Write files whole or not at all, and read them within bounds, under names that stay in their folder.
 
-What is written lies beside its place, is flushed to the disk, then renamed; what a killed process left is removed when
-something is written to the same folder again. What is written stands with its hash in the list LIST of its folder: only
-what is as listed there is ever replaced.
+A file is written beside its place, flushed to the disk, then renamed. Leftovers of a killed process are removed when
+something is written to the same folder again. The list of the folder (see own_files.py) gets its hash, because only a
+file that is as listed is ever replaced.
 """
 
 import errno
@@ -35,16 +35,20 @@ _MAX_LINE = 16 << 20
 
 @contextmanager
 def atomic_path(path: Path | str, overwrite: bool = False, *, ours: bool = False) -> Iterator[Path]:
-    """Yields a temporary path in the folder of `path`; what is written there becomes `path` when the block ends.
+    """Yield a temporary path in the folder of `path`; what is written there becomes `path` when the block ends.
 
     The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are made.
     If the block raises, the temporary file and the folders made are removed, and an existing `path` stays as it was.
 
-    overwrite: a file that this program wrote may be replaced. ours: `path` is a name of the program's own in a folder
-    of its own: whatever file is there is replaced, and the list is not kept.
+    Args:
+        path: The file.
+        overwrite: A file that this program wrote may be replaced.
+        ours: `path` is a name of the program's own in a folder of its own: any file there is replaced, and the list is
+            not kept.
 
-    Raises InputError where `path` exists (unless it may be replaced, and never for a folder, a link or a device),
-    SehdrError where the disk is full or the folder is not writable.
+    Raises:
+        InputError: If `path` exists (unless it may be replaced), or is a folder, a link or a device.
+        SehdrError: If the disk is full or the folder is not writable.
     """
     with _written_beside(Path(path), overwrite, ours, folder=False) as temporary:
         yield temporary
@@ -52,8 +56,11 @@ def atomic_path(path: Path | str, overwrite: bool = False, *, ours: bool = False
 
 @contextmanager
 def atomic_folder(path: Path | str, overwrite: bool = False, *, ours: bool = False) -> Iterator[Path]:
-    """As atomic_path, of a folder. An empty one at `path` counts as absent; with overwrite one that holds nothing but
-    what this program wrote is set aside, and removed only once the new one stands in its place."""
+    """Yield a temporary folder that becomes `path` when the block ends; arguments and errors as in atomic_path.
+
+    An empty folder at `path` counts as absent. With overwrite, one that holds only files of this program is set aside,
+    and removed once the new one is in its place.
+    """
     with _written_beside(Path(path), overwrite, ours, folder=True) as temporary:
         temporary.mkdir()
         yield temporary
@@ -65,7 +72,7 @@ def _written_beside(path: Path, overwrite: bool, ours: bool, folder: bool) -> It
     ours = ours or any(_NAMES.fullmatch(part.name) for part in (path, *path.absolute().parents))
     check_absent(path, overwrite, folder=folder, ours=ours)
     with writing(path):
-        made, temporary = make_parents(path), _beside(path)
+        new_parents, temporary = make_parents(path), _beside(path)
         try:
             yield temporary
             if folder and not ours:
@@ -82,15 +89,17 @@ def _written_beside(path: Path, overwrite: bool, ours: bool, folder: bool) -> It
                 error.args = tuple(str(item).replace(str(temporary), str(path)) for item in error.args)
             remove(temporary)
             with suppress(OSError):  # Someone else has put a file there in the meantime.
-                for parent in made:
+                for parent in new_parents:
                     parent.rmdir()
             raise
 
 
 def write_json(path: Path | str, value: Any, overwrite: bool = False, *, ours: bool = False) -> None:
-    """Writes plain values as indented UTF-8 JSON, atomically; NaN and infinity become null, as JSON has neither.
+    """Write plain values as indented UTF-8 JSON, atomically; NaN and infinity become null, because JSON has neither.
 
-    Raises InputError and SehdrError as atomic_path does, TypeError for a value that is not plain.
+    Raises:
+        InputError, SehdrError: As atomic_path does.
+        TypeError: For a value that is not plain.
     """
     text = json.dumps(_finite(value), indent=2, ensure_ascii=False) + "\n"
     with atomic_path(path, overwrite, ours=ours) as temporary:
@@ -102,6 +111,7 @@ class UnreadableError(InputError):
     """A file that the system does not let this user read; its content is not at fault."""
 
     def __init__(self, path: Path | str, error: OSError):
+        """Set the message from the system's error."""
         super().__init__(path, f"cannot be read ({error.strerror})", "check its rights")
 
 
@@ -117,7 +127,7 @@ def refuse_links(path: Path, folder: Path) -> None:
 
 
 def plain_size(path: Path) -> int:
-    """Bytes of a file; raises InputError for a folder, and for pipes and devices, which may never end, and OSError."""
+    """Return the bytes of a file; raise InputError for a folder, a pipe or a device, which may never end."""
     size = path.stat().st_size
     if not path.is_file():
         raise InputError(path, "is a folder, a pipe or a device, not a file", "name a file")
@@ -125,7 +135,7 @@ def plain_size(path: Path) -> int:
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
-    """The whole file; raises InputError where it is missing, unreadable, empty or larger than `limit` bytes."""
+    """Return the whole file; raise InputError if it is missing, unreadable, empty or larger than `limit` bytes."""
     try:
         if (size := plain_size(path)) > limit:
             problem = f"{size} bytes is more than the limit of {limit}"
@@ -197,7 +207,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict:
 
 
 def contained(folder: Path, name: str, source: Path) -> Path:
-    """The file that `name` (read from `source`) means inside `folder`.
+    """Return the file that `name` (read from `source`) means inside `folder`.
 
     Links inside the folder that lead out of it are refused like `..`: a downloaded data set must not be able to read
     any other file of the user's. Raises InputError for an absolute name, a name with `..`, or one that leaves `folder`.
@@ -219,9 +229,13 @@ def contained(folder: Path, name: str, source: Path) -> Path:
 
 
 def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False, ours: bool = False) -> None:
-    """Raises InputError where a file (or a folder that is not empty) at `path` would have to be replaced without leave
-    or is not this program's, or something else is in the way, and SehdrError where it cannot be written: for before the
-    work."""
+    """Check before the work that a file or folder can be written; arguments as in atomic_path.
+
+    Raises:
+        InputError: If a file, or a folder that is not empty, would have to be replaced without leave or is not this
+            program's, or if something else is in the way.
+        SehdrError: If it cannot be written.
+    """
     path = Path(path)
     _check_place(path)
     if not (path.exists() or path.is_symlink()):
@@ -248,7 +262,7 @@ def require_text(name: Path | str) -> None:
 
 
 def _check_place(path: Path) -> None:
-    """Raises InputError where what is to hold `path` is a file, SehdrError where there is no right to write there."""
+    """Raise InputError if the parent of `path` is a file, SehdrError if nothing may be written there."""
     require_text(path)
     parent = next(parent for parent in path.absolute().parents if parent.exists())
     if not parent.is_dir():
@@ -259,7 +273,7 @@ def _check_place(path: Path) -> None:
 
 @contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Turns the operating system's refusals to write `path` (a full disk, no rights) into a SehdrError of one line."""
+    """Turn the system's refusals to write `path` (a full disk, no rights) into a SehdrError of one line."""
     try:
         yield
     except OSError as error:
@@ -273,20 +287,20 @@ _NAMES = re.compile(r"\.(.*)\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.(tmp|old)(\.[^.]*
 
 
 def _beside(path: Path, kind: str = "tmp") -> Path:
-    """A new hidden name beside `path` that says whose it is, and whether it is written (`tmp`) or set aside (`old`)."""
+    """Return a new hidden name beside `path` with its process, and whether it is written (tmp) or set aside (old)."""
     owner = f"{_process_space()}-{os.getpid()}-{secrets.token_hex(4)}"
     return path.with_name(f".{_stem(path)}.{owner}.{kind}{path.suffix[:20]}")
 
 
 def _stem(path: Path) -> str:
-    """The stem of a path, or what stands for a long one: names beside it keep within file systems' 255 bytes."""
+    """Return the stem of a path, shortened if it is long: a name has at most 255 bytes on most file systems."""
     digest = hashlib.blake2s(os.fsencode(path.name), digest_size=4).hexdigest()
     return path.stem if len(path.stem) <= 40 else f"{path.stem[:31]}~{digest}"
 
 
 @functools.cache
 def _process_space() -> str:
-    """Eight digits that tell the process numbers of this machine or container from another's on the same disk."""
+    """Return eight digits that distinguish the process numbers of this machine or container on a shared disk."""
     try:
         space = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -295,29 +309,33 @@ def _process_space() -> str:
 
 
 def remove_stale(path: Path) -> None:
-    """Removes what killed processes of this machine left in the folder of `path`. A folder that was set aside to be
-    replaced by `path` goes back where nothing stands in its place; what others may still be writing is left alone."""
+    """Remove leftovers of this machine's killed processes in the folder of `path`.
+
+    A folder that was set aside to be replaced by `path` goes back if nothing is in its place. Names of processes that
+    still run, and of other machines, stay.
+    """
     try:
-        found = [match for name in os.listdir(path.parent) if (match := _NAMES.fullmatch(name))]
+        names = [match for name in os.listdir(path.parent) if (match := _NAMES.fullmatch(name))]
     except OSError:  # No such folder yet, or not ours to read.
         return
-    for match in (match for match in found if match[2] == _process_space() and not _runs(int(match[3]))):
-        left, ours = path.parent / match[0], (match[1], match[5] or "") == (_stem(path), path.suffix[:20])
+    for match in (match for match in names if match[2] == _process_space() and not _runs(int(match[3]))):
+        leftover, ours = path.parent / match[0], (match[1], match[5] or "") == (_stem(path), path.suffix[:20])
         if match[4] == "tmp" or (ours and path.exists()):
-            remove(left)
+            remove(leftover)
         elif ours:
             with suppress(OSError):  # Another process was as quick.
-                os.rename(left, path)
+                os.rename(leftover, path)
 
 
 def remove(path: Path) -> None:
+    """Delete a file or folder; what cannot be deleted stays."""
     shutil.rmtree(path, ignore_errors=True)
     with suppress(OSError):
         path.unlink(missing_ok=True)
 
 
 def _runs(process: int) -> bool:
-    """Whether a process of this number runs here; yes where that cannot be told."""
+    """Return whether a process of this number runs here, and True if that is unknown."""
     with suppress(PermissionError, OverflowError):  # Someone else's process, or no number of one.
         try:
             if os.name == "posix":  # Elsewhere os.kill ends the process.
@@ -328,7 +346,7 @@ def _runs(process: int) -> bool:
 
 
 def make_parents(path: Path) -> list[Path]:
-    """Makes the missing folders above a path, and says which, the deepest first."""
+    """Make the missing folders above a path; return them, the deepest first."""
     missing = list(takewhile(lambda parent: not parent.exists(), path.absolute().parents))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -340,7 +358,7 @@ def make_parents(path: Path) -> list[Path]:
 
 
 def _put(temporary: Path, path: Path) -> None:
-    """Gives what is written its name; a folder that stands there is set aside until then, and only then removed."""
+    """Rename what is written to its place; a folder there is set aside first, and removed afterwards."""
     old = _beside(path, "old") if path.is_dir() else None
     if old:
         os.rename(path, old)

@@ -1,5 +1,7 @@
-"""What the process of a command line meets: signals that end it, and standard streams that are closed, full or read by
-nobody. What a program says of its work never ends the work; what is asked of it, on standard output, fails in one line.
+"""The process of a command line: its signals, its standard streams, its locale and working directory.
+
+A failed write to standard error is ignored, because messages about the work must not end the work. A failed write to
+standard output, which was asked for, is an error of one line.
 """
 
 import gc
@@ -20,10 +22,10 @@ _collects_late = False
 
 
 class _Stream:
-    """A standard stream; once it fails it leads nowhere. asked: that it failed is an error, else it is passed over."""
+    """A standard stream that leads nowhere once it has failed. required: a failure is an error, else it is ignored."""
 
-    def __init__(self, stream: TextIO, number: int, asked: bool):
-        self._stream, self._number, self._asked = stream, number, asked
+    def __init__(self, stream: TextIO, number: int, required: bool):
+        self._stream, self._number, self._required = stream, number, required
 
     def write(self, text: str) -> int:
         self._attempt(self._stream.write, text)
@@ -37,9 +39,9 @@ class _Stream:
             do(*arguments)
         except (OSError, ValueError) as error:
             _lead_nowhere(self._number, os.O_WRONLY)
-            if self._asked and isinstance(error, BrokenPipeError):
+            if self._required and isinstance(error, BrokenPipeError):
                 raise
-            if self._asked:
+            if self._required:
                 reason = getattr(error, "strerror", None) or error
                 raise SehdrError(f"standard output cannot be written ({reason}); send it elsewhere") from None
 
@@ -48,7 +50,7 @@ class _Stream:
 
 
 def prepare() -> None:
-    """Makes signals and standard streams of this process what the head of this file says."""
+    """Install the signal handlers, and make the standard streams safe."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -59,7 +61,7 @@ def prepare() -> None:
     for number, stream in ((1, sys.stdout), (2, sys.stderr)):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-        setattr(sys, ("stdout", "stderr")[number - 1], _Stream(stream, number, asked=number == 1))
+        setattr(sys, ("stdout", "stderr")[number - 1], _Stream(stream, number, required=number == 1))
     collect_late()
     os.environ["MPLBACKEND"] = "agg"  # Pictures go to files, whatever a shell was set up for.
     for each, handler in (("SIGINT", _interrupt), ("SIGTERM", _end), ("SIGHUP", _end)):
@@ -67,8 +69,8 @@ def prepare() -> None:
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # As nohup asks.
             signal.signal(number, handler)
     hook, thread_hook = sys.unraisablehook, threading.excepthook
-    sys.unraisablehook = lambda told: None if interrupted() else hook(told)
-    threading.excepthook = lambda told: None if interrupted() else thread_hook(told)
+    sys.unraisablehook = lambda event: None if interrupted() else hook(event)
+    threading.excepthook = lambda event: None if interrupted() else thread_hook(event)
 
 
 def use_utf8() -> None:
@@ -90,16 +92,20 @@ def check_working_directory() -> None:
 
 
 def calm_threads() -> None:
-    """Has OpenMP's threads, torch's and ours, wait awake for no longer than from one launch to the next. By themselves
-    they wait so long that a training on a processor shared with other programs takes most of its time for it. Before
-    torch is loaded."""
+    """Limit how long OpenMP's threads, torch's and ours, spin between launches; call it before torch is loaded.
+
+    By default they spin so long that on a processor shared with other programs most of a training's time is spent so.
+    """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 
 def collect_late() -> None:
-    """Garbage is looked for only once libraries are loaded, and not in them: they leave next to none, and to look makes
-    a quarter of the time that they take. For programs of our own, once in a process: another's garbage is its own."""
+    """Postpone garbage collection until libraries are loaded, and exclude their objects from it.
+
+    Libraries leave next to no garbage while they load, and looking for it takes a quarter of the time. Only for
+    programs of our own, and once in a process.
+    """
     global _collects_late
     if _collects_late:
         return
@@ -115,7 +121,7 @@ def collect_late() -> None:
 
 
 def interrupted() -> bool:
-    """Whether Ctrl-C was pressed a moment ago: whatever is raised now may be its doing."""
+    """Return whether Ctrl-C was pressed a moment ago: whatever is raised now may be its effect."""
     return time.monotonic() - _interrupted < _SOON
 
 

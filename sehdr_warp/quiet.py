@@ -1,4 +1,4 @@
-"""Libraries that print past Python, kept silent where an exception or nothing at all says it better."""
+"""Silence libraries that print past Python, if an exception says it better or nothing needs to be said."""
 
 import atexit
 import ctypes
@@ -15,14 +15,14 @@ _silenced: dict[int, tuple[int, int | None]] = {}
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
-    """Whatever is written to file descriptor 2 meanwhile is lost; exceptions pass."""
+    """Discard what is written to file descriptor 2 meanwhile; exceptions pass."""
     with _silent(2):
         yield
 
 
 @contextmanager
 def silent_output() -> Iterator[None]:
-    """As silent_stderr, of descriptor 1 as well, and of what C's streams hold back until the end of the process."""
+    """Discard what is written to descriptors 1 and 2 meanwhile, and what C's streams hold back until the end."""
     with _silent(1), _silent(2):
         try:
             yield
@@ -34,27 +34,29 @@ def silent_output() -> Iterator[None]:
 @contextmanager
 def _silent(number: int) -> Iterator[None]:
     with _changing:
-        users, kept = _silenced.get(number, (0, None))
+        users, original = _silenced.get(number, (0, None))
         if not users:
             with suppress(OSError):  # The program runs without it: nothing to silence.
-                kept = os.dup(number)
+                original = os.dup(number)
                 with open(os.devnull, "wb") as nothing:
                     os.dup2(nothing.fileno(), number)
-        _silenced[number] = users + 1, kept
+        _silenced[number] = users + 1, original
     try:
         yield
     finally:
         with _changing:
-            users, kept = _silenced[number]
-            _silenced[number] = users - 1, kept
-            if users == 1 and kept is not None:
-                os.dup2(kept, number)
-                os.close(kept)
+            users, original = _silenced[number]
+            _silenced[number] = users - 1, original
+            if users == 1 and original is not None:
+                os.dup2(original, number)
+                os.close(original)
 
 
 def silence_exit() -> None:
-    """From the interpreter's end on nothing reaches file descriptor 2, where OpenImageIO is loaded: colour-science
-    loads it if it is installed, and it lists, when Python has gone, what Python still held."""
+    """Discard what is written to file descriptor 2 after the interpreter's end, if OpenImageIO is loaded then.
+
+    colour-science loads it if it is installed, and it lists what Python still held.
+    """
     atexit.unregister(_silence_if_loaded)
     atexit.register(_silence_if_loaded, "OpenImageIO")
 

@@ -36,11 +36,11 @@ def test_what_is_said_of_the_work_never_ends_it():
             raise OSError(28, "No space left on device")
 
     read, written = os.pipe()
-    stream = _Stream(Full(), written, asked=False)
+    stream = _Stream(Full(), written, required=False)
     assert stream.write("loss 0.1") == 8
     os.write(written, b"to nowhere")
     with pytest.raises(SehdrError, match="standard output cannot be written"):
-        _Stream(Full(), written, asked=True).write("{}")
+        _Stream(Full(), written, required=True).write("{}")
     os.close(written)
     assert os.read(read, 99) == b""
     os.close(read)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..apart import mat_arrays, read_apart
 from ..errors import InputError, SehdrError, nearest
 from ..files import read_json, read_text
+from ..sandbox import mat_arrays, read_sandboxed
 from .curve import Response
 from .table import ChannelResponse, TabulatedResponse
 
@@ -108,7 +108,7 @@ def _select(path: Path, curves: list[Response], selector: str | None) -> Respons
 
 
 def _dorf_mat(path: Path) -> list[Response]:
-    stored = read_apart(mat_arrays, path, "DoRF's B and I", "give 201_CRF_data.mat")
+    stored = read_sandboxed(mat_arrays, path, "DoRF's B and I", "give 201_CRF_data.mat")
     values, exposures = stored["B"], stored["I"]
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")

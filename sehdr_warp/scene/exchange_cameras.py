@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..apart import read_apart
 from ..errors import InputError
 from ..files import read_text
+from ..sandbox import read_sandboxed
 from ..splats.usd import open_stage, pxr
 from .camera import Camera
 from .read_transforms import pose_from_opengl
@@ -52,7 +52,7 @@ def read_exchange_cameras(path: Path) -> ExchangeCameras:
 
 def _read_usd(path: Path) -> ExchangeCameras:
     pxr("Usd")
-    stored = read_apart(usd_camera_arrays, path, "USD", "export it again")
+    stored = read_sandboxed(usd_camera_arrays, path, "USD", "export it again")
     cameras = []
     for name, lens, matrix in zip(stored["names"].tolist(), stored["lenses"], stored["matrices"], strict=True):
         try:
@@ -87,7 +87,7 @@ def usd_camera_arrays(path: Path) -> dict[str, Any]:
     stems = [prim.GetName() for prim in prims]
     names, lenses, matrices = [], [], []
     for prim, stem in zip(prims, stems, strict=True):
-        if stems.count(stem) > 1:  # One of several of this name: the whole path tells them apart.
+        if stems.count(stem) > 1:  # One of several of this name: the whole path tells them sandbox.
             stem = str(prim.GetPath()).strip("/").replace("/", "_")
         camera, times = UsdGeom.Camera(prim), _sample_times(stage, prim)
         size = [(prim.GetAttribute(name).Get() if prim.HasAttribute(name) else 0) or 0 for name in USD_SIZE]

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..apart import read_apart
 from ..errors import InputError, SehdrError
 from ..files import atomic_path
+from ..sandbox import read_sandboxed
 from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_matrix
 
 COLOR_SPACE = "lin_rec709_scene"
@@ -35,7 +35,7 @@ def pxr(module: str) -> Any:
 def open_stage(path: Path) -> Any:
     """Open a stage whose files all lie in the folder of `path`.
 
-    Call it only from functions that read_apart calls: a damaged file can make OpenUSD fill any memory.
+    Call it only from functions that read_sandboxed calls: a damaged file can make OpenUSD fill any memory.
     """
     stage = pxr("Usd").Stage.Open(str(path))
     folder = path.resolve().parent
@@ -87,7 +87,7 @@ def write_usd(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 def read_usd(path: Path) -> GaussianArrays:
     """Read the one ParticleField3DGaussianSplat of a stage, in world coordinates."""
     pxr("Usd")
-    stored = read_apart(usd_arrays, path, "USD", "export it again")
+    stored = read_sandboxed(usd_arrays, path, "USD", "export it again")
     if stored["count"] != 1:
         problem = f"has {stored['count']} prims of ParticleField3DGaussianSplat, not one"
         raise InputError(path, problem, "export Gaussians by OpenUSD's schema")

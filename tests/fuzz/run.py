@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from sehdr_warp import apart
+from sehdr_warp import sandbox
 
 from .mutate import mutate
 from .readers import READERS, Workspace
@@ -31,8 +31,8 @@ class TooSlow(BaseException):
     """Raised by the timer within a reader; no reader's `except Exception` may swallow it."""
 
 
-def forked(words, seconds: float) -> tuple[int, bytes, bytes]:
-    """As apart.start, which takes half a second to load what this process has loaded."""
+def forked(words, seconds: float) -> sandbox.Result:
+    """As sandbox.start, which takes half a second to load what this process has loaded."""
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as told:
         child = os.fork()
         if child == 0:
@@ -40,12 +40,12 @@ def forked(words, seconds: float) -> tuple[int, bytes, bytes]:
             try:
                 os.dup2(out.fileno(), 1), os.dup2(told.fileno(), 2)
                 signal.alarm(int(seconds) + 1)
-                code = apart.main(*words)
+                code = sandbox.main(*words)
             finally:
                 os._exit(code)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         out.seek(0), told.seek(0)
-        return code, out.read(), told.read()
+        return sandbox.Result(code, out.read(), told.read())
 
 
 def seed_of(name: str, seed: int, index: int) -> int:
@@ -111,7 +111,7 @@ def _child(pipe, name: str, folder: Path, options, first: int, inputs: int) -> N
     torch.set_num_threads(1)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + (options.memory << 20),) * 2)
-    apart.start = forked
+    sandbox.start = forked
     for message in fuzz(name, folder, options.seed, first, inputs - first, options.seconds):
         pipe.send(message)
 

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from sehdr_warp import apart
+from sehdr_warp import sandbox
 from sehdr_warp.errors import InputError
 
 from .mutate import mutate
@@ -14,7 +14,7 @@ from .run import forked, fuzz, make_input, share, try_input
 
 @pytest.fixture(autouse=True)
 def quick_children(monkeypatch):
-    monkeypatch.setattr(apart, "start", forked)
+    monkeypatch.setattr(sandbox, "start", forked)
 
 
 @pytest.mark.parametrize("name", list(READERS))

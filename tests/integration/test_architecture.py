@@ -13,12 +13,12 @@ PACKAGE = ROOT / "sehdr_warp"
 
 # What each room may import of the others: training -> runs -> model -> response -> rasterizer -> kernels, and below
 # them all what any room may use.
-ANY = {"errors", "quiet", "arguments", "files", "own_files", "console", "apart", "parallel", "limits", "caches"}
+ANY = {"errors", "quiet", "arguments", "files", "own_files", "console", "sandbox", "parallel", "limits", "caches"}
 ALLOWED = {
     "kernels": set(),
     "errors": set(),
     "quiet": set(),
-    "apart": {"errors"},
+    "sandbox": {"errors"},
     "parallel": {"limits"},
     "limits": set(),
     "caches": set(),

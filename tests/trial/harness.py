@@ -34,6 +34,8 @@ COMMANDS = {
     "envmap": "envmap run --out made/light.exr --size 32 --device cpu --overwrite",
     "eval": "eval run --json made/figures.json --device cpu --overwrite",
     "synth": "synth truth --out set --overwrite",
+    "film": "render run --video made/film.mp4 --cameras all --device cpu --overwrite",
+    "lights": "lights run --out made/lights.json --device cpu --overwrite",
 }
 VIEW = ["view", "run", "--port", "0", "--device", "cpu"]
 COMMANDS = {name: line.split() for name, line in COMMANDS.items()}

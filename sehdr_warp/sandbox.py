@@ -1,5 +1,8 @@
-"""Other people's readers of files, which believe the lengths that they find: a damaged file ends the process, takes
-minutes or fills the memory. They run in a process of their own, with bounds, and give plain arrays."""
+"""A sandbox for readers of libraries: a process of its own with bounds on memory and time.
+
+Such readers believe the lengths that a file states, so a damaged file would end the process, take minutes or fill the
+memory. A sandboxed reader returns plain arrays.
+"""
 
 import io
 import os
@@ -9,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,10 +24,17 @@ _SECONDS, _BYTES_PER_SECOND = 25, 10 << 20
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"), "1")
 
 
-def read_apart(read: Callable[[Path], dict[str, np.ndarray]], path: Path, kind: str, remedy: str) -> dict:
-    """What `read`, a function of a module that loads quickly, makes of a file.
+def read_sandboxed(read: Callable[[Path], dict[str, np.ndarray]], path: Path, kind: str, remedy: str) -> dict:
+    """Return the arrays that a reader makes of a file.
 
-    Raises InputError where the file is missing, and, as "cannot be read as `kind`", for whatever ends the reader.
+    Args:
+        read: The reader, a function of a module that loads quickly.
+        path: The file.
+        kind: What it is to be, for messages.
+        remedy: What to do if it cannot be read.
+
+    Raises:
+        InputError: If the file is missing, or whatever ends the reader.
     """
     if not path.is_file():
         raise InputError(path, "file not found", "check the name")
@@ -31,31 +42,39 @@ def read_apart(read: Callable[[Path], dict[str, np.ndarray]], path: Path, kind: 
     words = (read.__module__, read.__name__, str(path), str(_MEMORY + _MEMORY_PER_BYTE * size))
     seconds = _SECONDS + size / _BYTES_PER_SECOND
     try:
-        code, out, told = start(words, seconds)
+        result = start(words, seconds)
     except OSError as error:
-        code, out, told = 1, b"", str(error).encode()
+        result = Result(1, b"", str(error).encode())
     except subprocess.TimeoutExpired:
-        code, out, told = 1, b"", f"not read after {seconds:.0f} s".encode()
-    if code:
-        reason = told.decode(errors="replace").strip().splitlines()[-1:] or ["its reader ended early"]
-        raise InputError(path, f"cannot be read as {kind} ({reason[0]:.160})", remedy)
-    with np.load(io.BytesIO(out)) as stored:
-        return dict(stored)
+        result = Result(1, b"", f"not read after {seconds:.0f} s".encode())
+    if result.code:
+        lines = result.err.decode(errors="replace").strip().splitlines() or ["its reader ended early"]
+        raise InputError(path, f"cannot be read as {kind} ({lines[-1]:.160})", remedy)
+    with np.load(io.BytesIO(result.out)) as arrays:
+        return dict(arrays)
 
 
-def start(words: Sequence[str], seconds: float) -> tuple[int, bytes, bytes]:
-    """Code, standard output and error of main(*words) in a process; subprocess.TimeoutExpired after so long."""
+class Result(NamedTuple):
+    """How a process ended: its exit code, standard output and standard error."""
+
+    code: int
+    out: bytes
+    err: bytes
+
+
+def start(words: Sequence[str], seconds: float) -> Result:
+    """Run main(*words) in a process; raise subprocess.TimeoutExpired if it takes longer than `seconds`."""
     # The modules of this process, and none that lie where it was started.
     environment = {**os.environ, **_ONE_THREAD, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-P", "-m", __name__, *words]
     done = subprocess.run(
         command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds, env=environment, check=False
     )
-    return done.returncode, done.stdout, done.stderr
+    return Result(done.returncode, done.stdout, done.stderr)
 
 
 def main(module: str, name: str, path: str, memory: str) -> int:
-    """Writes the arrays to standard output; returns the code to exit with."""
+    """Write the arrays of a reader to standard output; return the exit code."""
     try:
         read = getattr(import_module(module), name)
         with suppress(ImportError, OSError, ValueError):
@@ -75,7 +94,7 @@ def main(module: str, name: str, path: str, memory: str) -> int:
 
 
 def mat_arrays(path: Path) -> dict[str, np.ndarray]:
-    """B and I of a MATLAB file."""
+    """Return B and I of a MATLAB file."""
     from scipy.io import loadmat
 
     stored = loadmat(path, variable_names=["B", "I"])

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from sehdr_warp import apart
+from sehdr_warp import sandbox
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians
 
@@ -26,12 +26,12 @@ def test_bounds(tmp_path, monkeypatch):
     (tmp_path / "a").write_bytes(b"abc")
     (tmp_path / "numpy.py").write_text("raise SystemExit('a module of the folder was run')")
     monkeypatch.chdir(tmp_path)
-    stored = apart.read_apart(given, tmp_path / "a", "x", "y")
+    stored = sandbox.read_sandboxed(given, tmp_path / "a", "x", "y")
     assert bytes(stored["read"]) == b"abc" and str(stored["word"]) == "é"
-    monkeypatch.setattr(apart, "_SECONDS", 3)
-    for read, told in ((fills_memory, "a: cannot be read as x .*allocate"), (never_ends, "not read after 3 s")):
+    monkeypatch.setattr(sandbox, "_SECONDS", 12)
+    for read, told in ((fills_memory, "a: cannot be read as x .*allocate"), (never_ends, "not read after 12 s")):
         with pytest.raises(InputError, match=told):
-            apart.read_apart(read, tmp_path / "a", "x", "y")
+            sandbox.read_sandboxed(read, tmp_path / "a", "x", "y")
 
 
 def test_a_stage_leads_to_no_other_folder(tmp_path):
