@@ -5,8 +5,8 @@ The maths is blend_cpu's; what differs is who does what. The adjoint is in blend
 Most intersections of a 16 x 16 tile miss an 8 x 4 corner of it. `find_lists` of tiles.py tests every entry's ellipse
 exactly against the corners of its tile, and leaves a bit for each. A warp walks its tile's list 32 intersections at a
 time, ROUNDS of them together, and packs those that touch its corner into a queue in shared memory, a ring; they are
-blended in batches of 32. In a batch a lane fetches one Gaussian's records and features, and then each lane draws all of
-them on its pixel.
+blended in batches of 32. In a batch a lane fetches one Gaussian's shape, ellipse and features, and then each lane draws
+all of them on its pixel.
 
 Lists differ in length by a hundred times, and the longest decide how long a picture takes: a warp that waits for what
 it has just asked for does nothing else. So the next rounds, and the next batch, are on their way while a batch is

@@ -49,7 +49,7 @@ class CodeScale:
     wide: Tensor | None = None
 
     def widen(self) -> None:
-        """From now on codes are intervals where they are wide. In place: recorded steps feel it."""
+        """Treat bright codes as intervals from now on; in place, so that captured CUDA graphs do too."""
         if self.wide is not None:
             self.table.copy_(self.wide)
 
