@@ -26,7 +26,7 @@ TOPICS = {
 
 def home(room: str) -> Path:
     """Return the folder of a room's modules."""
-    return ROOT / room if room in ("kernels", "benchmarks") else ROOT / "sehdr_warp" / room
+    return ROOT / room if room in ("kernels", "benchmarks", "priors") else ROOT / "sehdr_warp" / room
 
 
 @pytest.mark.parametrize("test", sorted(TESTS.rglob("test_*.py")), ids=lambda path: str(path.relative_to(TESTS)))

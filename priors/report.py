@@ -1,0 +1,91 @@
+"""Write the report page of the prior for clipped light from the figures of `priors.judge`.
+
+python -m priors.report FIGURES.json docs
+"""
+
+import argparse
+import json
+from math import erf
+from pathlib import Path
+
+import numpy as np
+
+PAGE = "light-prior"
+_COLUMNS = {
+    "rms": "RMS, stops",
+    "level": "spread of a photo's level, stops",
+    "light": "total light, median error, log2",
+    "psnr": "mu-law dB",
+    "worst": "worst 5 %, dB",
+}
+_SETS = {
+    "plain": "sRGB, 8 bits, 0.2 to 20 % of the pixels at white",
+    "camera": "random camera curves, white balance, noise, JPEG and exposures; the curve known to a fifth of a stop",
+}
+_TEXT = """# The prior for light above white
+
+How well the network that comes with the package estimates clipped light ([Light above white](light.md)), on photos of
+ten panoramas that it was not trained on (`priors/sources.toml`). Each row estimates the log2 excess over white of
+clipped values: by nothing (*white*), by the mean of the training (*constant*), by a ridge regression on ten figures of
+the photo's histogram, and by a network that was trained like the one in the package on the other panoramas. RMS counts
+all clipped values alike. The card beside the weights, `sehdr_warp/prior/clipped_light.md`, says how it was trained.
+
+{tables}
+
+![Estimates against the truth, and how often the truth lies within a deviation](images/{page}.png)
+
+The truth lies within one deviation for {within:.0%} of the clipped values; one factor for all deviations was fitted on
+five of the ten panoramas. By quarters of the deviation:
+
+| mean deviation, stops | RMS, stops | within one deviation |
+| -: | -: | -: |
+{quarters}
+"""
+
+
+def main() -> None:
+    """Write page and plot."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("figures", type=Path)
+    parser.add_argument("folder", type=Path)
+    args = parser.parse_args()
+    figures = json.loads(args.figures.read_text())
+    tables = "\n\n".join(f"**{title}**\n\n{_table(figures[name])}" for name, title in _SETS.items() if name in figures)
+    network = figures["camera"]["network"]
+    rows = [f"| {row['deviation']:.2f} | {row['rms']:.2f} | {row['within']:.0%} |" for row in network["by_deviation"]]
+    values = {"page": PAGE, "tables": tables, "within": network["within_one_deviation"], "quarters": "\n".join(rows)}
+    (args.folder / f"{PAGE}.md").write_text(_TEXT.format(**values))
+    _plot(np.array(network["sample"]), args.folder / "images" / f"{PAGE}.png")
+
+
+def _table(estimates: dict) -> str:
+    lines = [f"| estimate | {' | '.join(_COLUMNS.values())} |", f"| --- |{' -: |' * len(_COLUMNS)}"]
+    for name, row in estimates.items():
+        lines.append(f"| {name} | {' | '.join(f'{row[column]:.2f}' for column in _COLUMNS)} |")
+    return "\n".join(lines)
+
+
+def _plot(sample: np.ndarray, path: Path) -> None:
+    """Plot estimates against the truth, and the share of values within a number of deviations."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4))
+    left.scatter(sample[:, 0], sample[:, 1], s=3, c=sample[:, 2], cmap="viridis", alpha=0.6)
+    left.plot([0, 10], [0, 10], "k", lw=0.8)
+    left.set(xlabel="true excess over white, stops", ylabel="estimate, stops", xlim=(0, 10), ylim=(0, 10))
+    left.set_title(f"{len(sample)} clipped values; brighter: less sure")
+    off, places = np.abs(sample[:, 1] - sample[:, 0]) / sample[:, 2], np.linspace(0, 3, 200)
+    right.plot(places, [(off <= place).mean() for place in places], label="measured")
+    right.plot(places, [erf(place / 2**0.5) for place in places], "k--", lw=0.8, label="normal distribution")
+    right.set(xlabel="deviations from the estimate", ylabel="share of clipped values within", ylim=(0, 1))
+    right.set_title("Calibration")
+    right.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+
+
+if __name__ == "__main__":
+    main()
