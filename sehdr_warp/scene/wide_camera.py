@@ -80,8 +80,10 @@ def solid_angles(camera: Camera) -> np.ndarray:
 
 
 def pixels_of_directions(directions: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return [..., 2] row and column indices (the first pixel's center is 0) at which a camera shows directions
-    [..., 3] in its axes; NaN for what it does not show."""
+    """Return [..., 2] row and column at which a camera shows directions [..., 3] in its axes; NaN if it does not.
+
+    The center of the first pixel is (0, 0).
+    """
     x, y, z = np.moveaxis(directions, -1, 0)
     if camera.projection == "equirectangular":
         column = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * camera.width - 0.5
