@@ -40,6 +40,7 @@ COMMANDS = {
 VIEW = ["view", "run", "--port", "0", "--device", "cpu"]
 COMMANDS = {name: line.split() for name, line in COMMANDS.items()}
 TRAIN = COMMANDS.pop("train")
+LOCAL = ("127.0.0.1", "::1", "localhost")
 STARTED = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn")
 LATEST = 300.0
 """Seconds after which a command hangs, on however busy a machine; of its processor's time it may take 30."""
@@ -142,8 +143,11 @@ def _run(words, folder, said, count, kill_at, prepare) -> None:
 
 
 def _watch(event: str, arguments) -> None:
+    """Tells of programs that are started and hosts that are connected to."""
     if event.startswith(STARTED) and str(arguments[0]) != sys.executable:
         os.write(2, f"STARTED {event} {arguments[:2]}\n".encode())
+    if event == "socket.connect" and isinstance(arguments[1], tuple) and arguments[1][0] not in LOCAL:
+        os.write(2, f"STARTED a connection to {arguments[1]}\n".encode())
 
 
 def _count(kill_at: int | None) -> list[int]:

@@ -89,7 +89,7 @@ FILMS = {
     **dict.fromkeys(
         ("film.mpd", "film.m3u8", "film.ism", "film.gif", "film%d.png", "film.sdp", "film.ffmeta", "film", "film.mp4.",
          ".mp4", "film.tee", "pipe:1", "http://127.0.0.1:9/film.mp4", "rtmp://127.0.0.1/film.mp4",
-         "file:///tmp/film.mp4", "concat:a|b.mp4/x", "film.mp4/", "/dev/null", "/dev/stdout", "/proc/film.mp4"), 1),
+         "file:///tmp/film.mp4", "concat:a|b.mp4/x", "/dev/null", "/dev/stdout", "/proc/film.mp4"), 1),
 }  # fmt: skip
 
 
