@@ -12,7 +12,7 @@ lists the same names for editors and type checkers.
 
 from importlib import import_module
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _HOMES = {
     "errors": ("InputError", "SehdrError"),

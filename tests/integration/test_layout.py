@@ -10,16 +10,16 @@ NOT_ROOMS = {"integration", "fuzz", "trial", "scenes_generator"}
 TOPICS = {
     "benchmarks": {"bench"},
     "compat/gsplat": {"against_gsplat"},
-    "output": {"pictures"},
+    "output": {"blender", "pictures"},
     "rasterizer": {"blend_blocks", "culling", "extremes", "properties", "rasterize"},
     "response": {"responses"},
-    "scene": {"scene_colmap", "scene_images", "scene_load", "scene_transforms"},
-    "splats": {"npm_parsers", "splat_files"},
+    "scene": {"hdr_colors", "scene_colmap", "scene_images", "scene_load", "scene_transforms"},
+    "splats": {"compressed_files", "npm_parsers", "other_tools", "splat_files"},
     "training": {
         "bad_input", "confidence", "deterministic", "divergence", "fields", "out_of_memory", "reserved_rows", "resume",
         "rivals", "units",
     },
-    "viewer": {"page", "scene_page"},
+    "viewer": {"page", "proxies", "scene_page"},
 }  # fmt: skip
 """Tests of what several modules of a room do together. Prefer a module's name."""
 

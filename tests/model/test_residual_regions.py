@@ -74,8 +74,8 @@ def test_what_does_not_count_is_not_missing_and_light_that_is_not_there_is(tmp_p
     }
     masked = [replace(view, mask=np.zeros((64, 64), np.float32)) for view in dark.views]
     assert find_residual_regions(run.model, dark.views) and not find_residual_regions(run.model, masked)
-    # A finished run is asked again when it is resumed.
+    # A training reports what its photos show and the scene does not hold.
     spoiled = replace(scene, views=(*scene.views[:8], dark.views[8]))
-    worst = train(spoiled, tmp_path / "run", device="cpu", resume=True).summary()["unexplained"]["worst"][0]
+    worst = train(spoiled, tmp_path / "spoiled", CONFIG, device="cpu").summary()["unexplained"]["worst"][0]
     assert worst["photo"] == "v_8" and worst["stops"] < 0
     assert "1 regions in 1 photos are not explained by the scene; the worst: v_8" in caplog.text
