@@ -1,5 +1,7 @@
-"""Camera responses by name: the formulae, the encodings of colour-science, and curves from files. To list their names
-loads no torch."""
+"""Camera responses by name: formulae, the encodings of colour-science, and curves from files.
+
+Listing their names loads no torch.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,12 +35,12 @@ def __getattr__(name: str):
 
 
 def response_names() -> dict[str, str]:
-    """The responses with a formula, each with a line that says what it stands for."""
+    """Return the responses with a formula, each with a line that says what it is for."""
     return dict(DESCRIPTIONS)
 
 
 def response_by_name(text: str | Path) -> "Response":
-    """A response from what a user writes.
+    """Return the response of a name or file, as a user writes it.
 
     Args:
         text: one of response_names(); `gamma-G`; `colour:S-Log3` and the like; `FILE` or `FILE:SELECTOR` (see

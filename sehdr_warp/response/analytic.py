@@ -24,6 +24,7 @@ class PowerLaw(NamedTuple):
     toe_end: float
 
     def invert(self, value):
+        """Return the exposure of a value."""
         power = ((value + self.offset) / (1.0 + self.offset)).pow(self.exponent)
         return torch.where(value < self.toe_slope * self.toe_end, value / self.toe_slope, power)
 
@@ -34,6 +35,7 @@ class Reinhard:
     kind, numbers, clip_exposure = "reinhard", (), math.inf
 
     def invert(self, value):
+        """Return the exposure of a value below 1."""
         return value / (1.0 - value)
 
 
@@ -43,11 +45,13 @@ class Filmic:
     kind = "filmic"
 
     def __init__(self, a, b, d, e, g, clip_exposure):
+        """Normalize the constants of the formula so that clip_exposure is white."""
         x = self.clip_exposure = clip_exposure
         peak = (a * x * x + b * x) / (d * x * x + e * x + g)
         self.numbers = (a / peak, b / peak, d, e, g)
 
     def invert(self, value):
+        """Return the exposure of a value."""
         # P x^2 + Q x = g y, by whichever form of the positive root does not cancel.
         a, b, d, e, g = self.numbers
         square, linear, constant = a - value * d, b - value * e, value * g
@@ -64,10 +68,12 @@ class Knee:
     kind = "knee"
 
     def __init__(self, start: float, softness: float):
+        """Compute the clip point of a knee that begins at `start` and bends by `softness`."""
         self.numbers = (start, softness)
         self.clip_exposure = start + softness * math.expm1((1.0 - start) / softness)
 
     def invert(self, value):
+        """Return the exposure of a value."""
         start, softness = self.numbers
         return value.clamp_max(start) + softness * ((value - start).clamp_min(0.0) / softness).expm1()
 
@@ -78,6 +84,7 @@ class AnalyticResponse(Response, kind="analytic"):
     black, peak = 0.0, 1.0
 
     def __init__(self, name: str, display: PowerLaw, tone: Reinhard | Filmic | Knee | None = None):
+        """Combine a tone curve, if there is one, with the display curve that follows it."""
         self.name = name
         self._display, self._tone = display, tone
         self.curve = FormulaCurve(display)
@@ -93,7 +100,8 @@ class AnalyticResponse(Response, kind="analytic"):
         return light if self._tone is None else self._tone.invert(light)
 
     def rise(self, value):
-        # By the inverse: what the slope needs is a kernel of its own for each curve.
+        """Return d ln x / dz at values z; see Response.rise."""
+        # By the inverse, because the slope would compile a kernel for each curve.
         values = torch.from_numpy(np.minimum(value, self._limit)).requires_grad_()
         with torch.enable_grad():
             self._invert(values).log().sum().backward()
@@ -101,6 +109,7 @@ class AnalyticResponse(Response, kind="analytic"):
         return values.grad.numpy()
 
     def to_dict(self):
+        """Return plain values for JSON."""
         return {"kind": "analytic", "name": self.name}
 
     @classmethod
@@ -137,9 +146,10 @@ _ALIASES = {"reinhard-gamma": "hdr-nerf", "gamma": "gamma-2.2", "rec.709": "rec7
 
 
 def analytic_response(name: str) -> Response:
-    """A response by its formula's name: one of DESCRIPTIONS, an alias, or `gamma-G` with G in [1, 5].
+    """Return the response of a formula's name: one of DESCRIPTIONS, an alias, or `gamma-G` with G in [1, 5].
 
-    Raises SehdrError for any other name.
+    Raises:
+        SehdrError: for any other name.
     """
     key = _ALIASES.get(name.lower(), name.lower())
     if key in _CURVES:

@@ -8,7 +8,7 @@ import numpy as np
 from ..errors import InputError
 from .table import TabulatedResponse
 
-# 8-bit codes outside are clipped, or nearly, and tell nothing.
+# 8-bit codes outside of this range are clipped or nearly so, and are not used.
 DARKEST, BRIGHTEST = 3, 252
 CHANNELS = ("red", "green", "blue")
 # Weight of the squared second derivative of the curve against the mean weight of a code.
@@ -25,14 +25,14 @@ _REMEDY = "photograph one still scene from a tripod at several times, one to thr
 
 @dataclass(frozen=True)
 class Calibration:
-    """A measured response and what speaks for it.
+    """A measured response and how well it fits.
 
     Attributes:
         response: the curve; exposure 1 is white.
-        residual: weighted RMS of what the curve leaves unexplained, stops.
-        channel_spread: RMS difference of each channel's own curve from the shared one, stops; NaN where a channel tells
-            nothing alone.
-        photo_offsets: by how many stops each photo is brighter than its time says.
+        residual: weighted RMS residual in stops.
+        channel_spread: RMS difference of each channel's own curve from the shared one, stops; NaN if a channel does not
+            determine a curve alone.
+        photo_offsets: stops by which each photo is brighter than its time states.
         samples: [S, 2] exposures and encoded values of some samples, for a plot.
     """
 
@@ -46,7 +46,7 @@ class Calibration:
 def calibrate_codes(
     photos: Sequence[np.ndarray], times: Sequence[float], *, channel: str | None = None, name: str = "calibrated"
 ) -> Calibration:
-    """The response of the camera that took a stack.
+    """Measure the response of the camera that took a stack.
 
     Least squares over pixels i and photos j of w (g(z_ij) - log2 E_i - log2 t_j)^2, w a hat over the codes that are not
     clipped, with a penalty on the curvature of g, which only rises. Outliers count less from round to round.
@@ -57,7 +57,8 @@ def calibrate_codes(
         channel: "red", "green" or "blue" alone; None finds one curve for all three.
         name: of the response, and of the stack in errors.
 
-    Raises InputError for a stack that tells nothing, with the reason.
+    Raises:
+        InputError: if the stack does not determine a curve, with the reason.
     """
     if channel not in (None, *CHANNELS):
         raise InputError(name, f"channel {channel!r} is not one of {', '.join(CHANNELS)}", "name one, or none for all")
@@ -96,7 +97,7 @@ def calibrate_codes(
 
 
 def _spread(codes: np.ndarray, stops: np.ndarray, shared: np.ndarray) -> float:
-    """RMS difference in stops of one channel's own curve from the shared one, over its codes from 10 to 245."""
+    """Return the RMS difference in stops of one channel's curve from the shared one, over its codes from 10 to 245."""
     try:
         own, _, weights, _ = _solve(codes, stops, "")
     except InputError:
@@ -106,8 +107,11 @@ def _spread(codes: np.ndarray, stops: np.ndarray, shared: np.ndarray) -> float:
 
 
 def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
-    """log2 exposure of each code [256], and of samples [J, S]: residuals in stops, weights, and log2 radiance [S],
-    which is eliminated, so that 256 unknowns are left."""
+    """Solve for the log2 exposure of each code; radiance is eliminated, so that 256 unknowns remain.
+
+    Returns:
+        log2 exposures [256], residuals in stops and weights [J, S] of the samples, and log2 radiance [S].
+    """
     from scipy.linalg import solve
 
     hat = np.sqrt(np.minimum(_CODES - DARKEST + 1, BRIGHTEST - _CODES + 1).clip(min=0) / (0.5 * (BRIGHTEST - DARKEST)))
@@ -142,7 +146,7 @@ def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
 
 
 def _rising(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The solution of the normal equations whose steps are all at least _LEAST_RISE."""
+    """Return the solution of the normal equations whose steps are all at least _LEAST_RISE."""
     from scipy.linalg import cholesky, solve_triangular
     from scipy.optimize import lsq_linear
 

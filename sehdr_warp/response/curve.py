@@ -44,22 +44,25 @@ class Response(ABC):
     _kinds: ClassVar[dict[str, type["Response"]]] = {}
 
     def __init_subclass__(cls, *, kind: str | None = None, **options):
+        """Register a subclass under the kind by which from_dict finds it."""
         super().__init_subclass__(**options)
         if kind is not None:
             Response._kinds[kind] = cls
 
     @abstractmethod
     def _encode(self, exposure: torch.Tensor, extension_slope: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """f, with extension_slope log(x / clip) added beyond the clip point, and its slope there, 0 below 0; called
-        without autograd."""
+        """Return f and its slope, which is 0 below 0, without autograd.
+
+        Beyond the clip point extension_slope * log(x / clip) is added.
+        """
 
     @abstractmethod
     def _invert(self, value: torch.Tensor) -> torch.Tensor:
-        """The exposure for values within [black, peak); called without autograd."""
+        """Return the exposure for values within [black, peak), without autograd."""
 
     @abstractmethod
     def to_dict(self) -> dict:
-        """Plain values for JSON that Response.from_dict turns back into the same curve."""
+        """Return plain values for JSON that Response.from_dict turns back into the same curve."""
 
     @classmethod
     @abstractmethod
@@ -67,7 +70,11 @@ class Response(ABC):
 
     @staticmethod
     def from_dict(values: dict) -> "Response":
-        """The curve that to_dict described; SehdrError if the description is not one."""
+        """Return the curve that to_dict described.
+
+        Raises:
+            SehdrError: if the description is damaged or of an unknown kind.
+        """
         kind = values.get("kind") if isinstance(values, dict) else None
         if not isinstance(kind, str) or kind not in Response._kinds:
             raise SehdrError(f"response: kind = {kind!r:.60} is not one of {', '.join(sorted(Response._kinds))}")
@@ -77,7 +84,7 @@ class Response(ABC):
             raise SehdrError(f"response: the stored {kind} curve is damaged ({error!r:.200})") from error
 
     def start_exposures(self, encoded: np.ndarray) -> np.ndarray:
-        """Exposures above 0 for Gaussians to start from, of encoded values in (0, 1); same shape, float64."""
+        """Return exposures above 0 for Gaussians to start from, of encoded values in (0, 1); float64 of one shape."""
         return np.maximum(self.decode(np.asarray(encoded, np.float64)), START_FLOOR)
 
     @property
@@ -91,16 +98,21 @@ class Response(ABC):
         return float(self._invert(torch.tensor(self.peak - HALF_CODE, dtype=torch.float64)))
 
     def encode(self, exposure):
-        """f(x), in [black, peak]. Exposures below 0 count as 0; the gradient is 0 there and beyond the clip point."""
+        """Return f(x) in [black, peak]; the gradient is 0 below exposure 0 and beyond the clip point."""
         return self._through(lambda x: _Pointwise.apply(x, self._encode, 0.0), exposure)
 
     def encode_extended(self, exposure):
-        """f(x) up to the clip point; beyond it f(clip) + EXTENSION_SLOPE log(x / clip), which leaves a gradient and a
-        surplus over 1 that a hinge can weigh. Equals encode for a curve that never clips."""
+        """Return f(x) up to the clip point, and f(clip) + EXTENSION_SLOPE log(x / clip) beyond it.
+
+        The extension leaves a gradient and a surplus over 1 that a hinge can weigh. For a curve that never clips this
+        equals encode.
+        """
         return self._through(lambda x: _Pointwise.apply(x, self._encode, EXTENSION_SLOPE), exposure)
 
     def decode(self, value):
-        """The exposure of a value, limited to [black, peak]: decode(encode(x)) = x for x in [0, clip_exposure].
+        """Return the exposure of a value, which is limited to [black, peak].
+
+        decode(encode(x)) = x for x in [0, clip_exposure].
 
         A curve that only approaches its peak is inverted up to `white`, since the exact inverse of 1 is infinite.
         """
@@ -109,12 +121,12 @@ class Response(ABC):
         )
 
     def rise(self, value: np.ndarray) -> np.ndarray:
-        """d ln x / dz at values z in (black, peak) of exposures x, float64."""
+        """Return the derivative d ln x / dz at values z in (black, peak) of exposures x, float64."""
         exposure = np.asarray(self.decode(value))
         return 1 / (exposure * np.maximum(np.asarray(self.slope(exposure)), 1e-9))
 
     def slope(self, exposure):
-        """df/dx of encode, shaped like the exposures; 0 beyond the clip point. Not differentiable itself."""
+        """Return df/dx of encode, shaped like the exposures and 0 beyond the clip point; it is not differentiable."""
         return self._through(lambda x: self._encode(x.detach(), 0.0)[1], exposure)
 
     @property
@@ -143,6 +155,7 @@ class Response(ABC):
         return function(torch.from_numpy(np.array(array, order="C"))).numpy()
 
     def __repr__(self) -> str:
+        """Return the class and name."""
         return f"{type(self).__name__}({self.name!r})"
 
 

@@ -1,4 +1,4 @@
-"""Responses that are read: EMoR and DoRF files, a curve of one's own, and the camera encodings of colour-science."""
+"""Responses from files (EMoR, DoRF, CSV, JSON), and the camera encodings of colour-science."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,7 @@ MAX_BYTES = 64 * 2**20  # Of a text file; all of DoRF has 5 MB.
 
 
 def response_from_file(path: Path, selector: str | None = None) -> Response:
-    """The curve in a file. `selector` is what follows the last colon of `FILE:SELECTOR`.
+    """Read the curve in a file; `selector` is the part after the last colon of `FILE:SELECTOR`.
 
     201_CRF_data.mat and dorfCurves.txt (DoRF; exposures and values normalized to [0, 1]): an index from 0, or a
     curve's name where the file holds names. emor.txt (f = f0 + sum c_i h_i) and invemor.txt (the same for the inverse):
@@ -24,7 +24,8 @@ def response_from_file(path: Path, selector: str | None = None) -> Response:
     or four, exposure, red, green and blue; an optional line of headings, `#` comments. JSON: {"exposures": [...],
     "values": [...]} or Response.to_dict's.
 
-    Raises InputError for a file that is missing, too large, of another content, or whose curve cannot be used.
+    Raises:
+        InputError: for a file that is missing, too large, of another content, or whose curve cannot be used.
     """
     suffix = path.suffix.lower()
     text = "" if suffix in (".mat", ".json") else read_text(path, MAX_BYTES)
@@ -38,7 +39,11 @@ def response_from_file(path: Path, selector: str | None = None) -> Response:
 
 
 def responses_in_file(path: Path | str) -> list[Response]:
-    """Every curve of a DoRF file (.mat with B and I of [curves, samples], or dorfCurves.txt); InputError otherwise."""
+    """Read every curve of a DoRF file (.mat with B and I of [curves, samples], or dorfCurves.txt).
+
+    Raises:
+        InputError: for any other file.
+    """
     path = Path(path)
     if path.suffix.lower() == ".mat":
         return _dorf_mat(path)
@@ -49,11 +54,13 @@ def responses_in_file(path: Path | str) -> list[Response]:
 
 
 def colour_response(encoding: str) -> Response:
-    """A camera or display encoding of colour-science by name (`S-Log3`; case, blanks and hyphens do not matter).
+    """Return a camera or display encoding of colour-science by name (`S-Log3`; case, blanks, hyphens do not matter).
 
     The exposure axis is scene reflectance as that encoding defines it (0.18 is middle gray); values are limited to
-    [0, 1]. Sampled once at 32 points an octave, 24 octaves below white. Raises SehdrError for an unknown name or an
-    encoding that is not a camera's (undefined values, or white beyond 2^20).
+    [0, 1]. Sampled once at 32 points an octave, 24 octaves below white.
+
+    Raises:
+        SehdrError: for an unknown name, or an encoding that is not a camera's (undefined values, or white beyond 2^20).
     """
     import colour
     from colour.utilities import suppress_warnings
@@ -122,7 +129,7 @@ def _is_dorf(text: str) -> bool:
 
 
 def _dorf_text(path: Path, text: str) -> list[Response]:
-    """Six lines a curve: name, kind, "I =", exposures, "B =", values."""
+    """Read six lines a curve: name, kind, "I =", exposures, "B =", values."""
     lines = [line for line in text.splitlines() if line.strip()]
     curves = []
     for index in range(-(-len(lines) // 6)):
@@ -135,7 +142,7 @@ def _dorf_text(path: Path, text: str) -> list[Response]:
 
 
 def _emor(path: Path, text: str, selector: str | None) -> Response:
-    """Sections "E =", "f0 =", "h(1)=", ... of equal length; in the inverse file "B =", "g0 =", "hinv(1)=", ..."""
+    """Read sections "E =", "f0 =", "h(1)=", ... of equal length, or "B =", "g0 =", "hinv(1)=" ... of the inverse."""
     rows = [_numbers(path, body) for body in re.split(r"^[^=\n]*=", text, flags=re.MULTILINE)[1:]]
     if len(rows) < 3 or len({len(row) for row in rows}) != 1:
         problem = "is not EMoR's layout of sections of one length"

@@ -38,6 +38,11 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     black, peak, clip_exposure = 0.0, 1.0, math.inf
 
     def __init__(self, width: int = 128, seed: int = 0):
+        """Initialize the weights, so that all channels rise.
+
+        Raises:
+            SehdrError: if the width is not a number from 1.
+        """
         super().__init__()
         if not isinstance(width, int) or isinstance(width, bool) or width < 1:
             raise SehdrError(f"tone mapper: width = {width!r} is not a number from 1")
@@ -52,7 +57,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
 
     @torch.no_grad()
     def _start_rising(self) -> None:
-        """Turns over each of four groups of units (active towards dark or light, at log x = 0 or not) that falls."""
+        """Flip each of four groups of units (active towards dark or light, at log x = 0 or not) if it falls."""
         inner, bias, outer = self.weights[0].mT, self.biases[0].mT, self.weights[1]
         for towards in (inner < 0, inner > 0):
             for group in (towards & (bias < 0), towards & (bias >= 0)):
@@ -60,17 +65,17 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
                 outer[group & falls] *= -1
 
     def encode(self, exposure):
-        """Encoded values in (0, 1) of exposures [..., 3]; a tensor for a tensor, else a NumPy array."""
+        """Return encoded values in (0, 1) of exposures [..., 3], a tensor for a tensor, else a NumPy array."""
         if isinstance(exposure, torch.Tensor):
             return self.encode_log((exposure.clamp_min(0) + EXPOSURE_FLOOR).log())
         return self._with_arrays(self.encode, exposure)
 
     def encode_extended(self, exposure):
-        """As encode: the sigmoid leaves a gradient everywhere."""
+        """Return encode(exposure), because the sigmoid leaves a gradient everywhere."""
         return self.encode(exposure)
 
     def encode_log(self, log_exposure: torch.Tensor) -> torch.Tensor:
-        """Encoded values in (0, 1) of natural logarithms of exposures [..., 3]; many are interpolated in a table."""
+        """Return encoded values in (0, 1) of log exposures [..., 3]; large inputs are interpolated in a table."""
         points = log_exposure.reshape(-1, 3)
         if len(points) < EXACT_BELOW or points.dtype != torch.float32 or torch.are_deterministic_algorithms_enabled():
             return self._logits(points).sigmoid().reshape(log_exposure.shape)
@@ -109,7 +114,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
             return torch.autograd.grad(self.encode(given).sum(), given)[0]
 
     def start_exposures(self, encoded):
-        """The logarithm starts at the encoded value (HDR-GS): what the mapper will make of it is not known yet."""
+        """Return exp(encoded), as HDR-GS starts, because the mapper is not trained yet."""
         return np.exp(np.asarray(encoded, np.float64))
 
     @property
@@ -118,7 +123,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return float(self.decode(torch.full((1, 3), 1 - HALF_CODE)).max())
 
     def to_dict(self) -> dict:
-        """The mapper's shape; the weights are in state_dict()."""
+        """Return the mapper's shape; the weights are in state_dict()."""
         return {"kind": "mlp", "width": self.width}
 
     @classmethod
@@ -138,4 +143,5 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return self.decode(value)
 
     def __repr__(self) -> str:
+        """Return the class and name."""
         return Response.__repr__(self)

@@ -114,10 +114,10 @@ def select_response(
     from_camera: bool = False,
     seed: int = 0,
 ) -> ResponseSelection:
-    """The candidate under which photos look most like linear light, up to the exposure's scale.
+    """Select the candidate under which photos look most like linear light, up to the exposure's scale.
 
     Args:
-        image: [H, W, 3] codes as photographed, uint8 or uint16, or encoded values in [0, 1]; or several such photos
+        image: [H, W, 3] codes of a photo, uint8 or uint16, or encoded values in [0, 1]; or several such photos
             of one camera, taken one by one. Resampling in encoded values mixes colors, which edges then tell of.
         candidates: by default the responses with a formula.
         method: "posterior" judges edges (Lin et al. 2004), clipped pixels, the spread and smoothness of light, and
@@ -129,8 +129,9 @@ def select_response(
         from_camera: the photos are a camera's own JPEGs, with the prior of cameras.
         seed: of the sample of edges where there are more than 4000.
 
-    Raises SehdrError for another method, no candidates, an image of another shape or not finite, or, by "paper", under
-    100 pixels that are neither black nor clipped.
+    Raises:
+        SehdrError: for another method, no candidates, an image of another shape or not finite, or, by "paper", fewer
+            than 100 pixels that are neither black nor clipped.
     """
     if method not in ("posterior", "paper"):
         raise SehdrError(f"select_response: method = {method!r} is neither posterior nor paper")
@@ -188,7 +189,7 @@ def _on_grid(response: Response) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bands(image) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A photo, or bands of a large one: encoded values [h, W, 3] float64, and where neither black nor clipped."""
+    """Return a photo, or bands of a large one: encoded [h, W, 3] float64, and where neither black nor clipped."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3:
         raise SehdrError(f"select_response: an image of shape {list(image.shape)} is not [H, W, 3]")
@@ -242,8 +243,11 @@ def _highlights(shares: np.ndarray, fine: np.ndarray) -> np.ndarray:
 
 
 def _span(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """Of the spread of ln exposure, which is much the same in all scenes; a wrong curve stretches or squeezes it. The
-    standard deviation is log-normal; its weight is the share of values between black and white."""
+    """Return log likelihoods by the spread of ln exposure, which is similar in most scenes.
+
+    A wrong curve stretches or compresses it. The standard deviation is log-normal; its weight is the share of values
+    between black and white.
+    """
     inside, logs = shares[1:255].sum(), logs[:, 1:255]
     if inside <= 0:
         return np.zeros(len(logs))
@@ -339,8 +343,10 @@ def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray
 
 
 def _mixture_surprise(exposures: torch.Tensor, slopes: torch.Tensor, lines: torch.Tensor) -> torch.Tensor:
-    """[misfits, K] sums over E edges, from exposures and the curve's slopes [E, 9, K] at the nine colors, and exposures
-    [E, 4, K] at the last points of _edges.
+    """Return sums [misfits, K] over E edges of the surprise of their mixed colors.
+
+    The arguments are exposures and the curve's slopes [E, 9, K] at the nine colors, and exposures [E, 4, K] at the last
+    points of _edges.
 
     The middle color's distance from the line of its two sides, in code values at the middle color, has the variance
     that rounding of all three gives it. Along the line every share of linear light within the limits is as likely.

@@ -32,6 +32,7 @@ class TabulatedResponse(Response, kind="table"):
     """
 
     def __init__(self, name: str, exposures, values, *, notes: tuple[str, ...] = (), source: str | None = None):
+        """Repair the samples, and prepare the table."""
         self.name = name
         samples = np.asarray(exposures, np.float64), np.asarray(values, np.float64)
         knots, levels, repairs = _monotone(*samples, source or name)
@@ -92,6 +93,7 @@ class TabulatedResponse(Response, kind="table"):
         return torch.lerp(nodes[cell], nodes[cell + 1], part).to(value.dtype)
 
     def to_dict(self):
+        """Return plain values for JSON."""
         columns = {"exposures": self._knots.tolist(), "values": self._levels.tolist()}
         return {"kind": "table", "name": self.name, **columns, "notes": list(self.notes)}
 
@@ -190,8 +192,10 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
 
 
 def _tilt_flat_parts(exposures: np.ndarray, values: np.ndarray):
-    """Samples up to the clip point with strictly increasing values, of increasing ones: a flat part (steps under
-    LEAST_STEP) becomes a line of FLAT_TILT, less where neighbours are near."""
+    """Return samples up to the clip point with strictly increasing values.
+
+    A flat part (steps under LEAST_STEP) becomes a line of FLAT_TILT, less if neighbours are near.
+    """
     edges = np.flatnonzero(np.diff(values) >= LEAST_STEP) + 1
     starts, ends = np.r_[0, edges], np.r_[edges, len(values)] - 1
     # The end of each part, so that the peak stays what it is.

@@ -33,34 +33,24 @@ _REMEDY = "develop the photos as JPEG, PNG or TIFF, or convert them to DNG"
 
 
 def kind_of(path: Path) -> str:
-    """raw, float or encoded, by the suffix."""
+    """Return raw, float or encoded, by the suffix."""
     suffix = path.suffix.lower()
     return "raw" if suffix in RAW_SUFFIXES else "float" if suffix in HDR_SUFFIXES else "encoded"
 
 
-def one_kind(photos: Sequence[Path]) -> str:
-    """The kind of all photos of a set; InputError where they differ."""
-    kinds = [kind_of(photo) for photo in photos]
-    other = next((photo for photo, kind in zip(photos, kinds, strict=True) if kind != kinds[0]), None)
-    if other is not None:
-        problem = f"is {kind_of(other)}, and {photos[0].name} is {kinds[0]}: photos of one set are of one kind"
-        raise InputError(other, problem, "keep one kind in the folder")
-    return kinds[0]
-
-
 def float_codes(radiance: np.ndarray, time: float) -> np.ndarray:
-    """[H, W, 3] uint16 codes of linear values at an exposure time."""
+    """Return [H, W, 3] uint16 codes of linear values at an exposure time."""
     return codes_of(reinhard_gamma(radiance * time), 16)
 
 
 def float_time(photos: Sequence[Path]) -> float:
-    """The exposure time at which a set of float pictures is exposed well: its log-average is middle grey."""
+    """Return the exposure time at which the log-average of a set of float images is middle grey."""
     chosen = photos[:: -(-len(photos) // _MOST_JUDGED)]
     return _MIDDLE_GREY / float(np.exp(np.mean([np.log(_log_average(read_hdr(photo))) for photo in chosen])))
 
 
 def tone_mapped(path: Path) -> np.ndarray:
-    """[H, W, 3] uint8 of a float picture by itself, for the eye and for structure from motion."""
+    """Return [H, W, 3] uint8 of a float image at its own exposure, for structure from motion."""
     radiance = read_hdr(path)
     return codes_of(reinhard_gamma(radiance * _MIDDLE_GREY / _log_average(radiance)), 8)
 
@@ -122,8 +112,10 @@ def _developed(raw: Any, oriented: bool) -> np.ndarray:
 
 
 def linear_codes(linear: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint16 sRGB codes of a sensor's light, 1 at white: of 16 linear bits, what the dark keeps is what
-    matters. From 0.99 on it counts as white."""
+    """Return [H, W, 3] uint16 sRGB codes of a sensor's light, which is 1 at white; from 0.99 on it counts as white.
+
+    The codes of a curve keep more of the dark than 16 linear bits.
+    """
     linear = np.where(linear >= CLIPPED, 1, linear)
     bright = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return codes_of(np.where(linear <= 0.0031308, 12.92 * linear, bright), 16)

@@ -1,7 +1,7 @@
-"""Arrays in a temporary file that is mapped into memory: photos that fit on the disk and not into memory, and what
-several processes of one machine read together.
+"""Arrays in a temporary file that is mapped into memory.
 
-The file has no name once it is open: the system removes it with the last process that uses it, however that ends.
+For photos that fit on the disk and not into memory, and for what several processes of one machine read together. The
+file has no name once it is open: the system removes it with the last process that uses it, however that ends.
 """
 
 import io

@@ -33,6 +33,7 @@ class Synth:
 
 
 def run_synth(asked: Synth) -> None:
+    """Expose a set with truth and write the photos."""
     from ..files import check_absent
     from ..model.exposure import read_exposures
     from ..response import response_by_name

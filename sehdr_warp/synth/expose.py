@@ -31,6 +31,7 @@ class SensorNoise:
     read_noise: float = 5.0
 
     def __post_init__(self):
+        """Check the figures."""
         if not 1.0 <= self.full_well < 1e12:
             raise InputError("sensor noise", f"full well of {self.full_well:g} electrons", "give 1 to 1e12")
         if not 0.0 <= self.read_noise < 1e9:
@@ -48,20 +49,27 @@ class RadianceView:
 
 
 def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise | None = None, seed: int = 0) -> Scene:
-    """The scene as photographed: each photo becomes response.encode(hdr * exposure_time), rounded to 8 bits.
+    """Expose the truth of a scene: each photo becomes response.encode(hdr * exposure_time), rounded to 8 bits.
 
-    scene: every view has truth (View.hdr), which is kept. exposure_time: seconds.
-    noise: applied to the exposure before the response, drawn for each view from (seed, its name).
-    Each point takes its new color from the training view whose old photo showed it most nearly in its old color, the
-    likeliest to see it unoccluded; one outside of all training views keeps its own.
+    Each point takes its new color from the training view whose old photo is nearest to the point's old color, which
+    most likely shows it unoccluded; a point outside of all training views keeps its color.
 
-    Raises InputError for a view without truth or an impossible time.
+    Args:
+        scene: every view has truth (View.hdr).
+        response: encodes exposures.
+        exposure_time: seconds.
+        noise: applied to the exposure before the response, sampled for each view from (seed, its name).
+        seed: of the noise.
+
+    Raises:
+        InputError: for a view without truth or an impossible time.
     """
     if not (math.isfinite(exposure_time) and exposure_time > 0):
         raise InputError(scene.name, f"exposure time {exposure_time:g} s is not positive and finite", "give seconds")
     views = []
     for view in scene.views:
-        exposure = _truth(scene, view).astype(np.float64) * exposure_time
+        # Colors beyond Rec.709 have negative parts, which no sensor counts.
+        exposure = np.maximum(_truth(scene, view).astype(np.float64), 0) * exposure_time
         if noise is not None:
             rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
             exposure = noisy(exposure, response.clip_exposure if response.clips else response.white, noise, rng)
@@ -71,7 +79,11 @@ def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise |
 
 
 def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
-    """ladder_of the truth of the training views; raises InputError where one has none."""
+    """Return ladder_of() the truth of the training views.
+
+    Raises:
+        InputError: if a view has no truth.
+    """
     truth = [_truth(scene, view) for view in scene.train_views]
     return ladder_of(scene.name, truth, response.encode, count, factor)
 
@@ -108,7 +120,7 @@ def _truth(scene: Scene, view: View) -> np.ndarray:
 
 
 def noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.random.Generator) -> np.ndarray:
-    """The exposure that the sensor reports: photons counted up to the full well, then read out."""
+    """Return the exposure that the sensor reports: photons counted up to the full well, then read with noise."""
     # Ten full wells saturate as surely as more, and Poisson's generator has a largest mean.
     photons = np.minimum(exposure / saturation, 10.0) * noise.full_well
     electrons = np.minimum(rng.poisson(photons), noise.full_well) + rng.normal(0.0, noise.read_noise, exposure.shape)
@@ -137,8 +149,11 @@ def _recolored(scene: Scene, views: Sequence[View]) -> np.ndarray:
 
 
 def write_photo_set(scene: Scene, out: Path, response, times: Sequence[float], *, noise=None, seed=0, overwrite=False):
-    """Write an HDR-NeRF synthetic set of a scene with truth: photos at each time (seconds), poses, truth and points in
-    the colors of the middle time. Noise is drawn anew for each time. Raises as expose and write_tables do."""
+    """Write an HDR-NeRF synthetic set of a scene with truth.
+
+    It holds photos at each time (seconds), poses, truth, and points in the colors of the middle time. Noise is sampled
+    anew for each time. Raises as expose and write_tables.
+    """
     exposed = [expose(scene, response, time, noise=noise, seed=seed * len(times) + k) for k, time in enumerate(times)]
     views = [RadianceView(view.name, view.camera, _truth(scene, view), view.split) for view in scene.views]
     points = (scene.points, exposed[len(times) // 2].point_colors) if len(scene.points) else None
@@ -170,7 +185,7 @@ def write_hdr_nerf_scene(
 
 
 def truth_path(folder: Path, split: str, place: int) -> Path:
-    """The EXR of a split's frame number `place`."""
+    """Return the path of the EXR file of a split's frame number `place`."""
     return folder / f"{split}_hdr" / f"hdr_{place:03d}.exr"
 
 
@@ -180,9 +195,10 @@ def write_radiance(path: Path, radiance: np.ndarray, **options) -> None:
 
 
 def write_tables(folder: Path, views: Sequence[RadianceView], times: Sequence[float], points, **stated) -> None:
-    """A set's poses, times and points: all but its pictures. stated: more of transforms_<split>.json.
+    """Write a set's poses, times and points, without its pictures; `stated` are more fields of transforms_<split>.json.
 
-    Raises InputError for cameras that differ, or have no square pixels or centered principal point.
+    Raises:
+        InputError: for cameras that differ, or have no square pixels or centered principal point.
     """
     for split in ("train", "test"):
         chosen = [view for view in views if view.split == split]
