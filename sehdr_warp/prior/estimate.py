@@ -124,7 +124,7 @@ def load_prior(device: torch.device | str = "cpu", path: Path = WEIGHTS) -> Ligh
 def _load(device: str, path: Path) -> LightPrior:
     from safetensors import SafetensorError, safe_open
 
-    remedy = "install sehdr-warp again, or train with --loss.light_prior=false"
+    remedy = "install sehdr-warp again, or train with --loss.light-prior=false"
     if not path.is_file():
         raise InputError(path, "the weights of the prior for clipped light are missing", remedy)
     if path.stat().st_size > MOST_BYTES:

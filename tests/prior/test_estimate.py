@@ -88,7 +88,7 @@ def test_weights_that_cannot_be_used_are_one_line(tmp_path):
     for name, problem in (names | {"nan": "not finite", "large": "bytes"}).items():
         with pytest.raises(InputError, match=problem) as error:
             load_prior(path=tmp_path / f"{name}.safetensors")
-        assert f"{name}.safetensors" in str(error.value) and "light_prior=false" in str(error.value)
+        assert f"{name}.safetensors" in str(error.value) and "light-prior=false" in str(error.value)
         assert "\n" not in str(error.value)
 
 
