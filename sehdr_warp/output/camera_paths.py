@@ -15,8 +15,16 @@ Item = TypeVar("Item")
 _LONGEST = 100_000
 # A gap in azimuth smaller than this means that the photos go round the scene.
 _ROUND_GAP = np.radians(120)
-# Mean squared sine between optical axes below which they are parallel in effect and meet nowhere (1 degree).
-_PARALLEL = np.sin(np.radians(1)) ** 2
+# Mean squared sine between optical axes below which they are parallel in effect: where they meet is then chance, as of
+# photos from the air that look down (6 degrees).
+_PARALLEL = np.sin(np.radians(6)) ** 2
+
+# Weight of the mean up of the pictures beside the horizon of the cameras. Cameras that all look one way say nothing of
+# their pitch by their horizon; then the pictures' mean decides. Where they look around, it moves up by less than 1/10
+# of the cameras' mean pitch.
+_MEAN_UP_WEIGHT = 0.005
+_CANCELED, _ALIKE = 0.3, 0.7  # Length of the mean up of pictures, and of the mean viewing direction
+_DOWN = 0.2  # Mean of the pictures' up along the common up below which the viewing directions decide its sign
 
 
 def evenly(items: Sequence[Item], count: int) -> list[Item]:
@@ -55,7 +63,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
     middle = cameras[int(np.argmin(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
     if focus is None:
         focus = middle.position + focus_distance * middle.world_to_camera[2, :3]
-    up = mean_up(cameras, middle)
+    up = up_direction(cameras)
     back = _unit(np.mean(positions, axis=0) - focus, fallback=-middle.world_to_camera[2, :3])
     back = _unit(back - up * (back @ up), fallback=np.linalg.svd(up[None])[2][1])
     right = np.cross(up, back)
@@ -82,7 +90,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
 
 def surround(cameras: Sequence[Camera], focus: np.ndarray) -> bool:
     """Return whether cameras stand all around a point, as seen from above."""
-    up = mean_up(cameras)
+    up = up_direction(cameras)
     east = np.linalg.svd(up[None])[2][1]
     offsets = _positions(cameras) - focus
     return _go_round(np.arctan2(offsets @ np.cross(up, east), offsets @ east))
@@ -104,10 +112,44 @@ def _along(azimuths: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np
     return np.clip(course(at), values.min(), values.max()), float(np.std(values - course(azimuths)))
 
 
-def mean_up(cameras: Sequence[Camera], fallback: Camera | None = None) -> np.ndarray:
-    """[3] the unit vector that is up in most pictures; where they cancel out, the fallback's or the first camera's."""
-    alone = fallback or cameras[0]
-    return _unit(-_axes(cameras, 1).mean(axis=0), fallback=-alone.world_to_camera[1, :3])
+def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the unit vector [3] against gravity that the poses of photos show.
+
+    People hold cameras level: the horizontal axis of a picture, or the vertical one of a picture taken with the camera
+    turned by a quarter, is horizontal. Up is the direction nearest to orthogonal to all of them (least squares).
+    """
+    axes = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
+    mean_up, forward = -axes[:, 1].mean(axis=0), axes[:, 2].mean(axis=0)
+    if np.linalg.norm(mean_up) < _CANCELED < _ALIKE < np.linalg.norm(forward):
+        # Photos from the air look down with any heading: both axes of all pictures are level.
+        level = np.concatenate([axes[:, 0], axes[:, 1]])
+        up = np.linalg.eigh(level.T @ level)[1][:, 0]
+        return up if up @ forward < 0 else -up
+    anchor = mean_up if np.linalg.norm(mean_up) > 1e-6 else -axes[0, 1]
+    up = anchor / np.linalg.norm(anchor)
+    pull = _MEAN_UP_WEIGHT * np.outer(mean_up, mean_up)
+    for _ in range(4):
+        level = _level_axes(axes, up)
+        spread = (level[:, :, None] * level[:, None, :]).mean(axis=0)
+        candidate = np.linalg.eigh(spread - pull)[1][:, 0]
+        up = candidate if candidate @ up >= 0 else -candidate
+    along = float(mean_up @ up)
+    if abs(along) < _DOWN and abs(forward @ up) > _DOWN:  # Photos from the air look down.
+        up = -np.sign(forward @ up) * up
+    elif along < 0:
+        up = -up
+    return up
+
+
+def typical_roll(cameras: Sequence[Camera], up: np.ndarray) -> float:
+    """Return the median angle, in radians, between the level axes of pictures and the horizon of an up direction."""
+    level = _level_axes(np.stack([camera.world_to_camera[:3, :3] for camera in cameras]), up)
+    return float(np.median(np.arcsin(np.clip(np.abs(level @ up), 0, 1))))
+
+
+def _level_axes(axes: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return [n, 3], of the axes [n, 3, 3] of each camera that of the picture which is nearer to the horizon."""
+    return np.where((np.abs(axes[:, 0] @ up) <= np.abs(axes[:, 1] @ up))[:, None], axes[:, 0], axes[:, 1])
 
 
 def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
@@ -149,7 +191,7 @@ def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
     focus, up, size = None, np.array([0.0, -1.0, 0.0]), 0.0
     if cameras:
         focus, size = common_focus(cameras), float(np.linalg.norm(np.ptp(_positions(cameras), axis=0)))
-        up = _unit(-_axes(cameras, 1).sum(axis=0), fallback=up)
+        up = up_direction(cameras)
     return {
         "up": up.tolist(),
         "focus": None if focus is None else focus.tolist(),

@@ -19,19 +19,14 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 
 from ..files import read_json, write_json
-from .camera_paths import common_focus
+from .camera_paths import common_focus, typical_roll, up_direction
 
 log = logging.getLogger(__name__)
 AXES = ("upright", "scene")
 Y_DOWN_SUFFIXES = (".ply", ".sog", ".spz")
 ORIENTATION_FILE = "orientation.json"
 """File in a run's folder that keeps an up direction and a scale set for it; they then need no options."""
-# Weight of the mean up of the pictures beside the horizon of the cameras. Cameras that all look one way say nothing of
-# their pitch by their horizon; then the pictures' mean decides. Where they look around, it moves up by less than 1/10
-# of the cameras' mean pitch.
-_MEAN_UP_WEIGHT = 0.005
 _WORST_ROLL = math.radians(12)  # Median roll about the common up above which the cameras are said to have none
-_DOWN = 0.2  # Mean of the pictures' up along the common up below which the viewing directions decide its sign
 _LARGEST_SCALE = 1e6
 
 
@@ -137,6 +132,10 @@ def world_transform(
         return WorldTransform(rotation, np.zeros(3), factor)
     if direction is None:
         direction = up_direction(cameras)
+        roll = typical_roll(cameras, direction)
+        if roll > _WORST_ROLL:
+            text = "the photos share no up direction (typically %.0f degrees off); set --up x,y,z, or --axes scene"
+            log.warning(text, math.degrees(roll))
     rotation, origin = _rotation(direction, middle_camera(cameras) if cameras else None), np.zeros(3)
     if cameras:
         focus = common_focus(cameras)
@@ -159,39 +158,6 @@ def file_transform(transform: WorldTransform, path: Path | str) -> WorldTransfor
         return transform
     turn = np.diag([-1.0, -1.0, 1.0])
     return WorldTransform(turn @ transform.rotation, turn @ transform.translation, transform.scale)
-
-
-def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the unit vector [3] against gravity that the poses of photos show.
-
-    People hold cameras level: the horizontal axis of a picture, or the vertical one of a picture taken with the camera
-    turned by a quarter, is horizontal. Up is the direction nearest to orthogonal to all of them (least squares). A
-    warning says if the photos have no common up.
-    """
-    axes = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
-    mean_up, forward = -axes[:, 1].mean(axis=0), axes[:, 2].mean(axis=0)
-    anchor = mean_up if np.linalg.norm(mean_up) > 1e-6 else -axes[0, 1]
-    up = anchor / np.linalg.norm(anchor)
-    pull = _MEAN_UP_WEIGHT * np.outer(mean_up, mean_up)
-    for _ in range(4):
-        # Of each camera the axis of the picture that is level.
-        level = np.where((np.abs(axes[:, 0] @ up) <= np.abs(axes[:, 1] @ up))[:, None], axes[:, 0], axes[:, 1])
-        spread = (level[:, :, None] * level[:, None, :]).mean(axis=0)
-        candidate = np.linalg.eigh(spread - pull)[1][:, 0]
-        up = candidate if candidate @ up >= 0 else -candidate
-    along = float(mean_up @ up)
-    if abs(along) < _DOWN and abs(forward @ up) > _DOWN:  # Photos from the air look down.
-        up = -np.sign(forward @ up) * up
-    elif along < 0:
-        up = -up
-    roll = float(np.median(np.arcsin(np.clip(np.abs(level @ up), 0, 1))))
-    if roll > _WORST_ROLL:
-        degrees = math.degrees(roll)
-        log.warning(
-            "the photos share no up direction (typically %.0f degrees off); set --up x,y,z, or --axes scene",
-            degrees,
-        )
-    return up
 
 
 def middle_camera(cameras: Sequence[Camera]) -> Camera:

@@ -7,9 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.camera_exchange import camera_path
+from sehdr_warp.output.camera_paths import orbit, up_direction
 from sehdr_warp.output.export import export
 from sehdr_warp.output.render_views import render_views, select_cameras
-from sehdr_warp.output.world_transform import WorldTransform, up_direction, world_transform, write_orientation
+from sehdr_warp.output.world_transform import WorldTransform, world_transform, write_orientation
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera, load_cameras, look_at
 from sehdr_warp.splats import read_gaussians, write_gaussians
@@ -64,6 +65,22 @@ def test_up_of_a_flight_that_looks_straight_down():
         ahead = (math.cos(heading), 0, math.sin(heading))
         cameras.append(Camera(32, 24, 40, 40, 16, 12, look_at(position, np.array(position) - (0, 9, 0), up=ahead)))
     assert degrees(up_direction(cameras), np.array([0, 1, 0])) < 1
+    # So an orbit looks at the ground from their height.
+    for each in orbit(cameras, 5, 30.0):
+        assert each.position[1] == pytest.approx(30, abs=1) and each.world_to_camera[2, 1] < -0.9
+
+
+def test_up_of_a_flight_to_and_fro():
+    """The level axes of all pictures lie along one line, which says nothing of what is up."""
+    random, cameras = np.random.default_rng(0), []
+    for index in range(20):
+        position = np.array([index % 5, 20.0, index // 5])
+        ahead = (0, 0, 1 if index // 5 % 2 else -1)
+        target = position - (*random.normal(0, 0.08, 1), 1, *random.normal(0, 0.08, 1))
+        cameras.append(Camera(32, 24, 40, 40, 16, 12, look_at(position, target, up=ahead)))
+    assert degrees(up_direction(cameras), np.array([0, 1, 0])) < 3
+    for each in orbit(cameras, 5, 20.0):
+        assert each.position[1] == pytest.approx(20, abs=1) and each.world_to_camera[2, 1] < -0.9
 
 
 def test_photos_without_a_common_up_are_named(logged):
@@ -74,7 +91,9 @@ def test_photos_without_a_common_up_are_named(logged):
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = pose, -pose @ position
         cameras.append(Camera(32, 24, 40, 40, 16, 12, matrix))
-    up_direction(cameras)
+    run = AnalyticRun()
+    run.cameras = [Entry(str(i), "train", each) for i, each in enumerate(cameras)]
+    world_transform(run)
     assert any("share no up direction" in line and "--up x,y,z" in line for line in logged)
 
 
