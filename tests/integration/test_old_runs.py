@@ -1,10 +1,14 @@
 """Folders of runs that earlier versions wrote, which are stored in tests/data."""
 
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from ..refusals import refused
+from sehdr_warp.scene.hdr_files import read_hdr
+
+from ..refusals import call, refused
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 
@@ -15,3 +19,14 @@ def test_a_run_of_version_0_2_is_refused_with_what_to_do(command, tmp_path, capf
     line = refused(capfd, *words, "--device", "cpu")
     assert "of sehdr-warp 0.2.0" in line and "train again" in line
     assert not (tmp_path / "views").exists()
+
+
+def test_a_run_of_version_0_3_renders_exports_and_resumes(tmp_path):
+    """If the format of runs changes on purpose, refuse this run like that of 0.2, and store one of the new format."""
+    run = shutil.copytree(DATA / "run-0.3", tmp_path / "run")
+    assert call("render", run, "--out", tmp_path / "views", "--device", "cpu", "-q") == 0
+    pictures = [read_hdr(path) for path in (tmp_path / "views" / "hdr").glob("*.exr")]
+    assert pictures and all(np.isfinite(picture).all() and picture.max() > 0 for picture in pictures)
+    assert call("export", run, "--out", tmp_path / "scene.ply", "--device", "cpu", "-q") == 0
+    assert call("train", "--resume", "--out", run, "--iterations", 24, "--device", "cpu", "-q") == 0
+    assert (run / "checkpoints" / "iteration_00000024").is_dir()
