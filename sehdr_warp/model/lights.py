@@ -126,8 +126,8 @@ def _light_at(field: RadianceField, point: np.ndarray, cameras: Sequence[Camera]
     directions = torch.tensor(sphere_directions(DIRECTIONS), dtype=torch.float32).view(-1, 256, 3)
     focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras]))
     options = {"focal_length": focal, "pixel_angle": float(np.sqrt(4 * np.pi / DIRECTIONS)), "degree": degree}
-    seen = field.render_directions(point, directions.to(field.gaussians.means.device), **options)
-    return 4 * np.pi * float(seen.hdr.mean())
+    visible = field.render_directions(point, directions.to(field.gaussians.means.device), **options)
+    return 4 * np.pi * float(visible.hdr.mean())
 
 
 def _view_sums(field: RadianceField, camera: Camera, degree: int | None) -> tuple[Tensor, Tensor, Tensor]:

@@ -50,9 +50,9 @@ def find_residual_regions(field: RadianceField, views: Sequence[View], *, degree
     for view in views[:: -(-len(views) // MAX_VIEWS) or 1]:
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         for row, column, stops in _regions(view, exposure, field.response):
-            left, top = int(column.min()), int(row.min())
+            first_column, top = int(column.min()), int(row.min())
             middle = round(float(column.mean()) + 0.5, 1), round(float(row.mean()) + 0.5, 1)
-            box = left, top, int(column.max()) - left + 1, int(row.max()) - top + 1
+            box = first_column, top, int(column.max()) - first_column + 1, int(row.max()) - top + 1
             regions.append(Region(view.name, *middle, len(row), round(float(stops.mean()), 2), box))
     return sorted(regions, key=lambda region: -region.pixels * abs(region.stops))
 

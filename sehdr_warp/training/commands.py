@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Which photos to train on, and how to read them."""
+    """"""  # noqa: D419  (a text would be one more line of the help)
 
     response: str | None = None
     """Camera response: a name of `sehdr-warp responses`, a file, auto (the default) or learned."""
@@ -39,7 +39,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """What to train, and for how long."""
+    """"""  # noqa: D419  (a text would be one more line of the help)
 
     preset: str | None = None
     """A name of `sehdr-warp presets` or a TOML file. (default: default, or what --resume continues)"""
@@ -53,7 +53,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What to write and show."""
+    """"""  # noqa: D419  (a text would be one more line of the help)
 
     out: Path | None = None
     """Folder for the run."""
@@ -71,7 +71,7 @@ class OutputOptions:
 
 @dataclass(frozen=True)
 class MachineOptions:
-    """What to train on."""
+    """"""  # noqa: D419  (a text would be one more line of the help)
 
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
@@ -121,31 +121,31 @@ class ShowConfig:
     """Print it as JSON."""
 
 
-def run_train(asked: Train, argv: Sequence[str]) -> None:
+def run_train(args: Train, argv: Sequence[str]) -> None:
     """Train, or print the plan, and print what was written and what to do next.
 
     Args:
-        asked: the options.
+        args: the options.
         argv: the words of the command line, with which --gpus starts the other ranks.
     """
     from .ranks import device_of_rank, join_ranks, launched_as
 
-    gpus, place = asked.machine.gpus, launched_as()
+    gpus, place = args.machine.gpus, launched_as()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
-    if place is None and gpus > 1 and not asked.training.plan_only:
+    if place is None and gpus > 1 and not args.training.plan_only:
         from .launch import launch
 
-        device_of_rank(gpus - 1, asked.machine.device)
+        device_of_rank(gpus - 1, args.machine.device)
         launch(gpus, _run_as_rank, list(argv))
-    elif place is None or asked.training.plan_only:
-        _train(asked)
+    elif place is None or args.training.plan_only:
+        _train(args)
     elif gpus not in (1, place[1]):
         raise UsageError(f"--gpus {gpus}, but {place[1]} ranks were started; leave it out")
     else:
-        with join_ranks(*place, device_of_rank(place[0], asked.machine.device)) as ranks:
+        with join_ranks(*place, device_of_rank(place[0], args.machine.device)) as ranks:
             if ranks.leads:
-                _train(asked, ranks)
+                _train(args, ranks)
             else:
                 from .following import follow_leader
 
@@ -161,15 +161,15 @@ def _run_as_rank(words: list[str]) -> None:
     main(words)
 
 
-def _train(asked: Train, ranks=None) -> None:
+def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, or print a plan, on this rank."""
     from ..runs.device import pick_device
     from ..runs.run_writer import RunWriter
     from .hdr_truth import check_dataset_truth
 
-    output, resumed = asked.output, None
+    output, resumed = args.output, None
     out, how = output.out, {"resume": output.resume, "overwrite": output.overwrite}
-    if asked.training.plan_only:
+    if args.training.plan_only:
         out = None
     elif out is None:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
@@ -178,9 +178,9 @@ def _train(asked: Train, ranks=None) -> None:
         resumed = folder
     elif output.resume:
         log.info("%s holds no run yet: a training begins there", out)
-    data = _data(asked, resumed)
-    config = _config(asked, resumed)
-    device = pick_device(asked.machine.device) if ranks is None else ranks.device
+    data = _data(args, resumed)
+    config = _config(args, resumed)
+    device = pick_device(args.machine.device) if ranks is None else ranks.device
     options = config.response
     photos = {"device": "memory"}.get(config.schedule.photo_cache, config.schedule.photo_cache)
     given = {"method": options.method, "candidates": options.candidates, "photos": photos}
@@ -221,55 +221,55 @@ def _precompiling(config):
     return precompiled(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
 
 
-def run_presets(asked: Presets) -> None:
+def run_presets(args: Presets) -> None:
     """Print every preset with its purpose and cost."""
     names, purpose = configs.preset_names(), configs.preset_purpose
     rows = {name: {"purpose": purpose(name), "cost": _cost(configs.load_config(name))} for name in names}
     lines = (f"{name:<14}{row['purpose']}\n{'':<14}{row['cost']}" for name, row in rows.items())
-    print(json.dumps(rows) if asked.json else "\n".join(lines))
+    print(json.dumps(rows) if args.json else "\n".join(lines))
 
 
-def run_config(asked: ShowConfig) -> None:
+def run_config(args: ShowConfig) -> None:
     """Print a config."""
     from ..runs.run_folder import RunFolder
 
-    folder = RunFolder(asked.which)
-    config = folder.read_config() if folder.config.is_file() else configs.load_config(asked.which)
-    print(json.dumps(config.model_dump()) if asked.json else configs.config_as_toml(config, asked.diff))
+    folder = RunFolder(args.which)
+    config = folder.read_config() if folder.config.is_file() else configs.load_config(args.which)
+    print(json.dumps(config.model_dump()) if args.json else configs.config_as_toml(config, args.diff))
 
 
-def _data(asked: Train, resumed) -> dict:
+def _data(args: Train, resumed) -> dict:
     """Return the arguments of load_scene() of the command line, or else of the run that is resumed."""
     from ..scene import is_embedded
 
-    path = asked.data
+    path = args.data
     if path is not None and not is_embedded(path):
         path = str(Path(path).absolute())
         require_text(path)
-    given = {"path": path} | {name: getattr(asked.scene, name) for name in LOAD_OPTIONS}
+    given = {"path": path} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
     if resumed is not None:
         known = resumed.read_info()["data"]
         given = {name: known.get(name) if value is None else value for name, value in given.items()}
-    if given["path"] is None and asked.output.resume:
-        raise SehdrError(f"{asked.output.out}: does not say where its photos are; give SCENE")
+    if given["path"] is None and args.output.resume:
+        raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
     if given["path"] is None:
         raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
     return given
 
 
-def _config(asked: Train, resumed):
+def _config(args: Train, resumed):
     """Return the config of the preset, or of the run that is resumed, with the fields of the command line."""
-    options = asked.training
-    shortcuts = {"response.name": asked.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}
+    options = args.training
+    shortcuts = {"response.name": args.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}
     named = {path: value for path, value in shortcuts.items() if value is not None}
     flags = {"response.name": "--response", "schedule.iterations": "--iterations", "seed": "--seed"}
-    for path, text in configs.named_fields(asked.fields).items():
+    for path, text in configs.named_fields(args.fields).items():
         named[path], flags[path] = configs.value_of(path, text), configs.flag_of(path)
     if resumed is not None and options.preset is None:
         return configs.override_config(resumed.read_config(), named, flags=flags)
     config = configs.load_config(options.preset or "default", named, flags)
-    kept = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
-    return configs.override_config(config, {"plan.keep": sorted(kept)})
+    user_fields = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
+    return configs.override_config(config, {"plan.keep": sorted(user_fields)})
 
 
 def _cost(config) -> str:
@@ -289,12 +289,12 @@ def _ending(path: Path, summary: dict) -> str:
     """Return the lines that end a training: its result, and what to type next."""
     from .held_out import format_scores
 
-    told = [figures for line in summary["metrics"] if (figures := format_scores(line))]
-    heldout = f", {told[-1]}" if told else ""
-    made = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
+    scores = [figures for line in summary["metrics"] if (figures := format_scores(line))]
+    heldout = f", {scores[-1]}" if scores else ""
+    result = f"{summary['iteration']} iterations, {summary['gaussians']} Gaussians{heldout}"
     run, views, report = (shlex.quote(str(place)) for place in (path, path / "views", path / "report"))
-    cameras = "" if told else " --cameras train"
-    return f"""{path}: {made}, {summary["train_seconds"]:.1f} s on {summary["device"]}
+    cameras = "" if scores else " --cameras train"
+    return f"""{path}: {result}, {summary["train_seconds"]:.1f} s on {summary["device"]}
 look at it:         sehdr-warp view {run}
 exposure brackets:  sehdr-warp render {run} --out {views}{cameras} --evs=-4,-2,0,2,4
 pictures, splats:   sehdr-warp report {run} --out {report};  sehdr-warp export {run} --out scene.ply"""

@@ -122,9 +122,9 @@ def start_gaussians(
     field = field_of(read)
     field.response = response
     positions = np.stack([view.camera.position for view in scene.train_views])
-    wanted = gaussians_of(field, config.model.radiance, positions, time)
+    gaussians = gaussians_of(field, config.model.radiance, positions, time)
     _log.info("starting from the %d Gaussians of %s", read.count, config.model.init_file)
-    return field_of(replace(wanted, base_time=time)).gaussians.requires_grad_()
+    return field_of(replace(gaussians, base_time=time)).gaussians.requires_grad_()
 
 
 def start_points(
@@ -139,15 +139,15 @@ def start_points(
         [N, 3] points and their encoded colors [N, 3].
     """
     points, colors = scene.points, scene.point_colors
-    wanted = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
-    if wanted > len(points):
-        found = _matched(matcher(), wanted - len(points), config.seed)
-        points, colors = (np.concatenate(both) for both in zip((points, colors), found, strict=True))
-        _log.info("%d points matched between the photos", len(found[0]))
+    number = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
+    if number > len(points):
+        matches = _matched(matcher(), number - len(points), config.seed)
+        points, colors = (np.concatenate(both) for both in zip((points, colors), matches, strict=True))
+        _log.info("%d points matched between the photos", len(matches[0]))
     points = within_reach(points)
     if len(points) < FEWEST_POINTS:
-        drawn = random_points(scene, max(wanted, FEWEST_RANDOM), rng)
-        points, colors = (np.concatenate(both) for both in zip((points, colors), drawn, strict=True))
+        random = random_points(scene, max(number, FEWEST_RANDOM), rng)
+        points, colors = (np.concatenate(both) for both in zip((points, colors), random, strict=True))
     return points, colors
 
 
@@ -190,8 +190,8 @@ def match_points(
 
 def _matched(matcher: Matcher, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Match about `count` pixels; return points [N, 3] and colors [N, 3]."""
-    found = matcher.match(matcher.pixels(count, np.random.default_rng(seed)))
-    return found.points.double().cpu().numpy(), found.colors.cpu().numpy()
+    matches = matcher.match(matcher.pixels(count, np.random.default_rng(seed)))
+    return matches.points.double().cpu().numpy(), matches.colors.cpu().numpy()
 
 
 def start_count(config: Config, pixels: int) -> int:
@@ -236,17 +236,17 @@ def random_points(scene: Scene, count: int, rng: np.random.Generator) -> tuple[n
         SehdrError: If no two cameras see the same place.
     """
     views = scene.train_views
-    distance, found, total = focus_distance(views), [], 0
+    distance, batches, total = focus_distance(views), [], 0
     for _ in range(8):
         points = points_on_rays(views, count, distance, rng)
-        seen, mean = colors_in_views(points, views)
-        found.append((points[seen >= 2], mean[seen >= 2]))
-        total += len(found[-1][0])
+        visible, mean = colors_in_views(points, views)
+        batches.append((points[visible >= 2], mean[visible >= 2]))
+        total += len(batches[-1][0])
         if total >= count:
             break
     if total < 4:
         raise SehdrError(f"{scene.name}: no two training cameras look at the same place; check the poses")
-    points, colors = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+    points, colors = (np.concatenate(parts)[:count] for parts in zip(*batches, strict=True))
     return points, colors
 
 
@@ -295,12 +295,12 @@ def pixels_of(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray, n
 
 def colors_in_views(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return how many photos contain each point [N], and the mean of their encoded values there [N, 3]."""
-    seen, total = np.zeros(len(points)), np.zeros((len(points), 3))
+    visible, total = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
         row, column, inside = pixels_of(points, view)
-        seen[inside] += 1
+        visible[inside] += 1
         total[inside] += view.image[row[inside].astype(int), column[inside].astype(int)]
-    return seen, total / np.maximum(seen, 1)[:, None]
+    return visible, total / np.maximum(visible, 1)[:, None]
 
 
 def sizes_of(scene: Scene, gaussians: int | None = None) -> tuple[int, int, int]:

@@ -202,10 +202,10 @@ def hdr_loss(photo: TrainRender, target: Target, config: LossConfig, largest: fl
 
 def extra_images(config: LossConfig, has_truth: bool) -> frozenset[str]:
     """Return the extra images that render_train_view() must render for data_loss."""
-    wanted = {"exposure"} if config.hdr_weight > 0 and has_truth else set()
+    images = {"exposure"} if config.hdr_weight > 0 and has_truth else set()
     if config.linear_weight > 0:
-        wanted |= {"base"} if config.hdr_truth and has_truth else {"base", "exposure"}
-    return frozenset(wanted)
+        images |= {"base"} if config.hdr_truth and has_truth else {"base", "exposure"}
+    return frozenset(images)
 
 
 def data_loss(

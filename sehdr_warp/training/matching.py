@@ -62,7 +62,7 @@ class Matcher:
         """
         base = float(np.median([view.exposure_time for view in views]))
         tables = [_exposure_table(view.exposure_time / base, response) for view in views]
-        matchable = prefetch_map(lambda given: _matchable(*given), zip(views, tables, strict=True), len(views))
+        matchable = prefetch_map(lambda pair: _matchable(*pair), zip(views, tables, strict=True), len(views))
         self._images, cameras = zip(*matchable, strict=True)
         self._cameras, self._masks = cameras, [view.mask for view in views]
         self.device = torch.device(device)
@@ -71,10 +71,10 @@ class Matcher:
         poses = np.stack([camera.camera_to_world for camera in cameras])
         self._poses = torch.tensor(poses, dtype=torch.float32, device=device)
         self._set_depths(np.geomspace(focus * RANGE[1], focus * RANGE[0], PLANES[1]))
-        found = self.match(self.pixels(PROBES, np.random.default_rng(0))).footprints * float(cameras[0].fx)
+        depths = self.match(self.pixels(PROBES, np.random.default_rng(0))).footprints * float(cameras[0].fx)
         near, far = (part * focus for part in GUESS)
-        if len(found) >= FEWEST_FOUND:
-            near, far = (float(found.quantile(part)) * slack for part, slack in zip((0.01, 0.99), SLACK, strict=True))
+        if len(depths) >= FEWEST_FOUND:
+            near, far = (float(depths.quantile(part)) * slack for part, slack in zip((0.01, 0.99), SLACK, strict=True))
         planes = int(np.clip(_parallax(cameras, neighbors, near, far), *PLANES))
         self._set_depths(1 / np.linspace(1 / far, 1 / near, planes))
 
@@ -201,8 +201,8 @@ def _sample_squares(chance: np.ndarray, side: float, rng: np.random.Generator, v
 
 def _neighbors(cameras: Sequence[Camera], others: Sequence[Camera]) -> np.ndarray:
     """Return [V, NEIGHBORS] the nearest other cameras that look the same way; -1 if there are fewer."""
-    positions, others_positions = (np.stack([camera.position for camera in given]) for given in (cameras, others))
-    axes, others_axes = (np.stack([camera.world_to_camera[2, :3] for camera in given]) for given in (cameras, others))
+    positions, others_positions = (np.stack([camera.position for camera in pair]) for pair in (cameras, others))
+    axes, others_axes = (np.stack([camera.world_to_camera[2, :3] for camera in pair]) for pair in (cameras, others))
     distance = np.linalg.norm(positions[:, None] - others_positions, axis=2)
     distance[(axes @ others_axes.T < LEAST_COSINE) | (distance == 0)] = np.inf
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBORS]

@@ -105,12 +105,12 @@ class Plan:
 
     def lines(self) -> list[str]:
         """Return a line for each decision that changes something, and for each field that the user set."""
-        made = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.told]
+        lines = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.told]
         evened = any(row.name == "exposure-compensation" and row.told for row in self.decisions)
         if self.facts.drift >= DRIFT and not evened:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
-            made.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
-        return made + [f"plan: {line}, as given" for line in _format_fields(self.kept)]
+            lines.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
+        return lines + [f"plan: {line}, as given" for line in _format_fields(self.kept)]
 
 
 def _format_fields(fields: dict) -> list[str]:
@@ -196,12 +196,12 @@ def check_scene(scene: Scene, facts: SceneFacts) -> None:
 
 def check_fields(scene: Scene, config: Config) -> None:
     """Raise InputError, with both values, for fields in plan.keep, set by the user, that the scene contradicts."""
-    given, points = config.plan.keep, len(scene.points)
+    user_fields, points = config.plan.keep, len(scene.points)
 
     def refuse(path: str, problem: str, remedy: str) -> None:
         raise InputError(scene.name, f"{path} = {json.dumps(attrgetter(path)(config))}, but {problem}", remedy)
 
-    if "fusion.exposures" in given:
+    if "fusion.exposures" in user_fields:
         base = base_time(scene)
         timed = [item for item in config.fusion.exposures if is_seconds(item)]
         if timed and not scene.exposure_times_known:
@@ -211,9 +211,9 @@ def check_fields(scene: Scene, config: Config) -> None:
             if not 1 / REACH <= time / base <= REACH:
                 problem = f"{time:.3g} s is {time / base:.3g} times the photos' {base:.3g} s"
                 refuse("fusion.exposures", problem, f"stay within 1/{REACH:.0f} and {REACH:.0f} times")
-    if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(given):
+    if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(user_fields):
         largest_hdr_truth(scene, config.loss)
-    if "densification.cap_max" in given and config.densification.cap_max < points:
+    if "densification.cap_max" in user_fields and config.densification.cap_max < points:
         remedy = f"use {points} or more, or leave the field out"
         refuse("densification.cap_max", f"the scene starts from {points} points", remedy)
 
@@ -224,8 +224,8 @@ def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice
         return {}, "no search", "the photos hold light itself"
     if name != "auto":
         return {}, "no search", "learned with the scene" if name == "learned" else f"{name} was named"
-    made = "a camera made the files" if facts.from_camera else "nothing says what made the files"
-    return {}, "search", f"no curve was named, and {made}: it is chosen from {facts.photos} photos"
+    writer = "a camera made the files" if facts.from_camera else "nothing says what made the files"
+    return {}, "search", f"no curve was named, and {writer}: it is chosen from {facts.photos} photos"
 
 
 def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -254,12 +254,12 @@ def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice
 
 
 def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
-    shown = f"{facts.truths} of {facts.photos} photos have HDR truth"
+    truths = f"{facts.truths} of {facts.photos} photos have HDR truth"
     if config.loss.linear_weight == 0:
-        return {}, "none", f"loss.linear_weight = 0; {shown}"
+        return {}, "none", f"loss.linear_weight = 0; {truths}"
     if config.loss.hdr_truth and facts.truths:
-        return {}, "against truth", shown
-    return {"loss.linear_weight": 0.0}, "none", f"{shown}: against its own brackets a base learns nothing"
+        return {}, "against truth", truths
+    return {"loss.linear_weight": 0.0}, "none", f"{truths}: against its own brackets a base learns nothing"
 
 
 def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -290,26 +290,26 @@ def _is_short_of_time(facts: SceneFacts, config: Config, device: torch.device) -
     options, steps = config.densification, config.schedule.iterations
     if device.type != "cpu" or options.strategy != "mcmc" or config.mcmc.cap_density <= CPU_BUDGET:
         return False
-    asked = "schedule.iterations" in config.plan.keep and steps >= FEWEST_ITERATIONS
-    return not asked and FEWEST_ITERATIONS * cpu_step_seconds(facts, config) > CPU_SECONDS
+    set_by_user = "schedule.iterations" in config.plan.keep and steps >= FEWEST_ITERATIONS
+    return not set_by_user and FEWEST_ITERATIONS * cpu_step_seconds(facts, config) > CPU_SECONDS
 
 
 def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     preset = config.schedule.iterations
-    wanted = min(preset, math.ceil(max(FEWEST_ITERATIONS, STEPS_PER_PHOTO * facts.photos) / 100) * 100)
+    number = min(preset, math.ceil(max(FEWEST_ITERATIONS, STEPS_PER_PHOTO * facts.photos) / 100) * 100)
     bounds = f"at least {FEWEST_ITERATIONS}, at most {preset}" if preset > FEWEST_ITERATIONS else f"at most {preset}"
     reason = f"{STEPS_PER_PHOTO} steps on each of {facts.photos} photos, {bounds}"
     if device.type == "cpu":
         step = cpu_step_seconds(facts, config)
         most = max(CPU_FEWEST, math.ceil(CPU_SECONDS / step / 100) * 100)
-        if wanted > most:
+        if number > most:
             # Of the seconds and not of the steps: a step is as slow as its photo is large.
-            wanted, seconds = most, most * step
+            number, seconds = most, most * step
             took = f"{max(1, round(seconds / 60))} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
             reason = f"about {took} on a CPU with {thread_count()} threads; --iterations for more"
             if seconds > 2 * CPU_SECONDS:  # Of the fewest steps, then.
                 reason += ", --max-size for smaller photos and less time"
-    return {"schedule.iterations": wanted}, f"{wanted}", reason
+    return {"schedule.iterations": number}, f"{number}", reason
 
 
 def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Choice:

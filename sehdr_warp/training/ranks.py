@@ -87,12 +87,12 @@ class Ranks:
         """Log that this rank waits for the others."""
         log.info("rank %d of %d waits for the others", self.rank, self.count)
 
-    def all_reduce_min(self, wanted: int) -> int:
+    def all_reduce_min(self, signal: int) -> int:
         """Return the smallest of GO, WAIT and END that any rank passes.
 
         Rank 0 may take its time before it calls this; the others wait.
         """
-        answer = torch.tensor([wanted], dtype=torch.int32)
+        answer = torch.tensor([signal], dtype=torch.int32)
         # Rank 0 may evaluate or be paused, so only it expects answers in time.
         self._deadline = time.monotonic() + self._patience if self.leads else None
         with self._together():
@@ -242,12 +242,12 @@ class Ranks:
                 with suppress(RuntimeError):  # The store is gone: its rank will be missed otherwise.
                     if self.leads:
                         self.store.set("alive", str(now))
-                    elif self.store.check(["alive"]) and (told := self.store.get("alive").decode()) != heard:
-                        heard, since = told, now
+                    elif self.store.check(["alive"]) and (message := self.store.get("alive").decode()) != heard:
+                        heard, since = message, now
             if (deadline is not None and now > deadline) or (heard and now - since > self._patience):
                 if self.ends_first():
-                    told = "another rank did not answer rank %d of %d for %.0f s (%s): %s"
-                    log.error(told, self.rank, self.count, self._patience, TIMEOUT, ENDING)
+                    message = "another rank did not answer rank %d of %d for %.0f s (%s): %s"
+                    log.error(message, self.rank, self.count, self._patience, TIMEOUT, ENDING)
                 os._exit(1)
 
 
@@ -310,8 +310,8 @@ def join_ranks(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
     except BaseException as error:
         ranks.abandon()
         _end_soon(error)
-        first, told = ranks.ends_first(), isinstance(error, Exception) and as_user_error(error)
-        if told and not first:
+        first, message = ranks.ends_first(), isinstance(error, Exception) and as_user_error(error)
+        if message and not first:
             raise SystemExit(1) from None
         if rank and isinstance(error, KeyboardInterrupt):
             raise SystemExit(130) from None

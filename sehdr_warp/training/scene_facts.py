@@ -69,11 +69,13 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     """Measure a scene with at least one training view; `seed` is that of the probes."""
     photos, views = scene.train_views, perspective_views(scene.train_views)
     rng = np.random.default_rng(seed)
-    probes = drawn = points_on_rays(views, PROBES, focus_distance(views), rng)
+    probes = ray_points = points_on_rays(views, PROBES, focus_distance(views), rng)
     if len(scene.points) >= FEWEST_POINTS:
         count = min(PROBES, len(scene.points))
         probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
-    shown, drawn = (np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, drawn))
+    visible, on_rays = (
+        np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, ray_points)
+    )
     figures = np.array([_codes(view) for view in views[:: -(-len(views) // MOST_VIEWS)]])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     gaze, ahead = _gaze(np.stack([view.camera.world_to_camera for view in views]))
@@ -83,8 +85,8 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         from_camera=are_camera_jpegs([view.source for view in photos]),
         truths=sum(view.hdr is not None for view in photos),
         points=len(scene.points),
-        seen=float(shown[shown > 0].mean()) if shown.any() else 0.0,
-        overlap=max(float((count >= 2).mean()) for count in (shown, drawn)),
+        seen=float(visible[visible > 0].mean()) if visible.any() else 0.0,
+        overlap=max(float((count >= 2).mean()) for count in (visible, on_rays)),
         clipped=clipped,
         black=black,
         contrast=float(np.sqrt(max(square - mean**2, 0.0))),

@@ -129,10 +129,10 @@ class Trainer(TrainingState):
 
     def _agree_to_continue(self) -> bool:
         """Return whether there is a next step; any rank may end the training."""
-        wanted = self.iteration < self.total and not self.ending
+        remains = self.iteration < self.total and not self.ending
         if self.ranks is None:
-            return wanted
-        while (agreed := self.ranks.all_reduce_min(GO if wanted else END)) == WAIT:
+            return remains
+        while (agreed := self.ranks.all_reduce_min(GO if remains else END)) == WAIT:
             pass
         return agreed == GO
 
@@ -293,8 +293,10 @@ class Trainer(TrainingState):
         if changed and self.reserves_rows:
             self._reserve_rows()
         if changed and self.graphs.enabled:
-            kept = self.capacity.rescale(gaussians.count / max(1, count), keep=gaussians.reallocations == reallocations)
-            if not kept:
+            valid = self.capacity.rescale(
+                gaussians.count / max(1, count), keep=gaussians.reallocations == reallocations
+            )
+            if not valid:
                 self.graphs.invalidate()
 
     def _seed(self, number: Tensor, bound: int) -> Seeds:

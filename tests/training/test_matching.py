@@ -84,23 +84,24 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     dark = [replace(v, codes=np.where(v.codes.min(2, keepdims=True) > 250, np.uint8(77), v.codes)) for v in scene.views]
     wall = replace(scene, views=tuple(dark))
     field = make_field(wall, config, LINEAR, device)
-    views = training_views(scene.train_views, field.base_time, device, truth=False)
-    matcher = make_matcher(scene, LINEAR, device)
+    normalized = field.normalization.scene(scene)
+    views = training_views(normalized.train_views, field.base_time, device, truth=False)
+    matcher = make_matcher(normalized, LINEAR, device)
     with torch.no_grad():
         # Opaque, so that the wall is explained from the start.
         field.gaussians.opacity_logits.fill_(4.0)
         shown = field.render_train_view(views[0].camera, views[0].exposure_time, degree=0).encoded
     wanted = torch.tensor(200, device=device)
     given = field, matcher, shown, views[0], 0
-    (rows, born), (again, roomy) = (seed_gaussians(*given, wanted, room, seed=3) for room in (200, 300))
+    (rows, born), (again, roomy) = (seed_gaussians(*given, wanted, room, random_seed=3) for room in (200, 300))
     assert 0 < int(born) < 200 and born == roomy
     rows, again = ({name: values[: int(born)] for name, values in each.items()} for each in (rows, again))
     assert all(torch.equal(values, again[name]) for name, values in rows.items())
     assert all(values.isfinite().all() for values in rows.values())
-    none = seed_gaussians(*given, torch.tensor(0, device=device), 10, seed=3)
+    none = seed_gaussians(*given, torch.tensor(0, device=device), 10, random_seed=3)
     assert not int(none[1])
     white = rows["harmonics_dc"].amax((1, 2)) == rows["harmonics_dc"].max()
-    depth = rows["means"][white, 2]
+    depth = torch.from_numpy(field.normalization.scene_points(rows["means"][white].cpu().numpy())[:, 2])
     assert white.float().mean() > 0.3 and ((depth - LAMP).abs() < 0.15 * LAMP).float().mean() > 0.6
     assert {name: tuple(values.shape[1:]) for name, values in rows.items()} == {
         name: tuple(values.shape[1:]) for name, values in field.gaussians.tensors().items()
