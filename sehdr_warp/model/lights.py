@@ -1,7 +1,7 @@
 """Lights of a trained scene: groups of bright Gaussians that the photos clipped, as simple emitting shapes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -103,12 +103,16 @@ def find_lights(
     widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
     confidence = None if field.confidence is None else field.confidence[members].cpu().numpy()
-    received = np.stack([part[2][members].cpu().numpy() for part in sums])
+    covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
     total = max(_light_at(field, middle, cameras, degree), 1e-30)
     lights = []
     for group in _groups(places, REACH * float(np.median(widths))):
         shape = _shape(places[group], widths[group], weights[group], middle)
-        radiance = _radiance(shape, received[:, group].sum(1), cameras)
+        area = float(_fitted(shape, covered[:, group].sum(1, keepdims=True), cameras)[0])
+        # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
+        sides = [side * min(max(area, 1e-4), 1e4) ** 0.5 for side in shape.size]
+        shape = replace(shape, size=(sides[0], sides[1]))
+        radiance = _fitted(shape, received[:, group].sum(1), cameras)
         deviation = None
         if confidence is not None:
             stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
@@ -177,8 +181,10 @@ def _shape(places: np.ndarray, widths: np.ndarray, weights: np.ndarray, middle: 
     return LightShape("rect", position, axes, (width, height))
 
 
-def _radiance(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the radiance [3] by which a shape gives cameras the light [V, 3] that they receive, by least squares.
+def _fitted(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the values [C] whose products with a shape's solid angles are what cameras receive [V, C].
+
+    By least squares: the radiance of light, or the area of a solid angle as a multiple of the shape's.
 
     Cameras that the light is only partly in the frame of are left out, if there are others.
     """
@@ -186,7 +192,7 @@ def _radiance(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]
     whole = np.array([_in_frame(camera, shape) for camera in cameras]) & (angles > 0)
     used = whole if whole.any() else angles > 0
     if not used.any():
-        return np.zeros(3)
+        return np.zeros(received.shape[1])
     return angles[used] @ received[used] / (angles[used] @ angles[used])
 
 

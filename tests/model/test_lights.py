@@ -50,6 +50,7 @@ def test_a_panel_is_found_with_its_place_size_direction_and_light():
     assert light.shape.axes[2] == pytest.approx([0, 0, -1], abs=0.02)
     # What counts is the light that a surface gets: radiance times solid angle.
     assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.06)
+    assert light.radiance == pytest.approx(RADIANCE, rel=0.05)
     assert light.share == pytest.approx(1, abs=0.15) and len(light.members) == scene.gaussians.count
     assert light.deviation is None and light.lower_bound == pytest.approx(np.ones(3), rel=0.01)
 
