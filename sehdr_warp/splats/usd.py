@@ -47,41 +47,50 @@ def open_stage(path: Path) -> Any:
 
 def write_usd(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     """Write a .usda, .usdc or .usdz file; arguments as in write_gaussians."""
-    Usd, UsdGeom, UsdVol, Sdf = (pxr(name) for name in ("Usd", "UsdGeom", "UsdVol", "Sdf"))
+    Sdf, Tf = pxr("Sdf"), pxr("Tf")
     packed = path.suffix.lower() == ".usdz"
     with atomic_path(path, overwrite) as temporary:
         layer = temporary.with_suffix(".usdc") if packed else temporary
-        stage = Usd.Stage.CreateNew(str(layer))
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Splats")
-        prim = splat.GetPrim()
-        stage.SetDefaultPrim(prim)
-        Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOR_SPACE)
-        prim.CreateAttribute(_BASE_TIME, Sdf.ValueTypeNames.Double, True).Set(gaussians.base_time)
-        if gaussians.world_matrix is not None:
-            matrix = pxr("Gf").Matrix4d(gaussians.world_matrix.T.tolist())  # USD's matrices act on row vectors.
-            prim.CreateAttribute(_WORLD_MATRIX, Sdf.ValueTypeNames.Matrix4d, True).Set(matrix)
-        harmonics = gaussians.harmonics.astype(np.float32, copy=True)
-        harmonics[:, 0] -= _BIAS
-        splat.CreatePositionsAttr(_array("Vec3fArray", gaussians.means))
-        splat.CreateScalesAttr(_array("Vec3fArray", np.exp(gaussians.log_scales)))
-        splat.CreateOrientationsAttr(_quaternions(gaussians.unit_quaternions))
-        splat.CreateOpacitiesAttr(_array("FloatArray", gaussians.opacities))
-        splat.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.degree)
-        radiance = splat.CreateRadianceSphericalHarmonicsCoefficientsAttr(
-            _array("Vec3fArray", harmonics.reshape(-1, 3))
-        )
-        radiance.SetMetadata("elementSize", harmonics.shape[1])
-        splat.CreateExtentAttr(_array("Vec3fArray", _extent(gaussians)))
-        stage.GetRootLayer().Save()
-        if packed:
-            try:
-                package = pxr("UsdUtils").CreateNewUsdzPackage
-                if not package(Sdf.AssetPath(str(layer)), str(temporary), "splats.usdc"):
-                    raise SehdrError(f"{path}: cannot be packed as USDZ; write .usdc instead")
-            finally:
+        try:
+            _write_stage(layer, gaussians)
+            package = pxr("UsdUtils").CreateNewUsdzPackage
+            if packed and not package(Sdf.AssetPath(str(layer)), str(temporary), "splats.usdc"):
+                raise SehdrError(f"{path}: cannot be packed as USDZ; write .usdc instead")
+        except Tf.ErrorException as error:
+            reason = " ".join(str(error).split())
+            raise SehdrError(
+                f"{path}: cannot be written ({reason:.160}); free space or choose another folder"
+            ) from None
+        finally:
+            if packed:
                 layer.unlink(missing_ok=True)
+
+
+def _write_stage(path: Path, gaussians: GaussianArrays) -> None:
+    """Write a layer with one prim of Gaussians."""
+    Usd, UsdGeom, UsdVol, Sdf = (pxr(name) for name in ("Usd", "UsdGeom", "UsdVol", "Sdf"))
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Splats")
+    prim = splat.GetPrim()
+    stage.SetDefaultPrim(prim)
+    Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOR_SPACE)
+    prim.CreateAttribute(_BASE_TIME, Sdf.ValueTypeNames.Double, True).Set(gaussians.base_time)
+    if gaussians.world_matrix is not None:
+        matrix = pxr("Gf").Matrix4d(gaussians.world_matrix.T.tolist())  # USD's matrices act on row vectors.
+        prim.CreateAttribute(_WORLD_MATRIX, Sdf.ValueTypeNames.Matrix4d, True).Set(matrix)
+    harmonics = gaussians.harmonics.astype(np.float32, copy=True)
+    harmonics[:, 0] -= _BIAS
+    splat.CreatePositionsAttr(_array("Vec3fArray", gaussians.means))
+    splat.CreateScalesAttr(_array("Vec3fArray", np.exp(gaussians.log_scales)))
+    splat.CreateOrientationsAttr(_quaternions(gaussians.unit_quaternions))
+    splat.CreateOpacitiesAttr(_array("FloatArray", gaussians.opacities))
+    splat.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.degree)
+    radiance = splat.CreateRadianceSphericalHarmonicsCoefficientsAttr(_array("Vec3fArray", harmonics.reshape(-1, 3)))
+    radiance.SetMetadata("elementSize", harmonics.shape[1])
+    splat.CreateExtentAttr(_array("Vec3fArray", _extent(gaussians)))
+    stage.GetRootLayer().Save()
 
 
 def read_usd(path: Path) -> GaussianArrays:
