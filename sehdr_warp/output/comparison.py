@@ -11,6 +11,8 @@ from .camera_paths import interpolate
 from .images import as_array
 from .light_pictures import photo_light, shown_photo
 
+_GREY = 0.3  # Display light at which what photos clip is shown
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -33,6 +35,20 @@ class Comparison:
     truth: np.ndarray | None = None
     confidence: np.ndarray | None = None
     new: np.ndarray | None = None
+
+
+def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: float = 1.0) -> int:
+    """Return the stops, from -8 to -1, at which pictures tell best what photo and scene hold above white.
+
+    The brightest light that a photo can hold is then a middle grey, and brighter light of the scene stands out from it.
+
+    Args:
+        comparisons: The views.
+        exposure_time: Seconds at 0 EV.
+        gain: From exposures to display light (see display_gain).
+    """
+    white = max(float(np.max(each.from_photo)) for each in comparisons) * exposure_time * gain
+    return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), -8, -1))
 
 
 def compare(run, view: View, views: Sequence[View]) -> Comparison:

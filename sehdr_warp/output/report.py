@@ -15,13 +15,10 @@ from sehdr_warp.scene.exposure import shutter
 from ..files import atomic_path, check_absent
 from .camera_paths import evenly
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
-from .comparison import Comparison, compare
+from .comparison import Comparison, compare, darker_stops
 from .report_page import STOPS, report_page
 from .report_page import stops_text as _stops
 from .tonemap import expose, fit_tone_map
-
-DARKER = -4
-"""Stops at which photo, scene and truth stand side by side: what was clipped tells them apart."""
 
 
 def write_report(
@@ -37,8 +34,8 @@ def write_report(
 
     `report.html`: one page without a network: figures, what was left out and why, photo, scene and truth as Ultra HDR,
     brackets with an exposure dial, confidence, unexplained regions, error against time, cameras. For papers:
-    `comparison.png`: photo; photo, HDR scene and truth (if known) at -4 EV; a new view. `stops.png`: the view with the
-    most clipped light from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
+    `comparison.png`: photo; photo, HDR scene and truth (if known) some stops darker; a new view. `stops.png`: the view
+    with the most clipped light from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
     `training.png`: held-out error against training time; absent for a run without evaluations. A scene without test
     views shows training views, and captions say so.
 
@@ -80,7 +77,7 @@ def write_report(
 
 
 def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, caption: str, *, held_out: bool = True):
-    """Draw photos, what photo and scene hold four stops darker, and a new view, one row for each comparison.
+    """Draw photos, what photo and scene hold some stops darker, and a new view, one row for each comparison.
 
     Args:
         comparisons: The rows. New views are tone-mapped by one map.
@@ -91,11 +88,12 @@ def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, c
     Returns:
         A matplotlib Figure.
     """
+    darker = darker_stops(comparisons, exposure_time)
     columns = {"Held-out photo" if held_out else "Training photo": [c.photo for c in comparisons]}
     for name, key in (("Photo", "from_photo"), ("HDR scene", "hdr"), ("Truth", "truth")):
         radiances = [getattr(c, key) for c in comparisons]
         if all(radiance is not None for radiance in radiances):
-            columns[f"{name} at {_stops(DARKER)}"] = [expose(r, DARKER, scale=exposure_time) for r in radiances]
+            columns[f"{name} at {_stops(darker)}"] = [expose(r, darker, scale=exposure_time) for r in radiances]
     new = [c.new for c in comparisons if c.new is not None]
     if len(new) == len(comparisons):
         columns["New view, tone-mapped"] = list(map(fit_tone_map(new), new))

@@ -13,7 +13,7 @@ from sehdr_warp.scene.camera import limited_size
 from sehdr_warp.scene.exposure import shutter
 from sehdr_warp.scene.lens import area_average
 
-from .comparison import Comparison
+from .comparison import Comparison, darker_stops
 from .diagrams import camera_map, training_svg
 from .html import EMPTY, join, markup, page_file, whole_page
 from .light_pictures import (
@@ -59,6 +59,7 @@ def report_page(
     times = {view.name: view.exposure_time for view in scene.views}
     sections = [
         _header(run, scene),
+        _opening(brightest, times[brightest.name], gain),
         _pictures(run, comparisons, times, held_out),
         _brackets(brightest, times[brightest.name], gain),
         _confidence(comparisons),
@@ -154,6 +155,19 @@ def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, f
     )
     lead += "on an HDR display, on any other what the camera would have shown."
     return _section("Photo, scene, truth" if known else "Photo and scene", lead, _views(figures))
+
+
+def _opening(comparison: Comparison, time: float, gain: float) -> Markup:
+    """Return the picture that a reader sees first: photo and scene side by side, as dark as tells them apart."""
+    stops = darker_stops([comparison], time, gain)
+    figures = []
+    for name, light in (("Photo", comparison.from_photo), ("Scene", comparison.hdr)):
+        small = smaller(light, _PICTURE)
+        picture = jpeg(expose(small, stops, scale=time * gain))
+        title = f"{name} at {stops_text(stops)}"
+        figures.append(_figure(img(picture, title, (small.shape[1], small.shape[0])), title))
+    lead = f"View {comparison.name}, {-stops} stop{'s' * (stops < -1)} darker. What the photo clipped stays flat grey."
+    return _section("Light above white", lead, markup('<div class="views">{}</div>', join(figures)))
 
 
 def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:

@@ -4,7 +4,7 @@ from PIL import Image
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.charts import save_picture, training_chart
-from sehdr_warp.output.comparison import Comparison, compare
+from sehdr_warp.output.comparison import Comparison, compare, darker_stops
 from sehdr_warp.output.report import comparison_figure, stops_figure, write_report
 from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.scene import Scene, View, codes_of
@@ -114,7 +114,8 @@ def test_the_new_view_lies_halfway_to_the_nearest(tmp_path):
     assert np.abs(np.array(seen) - between).sum(axis=1).min() < 1e-9
     comparison = Comparison("v", scene.views[0].image, *[scene.views[0].hdr] * 3, None, scene.views[0].hdr * 2)
     titles = [axes.get_title() for axes in comparison_figure([comparison], 0.5, "").axes]
-    darker = [f"{what} at \N{MINUS SIGN}4 EV" for what in ("Photo", "HDR scene", "Truth")]
+    stops = f"\N{MINUS SIGN}{-darker_stops([comparison], 0.5)} EV"
+    darker = [f"{what} at {stops}" for what in ("Photo", "HDR scene", "Truth")]
     assert titles == ["Held-out photo", *darker, "New view, tone-mapped"]
 
 

@@ -20,6 +20,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp import output
+from sehdr_warp.output.comparison import Comparison, darker_stops
 from sehdr_warp.output.light_pictures import dial, display_gain, jpeg, packed_light
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report import write_report
@@ -70,7 +71,7 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     validate(text)
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", text) and "url(" not in text
     assert len(text) < 5e6
-    expected = ["Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
+    expected = ["Light above white", "Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
     assert headings(text) == [*expected, "What was left out, and why", "Figures", "Error against time", "Cameras"]
     for told in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
         assert told in text
@@ -88,7 +89,7 @@ def test_what_is_not_known_is_left_out(tmp_path):
     assert "What stays unexplained" not in headings(text) and "Error against time" not in headings(text)
     assert "none is held out" in text and 'data-name="Truth"' not in text
     assert "--out views --cameras train --evs" in text
-    assert headings(text)[0] == "Photo and scene" and "Scene and truth" not in text
+    assert headings(text)[1] == "Photo and scene" and "Scene and truth" not in text
 
 
 def test_the_pictures_keep_the_light_and_look_like_photos(tmp_path):
@@ -226,3 +227,12 @@ def test_no_markup_is_made_but_by_the_one_function(path):
         if name == "markup":
             assert isinstance(node.args[0], ast.Constant | ast.Name), f"{path.name}:{node.lineno}"
         assert name != "Markup" or path.name == "html.py", f"{path.name}:{node.lineno}"
+
+
+def test_the_opening_shows_what_photos_clip_as_grey():
+    flat = np.full((4, 4, 3), 2.0)
+    shown = Comparison("v", np.ones((4, 4, 3)), flat, flat * 30)
+    # White of 2 s^-1 for half a second is an exposure of 1: two stops darker it is a quarter.
+    assert darker_stops([shown], 0.5) == -2
+    assert darker_stops([shown], 0.5, gain=8.0) == -5
+    assert darker_stops([shown], 1e-9) == -1 and darker_stops([shown], 1e9) == -8
