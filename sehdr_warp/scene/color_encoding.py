@@ -6,6 +6,7 @@ turned light into codes: such photos are converted to sRGB's codes, and their re
 light, PQ, HLG and logarithmic curves are light themselves, and leave nothing to guess.
 """
 
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,6 +36,10 @@ _BAND_ROWS = 256
 _GREY = ("L", "LA", "La", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _INTEROP = 0xA005, 1  # EXIF's interoperability table, and its index
 _COLOR_SPACE = 0xA001
+# EXIF's entry of a ColorSpace of 2 or 65535, in either byte order.
+_NOT_SRGB = re.compile(
+    rb"\xa0\x01\x00\x03\x00\x00\x00\x01(\x00\x02|\xff\xff)|\x01\xa0\x03\x00\x01\x00\x00\x00(\x02\x00|\xff\xff)"
+)
 _EXIF_IFD = 0x8769
 
 
@@ -332,6 +337,10 @@ def _from_tiff(image: Image.Image) -> ColorEncoding | None:
 
 def _from_exif(image: Image.Image) -> ColorEncoding | None:
     """Return Adobe RGB for EXIF's ColorSpace 2, or for interoperability index R03 (DCF 2.0)."""
+    # To parse EXIF takes longer than to open a JPEG, so its bytes are looked at first.
+    raw = image.info.get("exif", b"")
+    if image.format in ("JPEG", "MPO", "WEBP") and not (isinstance(raw, bytes) and _NOT_SRGB.search(raw)):
+        return None
     try:
         exif = exif_of(image)
         space = exif.get_ifd(_EXIF_IFD).get(_COLOR_SPACE)
