@@ -29,6 +29,10 @@ _MOST_IFDS = 64
 _LARGEST_SCALE = 8.0  # Of DefaultScale; files state 1 or 2
 _FLOAT = 3  # SampleFormat
 _CONVERT = "convert it with Adobe DNG Converter"
+_MAX_SIDE = 65536
+"""Pixels of the longest side that is read, because a damaged size would fill the memory."""
+_MAX_REPEAT = 64
+"""Rows and columns of the largest pattern of black levels that is read."""
 
 
 @dataclass(frozen=True)
@@ -161,11 +165,15 @@ def _numbers(table: Any, tag: int, default: Any) -> tuple[float, ...]:
 def _raw_of(table: Any, first: Any) -> DngRaw:
     """Return the meaning of a raw image's directory. Raises ValueError and its kin for values that cannot be."""
     width, height = (int(table[tag]) for tag in (_WIDTH, _LENGTH))
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
+        raise ValueError(f"{width} x {height} pixels")
     samples = _samples(table)
     top, left, bottom, right = (int(v) for v in _numbers(table, _ACTIVE_AREA, (0.0, 0.0, height, width)))
     if not (0 <= top < bottom <= height and 0 <= left < right <= width):
         raise ValueError(f"ActiveArea {top, left, bottom, right} of {width} x {height}")
     rows, columns = (int(v) for v in _numbers(table, _BLACK_REPEAT, (1.0, 1.0)))
+    if not (0 < rows <= _MAX_REPEAT and 0 < columns <= _MAX_REPEAT):
+        raise ValueError(f"BlackLevelRepeatDim {rows, columns}")
     levels = _numbers(table, _BLACK, (0.0,))
     if len(levels) == 1:
         levels *= rows * columns * samples
