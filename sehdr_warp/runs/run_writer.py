@@ -26,7 +26,7 @@ from ..scene.exposure_compensation import ExposureCompensation
 from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
 from .config import Config
 from .run_folder import NEW, READY, RunFolder, confidence_metadata, describe_scene
-from .values import FORMAT, read_object
+from .values import FORMAT, read_object, require_readable
 
 _LOCK = ".lock"
 _NEW_NAMES = re.compile(
@@ -133,6 +133,7 @@ class RunWriter(RunFolder):
 
         for name in (scene.name, data.get("path") or "", *(view.name for view in scene.views)):
             require_text(name)
+        require_readable(data)
         self.lock()
         self.check(resume=False, overwrite=overwrite)  # Reading the photos took time.
         info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}

@@ -178,6 +178,14 @@ def read_values(path: Path, model: type[BaseModel], remedy: str = REMEDY) -> dic
     return values
 
 
+def require_readable(data: dict[str, Any]) -> None:
+    """Raise InputError for arguments of load_scene that a reader of the run would refuse."""
+    try:
+        DataValues.model_validate(data)
+    except ValidationError as error:
+        raise InputError("the photos' options", field_and_problem(error)[1], "use a value in its range") from None
+
+
 def read_object(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
     """Return the JSON object in a file of a run, unchecked; raise InputError as read_values does."""
     try:

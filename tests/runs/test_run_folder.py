@@ -252,6 +252,17 @@ def _with_views(scene, views):
     return replace(scene, views=views)
 
 
+@pytest.mark.parametrize("data", [{"max_size": 2**63}, {"max_size": 0}, {"holdout": 2**63}, {"exposure_index": -1}])
+def test_options_that_no_reader_takes_are_refused_before_the_training(tmp_path, data):
+    from sehdr_warp.runs.config_files import load_config
+    from sehdr_warp.training.train import train
+
+    config = load_config("default", {"schedule.iterations": 2, "plan.enabled": False, "response.name": "srgb"})
+    with pytest.raises(InputError, match=f"{next(iter(data))} = .*; use a value in its range"):
+        train(toy_scene(2, 8), tmp_path / "run", config, device="cpu", data={"path": "embedded", **data})
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("where", ["view", "scene", "data", "folder"])
 def test_names_that_are_no_text_are_refused_before_the_training(tmp_path, where):
     """A run with such a name would be written, and then be read as damaged."""
