@@ -44,7 +44,7 @@ class TrainingOptions:
     preset: str | None = None
     """A name of `sehdr-warp presets` or a TOML file. (default: default, or what --resume continues)"""
     iterations: int | None = None
-    """Steps; by default as many as the photos deserve."""
+    """Steps; by default planned from the photos."""
     seed: int | None = None
     """Seed of every random number."""
     plan_only: bool = False
@@ -92,8 +92,7 @@ class Train:
     }
 
     data: Annotated[Positional[str | None], tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
-    """Photos: COLMAP, transforms.json, HDR-NeRF, HDR-GS, LLFF, OpenSfM, a bare folder, or a video file; `embedded` is a
-    scene to try."""
+    """Folder of photos, bare or with poses, or a video; `embedded` is a demo."""
     scene: SceneOptions = SceneOptions()
     training: TrainingOptions = TrainingOptions()
     output: OutputOptions = OutputOptions()

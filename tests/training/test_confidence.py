@@ -1,6 +1,8 @@
 """The confidence of a run: measured at its end, kept beside its checkpoint, refused where damaged, and not needed to
 load."""
 
+import json
+
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -8,6 +10,7 @@ from safetensors.torch import load_file, save_file
 from sehdr_warp.errors import InputError
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import ensure_confidence, load_run
+from sehdr_warp.runs.run_folder import confidence_metadata
 from sehdr_warp.training.train import train
 
 
@@ -30,7 +33,7 @@ def test_a_training_leaves_its_confidence(trained, scene):
     assert torch.equal(confidence, trained.model.confidence)
     assert confidence.shape == (trained.gaussian_count,) and 0 <= confidence.min() < confidence.max() <= 1
     kept = load_file(trained.folder.confidence)
-    assert sorted(kept) == ["clipped", "confidence", "seen", "stops"]
+    assert sorted(kept) == ["clipped", "confidence", "peak", "seen", "stops"]
     shown = trained.render_confidence(scene.test_views[0].camera)
     assert shown.shape == (32, 32) and 0 < shown.max() <= 1
 
@@ -49,22 +52,24 @@ def test_an_older_run_gets_it_on_demand(run, scene, caplog):
 
 
 def test_that_of_another_checkpoint_does_not_count(run):
-    save_file({"confidence": run.model.confidence}, run.folder.confidence, {"format": "3", "checkpoint": "0" * 64})
+    metadata = {"sehdr_warp": json.dumps(confidence_metadata("0" * 64))}
+    save_file({"confidence": run.model.confidence}, run.folder.confidence, metadata)
     assert load_run(run.path).model.confidence is None
 
 
 @pytest.mark.parametrize(
     "confidence, problem",
-    [(torch.zeros(3), "shape"), (None, "outside of 0 to 1"), (b"\x00" * 40, "not safetensors")],
+    [(torch.zeros(3), "shape"), (None, "outside of 0 to 1"), (b"\x00" * 40, "not a file of confidence")],
     ids=["short", "values", "damaged"],
 )
 def test_damage_is_one_line(run, confidence, problem):
-    stated = {"format": "3", "checkpoint": run.checkpoint_hash}
+    metadata = {"sehdr_warp": json.dumps(confidence_metadata(run.checkpoint_hash))}
     if isinstance(confidence, bytes):
         run.folder.confidence.write_bytes(confidence)
     else:
         values = torch.full_like(run.model.confidence, torch.nan) if confidence is None else confidence
-        save_file({"confidence": values}, run.folder.confidence, stated)
+        stored = load_file(run.folder.confidence)
+        save_file(stored | {"confidence": values}, run.folder.confidence, metadata)
     with pytest.raises(InputError, match=problem) as error:
         load_run(run.path)
     assert run.folder.confidence.name in str(error.value) and "report" in str(error.value)
