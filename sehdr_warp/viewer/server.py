@@ -239,6 +239,7 @@ class Server(ThreadingHTTPServer):
     """The viewer's server on a port of a host; `url` is its address."""
 
     daemon_threads, block_on_close, request_queue_size = True, False, 64
+    _listening = False  # A port that is in use closes the server, but not what it shows
 
     def __init__(self, viewer: Viewer, host: str = "127.0.0.1", port: int = 8080, origins: Sequence[str] = ()):
         """Listen on the port, or on the next free one.
@@ -265,6 +266,7 @@ class Server(ThreadingHTTPServer):
                 log.info("port %d is in use", tried)
         else:
             raise SehdrError(f"--port {port}: no port from there on is free; choose another")
+        self._listening = True
         place = f"[{host}]" if ":" in host else host
         self.url = f"http://{place}:{self.server_address[1]}/"
 
@@ -285,8 +287,9 @@ class Server(ThreadingHTTPServer):
     def server_close(self) -> None:
         """Close all connections and end the work for them."""
         super().server_close()
-        self.connections.close()
-        self.viewer.close()
+        if self._listening:
+            self.connections.close()
+            self.viewer.close()
 
     def handle_error(self, request, client_address) -> None:
         """Log a broken connection for debugging only."""
