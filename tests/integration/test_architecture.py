@@ -1,4 +1,4 @@
-"""docs/architecture.md, held: which room may import which, and how large a file may be."""
+"""docs/architecture.md, held: which package may import which, and how large a file may be."""
 
 import ast
 import subprocess
@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "sehdr_warp"
 
-# What each room may import of the others: training -> runs -> model -> response -> rasterizer -> kernels, and below
-# them all what any room may use.
+# What each package may import of the others: training -> runs -> model -> response -> rasterizer -> kernels, and below
+# them all what any package may use.
 ANY = {"errors", "quiet", "arguments", "files", "own_files", "console", "sandbox", "parallel", "limits", "caches"}
 ALLOWED = {
     "kernels": set(),
@@ -60,7 +60,7 @@ ALLOWED = {
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "model.exposure"},
     "check": ANY | {"kernels.constants", "rasterizer", "runs.device"},
 }
-# Packages that only some rooms may import.
+# Packages that only some packages may import.
 ONLY_IN = {
     "torch": ALLOWED.keys() - ANY - {"kernels", "splats", "scene", "synth"},
     "warp": {"kernels", "rasterizer"},
@@ -71,10 +71,10 @@ LARGEST_FILE = 400
 def sources():
     for folder in (PACKAGE, ROOT / "kernels"):
         for path in sorted(folder.rglob("*.py")):
-            room = "kernels" if folder.name == "kernels" else path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-            if path.name == "commands.py":  # A part of the command line, wherever it lives: it may call any room.
-                room = "commands"
-            yield pytest.param(path, room, id=str(path.relative_to(ROOT)))
+            package = "kernels" if folder.name == "kernels" else path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+            if path.name == "commands.py":  # A part of the command line, wherever it lives: it may call any package.
+                package = "commands"
+            yield pytest.param(path, package, id=str(path.relative_to(ROOT)))
 
 
 def imports(path):
@@ -93,15 +93,15 @@ def imports(path):
             yield from (f"{stem}.{alias.name}" for alias in node.names)
 
 
-@pytest.mark.parametrize("path,room", list(sources()))
-def test_imports_go_down_the_line(path, room):
+@pytest.mark.parametrize("path,package", list(sources()))
+def test_imports_go_down_the_line(path, package):
     for name in imports(path):
         top, *rest = name.split(".")
-        if top == "sehdr_warp" and room in ALLOWED and rest and rest[0] != room:
-            fits = any(".".join(rest).startswith(allowed) for allowed in ALLOWED[room]) or rest[0] == "__version__"
-            assert fits, f"{room} may not import {name}"
-        if top in ONLY_IN and room in ALLOWED:
-            assert room in ONLY_IN[top], f"{room} may not import {name}"
+        if top == "sehdr_warp" and package in ALLOWED and rest and rest[0] != package:
+            fits = any(".".join(rest).startswith(allowed) for allowed in ALLOWED[package]) or rest[0] == "__version__"
+            assert fits, f"{package} may not import {name}"
+        if top in ONLY_IN and package in ALLOWED:
+            assert package in ONLY_IN[top], f"{package} may not import {name}"
 
 
 def test_no_files_import_each_other():

@@ -1,4 +1,4 @@
-"""Where tests are: beside the rooms of the package, named after the modules that they test."""
+"""Where tests are: beside the packages of the package, named after the modules that they test."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import pytest
 
 TESTS = Path(__file__).resolve().parents[1]
 ROOT = TESTS.parent
-NOT_ROOMS = {"integration", "fuzz", "trial", "scenes_generator"}
+NOT_PACKAGES = {"integration", "fuzz", "trial", "scenes_generator"}
 TOPICS = {
     "benchmarks": {"bench"},
     "compat/gsplat": {"against_gsplat"},
@@ -21,20 +21,20 @@ TOPICS = {
     },
     "viewer": {"page", "proxies", "scene_page"},
 }  # fmt: skip
-"""Tests of what several modules of a room do together. Prefer a module's name."""
+"""Tests of what several modules of a package do together. Prefer a module's name."""
 
 
-def home(room: str) -> Path:
-    """Return the folder of a room's modules."""
-    return ROOT / room if room in ("kernels", "benchmarks", "priors") else ROOT / "sehdr_warp" / room
+def home(package: str) -> Path:
+    """Return the folder of a package's modules."""
+    return ROOT / package if package in ("kernels", "benchmarks", "priors") else ROOT / "sehdr_warp" / package
 
 
 @pytest.mark.parametrize("test", sorted(TESTS.rglob("test_*.py")), ids=lambda path: str(path.relative_to(TESTS)))
 def test_a_test_has_the_name_of_its_module(test):
-    *room, _ = test.relative_to(TESTS).parts
+    *package, _ = test.relative_to(TESTS).parts
     name = test.stem.removeprefix("test_")
-    if (room and room[0] in NOT_ROOMS) or name in TOPICS.get("/".join(room), ()):
+    if (package and package[0] in NOT_PACKAGES) or name in TOPICS.get("/".join(package), ()):
         return
-    folder = home("/".join(room))
+    folder = home("/".join(package))
     remedy = f"name it after a module, move it to tests/integration, or add {name!r} to TOPICS here"
     assert [*folder.rglob(f"{name}.py")] or (folder / name).is_dir(), f"{folder} has no {name}.py: {remedy}"
