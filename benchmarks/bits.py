@@ -1,4 +1,4 @@
-"""What a photo's bits gain: scenes with truth, photographed linearly and through a curve at 8 to 14 bits.
+"""Measure the gain of a photo's bits: scenes with truth, photographed linearly and through a curve at 8 to 14 bits.
 
 python -m benchmarks.bits --json docs/reports/results/bits.json
 

@@ -27,7 +27,7 @@ STRATEGIES = ("default", "mcmc")
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a training had reached at a step: seconds of training until then."""
+    """Step of a training, and its seconds until then."""
 
     step: int
     seconds: float

@@ -6,6 +6,7 @@ python -m benchmarks.report_pages
 import csv
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import Any
@@ -108,12 +109,6 @@ def _scale_tables(result: dict) -> Iterable[str]:
     yield _checks_line(result)
 
 
-def _workers_tables(result: dict) -> Iterable[str]:
-    yield markdown_table(result["rows"], COLUMNS["workers"])
-    if result["checks"]:
-        yield _checks_line(result)
-
-
 def _large_tables(result: dict) -> Iterable[str]:
     rows: list[Mapping] = []
     for ours, theirs in groups(result["rows"], "gaussians", "width", "height").values():
@@ -206,7 +201,7 @@ def _median_of(rows: Sequence[Mapping], field: str) -> float | None:
 
 
 def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
-    """How well surfaces would be lit, by what clips."""
+    """Error of the light on surfaces, by what clips."""
     rows = [row for row in rows if row.get("irradiance") is not None]
     if not rows:
         return
@@ -298,12 +293,10 @@ def _bits_tables(result: dict) -> Iterable[str]:
     yield _pivot(rows, places, "scene", "hdr", ".2f")
 
 
-def _panorama_tables(result: dict) -> Iterable[str]:
-    yield markdown_table(result["rows"], COLUMNS["panorama"])
-
-
-def _units_tables(result: dict) -> Iterable[str]:
-    yield markdown_table(result["rows"], COLUMNS["units"])
+def _rows_table(name: str, result: dict) -> Iterable[str]:
+    yield markdown_table(result["rows"], COLUMNS[name])
+    if result.get("checks"):
+        yield _checks_line(result)
 
 
 def _captures_tables(result: dict) -> Iterable[str]:
@@ -315,10 +308,6 @@ def _captures_tables(result: dict) -> Iterable[str]:
         means["gaussians"] = round(means["gaussians"])
         table.append(dict.fromkeys(figures) | {**rows[0], **means, "seeds": len(rows), "spread": spread})
     yield markdown_table(table, COLUMNS["captures"])
-
-
-def _response_tables(result: dict) -> Iterable[str]:
-    yield markdown_table(result["rows"], COLUMNS["response"])
 
 
 def _stability_tables(result: dict) -> Iterable[str]:
@@ -373,16 +362,16 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "seeds-cpu": _seeds_tables,
     "readings": _readings_tables,
     "captures": _captures_tables,
-    "units": _units_tables,
+    "units": partial(_rows_table, "units"),
     "bits": _bits_tables,
-    "panorama": _panorama_tables,
+    "panorama": partial(_rows_table, "panorama"),
     "kernels": _kernel_tables,
     "step": _step_tables,
     "scale": _scale_tables,
-    "cores": _workers_tables,
-    "gpus": _workers_tables,
+    "cores": partial(_rows_table, "workers"),
+    "gpus": partial(_rows_table, "workers"),
     "large": _large_tables,
-    "response": _response_tables,
+    "response": partial(_rows_table, "response"),
     "stability": _stability_tables,
     "trust": _trust_tables,
 }

@@ -1,4 +1,4 @@
-"""How good the prior for clipped light is on panoramas: against white, a constant and a ridge regression.
+"""Compare the prior for clipped light on panoramas with white, a constant and a ridge regression.
 
 `python -m priors.judge PACK WEIGHTS --out FIGURES.json` judges weights of `priors.train --judge` again.
 """

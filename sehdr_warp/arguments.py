@@ -1,4 +1,4 @@
-"""What the command lines of all rooms share: parsing with tyro, one-line usage errors, and lists of numbers."""
+"""Command-line parsing with tyro, one-line usage errors, and lists of numbers."""
 
 import dataclasses
 import inspect

@@ -21,7 +21,7 @@ MIN_COLUMNS = 40
 
 
 class Command(NamedTuple):
-    """Where a command is defined."""
+    """Location of a command."""
 
     module: str
     """Module below the package."""
@@ -65,7 +65,7 @@ _RENAMED = {
     "score": f"the command is {PROGRAM} eval FOLDER --truth SET",
     "bench": "it left the installed program; in a checkout, run python -m benchmarks",
 }
-"""What to type for commands of earlier versions, and for words that people expect to be commands."""
+"""Hints for commands of earlier versions, and for words that people expect to be commands."""
 _WITHOUT_TORCH = {"presets", "config", "responses", "scenes", "completion"}
 """Commands that do not load torch, and so run in little address space."""
 _MIN_ADDRESS_SPACE = 1536 << 20

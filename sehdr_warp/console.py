@@ -1,4 +1,4 @@
-"""What a person sees while a command runs.
+"""Progress of a command on the terminal.
 
 The library's log goes to standard error as plain lines; a training on a terminal has a progress bar.
 """
@@ -29,7 +29,7 @@ class Progress(NamedTuple):
     seconds_left: float | None
     loss: float
     psnr: float
-    """Of the last photo, dB."""
+    """PSNR of the last photo, dB."""
     gaussians: int
 
 

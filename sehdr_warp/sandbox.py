@@ -55,7 +55,7 @@ def read_sandboxed(read: Callable[[Path], dict[str, np.ndarray]], path: Path, ki
 
 
 class Result(NamedTuple):
-    """How a process ended: its exit code, standard output and standard error."""
+    """Exit code, standard output and standard error of a process."""
 
     code: int
     out: bytes

@@ -37,7 +37,7 @@ class PictureOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions:
-    """What to write."""
+    """Files to write."""
 
     json: Path | None = None
     """Also write the figures to this file; - prints them on standard output in place of the table."""

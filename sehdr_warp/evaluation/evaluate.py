@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class Doubt(NamedTuple):
-    """How reliable a prediction is."""
+    """Reliability of a prediction."""
 
     confidence: Tensor
     """[H, W] in [0, 1]."""
@@ -36,7 +36,7 @@ class Doubt(NamedTuple):
 
 
 class Predictions(Protocol):
-    """What is predicted for the views of a scene."""
+    """Predictions for the views of a scene."""
 
     facts: dict[str, Any]
     """Plain values for the result."""

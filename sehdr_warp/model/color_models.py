@@ -1,4 +1,4 @@
-"""What a Gaussian's spherical harmonics mean: log exposure, exposure, or encoded values.
+"""Color models: spherical harmonics as log exposure, exposure, or encoded values.
 
 Colors are exposures x = E dt_1 at the field's base time (c^{l_1} in the paper), so that their size, and with it the
 learning rates, does not depend on the unit of time.

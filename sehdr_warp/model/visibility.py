@@ -1,4 +1,4 @@
-"""How many cameras show each Gaussian of a scene."""
+"""Count the cameras that show each Gaussian of a scene."""
 
 from collections.abc import Sequence
 

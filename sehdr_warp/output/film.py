@@ -35,7 +35,7 @@ REFERENCE_WHITE, PEAK = 203.0, 1000.0
 
 @dataclass(frozen=True)
 class Transfer:
-    """How light becomes codes.
+    """Encoding of light as codes.
 
     Attributes:
         codec: Encoder of FFmpeg.

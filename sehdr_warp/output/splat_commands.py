@@ -26,7 +26,7 @@ class SplatFileOptions:
 
 @dataclass(frozen=True)
 class EditOptions:
-    """What the file leaves out."""
+    """Gaussians that the file leaves out."""
 
     crop: str | None = None
     """Keep only this region, in upright coordinates: sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1."""

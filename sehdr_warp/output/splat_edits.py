@@ -74,7 +74,7 @@ def read_region(text: str) -> Box | Sphere:
 
 @dataclass(frozen=True)
 class SplatEdits:
-    """What a file leaves out.
+    """Gaussians that a file leaves out.
 
     Attributes:
         crop: Region to keep (see read_region), in upright coordinates.

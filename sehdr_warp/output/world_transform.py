@@ -72,7 +72,7 @@ class WorldTransform:
 
     @property
     def is_identity(self) -> bool:
-        """Whether nothing changes."""
+        """True if nothing changes."""
         return bool(np.array_equal(self.matrix, np.eye(4)))
 
     def inverse(self) -> "WorldTransform":

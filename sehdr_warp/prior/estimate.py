@@ -19,7 +19,7 @@ MOST_BYTES = 3_000_000  # Of a weights file
 
 @dataclass(frozen=True)
 class LightEstimate:
-    """What clipped pixels probably hold, in stops (log2) over white; [h, w, 3] each.
+    """Estimate of clipped pixels in stops (log2) over white; [h, w, 3] each.
 
     mean: expected excess over white, at least 0. deviation: its standard deviation. Both mean nothing at values that
     are not clipped.

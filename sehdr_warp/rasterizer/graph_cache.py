@@ -125,7 +125,7 @@ class _RenderGraph:
             del packed, offsets
         packed, offsets = self._counting.capture(None, count)
         self.adjoint: Adjoint = self._blending.capture(None, lambda: blend(packed, offsets, self.max_intersections))
-        """Of the last render; one launch, which needs no graph."""
+        """Confidence of the last render; one launch, which needs no graph."""
 
     def replay(self, splats: Splats) -> tuple[Tensor, Tensor, int]:
         """Return image, transmittance and the number of intersections; those beyond max_intersections are left out."""

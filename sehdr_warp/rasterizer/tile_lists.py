@@ -43,7 +43,7 @@ class Splats(NamedTuple):
 
 
 class PackedSplats(NamedTuple):
-    """What blending reads of each 2D Gaussian, in rows of four, and how many tiles it touches.
+    """Values of each 2D Gaussian that blending reads, in rows of four, and its number of tiles.
 
     Attributes:
         shapes: [N, 4] x, y, opacity, half-height.
@@ -70,7 +70,7 @@ class IntersectionOffsets(NamedTuple):
 
 @dataclass(frozen=True)
 class UnsortedIntersections:
-    """Where intersections stood before the sort by tile, those of one Gaussian next to each other.
+    """Positions of intersections before the sort by tile, those of one Gaussian next to each other.
 
     Attributes:
         order: [N] int32 Gaussians by depth, nearest first (ties by index; culled ones last).

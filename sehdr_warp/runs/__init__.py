@@ -1,1 +1,1 @@
-"""What a training reads and leaves: its config, its run folder, checkpoints, and the loaded run."""
+"""Files of a training: its config, its run folder, checkpoints, and the loaded run."""

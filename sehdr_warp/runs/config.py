@@ -36,7 +36,7 @@ class _Table(BaseModel):
 
 
 class ModelConfig(_Table):
-    """What the color of a Gaussian means, how images are made of it, and what a training starts from."""
+    """Colors of Gaussians, images made of them, and the start of a training."""
 
     radiance: Literal["log", "linear", "display"] = "log"
     """what the spherical harmonics represent; log: log exposure, so that radiance is positive; linear: exposure

@@ -32,7 +32,7 @@ _LOCK = ".lock"
 _NEW_NAMES = re.compile(
     r"(config|scene|run|plan)\.json|checkpoints(/iteration_[0-9]{8}(/(state\.safetensors|checkpoint\.json))?)?"
 )
-"""What is in a new run before it takes its place."""
+"""Contents of a new run before it takes its place."""
 _CHOOSE_OTHER = "choose another folder, or remove this one yourself"
 
 

@@ -78,7 +78,7 @@ class RunValues(Values):
 
 
 class CheckpointValues(Values):
-    """What checkpoint.json holds, beside the state of the optimizer."""
+    """Values of checkpoint.json, beside the state of the optimizer."""
 
     format: int
     iteration: Annotated[int, Field(ge=0, le=10_000_000)]
@@ -107,7 +107,7 @@ class UnexplainedValues(Values):
 
 
 class SummaryValues(Values):
-    """What summary.json holds."""
+    """Values of summary.json."""
 
     iteration: Count
     train_seconds: _Seconds
@@ -131,7 +131,7 @@ class DecisionValues(Values):
 
 
 class PlanValues(Values):
-    """What plan.json holds."""
+    """Values of plan.json."""
 
     decisions: Annotated[list[DecisionValues], Field(max_length=1000)]
 
@@ -156,7 +156,7 @@ class ViewValues(Values):
 
 
 class SceneValues(Values):
-    """What scene.json holds."""
+    """Values of scene.json."""
 
     views: Annotated[list[ViewValues], Field(max_length=1_000_000)]
 

@@ -94,7 +94,7 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether pixels are on a plane in front of the camera."""
+        """True if pixels are on a plane in front of the camera."""
         return self.projection == "pinhole"
 
     @property

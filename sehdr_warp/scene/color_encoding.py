@@ -1,4 +1,4 @@
-"""What the file of a photo states of its colors: primaries and transfer function, and their way to linear Rec.709.
+"""Colors that the file of a photo states: primaries and transfer function, and their way to linear Rec.709.
 
 ICC profiles (PNG, JPEG, TIFF, WebP), PNG's cICP, gAMA and cHRM, TIFF's chromaticities, EXIF's ColorSpace. A photo whose
 file states nothing is sRGB. Display curves (gamma, sRGB, BT.709) say how a picture is to be shown, not how the camera
@@ -45,7 +45,7 @@ _EXIF_IFD = 0x8769
 
 @dataclass(frozen=True)
 class ColorEncoding:
-    """How the codes of a photo stand for light, by its file.
+    """Encoding of a photo, as its file states it.
 
     Attributes:
         name: for the user, such as "Display P3 (ICC profile)".
@@ -65,7 +65,7 @@ class ColorEncoding:
 
     @property
     def is_srgb(self) -> bool:
-        """Whether the codes are sRGB's as they are."""
+        """True if the codes are sRGB's as they are."""
         return self.to_rec709 is None and not self.curves and self.table is None
 
     def to_linear(self, pixels: np.ndarray, above: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What a reader returns for a data folder before any pixel is decoded: cameras, files, exposure times, points."""
+"""Results of a dataparser before any pixel is decoded: cameras, files, exposure times, points."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a DNG file states of its raw image: levels, geometry, opcode lists (Adobe's DNG specification 1.7).
+"""Read what a DNG file states of its raw image: levels, geometry, opcode lists (Adobe's DNG specification 1.7).
 
 LibRaw decodes the samples. It applies LinearizationTable, and leaves the rest of this file's tags to others or to one
 level for all channels.

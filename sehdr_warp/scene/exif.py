@@ -22,7 +22,7 @@ _LARGEST_SHORT = 65535
 
 
 class ExifExposure(NamedTuple):
-    """What EXIF states of an exposure.
+    """Exposure that EXIF states.
 
     Attributes:
         time: seconds.

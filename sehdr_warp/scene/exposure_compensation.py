@@ -28,7 +28,7 @@ _log = logging.getLogger("sehdr_warp.scene")
 
 @dataclass(frozen=True)
 class ExposureCompensation:
-    """What a camera did to each photo beyond its stated exposure.
+    """Changes that a camera made to each photo beyond its stated exposure.
 
     Attributes:
         gains: by photo, the factor on its light in each channel (red, green, blue) beyond the stated exposure; their

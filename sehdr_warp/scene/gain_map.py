@@ -223,7 +223,7 @@ def _text(data: Any) -> str:
 
 @dataclass(frozen=True)
 class _Parameters:
-    """What metadata state: lists of 1 or 3 numbers, by the names of GainMap; apple_headroom is linear."""
+    """Parameters that metadata state: lists of 1 or 3 numbers, by the names of GainMap; apple_headroom is linear."""
 
     minimum: tuple[float, ...] = (0.0,)
     maximum: tuple[float, ...] = (1.0,)

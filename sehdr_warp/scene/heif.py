@@ -44,7 +44,7 @@ class Item:
 
 @dataclass(frozen=True)
 class HeifItems:
-    """What a file's meta box lists.
+    """Items of a file's meta box.
 
     Attributes:
         primary: number of the picture that a viewer shows.

@@ -26,7 +26,7 @@ _SAMPLES = 65_536  # Of a curve that a formula describes: exact at all codes of 
 
 @dataclass(frozen=True)
 class IccProfile:
-    """What a profile states.
+    """Colors that a profile states.
 
     Attributes:
         name: its description.

@@ -89,7 +89,7 @@ class Lens:
 
     @property
     def projection(self) -> str:
-        """What the photos are used as, see Camera.projection: a fisheye lens keeps its own if it sees too much."""
+        """Projection that the photos are used in, as Camera.projection; a fisheye that sees too much keeps its own."""
         if self.model == _SPHERE:
             return "equirectangular"
         if self.model not in FISHEYES:

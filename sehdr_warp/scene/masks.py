@@ -138,5 +138,5 @@ def _masks_beside(parent: Path) -> dict[str, Path]:
 
 
 def _is_photo(key: str, bases: Sequence[Path]) -> bool:
-    """Whether a photo of this name, with or without suffix, lies in one of the folders."""
+    """Return whether a photo of this name, with or without suffix, lies in one of the folders."""
     return any((base / key).is_file() or sibling(base / f"{key}.png", PHOTO_SUFFIXES) for base in bases)

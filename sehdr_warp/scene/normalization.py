@@ -43,7 +43,7 @@ class Normalization:
 
     @property
     def is_identity(self) -> bool:
-        """Whether both coordinates are the same."""
+        """True if both coordinates are the same."""
         return self.unit == 1.0 and not self.center.any()
 
     def points(self, points: np.ndarray) -> np.ndarray:

@@ -49,7 +49,7 @@ def matrix_to_rec709(chromaticities: tuple[float, ...]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class InteropEncoding:
-    """What a colorInteropID of OpenEXR (Color Interop Forum) states.
+    """Colors that a colorInteropID of OpenEXR (Color Interop Forum) states.
 
     Attributes:
         chromaticities: CIE xy of red, green, blue and white; None if the ID is not known.

@@ -47,7 +47,7 @@ EXHAUSTIVE_LIMIT = 150
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What structure from motion found.
+    """Result of structure from motion.
 
     Attributes:
         model: cameras, poses and points. Names are the photos' indices (`00003.png` is photos[3]); photos that could

@@ -71,7 +71,7 @@ _LOGS = {
 
 @dataclass(frozen=True)
 class VideoColor:
-    """What a clip states of its colors.
+    """Colors that a clip states.
 
     Attributes:
         curve: of its codes, in words.

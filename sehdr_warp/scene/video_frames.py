@@ -36,7 +36,7 @@ _SHARPNESS_WIDTH, _MOVEMENT_WIDTH = 640, 192
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """Which frames of a clip are used.
+    """Frames of a clip that are used.
 
     Attributes:
         numbers: of the chosen frames, in order.

@@ -1,4 +1,4 @@
-"""What compressed files of Gaussians share: order in space, small codebooks, and quaternions by three components."""
+"""Helpers of compressed files of Gaussians: order in space, small codebooks, quaternions by three components."""
 
 import numpy as np
 

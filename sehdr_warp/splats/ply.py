@@ -171,7 +171,7 @@ def _without(missing: list[str], names: set[str]) -> str:
 
 
 class _Facts(NamedTuple):
-    """What the header states in comments of this package."""
+    """Values that the header states in comments of this package."""
 
     color_model: str
     base_time: float

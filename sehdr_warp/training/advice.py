@@ -1,4 +1,4 @@
-"""What would make a finished training better, in plain words, each with the command to type."""
+"""Give advice on a finished training in plain words, each with the command to type."""
 
 import shlex
 from collections.abc import Mapping, Sequence

@@ -77,7 +77,7 @@ class SharedPoints:
 
 @dataclass(frozen=True)
 class Parts:
-    """Which parts of a compensation to apply."""
+    """Parts of a compensation to apply."""
 
     exposure: bool
     white_balance: bool

@@ -22,7 +22,7 @@ from .trainer import Trainer
 
 @dataclass(frozen=True)
 class SharedTraining:
-    """What the other ranks need for the same training.
+    """Values that the other ranks need for the same training.
 
     Attributes:
         scene: The scene with its training views.

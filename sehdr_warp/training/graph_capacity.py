@@ -1,4 +1,4 @@
-"""How many Gaussian-tile intersections a captured training step has memory for.
+"""Count the Gaussian-tile intersections that a captured training step has memory for.
 
 A CUDA graph fixes the size of its memory when it is captured, while photos differ in their number of intersections.
 """

@@ -1,4 +1,4 @@
-"""What a training writes to its run folder: evaluations, checkpoints, logs and the summary."""
+"""Write evaluations, checkpoints, logs and the summary of a training to its run folder."""
 
 import logging
 import math

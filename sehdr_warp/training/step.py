@@ -1,4 +1,4 @@
-"""What the loop of a trainer yields after each step."""
+"""Step that the loop of a trainer yields."""
 
 from .training_state import TrainingState
 

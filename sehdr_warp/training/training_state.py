@@ -1,4 +1,4 @@
-"""What a training consists of: scene, field, optimizer, strategy, random generators, and their state."""
+"""State of a training: scene, field, optimizer, strategy, random generators."""
 
 import time
 from collections.abc import Callable, Sequence

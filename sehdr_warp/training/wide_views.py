@@ -1,4 +1,4 @@
-"""What a training of panoramas and wide fisheye photos cannot do, or does otherwise."""
+"""Limits of a training on panoramas and wide fisheye photos."""
 
 from ..errors import InputError
 from ..runs.config import Config

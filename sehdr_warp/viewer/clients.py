@@ -1,4 +1,4 @@
-"""What a request knows of who asks, and the answer to one that is refused."""
+"""Clients of requests, and the answer to a request that is refused."""
 
 from .connections import Connection, Connections
 
@@ -13,7 +13,7 @@ class Refusal(Exception):
 
 
 class Client:
-    """Who asks: what a request may know of its connection."""
+    """Client of a request, with what the request may know of its connection."""
 
     def __init__(self, connections: Connections, connection: Connection):
         """Set the connection and those beside it."""

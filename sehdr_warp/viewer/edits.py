@@ -1,4 +1,4 @@
-"""What a page changes of a scene: crops with undo, and the up direction and scale that are kept with a run."""
+"""Edits of a page: crops with undo, and the up direction and scale that are kept with a run."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -53,7 +53,7 @@ _LOCAL = ("127.0.0.1", "localhost", "[::1]")
 
 
 class Viewer:
-    """What the server shows, and its answers to a page."""
+    """Runs that the server shows, and its answers to a page."""
 
     def __init__(
         self, runs: Sequence[ViewerScene], photos: Callable[[int], dict[str, Any]] | None = None, training: Any = None
