@@ -47,9 +47,9 @@ def processor_limit(proc: Path = PROC, mount: Path = MOUNT) -> int | None:
                 quota, period = ((group / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
             if float(quota) > 0:  # ValueError for "max"; -1 is none in version 1.
                 limits.append(float(quota) / float(period))
-    stated = os.environ.get("SLURM_CPUS_PER_TASK", "")
-    if stated.isdigit() and int(stated) > 0:
-        limits.append(float(stated))
+    slurm_cpus = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    if slurm_cpus.isdigit() and int(slurm_cpus) > 0:
+        limits.append(float(slurm_cpus))
     return max(1, math.ceil(min(limits))) if limits else None
 
 

@@ -73,8 +73,8 @@ def camera_path(views: Sequence[tuple[str, Camera]]) -> CameraPath | None:
 
     They are one if all have the same size and names that end in ascending numbers, such as orbit_000, orbit_001.
     """
-    found = [re.fullmatch(r"(.*?)_?(\d{3,})", name) for name, _ in views]
-    matches = [match for match in found if match]
+    numbered = [re.fullmatch(r"(.*?)_?(\d{3,})", name) for name, _ in views]
+    matches = [match for match in numbered if match]
     frames = [int(match[2]) for match in matches]
     sizes = {(camera.width, camera.height) for _, camera in views}
     if len(views) < 2 or len(matches) < len(views) or len(sizes) > 1 or len({match[1] for match in matches}) > 1:

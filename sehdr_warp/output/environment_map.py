@@ -134,8 +134,8 @@ def write_environment_map(
         added = (1 - alpha[..., None]) * inpainted(hdr, alpha, directions, weight)
     clipped = None if surroundings.clipped is None else as_array(surroundings.clipped)
     shares = light_shares(hdr, added, clipped, weight, run.response.white / run.base_time)
-    seen = 100 * weight[alpha > _COVERED].sum() / weight.sum()
-    log.info("%s: %.0f %% of all directions seen", path.name, seen)
+    coverage = 100 * weight[alpha > _COVERED].sum() / weight.sum()
+    log.info("%s: %.0f %% of all directions seen", path.name, coverage)
     log.info("its light is\n%s", shares.table())
     hdr = exposure * from_rec709(hdr + added, colorspace)
     if path.suffix.lower() == ".hdr":

@@ -157,9 +157,11 @@ def _log_loss(path: Path, run: Any, gaussians: GaussianArrays, kind: str, time: 
     if not views:
         log.info("it is not compared with the scene, which has no cameras of its own")
     elif kind == "ldr":
-        kept = agreement(gaussians, _photographed(run, time), views, time)
-        words = loss_in_words(kept)
-        log.info("kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white", kept, where, words)
+        decibels = agreement(gaussians, _photographed(run, time), views, time)
+        words = loss_in_words(decibels)
+        log.info(
+            "kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white", decibels, where, words
+        )
     else:
         dark = time / 2**_DARKER
         bright, dim = (agreement(gaussians, _shown(run, t), views, t) for t in (time, dark))
@@ -182,9 +184,9 @@ def _log_file_loss(
     else:
         field, beside = field_of(reference), "what was exported"
         picture = lambda camera: field.render_ldr(camera, time)  # noqa: E731
-    kept = agreement(gaussians, picture, views, time)
+    decibels = agreement(gaussians, picture, views, time)
     size = path.stat().st_size / 1e6
-    log.info("compressed: %.1f dB beside %s (%s), %.2f MB", kept, beside, loss_in_words(kept), size)
+    log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, beside, loss_in_words(decibels), size)
 
 
 def _judged(run) -> Sequence[Camera]:

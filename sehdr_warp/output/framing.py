@@ -38,8 +38,8 @@ def subject_radius(run: Any, photos: Sequence[Camera], focus: np.ndarray) -> flo
         points = _surface(run, camera.within(_SIZE))
         offsets = np.linalg.norm(points - focus, axis=1)
         distances.append(offsets[offsets < reach])
-    found = np.concatenate(distances)
-    return float(np.percentile(found, _EXTENT)) if found.size else None
+    radii = np.concatenate(distances)
+    return float(np.percentile(radii, _EXTENT)) if radii.size else None
 
 
 def film_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:

@@ -55,8 +55,8 @@ class LightPrior:
         parameter = next(self.network.parameters())
         picture = torch.cat([exposure, clipped.to(exposure)], 2).permute(2, 0, 1)[None].to(parameter)
         picture = F.interpolate(picture, size=coarse_size(*exposure.shape[:2]), mode="area")
-        found = self.network(network_input(picture[:, :3], picture[:, 3:]))
-        mean, deviation = (values[0].permute(1, 2, 0).to(exposure) for values in found)
+        prediction = self.network(network_input(picture[:, :3], picture[:, 3:]))
+        mean, deviation = (values[0].permute(1, 2, 0).to(exposure) for values in prediction)
         return LightEstimate(mean, deviation * self.deviation_scale)
 
 

@@ -58,12 +58,12 @@ def matching_costs(photos: PhotoSet, pixels: Tensor, depths: Tensor) -> Tensor:
     """
     costs = torch.empty(depths.shape, device=depths.device)
     others = photos.offsets, photos.sizes, photos.intrinsics, photos.neighbors, photos.between
-    asked = pixels.contiguous(), depths.contiguous(), costs
+    buffers = pixels.contiguous(), depths.contiguous(), costs
     if depths.device.type == "cpu":
         rows = -(-depths.shape[1] // plane_sweep_cpu.LANES)
-        launch(plane_sweep_cpu.sweep_rows, len(depths) * rows, photos.codes.view(torch.int32)[:, 0], *others, *asked)
+        launch(plane_sweep_cpu.sweep_rows, len(depths) * rows, photos.codes.view(torch.int32)[:, 0], *others, *buffers)
     else:
-        launch(plane_sweep.sweep, depths.numel(), photos.codes, *others, *asked)
+        launch(plane_sweep.sweep, depths.numel(), photos.codes, *others, *buffers)
     return costs
 
 

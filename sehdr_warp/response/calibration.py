@@ -102,8 +102,8 @@ def _spread(codes: np.ndarray, stops: np.ndarray, shared: np.ndarray) -> float:
         own, _, weights, _ = _solve(codes, stops, "")
     except InputError:
         return float("nan")
-    seen = np.bincount(codes.ravel(), weights.ravel(), 256) > 0
-    return float(np.std((own - shared)[10:246][seen[10:246]]))
+    present = np.bincount(codes.ravel(), weights.ravel(), 256) > 0
+    return float(np.std((own - shared)[10:246][present[10:246]]))
 
 
 def _solve(codes: np.ndarray, stops: np.ndarray, name: str):

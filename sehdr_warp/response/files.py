@@ -107,9 +107,9 @@ def _numbers(path: Path, text: str) -> np.ndarray:
 def _select(path: Path, curves: list[Response], selector: str | None) -> Response:
     if selector is None:
         raise InputError(path, f"holds {len(curves)} curves", f"say which, as {path.name}:INDEX or {path.name}:NAME")
-    wanted = selector.strip().lower()
+    selection = selector.strip().lower()
     for index, curve in enumerate(curves):
-        if wanted in (curve.name.lower(), str(index)):
+        if selection in (curve.name.lower(), str(index)):
             return curve
     raise InputError(path, f"has no curve {selector!r}", f"give an index from 0 to {len(curves) - 1}, or a name")
 

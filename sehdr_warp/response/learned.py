@@ -98,20 +98,20 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         low, high = (math.log(exposure) for exposure in TABLE_RANGE)
         nodes = torch.linspace(low, high, TABLE_NODES, dtype=torch.float32, device=self.weights[0].device)
         table = self.encode_log(nodes[:, None].expand(-1, 3)).cummax(0).values.T.contiguous()
-        wanted = value.to(table).reshape(-1, 3).T.contiguous()
-        after = torch.searchsorted(table, wanted).clamp(1, TABLE_NODES - 1)
+        encoded = value.to(table).reshape(-1, 3).T.contiguous()
+        after = torch.searchsorted(table, encoded).clamp(1, TABLE_NODES - 1)
         left, right = table.gather(1, after - 1), table.gather(1, after)
-        part = ((wanted - left) / (right - left).clamp_min(1e-12)).clamp(0, 1)
-        found = (nodes[after - 1] + part * (nodes[after] - nodes[after - 1])).exp()
-        return found.T.reshape(value.shape).to(value)
+        part = ((encoded - left) / (right - left).clamp_min(1e-12)).clamp(0, 1)
+        exposures = (nodes[after - 1] + part * (nodes[after] - nodes[after - 1])).exp()
+        return exposures.T.reshape(value.shape).to(value)
 
     def slope(self, exposure):
         """df/dx of encode, shaped like the exposures [..., 3]. Not differentiable itself."""
         if not isinstance(exposure, torch.Tensor):
             return self._with_arrays(self.slope, exposure)
         with torch.enable_grad():
-            given = exposure.detach().requires_grad_()
-            return torch.autograd.grad(self.encode(given).sum(), given)[0]
+            leaf = exposure.detach().requires_grad_()
+            return torch.autograd.grad(self.encode(leaf).sum(), leaf)[0]
 
     def start_exposures(self, encoded):
         """Return exp(encoded), as HDR-GS starts, because the mapper is not trained yet."""

@@ -278,20 +278,20 @@ def _relative(values: np.ndarray) -> np.ndarray:
 
 def _range_and_roughness(bands, logs: np.ndarray) -> tuple[float, float]:
     """In stops, of a photo under one candidate's log exposures [256]."""
-    seen, bends = [], []
+    ranges, bends = [], []
     for values, clear in bands:
         stops = np.interp(values, CODES, logs) / np.log(2)
-        seen.append(stops[clear].ravel())
+        ranges.append(stops[clear].ravel())
         for rows, known in ((stops, clear), (stops.swapaxes(0, 1), clear.T)):
             bends.append(np.abs(np.diff(rows, 2, axis=0))[known[2:] & known[1:-1] & known[:-2]].ravel())
-    seen, bends = np.concatenate(seen), np.concatenate(bends)
-    low, high = np.percentile(seen, (0.1, 99.9)) if len(seen) else (0.0, 0.0)
+    ranges, bends = np.concatenate(ranges), np.concatenate(bends)
+    low, high = np.percentile(ranges, (0.1, 99.9)) if len(ranges) else (0.0, 0.0)
     return high - low, bends.mean() if len(bends) else 0.0
 
 
 def _edge_colors(image: np.ndarray, clear: np.ndarray) -> np.ndarray:
     """[E, 3, 3] encoded colors (one side, middle, other side) of clean, colored edges along rows and columns."""
-    found, length = [np.zeros((0, 3, 3))], 2 * EDGE_REACH + 3
+    colors, length = [np.zeros((0, 3, 3))], 2 * EDGE_REACH + 3
     planes = np.ascontiguousarray(np.moveaxis(image, 2, 0))  # Sums over the first axis are many times as fast.
     for rows, known in ((planes, clear), (planes.swapaxes(1, 2), clear.T)):
         starts = len(known) - length + 1
@@ -308,8 +308,8 @@ def _edge_colors(image: np.ndarray, clear: np.ndarray) -> np.ndarray:
         cosine = (first * last).sum(0) / (np.linalg.norm(first, axis=0) * np.linalg.norm(last, axis=0) + 1e-12)
         mixed = (share > LEAST_SHARE) & (share < MOST_SHARE) & (cosine < np.cos(EDGE_ANGLE))
         chosen = seen & flat & apart & between & mixed
-        found.append(np.stack([side[:, chosen].T for side in (first, middle, last)], axis=1))
-    return np.concatenate(found)
+        colors.append(np.stack([side[:, chosen].T for side in (first, middle, last)], axis=1))
+    return np.concatenate(colors)
 
 
 def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray:

@@ -86,10 +86,10 @@ class TabulatedResponse(Response, kind="table"):
 
     def _invert(self, value):
         _, _, nodes, levels = self._table(value)
-        wanted = value.double()
-        cell = (torch.searchsorted(levels, wanted.contiguous()) - 1).clamp(0, len(levels) - 2)
+        encoded = value.double()
+        cell = (torch.searchsorted(levels, encoded.contiguous()) - 1).clamp(0, len(levels) - 2)
         rise = levels[cell + 1] - levels[cell]
-        part = ((wanted - levels[cell]) / rise.clamp_min(1e-300)).clamp(0.0, 1.0)
+        part = ((encoded - levels[cell]) / rise.clamp_min(1e-300)).clamp(0.0, 1.0)
         return torch.lerp(nodes[cell], nodes[cell + 1], part).to(value.dtype)
 
     def to_dict(self):

@@ -42,8 +42,8 @@ def light_estimates(
             found.append(torch.zeros(*coarse_size(*mask.shape[:2]), 6, dtype=torch.float16))
             continue
         exposure = response.decode(torch.from_numpy(view.image).to(device)).float() / response.white
-        stated = view.light_above_white
-        stated = None if stated is None else torch.from_numpy(stated).to(device).float()
-        estimates = combined_estimates(exposure, mask.to(device), prior, stated, view.light_above_white_deviation)
+        evidence = view.light_above_white
+        evidence = None if evidence is None else torch.from_numpy(evidence).to(device).float()
+        estimates = combined_estimates(exposure, mask.to(device), prior, evidence, view.light_above_white_deviation)
         found.append(estimates.cpu())
     return found

@@ -249,11 +249,11 @@ def _nclx(path: Path) -> ColorEncoding | None:
     """Return what the primary picture of a HEIF or AVIF file states by code points, unless it has an ICC profile."""
     try:
         items = read_items(path)
-        stated = [data for kind, data in items.items[items.primary].properties if kind == "colr"]
+        boxes = [data for kind, data in items.items[items.primary].properties if kind == "colr"]
     except (InputError, KeyError):
         return None
-    codes = [struct.unpack_from(">2H", data, 4) for data in stated if data[:4] == b"nclx" and len(data) >= 8]
-    profile = any(data[:4] in (b"prof", b"rICC") for data in stated)
+    codes = [struct.unpack_from(">2H", data, 4) for data in boxes if data[:4] == b"nclx" and len(data) >= 8]
+    profile = any(data[:4] in (b"prof", b"rICC") for data in boxes)
     return _from_cicp((*codes[0], 1), "nclx") if codes and (not profile or codes[0][1] in _LIGHT) else None
 
 
@@ -318,8 +318,8 @@ def _from_gama(info: dict) -> ColorEncoding | None:
             return ColorEncoding("gAMA", problem=f"its gAMA is {gamma:g}")
         if abs(gamma * 2.2 - 1) > 0.02:
             curves = (np.linspace(0, 1, _SAMPLES) ** (1 / gamma),) * 3
-    stated = [f"gAMA {gamma:.5g}"] * (gamma is not None) + ["cHRM"] * (matrix is not None)
-    return _simplified(" and ".join(stated), matrix, curves)
+    chunks = [f"gAMA {gamma:.5g}"] * (gamma is not None) + ["cHRM"] * (matrix is not None)
+    return _simplified(" and ".join(chunks), matrix, curves)
 
 
 def _from_tiff(image: Image.Image) -> ColorEncoding | None:

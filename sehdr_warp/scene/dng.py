@@ -102,12 +102,12 @@ def _tables(file: Any) -> Iterator[Any]:
     if prefix[2:4] in (b"\x2b\x00", b"\x00\x2b"):
         prefix += file.read(8)  # BigTIFF
     head = TiffImagePlugin.ImageFileDirectory_v2(prefix)
-    places, seen = [head.next], set()
-    while places and len(seen) < _MOST_IFDS:
+    places, visited = [head.next], set()
+    while places and len(visited) < _MOST_IFDS:
         place = places.pop(0)
-        if not place or place in seen:
+        if not place or place in visited:
             continue
-        seen.add(place)
+        visited.add(place)
         table = TiffImagePlugin.ImageFileDirectory_v2(prefix)
         file.seek(place)
         table.load(file)

@@ -62,10 +62,12 @@ def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorL
     samples = 3 if pattern is None else 1
     stored = np.asarray(raw.raw_image)
     stored = stored.reshape(*stored.shape[:2], -1)[:, :, :samples]
-    height, width, found = stored.shape
+    height, width, channels = stored.shape
     stored = stored[: dng.size[1], : dng.size[0]]  # LibRaw may pad to whole tiles.
     if stored.shape != (dng.size[1], dng.size[0], samples):
-        problem = f"its tags state {dng.size[0]} x {dng.size[1]} pixels, LibRaw decodes {width} x {height} of {found}"
+        problem = (
+            f"its tags state {dng.size[0]} x {dng.size[1]} pixels, LibRaw decodes {width} x {height} of {channels}"
+        )
         raise InputError(path, problem, DAMAGED)
     cell = 1 if pattern is None else len(pattern)
     if dng.opcodes[0]:

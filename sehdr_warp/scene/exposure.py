@@ -89,8 +89,8 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
     if None in times:
         unlisted = [record for record, time in zip(records, times, strict=True) if time is None]
         by_exif, more = _exif_times(unlisted)
-        stated = iter(by_exif)
-        times, notes = [next(stated) if time is None else time for time in times], [*notes, *more]
+        exif_times = iter(by_exif)
+        times, notes = [next(exif_times) if time is None else time for time in times], [*notes, *more]
     known = [time for time in times if time is not None]
     for record, time in zip(records, times, strict=True):
         if time is not None and not SHORTEST <= time <= LONGEST:
@@ -150,12 +150,12 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
         names = _names_of(images, [*bases, place])
         strange, ambiguous = [], []
         for name, seconds in listed.items():
-            found = names.get(_plain(name), [])
-            if len(found) == 1:
-                times[found[0]] = seconds
-            elif found:
+            matches = names.get(_plain(name), [])
+            if len(matches) == 1:
+                times[matches[0]] = seconds
+            elif matches:
                 ambiguous.append(
-                    f"{name} ({', '.join(image.relative_to(bases[-1]).as_posix() for image in found[:2])})"
+                    f"{name} ({', '.join(image.relative_to(bases[-1]).as_posix() for image in matches[:2])})"
                 )
             elif not any((base / _plain(name)).is_file() for base in (place, *bases, *{i.parent for i in images})):
                 strange.append(name)

@@ -45,8 +45,8 @@ def _factor(view: View, known: list[View], points: np.ndarray, response: Respons
     known = known[:: -(-len(known) // _MOST_VIEWS)]
     points = points[:: max(1, len(points) // _MOST)]
     if len(points):
-        seen = np.ones((1 + len(known), len(points)), bool)
-        light, _ = point_light([view, *known], points, seen, response)
+        visible = np.ones((1 + len(known), len(points)), bool)
+        light, _ = point_light([view, *known], points, visible, response)
         several = np.isfinite(light[1:]).sum(0) > 0
         shared = np.isfinite(light[0]) & several
         count = int(shared.any(1).sum())

@@ -113,11 +113,11 @@ def read_gain_map(path: Path, *, oriented: bool = False) -> GainMap | None:
         InputError: if the photo itself is missing or damaged.
     """
     try:
-        found = _of_jpeg(path) if _is_jpeg(path) else _of_items(path)
-        if found is not None and oriented:
+        gain_map = _of_jpeg(path) if _is_jpeg(path) else _of_items(path)
+        if gain_map is not None and oriented:
             with open_image(path) as image:
-                found = replace(found, encoded=turn_upright(found.encoded, orientation_of(image)))
-        return found
+                gain_map = replace(gain_map, encoded=turn_upright(gain_map.encoded, orientation_of(image)))
+        return gain_map
     except InputError:
         raise
     except (*PILLOW_ERRORS, IndexError, KeyError) as error:
@@ -185,8 +185,8 @@ def _of_items(path: Path) -> GainMap | None:
 
 def _described_by(items: HeifItems, number: int) -> list[int]:
     """Return the XMP items that describe an item."""
-    found = [source for kind, source, to in items.references if kind == "cdsc" and number in to]
-    return [source for source in found if source in items.items and items.items[source].kind == "mime"]
+    sources = [source for kind, source, to in items.references if kind == "cdsc" and number in to]
+    return [source for source in sources if source in items.items and items.items[source].kind == "mime"]
 
 
 def _item_pixels(path: Path, items: HeifItems, number: int, photo: tuple[int, int]) -> np.ndarray:
@@ -264,10 +264,10 @@ def _made(stated: _Parameters, encoded: np.ndarray) -> GainMap | None:
 
 def _of_xmp(xmp: str) -> _Parameters:
     """Return the parameters of Ultra HDR's XMP (hdrgm 1.0)."""
-    stated = _xmp_values(xmp, "hdrgm")
+    attributes = _xmp_values(xmp, "hdrgm")
 
     def numbers(name: str, default: float) -> tuple[float, ...]:
-        values = tuple(float(value) for value in stated.get(name, ()))
+        values = tuple(float(value) for value in attributes.get(name, ()))
         return values if len(values) in (1, 3) else (default,)
 
     return _Parameters(
@@ -277,16 +277,16 @@ def _of_xmp(xmp: str) -> _Parameters:
         base_offset=numbers("OffsetSDR", 1 / 64),
         alternate_offset=numbers("OffsetHDR", 1 / 64),
         headroom=numbers("HDRCapacityMax", 1.0)[0],
-        base_is_hdr=stated.get("BaseRenditionIsHDR", [""])[0].lower() == "true",
+        base_is_hdr=attributes.get("BaseRenditionIsHDR", [""])[0].lower() == "true",
     )
 
 
 def _xmp_values(xmp: str, prefix: str) -> dict[str, list[str]]:
     """Return the simple values and sequences of one namespace, by name."""
-    found = {name: [value] for name, value in re.findall(rf'\b{prefix}:(\w+)\s*=\s*["\']([^"\']*)["\']', xmp)}
+    attributes = {name: [value] for name, value in re.findall(rf'\b{prefix}:(\w+)\s*=\s*["\']([^"\']*)["\']', xmp)}
     for name, body in re.findall(rf"<{prefix}:(\w+)[^>/]*>(.*?)</{prefix}:\1>", xmp, re.DOTALL):
-        found[name] = re.findall(r"<rdf:li[^>]*>([^<]*)</rdf:li>", body) or [body.strip()]
-    return found
+        attributes[name] = re.findall(r"<rdf:li[^>]*>([^<]*)</rdf:li>", body) or [body.strip()]
+    return attributes
 
 
 def _of_iso(data: bytes) -> _Parameters:
@@ -324,9 +324,9 @@ def _of_apple(xmp: str, exif: Any) -> _Parameters:
 
     Raises ValueError if neither states it.
     """
-    stated = _xmp_values(xmp, "HDRGainMap").get("HDRGainMapHeadroom")
-    if stated is not None:
-        headroom = float(stated[0])
+    headroom_text = _xmp_values(xmp, "HDRGainMap").get("HDRGainMapHeadroom")
+    if headroom_text is not None:
+        headroom = float(headroom_text[0])
     else:
         note = _apple_note(exif.get_ifd(0x8769).get(0x927C, b""))
         if 33 not in note or 48 not in note:

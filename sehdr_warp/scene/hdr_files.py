@@ -85,8 +85,8 @@ def _exr_colors(
     channels: Mapping[str, np.ndarray], header: Mapping[str, Any], path: Path
 ) -> tuple[np.ndarray, tuple[float, ...]]:
     """Return [H, W, 3] linear values, and the primaries that they are in."""
-    stated = header.get("chromaticities")
-    primaries = REC709 if stated is None else tuple(map(float, stated))
+    chromaticities = header.get("chromaticities")
+    primaries = REC709 if chromaticities is None else tuple(map(float, chromaticities))
     encoding = encoding_of_interop_id(str(header.get("colorInteropID", "")))
     if encoding.chromaticities is not None:
         primaries = encoding.chromaticities
@@ -94,8 +94,8 @@ def _exr_colors(
         return _from_luminance(channels, primaries, path), primaries
     names = next((names for names in ("RGB", "rgb", "XYZ", "YYY", "VVV") if set(names) <= set(channels)), None)
     if names is None:
-        found = f"has the channels {sorted(channels)[:8]}, not R, G, B"
-        raise InputError(path, found, "export it with color channels")
+        problem = f"has the channels {sorted(channels)[:8]}, not R, G, B"
+        raise InputError(path, problem, "export it with color channels")
     pixels = np.stack([channels[name] for name in names], axis=2)
     if names == "XYZ":
         return pixels, _XYZ
@@ -213,8 +213,8 @@ def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float, tup
     if size is None:
         raise InputError(path, "Radiance header has no '-Y height +X width' line", _REMEDY)
     try:
-        stated = re.findall(rb"^EXPOSURE\s*=\s*([^\s]{1,40})", data[:end], re.MULTILINE)
-        exposure = float(np.prod([float(value) for value in stated]))
+        exposures = re.findall(rb"^EXPOSURE\s*=\s*([^\s]{1,40})", data[:end], re.MULTILINE)
+        exposure = float(np.prod([float(value) for value in exposures]))
     except ValueError:
         exposure = np.nan
     if not (np.isfinite(exposure) and exposure > 0):

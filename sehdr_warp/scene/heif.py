@@ -219,7 +219,7 @@ def _places(data: bytes, start: int, end: int) -> dict[int, tuple[int, tuple[tup
 def _properties(data: bytes, start: int, end: int) -> dict[int, tuple[tuple[str, bytes], ...]]:
     """Return the properties of each item of an `iprp` box."""
     every: list[tuple[str, bytes]] = []
-    found: dict[int, tuple[tuple[str, bytes], ...]] = {}
+    properties: dict[int, tuple[tuple[str, bytes], ...]] = {}
     for kind, at, last in _boxes(data, start, end):
         if kind == "ipco":
             every = [(name, data[first:final]) for name, first, final in _boxes(data, at, last)]
@@ -234,8 +234,8 @@ def _properties(data: bytes, start: int, end: int) -> dict[int, tuple[tuple[str,
                 indices = [int.from_bytes(data[at + 1 + i * size : at + 1 + (i + 1) * size]) for i in range(used)]
                 at += 1 + used * size
                 indices = [index & (0x7FFF if wide_index else 0x7F) for index in indices]
-                found[number] = tuple(every[index - 1] for index in indices if 0 < index <= len(every))
-    return found
+                properties[number] = tuple(every[index - 1] for index in indices if 0 < index <= len(every))
+    return properties
 
 
 def _references(data: bytes, start: int, end: int) -> Iterator[tuple[str, int, tuple[int, ...]]]:

@@ -129,8 +129,8 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
         if several:
             raise InputError(path, "holds several pictures, pages or an animation", "save the one that counts")
         if image.mode not in (*_MODES, *("1" * mask)):
-            found = _OTHER_MODES.get(image.mode, f"{image.mode}, not RGB")
-            raise InputError(path, f"holds {found}", "export it as RGB or grey, in PNG or JPEG")
+            mode = _OTHER_MODES.get(image.mode, f"{image.mode}, not RGB")
+            raise InputError(path, f"holds {mode}", "export it as RGB or grey, in PNG or JPEG")
     except InputError:
         image.close()
         raise
@@ -192,8 +192,8 @@ def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndar
     if image.mode.startswith("I"):
         values = np.asarray(image)
         if values.min() < 0 or values.max() > 65535:
-            found = f"32-bit values up to {int(values.max())} have no known white"
-            raise InputError(path, found, "export it with 16 bits")
+            problem = f"32-bit values up to {int(values.max())} have no known white"
+            raise InputError(path, problem, "export it with 16 bits")
         return _split(values.astype(np.uint16))
     transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     return _split(_converted(image, "RGBA" if transparent else "RGB"))

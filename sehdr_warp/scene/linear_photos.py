@@ -124,8 +124,8 @@ def linear_codes(linear: np.ndarray) -> np.ndarray:
 def raw_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
     """Exposure time in seconds, ISO speed and f-number that a RAW file states, None where it does not."""
     with _opened(path) as raw:
-        stated = raw.other
-        return tuple(v if v > 0 else None for v in (stated.shutter_speed, stated.iso_speed, stated.aperture))  # type: ignore[return-value]
+        metadata = raw.other
+        return tuple(v if v > 0 else None for v in (metadata.shutter_speed, metadata.iso_speed, metadata.aperture))  # type: ignore[return-value]
 
 
 def color_matrix(photos: Sequence[Path]) -> np.ndarray:
@@ -136,9 +136,9 @@ def color_matrix(photos: Sequence[Path]) -> np.ndarray:
     first = None
     for photo in photos:
         with _opened(photo) as raw:
-            matrix, stated = np.array(raw.color_matrix)[:, :3], np.array(raw.rgb_xyz_matrix)[:3]
-            if not matrix.any() and stated.any():
-                to_camera = stated @ _XYZ_FROM_REC709
+            matrix, xyz_matrix = np.array(raw.color_matrix)[:, :3], np.array(raw.rgb_xyz_matrix)[:3]
+            if not matrix.any() and xyz_matrix.any():
+                to_camera = xyz_matrix @ _XYZ_FROM_REC709
                 matrix = np.linalg.inv(to_camera / to_camera.sum(axis=1, keepdims=True))
             balance = next((b for b in (raw.camera_whitebalance, raw.daylight_whitebalance) if min(b[:3]) > 0), None)
         if not matrix.any() or balance is None:

@@ -81,8 +81,8 @@ def parse_dataset(
     records, split = _with_splits(records, dataset, holdout)
     training = sum(record.split == "train" for record in records)
     if training < 2:
-        found = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
-        raise InputError(folder, f"has {found}; one view does not show depth", "add views from other places")
+        counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
+        raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
     unused = [] if is_embedded(path) or dataset.format == "video" else unused_notes(folder, every, unplaced)
     notes = (*dataset.notes, *masks, *exposures, *odd, *times, *split, *unused)
     return replace(dataset, records=tuple(records), notes=notes, name=name)
@@ -93,9 +93,9 @@ def _with_times(records: list[ImageRecord], kind: str, folder: Path) -> tuple[li
     if kind != "float" or any(record.exposure_time is not None for record in records):
         return with_exposure_times(records, folder)
     time = float_time([record.image for record in records])
-    stated = [exr_exposure_time(record.image) for record in records]
-    known = [each for each in stated if each is not None]
-    if len(known) < len(stated) or max(known) < min(known) * 1.001:
+    header_times = [exr_exposure_time(record.image) for record in records]
+    known = [each for each in header_times if each is not None]
+    if len(known) < len(header_times) or max(known) < min(known) * 1.001:
         note = "float images: their values are taken as light, at no exposure"
         timed = [replace(record, exposure_time=time, hdr=record.hdr or record.image) for record in records]
         return timed, True, [note]
@@ -203,5 +203,5 @@ def embedded_folder(path: str) -> Path:
 def _places() -> list[Path]:
     """List the folders of scenes: in the package, in $SEHDR_SCENES, and in scenes/ beside a checkout's package."""
     package = Path(str(resources.files("sehdr_warp")))
-    stated = os.environ.get("SEHDR_SCENES")
-    return [package / "embedded", *([Path(stated)] if stated else []), package.parent / "scenes"]
+    scenes_folder = os.environ.get("SEHDR_SCENES")
+    return [package / "embedded", *([Path(scenes_folder)] if scenes_folder else []), package.parent / "scenes"]

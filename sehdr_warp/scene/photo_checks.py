@@ -94,9 +94,9 @@ def left_out(problems: Sequence[InputError], count: int) -> list[str]:
     rest = count - len(problems)
     if 2 * len(problems) > count or rest < min(FEWEST_PHOTOS, count):
         raise problems[0]
-    told = "; ".join(f"{Path(error.path).name}: {error.problem}" for error in problems[:_MOST_NAMED])
+    reasons = "; ".join(f"{Path(error.path).name}: {error.problem}" for error in problems[:_MOST_NAMED])
     more = " ..." if len(problems) > _MOST_NAMED else ""
-    return [f"{len(problems)} of {count} photos cannot be used and were left out ({told}{more})"]
+    return [f"{len(problems)} of {count} photos cannot be used and were left out ({reasons}{more})"]
 
 
 def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRecord], list[str]]:

@@ -203,20 +203,20 @@ class PhotoKeeper:
 
 def available_memory() -> int:
     """Return the bytes of memory that this process may still take without swapping, as far as the system reports."""
-    found = [1 << 62]
+    limits = [1 << 62]
     with suppress(OSError, ValueError, AttributeError):
-        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
-        found.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
+        limits.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
     if (left := memory_left()) is not None:
-        found.append(left)
-    return min(found)
+        limits.append(left)
+    return min(limits)
 
 
 def _folder() -> Path:
-    stated = os.environ.get("SEHDR_CACHE")
-    folder = user_cache("sehdr-warp") if stated is None else Path(stated)
+    cache_folder = os.environ.get("SEHDR_CACHE")
+    folder = user_cache("sehdr-warp") if cache_folder is None else Path(cache_folder)
     if folder is None or not usable(folder):
         return Path(tempfile.gettempdir())
     folder.mkdir(parents=True, exist_ok=True)

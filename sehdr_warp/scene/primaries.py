@@ -79,5 +79,7 @@ def encoding_of_interop_id(name: str) -> InteropEncoding:
         return InteropEncoding((1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.3127, 0.3290), curve)
     import OpenEXR
 
-    found = OpenEXR.colorInteropIDToChromaticities(f"lin_{space}_scene")
-    return InteropEncoding(None if found is None else tuple(map(float, found)), curve if found else "lin")
+    chromaticities = OpenEXR.colorInteropIDToChromaticities(f"lin_{space}_scene")
+    return InteropEncoding(
+        None if chromaticities is None else tuple(map(float, chromaticities)), curve if chromaticities else "lin"
+    )

@@ -130,12 +130,12 @@ def _model(folder: Path) -> tuple[SparseModel, Path]:
 
 
 def _exposures_by_view(images: Path) -> dict[str, dict[int, Path]]:
-    found: dict[str, dict[int, Path]] = {}
+    by_view: dict[str, dict[int, Path]] = {}
     for image in images.iterdir():
         view, key = view_and_exposure(image.stem)
         if key is not None and image.suffix.lower() in LDR_SUFFIXES:
-            found.setdefault(view, {})[key] = image
-    return found
+            by_view.setdefault(view, {})[key] = image
+    return by_view
 
 
 def _hdr_gs_seconds(folder: Path, count: int) -> tuple[list[float] | None, tuple[str, ...]]:
@@ -226,9 +226,9 @@ def find_photos(folder: Path) -> DataparserOutputs:
         InputError: if there are none, or too few.
     """
     places = (place for place in (folder, folder / "images") if place.is_dir())
-    found = [list_images(place, PHOTO_SUFFIXES) for place in places]
+    candidates = [list_images(place, PHOTO_SUFFIXES) for place in places]
     # A single picture beside `images/` is a cover.
-    photos = next((each for each in found if len(each) > 1), next(filter(None, found), []))
+    photos = next((each for each in candidates if len(each) > 1), next(filter(None, candidates), []))
     if not photos:
         if heif := next((file for file in sorted(folder.iterdir()) if file.suffix.lower() in HEIF_SUFFIXES), None):
             register_heif(heif)
@@ -270,15 +270,19 @@ def place_photos(
     if kind == "raw":
         color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
-    found = reconstruct_panoramas(photos, cache) if are_panoramas(photos) else reconstruct(photos, cache)
-    cameras = {int(Path(image.name).stem): image for image in found.model.images}
+    reconstruction = reconstruct_panoramas(photos, cache) if are_panoramas(photos) else reconstruct(photos, cache)
+    cameras = {int(Path(image.name).stem): image for image in reconstruction.model.images}
     placed = [
         replace(record, lens=image.lens, world_to_camera=image.world_to_camera)
         for i, record in enumerate(records)
         if (image := cameras.get(i)) is not None
     ]
     lost = [record.image.name for i, record in enumerate(records) if i not in cameras]
-    return replace(dataset, cloud=found.model.cloud, notes=(*dataset.notes, *found.notes(photos))), placed, lost
+    return (
+        replace(dataset, cloud=reconstruction.model.cloud, notes=(*dataset.notes, *reconstruction.notes(photos))),
+        placed,
+        lost,
+    )
 
 
 def _require_photos(count: int, first: Path, folder: Path) -> None:

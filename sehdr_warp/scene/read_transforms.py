@@ -64,9 +64,11 @@ def read_hdr_nerf(folder: Path) -> DataparserOutputs:
         if split == "test" and not path.is_file():
             continue
         values, times = read_json(path), _exposures_of(read_json(times_path), times_path)
-        stated = values.get("photo_response")
-        if stated not in (None, DERIVED_PHOTOS):
-            raise InputError(path, f"photo_response is {stated!r:.40}", f"only {DERIVED_PHOTOS!r} can be derived")
+        photo_response = values.get("photo_response")
+        if photo_response not in (None, DERIVED_PHOTOS):
+            raise InputError(
+                path, f"photo_response is {photo_response!r:.40}", f"only {DERIVED_PHOTOS!r} can be derived"
+            )
         for place, (name, frame) in enumerate(frames_of(values, path)):
             exposures = times.get(_plain(name))
             if not exposures:
@@ -74,15 +76,15 @@ def read_hdr_nerf(folder: Path) -> DataparserOutputs:
                 raise InputError(times_path, problem, "list <file_path>_<k>.png: seconds")
             truth = folder / f"{split}_hdr" / f"hdr_{place:03d}.exr"
             hdr, pose = sibling(truth, HDR_SUFFIXES), frame_pose(frame, path, name)
-            if stated and hdr is None:
+            if photo_response and hdr is None:
                 raise InputError(truth, "HDR truth not found", _INCOMPLETE)
             present = []
             for key, (file, time) in sorted(exposures.items()):
-                image = hdr if stated and hdr else contained(folder, file, times_path)
+                image = hdr if photo_response and hdr else contained(folder, file, times_path)
                 if image.is_file():
                     lens, view = frame_lens(values, frame, image, path), Path(_plain(name)).name
                     present.append(
-                        ImageRecord(view, image, lens, pose, key, time, split, hdr=hdr, derived=bool(stated))
+                        ImageRecord(view, image, lens, pose, key, time, split, hdr=hdr, derived=bool(photo_response))
                     )
             if not present:
                 absent.append(f"{_plain(name)}_{min(exposures)}.png")
@@ -116,8 +118,8 @@ def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str
         listed = values.get(f"{split}_filenames")
         if isinstance(listed, list):
             named.update({name: split for name in listed if isinstance(name, str)})
-    kept = {"train": "train", "test" if "test" in named.values() else "val": "test"}
-    return {name: kept[split] for name, split in named.items() if split in kept}
+    splits = {"train": "train", "test" if "test" in named.values() else "val": "test"}
+    return {name: splits[split] for name, split in named.items() if split in splits}
 
 
 def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:
@@ -191,10 +193,10 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     Raises:
         InputError: if values are missing or not possible.
     """
-    stated = values | frame
+    fields = values | frame
 
     def number(key: str, absent: Any = None) -> Any:
-        value = stated.get(key)
+        value = fields.get(key)
         if value is None:
             return absent
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
@@ -210,7 +212,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         if image is None:
             raise InputError(path, "states no image size", "add w and h")
         width, height = photo_sizes(image)[0]
-    if stated.get("camera_model") == "EQUIRECTANGULAR":
+    if fields.get("camera_model") == "EQUIRECTANGULAR":
         return Lens("EQUIRECTANGULAR", int(width), int(height), (width, height), path)
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
@@ -218,8 +220,8 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     center = number("cx", width / 2), number("cy", height / 2)
     pinhole: tuple[Any, ...] = fy if fx is None else fx, fx if fy is None else fy, *center
     k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model, bent = stated.get("camera_model", "OPENCV"), (k1, k2, p1, p2)
-    if model == "OPENCV_FISHEYE" or stated.get("is_fisheye") is True:
+    model, bent = fields.get("camera_model", "OPENCV"), (k1, k2, p1, p2)
+    if model == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True:
         model, bent = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL"):
         raise InputError(
@@ -263,10 +265,10 @@ def _plain(name: str) -> str:
 
 def _exposures_of(values: dict, path: Path) -> dict[str, dict[int, tuple[str, float]]]:
     """Return frame -> exposure number -> (file name, seconds)."""
-    found: dict[str, dict[int, tuple[str, float]]] = {}
+    by_view: dict[str, dict[int, tuple[str, float]]] = {}
     for key, value in values.items():
         match = re.fullmatch(r"(.+)_(\d{1,3})(\.[A-Za-z]+)?", _plain(key))
         if match:
             name = _plain(key) if match[3] else f"{_plain(key)}.png"
-            found.setdefault(match[1], {})[int(match[2])] = (name, parse_seconds(value, path, key))
-    return found
+            by_view.setdefault(match[1], {})[int(match[2])] = (name, parse_seconds(value, path, key))
+    return by_view

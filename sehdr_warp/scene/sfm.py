@@ -125,9 +125,12 @@ def _placement(folder: Path) -> tuple[float, tuple[int, ...]]:
     import pycolmap
 
     with quiet_colmap():
-        found = pycolmap.Reconstruction(str(folder))
-        shared = {int(Path(found.images[i].name).stem): found.images[i].num_points3D for i in found.reg_image_ids()}
-        error = float(found.compute_mean_reprojection_error())
+        reconstruction = pycolmap.Reconstruction(str(folder))
+        shared = {
+            int(Path(reconstruction.images[i].name).stem): reconstruction.images[i].num_points3D
+            for i in reconstruction.reg_image_ids()
+        }
+        error = float(reconstruction.compute_mean_reprojection_error())
     return error, tuple(sorted(index for index, count in shared.items() if count < FEWEST_SHARED))
 
 
@@ -139,8 +142,8 @@ def cached_result(cache: Path | str | None, name: str, solve: Callable[[Path, Pa
     is temporary; a damaged result is computed again. A cache that the caller names must be writable.
     """
     with contextlib.ExitStack() as stack:
-        stated = cache or os.environ.get("SEHDR_CACHE")
-        folder = user_cache("sehdr-warp") if stated is None else Path(stated)
+        cache_folder = cache or os.environ.get("SEHDR_CACHE")
+        folder = user_cache("sehdr-warp") if cache_folder is None else Path(cache_folder)
         place = (folder or Path()) / name
         if folder and place.is_dir() and not is_sealed(place):
             _log.warning("%s is damaged and is made again", place)
@@ -246,8 +249,8 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params)
     """Extract the features of images that share one camera."""
     import pycolmap
 
-    stated = ",".join(f"{value:.17g}" for value in params)
-    reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=stated)
+    camera_params = ",".join(f"{value:.17g}" for value in params)
+    reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=camera_params)
     for start in range(0, len(names), 8):  # Eight photos at a time, one on each core.
         part = names[start : start + 8]
         if len(names) > 1:

@@ -44,9 +44,9 @@ def are_panoramas(photos: Sequence[Path]) -> bool:
         if abs(width - 2 * height) > _SKEW:
             return False
     judged = photos[:: max(1, len(photos) // _JUDGED)][:_JUDGED]
-    stated = {kind for photo in judged if (kind := _stated_projection(photo))}
-    if stated:
-        return stated == {"equirectangular"}
+    projections = {kind for photo in judged if (kind := _stated_projection(photo))}
+    if projections:
+        return projections == {"equirectangular"}
     return float(np.median([_seam(photo) for photo in judged])) < _SEAM
 
 
@@ -56,8 +56,8 @@ def _stated_projection(photo: Path) -> str | None:
         return None
     with open_image(photo) as image:
         xmp = image.info.get("xmp", b"")
-    found = _PROJECTION.search(xmp if isinstance(xmp, bytes) else str(xmp).encode())
-    return found[1].decode().lower() if found else None
+    match = _PROJECTION.search(xmp if isinstance(xmp, bytes) else str(xmp).encode())
+    return match[1].decode().lower() if match else None
 
 
 def _seam(photo: Path) -> float:

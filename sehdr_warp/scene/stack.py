@@ -92,12 +92,12 @@ def _alike(one: np.ndarray, other: np.ndarray) -> bool:
     """Return whether thumbnails rank the brightness of places alike, except black and white ones."""
     if one.shape != other.shape:
         return False
-    shown = (np.minimum(one, other) > 8) & (np.maximum(one, other) < 247)
-    if shown.mean() < LEAST_SHOWN:
+    exposed = (np.minimum(one, other) > 8) & (np.maximum(one, other) < 247)
+    if exposed.mean() < LEAST_SHOWN:
         return False
     from scipy.stats import rankdata
 
-    return bool(np.corrcoef(rankdata(one[shown]), rankdata(other[shown]))[0, 1] >= LEAST_ALIKE)
+    return bool(np.corrcoef(rankdata(one[exposed]), rankdata(other[exposed]))[0, 1] >= LEAST_ALIKE)
 
 
 def calibrate(
@@ -137,15 +137,15 @@ def calibrate(
     photos = [read_ldr(file).pixels for file in files]
     try:
         channels = CHANNELS if channel == "each" else (channel,)
-        found = [calibrate_codes(photos, times, channel=each, name=name) for each in channels]
+        curves = [calibrate_codes(photos, times, channel=each, name=name) for each in channels]
     except InputError as error:
         raise InputError(folder, *error.args[0].split(": ", 1)[1].split("; ", 1)) from None
-    for calibration in found:
+    for calibration in curves:
         _tell(calibration, files, channel)
-    response = found[0].response if len(found) == 1 else _joined(name, found)
+    response = curves[0].response if len(curves) == 1 else _joined(name, curves)
     if paths:
         with atomic_path(paths[1], overwrite) as picture:
-            _plot(found, times, picture)
+            _plot(curves, times, picture)
         with atomic_path(paths[0], overwrite) as table:
             table.write_text("\n".join([*_rows(response), ""]), encoding="utf-8")
     return response

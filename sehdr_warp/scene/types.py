@@ -50,11 +50,11 @@ class View:
         """Check the types and shapes."""
         codes = self.codes
         if getattr(codes, "dtype", None) not in (np.uint8, np.uint16) or codes.ndim != 3 or codes.shape[2] != 3:
-            found = f"{getattr(codes, 'dtype', type(codes).__name__)} {list(getattr(codes, 'shape', ()))}"
-            raise ValueError(f"codes of view {self.name} are {found}, not uint8 or uint16 [H, W, 3]; see codes_of")
+            problem = f"{getattr(codes, 'dtype', type(codes).__name__)} {list(getattr(codes, 'shape', ()))}"
+            raise ValueError(f"codes of view {self.name} are {problem}, not uint8 or uint16 [H, W, 3]; see codes_of")
         if self.light_above_white is not None and self.light_above_white.shape != codes.shape:
-            found = list(self.light_above_white.shape)
-            raise ValueError(f"light_above_white of view {self.name} is {found}, its codes are {list(codes.shape)}")
+            problem = list(self.light_above_white.shape)
+            raise ValueError(f"light_above_white of view {self.name} is {problem}, its codes are {list(codes.shape)}")
 
     @property
     def levels(self) -> int:

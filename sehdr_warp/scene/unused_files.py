@@ -80,12 +80,12 @@ def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
     common = bases_of(images, folder)[0]
     deep = common != folder and common.is_relative_to(folder)
     places = [common] if deep else sorted({image.parent for image in images})
-    seen = 0
+    count = 0
     for place in places:
         for root, _, names in os.walk(place) if deep else [(place, [], os.listdir(place))]:
             for name in sorted(names, key=natural_key):
-                seen += 1
-                if seen > _MOST_FILES:
+                count += 1
+                if count > _MOST_FILES:
                     return
                 file = Path(root) / name
                 if not name.startswith(".") and file.is_file():

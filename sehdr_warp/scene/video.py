@@ -247,25 +247,25 @@ def _color(container: Any, stream: Any, frame: Any) -> VideoColor:
     full = int(context.color_range or 0) == _FULL_RANGE or frame.format.name.startswith("yuvj")
     luma = None if frame.format.is_rgb else _LUMA.get(matrix, _LUMA[1 if frame.height > 576 else 5])
     texts = [*container.metadata.items(), *stream.metadata.items()]
-    stated = VideoColor("", None, _PRIMARIES.get(primaries), luma, full, bits)
+    color = VideoColor("", None, _PRIMARIES.get(primaries), luma, full, bits)
     if log := _log_curve(texts, transfer, primaries, bits):
-        return replace(stated, curve=log[0], response=f"colour:{log[0]}", primaries=log[1])
+        return replace(color, curve=log[0], response=f"colour:{log[0]}", primaries=log[1])
     if transfer in _STATED_CURVES:
         # Where a clip states HLG or PQ alone, its primaries are those of BT.2100.
-        known = stated.primaries or (None if primaries == 1 else "ITU-R BT.2020")
-        return replace(stated, curve=_CURVE_NAMES[transfer], response=_STATED_CURVES[transfer], primaries=known)
+        known = color.primaries or (None if primaries == 1 else "ITU-R BT.2020")
+        return replace(color, curve=_CURVE_NAMES[transfer], response=_STATED_CURVES[transfer], primaries=known)
     if transfer == 8:
-        return replace(stated, curve="linear", response="linear")
-    return replace(stated, curve=_CURVE_NAMES.get(transfer, "no stated curve"))
+        return replace(color, curve="linear", response="linear")
+    return replace(color, curve=_CURVE_NAMES.get(transfer, "no stated curve"))
 
 
 def _log_curve(texts: list[tuple[str, str]], transfer: int, primaries: int, bits: int) -> tuple[str, str] | None:
     """Return colour-science's names of a log curve and its primaries if a clip states them."""
     for _, text in texts:
         plain = "".join(letter for letter in text.lower() if letter.isalnum())
-        for name, found in _LOGS.items():
+        for name, curve in _LOGS.items():
             if plain == name or plain.endswith(name) or f"gamma{name}" in plain:
-                return found
+                return curve
     makers = {text.lower() for key, text in texts if key.lower().endswith("make")}
     # iPhones leave the transfer function of Apple Log open, and state BT.2020 with 10 bits.
     if transfer == _UNSPECIFIED and primaries == 9 and bits >= 10 and "apple" in makers:

@@ -100,8 +100,8 @@ def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
             process if that cannot be written.
     """
     named = f"video-{file_digest(clip.path)[:16]}-{_VERSION}"
-    stated = cache or os.environ.get("SEHDR_CACHE")
-    folder = user_cache("sehdr-warp") if stated is None else Path(stated)
+    cache_folder = cache or os.environ.get("SEHDR_CACHE")
+    folder = user_cache("sehdr-warp") if cache_folder is None else Path(cache_folder)
     if folder is None or not usable(folder):
         if cache is not None:
             raise InputError(cache, "the frames cannot be kept there", "name a folder that can be written")
@@ -134,10 +134,10 @@ def _temporary() -> Path:
 
 
 def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
-    wanted = frozenset(choice.numbers)
-    for done, (number, frame) in enumerate(decode(clip, wanted)):
+    numbers = frozenset(choice.numbers)
+    for done, (number, frame) in enumerate(decode(clip, numbers)):
         if done % 10 == 0:
-            _log.info("keeping frames %d to %d of %d", done + 1, min(done + 10, len(wanted)), len(wanted))
+            _log.info("keeping frames %d to %d of %d", done + 1, min(done + 10, len(numbers)), len(numbers))
         pixels, file = codes(frame, clip.color), folder / f"frame_{number:06d}.png"
         if pixels.dtype == np.uint8:
             Image.fromarray(pixels).save(file, compress_level=1)
@@ -157,10 +157,10 @@ def read_video(path: Path, cache: Path | str | None = None) -> DataparserOutputs
     folder = frames_folder(clip, cache)
     facts = json.loads((folder / "frames.json").read_text())
     dataset = find_photos(folder)
-    kept = len(list_images(folder, (".png",)))
+    count = len(list_images(folder, (".png",)))
     color = clip.color
     known = f"its response is {color.response}" if color.response else "its response is chosen as for photos"
-    note = f"video: the sharpest {kept} of {facts['total']} frames are used; its curve is {color.curve}: {known}"
+    note = f"video: the sharpest {count} of {facts['total']} frames are used; its curve is {color.curve}: {known}"
     return replace(
         dataset,
         format="video",

@@ -124,15 +124,15 @@ def faces_of(view: View, size: int | None = None) -> list[View]:
         face = Camera(count, count, focal, focal, count / 2, count / 2, pose @ camera.world_to_camera)
         # A face's axes are turn times the photo's.
         places = pixels_of_directions(pixel_directions(face) @ turn, camera)
-        shown = np.isfinite(places).all(axis=2)
-        if shown.mean() < _LEAST_FILLED:
+        visible = np.isfinite(places).all(axis=2)
+        if visible.mean() < _LEAST_FILLED:
             continue
         wrap = camera.projection == "equirectangular"
         stored = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="wrap") if wrap else image
-        rows, columns = np.where(shown[..., None], places, 0).transpose(2, 0, 1)  # pyright: ignore[reportIndexIssue]
+        rows, columns = np.where(visible[..., None], places, 0).transpose(2, 0, 1)  # pyright: ignore[reportIndexIssue]
         at = np.stack([rows, columns + wrap])
         codes = np.stack([map_coordinates(stored[..., c], at, order=1, mode="nearest") for c in range(3)], axis=2)
-        counted = shown.astype(np.float32)
+        counted = visible.astype(np.float32)
         if mask is not None:
             counted *= map_coordinates(mask, np.stack([rows, columns]), order=0, mode="nearest")
         part = None if counted.min() >= 1 else counted

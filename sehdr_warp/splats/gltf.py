@@ -130,7 +130,7 @@ def _shown_meshes(described: dict, path: Path) -> list[tuple[int, np.ndarray]]:
     """Return the mesh and the world transform of each node with a mesh; of a file without nodes all meshes, unmoved."""
     nodes = described.get("nodes", [])
     parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
-    shown = []
+    meshes = []
     for number, node in enumerate(nodes):
         if "mesh" not in node:
             continue
@@ -142,8 +142,8 @@ def _shown_meshes(described: dict, path: Path) -> list[tuple[int, np.ndarray]]:
             matrix = _node_matrix(nodes[above]) @ matrix
         else:
             raise InputError(path, "has nodes that hold each other", _DAMAGED)
-        shown.append((node["mesh"], matrix))
-    return shown or [(number, np.eye(4)) for number in range(len(described["meshes"]))]
+        meshes.append((node["mesh"], matrix))
+    return meshes or [(number, np.eye(4)) for number in range(len(described["meshes"]))]
 
 
 def _node_matrix(node: dict) -> np.ndarray:

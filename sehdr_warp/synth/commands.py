@@ -54,5 +54,5 @@ def run_synth(asked: Synth) -> None:
     scene = load_scene(asked.truth, response="srgb")
     times = times or exposure_ladder(scene, response)
     write_photo_set(scene, asked.out, response, times, noise=noise, seed=asked.seed, overwrite=asked.overwrite)
-    stated = ", ".join(f"{time:.4g}" for time in times)
-    print(f"{asked.out}: {len(scene.views)} views at {stated} s through {response.name}")
+    times_text = ", ".join(f"{time:.4g}" for time in times)
+    print(f"{asked.out}: {len(scene.views)} views at {times_text} s through {response.name}")

@@ -74,8 +74,8 @@ def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise |
             rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
             exposure = noisy(exposure, response.clip_exposure if response.clips else response.white, noise, rng)
         views.append(replace(view, codes=codes_of(response.encode(exposure), 8), exposure_time=float(exposure_time)))
-    made = {"views": tuple(views), "point_colors": _recolored(scene, views), "exposure_times_known": True}
-    return replace(scene, **made, response=None, chosen_by=None)
+    fields = {"views": tuple(views), "point_colors": _recolored(scene, views), "exposure_times_known": True}
+    return replace(scene, **fields, response=None, chosen_by=None)
 
 
 def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
@@ -138,8 +138,8 @@ def _recolored(scene: Scene, views: Sequence[View]) -> np.ndarray:
         x, y, z = camera.world_to_camera[:3, :3] @ scene.points.T + camera.world_to_camera[:3, 3:]
         depth = np.where(z > 1e-9, z, np.inf)
         column, row = np.floor(camera.fx * x / depth + camera.cx), np.floor(camera.fy * y / depth + camera.cy)
-        seen = (z > 1e-9) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-        place = np.flatnonzero(seen)
+        visible = (z > 1e-9) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        place = np.flatnonzero(visible)
         at = row[place].astype(int), column[place].astype(int)
         difference = np.abs(old.image[at] - scene.point_colors[place]).sum(axis=1)
         better = difference < nearest[place]

@@ -182,11 +182,11 @@ def _train(args: Train, ranks=None) -> None:
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     options = config.response
     photos = {"device": "memory"}.get(config.schedule.photo_cache, config.schedule.photo_cache)
-    given = {"method": options.method, "candidates": options.candidates, "photos": photos}
+    selection = {"method": options.method, "candidates": options.candidates, "photos": photos}
     if out is not None:
         check_dataset_truth(data, config)
     with nullcontext() if out is None or device.type != "cpu" else _precompiling(config):
-        scene = load_photos(data, response=options.name, **given)
+        scene = load_photos(data, response=options.name, **selection)
         if out is None:
             from .plan import make_plan
 
@@ -245,15 +245,15 @@ def _data(args: Train, resumed) -> dict:
     if path is not None and not is_embedded(path):
         path = str(Path(path).absolute())
         require_text(path)
-    given = {"path": path} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
+    options = {"path": path} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
     if resumed is not None:
         known = resumed.read_info()["data"]
-        given = {name: known.get(name) if value is None else value for name, value in given.items()}
-    if given["path"] is None and args.output.resume:
+        options = {name: known.get(name) if value is None else value for name, value in options.items()}
+    if options["path"] is None and args.output.resume:
         raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
-    if given["path"] is None:
+    if options["path"] is None:
         raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
-    return given
+    return options
 
 
 def _config(args: Train, resumed):

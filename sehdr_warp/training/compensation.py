@@ -116,7 +116,7 @@ def estimates_compensation(scene: Scene, config: Config, response: Response) -> 
 
 def estimate_compensation(scene: Scene, config: Config, response: Response, device: torch.device | str) -> Compensation:
     """Match points between the photos of a scene and estimate the compensation that explains their differences."""
-    stated = scene.exposure_times_known and config.model.exposure_compensation != "always"
+    use_times = scene.exposure_times_known and config.model.exposure_compensation != "always"
     views, others = scene.train_views, scene.test_views
     cameras = [view.camera for view in others]
 
@@ -133,27 +133,27 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
 
     def no_drift(matcher: Matcher) -> Compensation:
         least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
-        reason = "do not contradict the stated times" if stated else f"differ by less than {least}"
+        reason = "do not contradict the stated times" if use_times else f"differ by less than {least}"
         return Compensation(None, matcher, Decision("exposure-compensation", {}, "none", f"matched points {reason}"))
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=tuple(prefetch_map(at_matching_size, views, RESIZED_AT_ONCE)))
     matcher = matcher_of(small)
-    if stated and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
+    if use_times and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
         return no_drift(matcher)
     shared, guess = match(matcher), initial_gains(small.views, response)
-    if not stated and len(shared) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
+    if not use_times and len(shared) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
         shared = max(shared, match(matcher_of(guess.normalize_photos(small, response))), key=len)
     if len(shared) < MIN_POINTS:
         return no_drift(matcher)
     gains = fit(shared)
-    parts = _explanatory_parts(gains, views, shared, response, stated)
+    parts = _explanatory_parts(gains, views, shared, response, use_times)
     if not (parts.exposure or parts.white_balance or parts.vignetting):
         return no_drift(matcher)
     # Match again in photos that are already similar: more points are found.
     matcher = matcher_of(parts.of(gains).normalize_photos(small, response))
     gains = parts.of(fit(match(matcher)))
-    return Compensation(gains, matcher_of(gains.normalize_photos(small, response)), _decision(gains, parts, stated))
+    return Compensation(gains, matcher_of(gains.normalize_photos(small, response)), _decision(gains, parts, use_times))
 
 
 def _may_drift(views: Sequence[View], shared: SharedPoints, response: Response) -> bool:

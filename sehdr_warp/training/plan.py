@@ -133,15 +133,17 @@ def make_plan(scene: Scene, config: Config, device: str | torch.device | None = 
     facts = measure_scene(scene, config.seed)
     check_scene(scene, facts)
     check_fields(scene, config)
-    planned, decisions, kept = config, [], {}
+    planned, decisions, overridden = config, [], {}
     for name, rule in RULES.items():
         fields, choice, reason = rule(facts, planned, device)
-        kept |= {path: attrgetter(path)(planned) for path in fields if path in config.plan.keep}
-        changes = {path: new for path, new in fields.items() if path not in kept and new != attrgetter(path)(planned)}
+        overridden |= {path: attrgetter(path)(planned) for path in fields if path in config.plan.keep}
+        changes = {
+            path: new for path, new in fields.items() if path not in overridden and new != attrgetter(path)(planned)
+        }
         decisions.append(Decision(name, changes, choice, reason))
         planned = override_config(planned, changes, f"{scene.name}: plan of {name}")
     planned = override_config(planned, {"plan.enabled": False}, scene.name)
-    return Plan(planned, facts, tuple(decisions), kept)
+    return Plan(planned, facts, tuple(decisions), overridden)
 
 
 def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Config, Plan | None]:
@@ -175,10 +177,12 @@ def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: 
     step = STEP_SECONDS + PIXEL_SECONDS * pixels + GAUSSIAN_SECONDS * gaussians
     exchange = EXCHANGE_SECONDS + 2 * (1 - 1 / count) * NUMBER_SECONDS * (NUMBERS + RANK_NUMBERS * count) * gaussians
     alone, together = photos * step, photos / count * (step + exchange)
-    told = f"an estimated {alone / together:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
+    estimate = (
+        f"an estimated {alone / together:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
+    )
     if alone < together + START_SECONDS:
-        told = f"about {alone:.1g} s of steps are too few to gain by more processes ({told})"
-    return f"plan: ranks: {count} GPUs, a photo each in a step: {told}"
+        estimate = f"about {alone:.1g} s of steps are too few to gain by more processes ({estimate})"
+    return f"plan: ranks: {count} GPUs, a photo each in a step: {estimate}"
 
 
 def check_scene(scene: Scene, facts: SceneFacts) -> None:

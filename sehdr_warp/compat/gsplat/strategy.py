@@ -258,8 +258,8 @@ class MCMCStrategy(Strategy):
             return 0
         sources = _draw(params["opacities"].detach().flatten().sigmoid(), added)
         self._share(params, sources)
-        kept = torch.ones(count, dtype=torch.bool, device=sources.device)
-        change_rows(params, optimizers, {}, kept, {name: v.detach()[sources] for name, v in params.items()})
+        single = torch.ones(count, dtype=torch.bool, device=sources.device)
+        change_rows(params, optimizers, {}, single, {name: v.detach()[sources] for name, v in params.items()})
         return added
 
     def _share(self, params: Parameters, sources: Tensor) -> None:
