@@ -93,7 +93,7 @@ def write_sog(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         archive.writestr(_entry("meta.json"), json.dumps(meta))
         for name, texels in pictures.items():
             buffer = io.BytesIO()
-            Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=100, method=4)
+            Image.fromarray(texels).save(buffer, "WEBP", lossless=True, exact=True, quality=100, method=4)
             archive.writestr(_entry(name), buffer.getvalue())
 
 
