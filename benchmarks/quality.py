@@ -34,7 +34,7 @@ from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
 MONTH = 30 * 24 * 60  # Minutes, the longest that a worker may take
-FORMAT = 5  # Of a job and of its result; others are run again.
+FORMAT = 6  # Of a job and of its result; others are run again.
 RESULT, FAILURE = "result.json", "failure.json"
 TESTS, FIRST_TEST = 16, 100
 """A training tests its held-out views this often, at iterations spaced evenly on a log scale from 1/100 of all."""
@@ -228,6 +228,7 @@ def row_of(result: dict) -> dict:
         "ldr": figures["ldr"]["psnr"],
         **{region.replace("-", "_"): regions[region]["psnr_mu"]["aligned"] for region in REGIONS},
         **{f"lights_{name}": figures["lights"][name] for name in ("count", "lost")},
+        "light_energies": figures["lights"]["energies"],
         "irradiance": figures["irradiance"]["median"],
         "clipped_share": regions["clipped"]["fraction"],
         "confidence": figures["confidence"]["spearman_log2"],

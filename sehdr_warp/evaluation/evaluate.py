@@ -91,7 +91,7 @@ def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None)
     Returns:
         Plain values, ready for strict JSON. "protocol": {name: psnr_mu, ssim_mu, lpips_mu, views}, with "scale" for
         "aligned"; "pu21": {name: psnr, ssim}; "ldr": psnr, ssim, lpips of the simulated photo, unquantised; "regions":
-        {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "lights": count and lost, see lights.py;
+        {region: fraction, psnr_ldr, psnr_mu}, pooled over views; "lights": see count_lights();
         "confidence": see ranking.py; "views": the same for each view; "split", "lpips_backbone" and the run's facts.
         A figure that cannot be computed is None with "reason" (or "lpips_reason") beside it. Pixels outside a view's
         mask are not averaged, except by LPIPS, for which the prediction equals the truth there; views with an empty
@@ -172,7 +172,9 @@ class Evaluation:
             "pu21": pu21 | {"peak_luminance": PEAK_LUMINANCE},
             "ldr": ldr,
             "regions": {region: self._region(region, missing) for region in metrics.REGIONS},
-            "lights": {"count": None, "lost": None, "reason": missing} if missing else count_lights(self.lights),
+            "lights": dict.fromkeys(("count", "lost", "energies")) | {"reason": missing}
+            if missing
+            else count_lights(self.lights),
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
             "lpips_backbone": BACKBONE if self.lpips else None,
@@ -221,7 +223,7 @@ class Evaluation:
             self.ranking.add(doubt.confidence, hdr, truth, regions["well-exposed"], doubt.black, mask)
         if truth is not None and view.camera.is_pinhole:
             true_light, light = (image.mean(2).cpu().numpy() for image in (truth, hdr * (scale or 1.0)))
-            self.lights += light_regions(true_light, light, view.camera)
+            self.lights += light_regions(true_light, light, view.camera, regions["clipped"].cpu().numpy())
         for name in PROTOCOLS:
             if truth is None or (name == "aligned" and scale is None):
                 continue

@@ -1,10 +1,11 @@
-"""Count the lights of the truth that a trained scene lost.
+"""Compare the lights of the truth with those of a trained scene: how many are lost, how much energy the rest has.
 
 Lights are bright regions of the views, joined across views by the points in space that they show.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ MIN_PIXELS = 6
 """Pixels of the smallest region that counts as a light."""
 MIN_SHARE = 0.5
 """Part of its radiance with which a region must be rendered, else it counts as lost."""
+MARGIN = 2
+"""Pixels around a region whose light counts as the light's energy, because renders blur its edge."""
 MAX_AREA_RATIO = 3.3
 """Largest ratio between the areas of two regions that can show the same light."""
 TOLERANCE_PIXELS, TOLERANCE_RADII = 1.0, 0.35
@@ -32,6 +35,9 @@ class LightRegion:
         area: pixels.
         direction: unit vector from the camera to the center, in the scene's axes.
         share: the part of its radiance that is rendered.
+        true_energy: sum of the true radiance over its pixels and MARGIN pixels around.
+        rendered_energy: the same of the render.
+        clipped: whether the photo shows most of its pixels as white.
     """
 
     camera: Camera
@@ -39,15 +45,21 @@ class LightRegion:
     area: int
     direction: np.ndarray
     share: float
+    true_energy: float
+    rendered_energy: float
+    clipped: bool
 
 
-def light_regions(truth: np.ndarray, render: np.ndarray, camera: Camera) -> list[LightRegion]:
+def light_regions(
+    truth: np.ndarray, render: np.ndarray, camera: Camera, clipped: np.ndarray | None = None
+) -> list[LightRegion]:
     """Find the regions of at least MIN_PIXELS connected pixels above BRIGHT times the mean of a view's truth.
 
     Args:
         truth: radiance, [H, W].
         render: radiance in the same unit, [H, W].
         camera: of the view.
+        clipped: the pixels that the view's photo shows as white, [H, W] bool; None if none is.
     """
     from scipy import ndimage
 
@@ -62,12 +74,16 @@ def light_regions(truth: np.ndarray, render: np.ndarray, camera: Camera) -> list
             ray = np.array([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, 1.0])
             direction = camera.world_to_camera[:3, :3].T @ (ray / np.linalg.norm(ray))
             share = float(render[window][inside].mean() / truth[window][inside].mean())
-            regions.append(LightRegion(camera, np.array([column, row]), area, direction, share))
+            wide = tuple(slice(max(0, part.start - MARGIN), part.stop + MARGIN) for part in window)
+            around = ndimage.binary_dilation(labels[wide] == index, np.ones((3, 3)), iterations=MARGIN)
+            energies = (float(image[wide][around].sum()) for image in (truth, render))
+            white = clipped is not None and bool(clipped[window][inside].mean() > 0.5)
+            regions.append(LightRegion(camera, np.array([column, row]), area, direction, share, *energies, white))
     return regions
 
 
-def count_lights(regions: Sequence[LightRegion]) -> dict[str, int]:
-    """Count the lights that two views or more show, and those that the renders lost.
+def count_lights(regions: Sequence[LightRegion]) -> dict[str, Any]:
+    """Count the lights that two views or more show, and those that the renders lost, and compare their energy.
 
     A light is lost if more than half of its regions are rendered with less than MIN_SHARE of their radiance.
 
@@ -75,7 +91,8 @@ def count_lights(regions: Sequence[LightRegion]) -> dict[str, int]:
         regions: of all views.
 
     Returns:
-        "count" and "lost".
+        "count"; "lost"; "energies": rendered over true energy, summed over its regions, of each light that most of its
+        regions clip, ascending.
     """
     remaining, lights = list(regions), []
     while remaining:
@@ -85,7 +102,11 @@ def count_lights(regions: Sequence[LightRegion]) -> dict[str, int]:
         remaining = [region for region in remaining if region not in lights[-1]]
     confirmed = [light for light in lights if len(light) > 1]
     lost = sum(np.mean([region.share < MIN_SHARE for region in light]) > 0.5 for light in confirmed)
-    return {"count": len(confirmed), "lost": int(lost)}
+    clipped = [light for light in confirmed if np.mean([region.clipped for region in light]) > 0.5]
+    energies = [
+        sum(each.rendered_energy for each in light) / sum(each.true_energy for each in light) for light in clipped
+    ]
+    return {"count": len(confirmed), "lost": int(lost), "energies": sorted(energies)}
 
 
 def _intersections(region: LightRegion, others: Sequence[LightRegion]) -> Iterator[np.ndarray]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import zip_longest
+from statistics import median
 
 
 def columns(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
@@ -35,8 +36,20 @@ def format_table(result: dict) -> str:
         correlations = f"{ranking['spearman_log2']:.2f} (log2), {ranking['spearman_mu']:.2f} (mu-law)"
         lines += ["", f"confidence ranks errors: {correlations}; mean confidence {ranking['mean']:.2f}"]
     if result["lights"]["count"]:
-        lines += ["", "lights: {count} in the truth, {lost} lost".format(**result["lights"])]
+        lines += [
+            "",
+            "lights: {count} in the truth, {lost} lost".format(**result["lights"]) + _energies(result["lights"]),
+        ]
     return "\n".join([*lines, "", *_notes(result, bool(names))])
+
+
+def _energies(lights: dict) -> str:
+    """Return the energy of clipped lights in words; nothing if none clips."""
+    ratios = lights.get("energies")
+    if not ratios:
+        return ""
+    figures = f"{ratios[0]:.2f} to {ratios[-1]:.2f} times their energy, median {median(ratios):.2f}"
+    return f"; those that clip ({len(ratios)}) have {figures}"
 
 
 def _row(label: str, figures: dict, suffix: str = "") -> list[str]:

@@ -33,7 +33,7 @@ def made_up(job: Job, psnr: float = 30.0) -> dict:
         "regions": {
             name: {"fraction": 0.3, "psnr_mu": {"aligned": psnr - 3}} for name in ("clipped", "well-exposed", "dark")
         },
-        "lights": {"count": 7, "lost": 0},
+        "lights": {"count": 7, "lost": 0, "energies": [0.8, 1.1]},
         "irradiance": {"median": None},
         "confidence": {"spearman_log2": 0.6},
         "response": "srgb",

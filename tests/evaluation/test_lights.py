@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from sehdr_warp.evaluation.lights import count_lights, light_regions
 from sehdr_warp.scene import Camera, look_at
@@ -23,15 +24,17 @@ def picture(camera, places, radius=3.0):
     return image
 
 
+def compare(render, radius=3.0, clipped=lambda camera: None):
+    regions = []
+    for index, camera in enumerate(CAMERAS):
+        truth = picture(camera, PLACES, radius)
+        regions += light_regions(truth, render(index, camera), camera, clipped(camera))
+    return count_lights(regions)
+
+
 def count(render, radius=3.0):
-    views = enumerate(CAMERAS)
-    return count_lights(
-        [
-            region
-            for index, camera in views
-            for region in light_regions(picture(camera, PLACES, radius), render(index, camera), camera)
-        ]
-    )
+    found = compare(render, radius)
+    return {name: found[name] for name in ("count", "lost")}
 
 
 def test_a_light_that_is_missing_is_lost_once():
@@ -48,4 +51,16 @@ def test_a_light_is_lost_where_most_views_lack_it(views, lost):
 def test_specks_and_what_one_view_shows_are_no_lights():
     assert count(lambda _, camera: picture(camera, PLACES), radius=1.0) == {"count": 0, "lost": 0}
     alone = light_regions(picture(CAMERAS[0], PLACES[:1]), picture(CAMERAS[0], []), CAMERAS[0])
-    assert len(alone) == 1 and count_lights(alone) == {"count": 0, "lost": 0}
+    assert len(alone) == 1 and count_lights(alone)["count"] == 0
+
+
+def test_energy_is_that_of_clipped_lights_and_of_what_is_blurred_around_them():
+    def clipped(camera):
+        return picture(camera, PLACES[:2]) > 1
+
+    assert compare(lambda _, camera: picture(camera, PLACES))["energies"] == []
+    assert compare(lambda _, camera: picture(camera, PLACES), clipped=clipped)["energies"] == pytest.approx([1, 1])
+    brighter = compare(lambda _, camera: 3 * picture(camera, PLACES[1:]), clipped=clipped)
+    assert brighter["energies"] == pytest.approx([0, 3], abs=0.01)
+    blurred = compare(lambda _, camera: ndimage.uniform_filter(picture(camera, PLACES), 3), clipped=clipped)
+    assert blurred["lost"] == 0 and blurred["energies"] == pytest.approx([1, 1], abs=0.02)
