@@ -23,6 +23,7 @@ from torch import Tensor
 from .gradients import kernel_layout
 from .torch_contract import torch_operation
 from .warp_launch.launching import launch
+from .warp_launch.packing import check_dimensions
 from .warp_launch.threads import single_range
 
 P = ParamSpec("P")
@@ -88,7 +89,7 @@ class Program:
         Raises:
             TypeError: if a tensor's dtype or number of dimensions does not fit the kernel.
         """
-        _check_dimensions(kernel, (*inputs, *outputs))
+        check_dimensions(kernel, (*inputs, *outputs))
         launch(kernel, dim, *inputs, *outputs)
         if self._differentiable:
             places = [[self._place(v) if isinstance(v, Tensor) else v for v in part] for part in (inputs, outputs)]
@@ -101,19 +102,6 @@ class Program:
             place = self._places[id(tensor)] = _Place(len(self._tensors))
             self._tensors.append(tensor)
         return place
-
-
-def _check_dimensions(kernel: Any, values: Sequence[Any]) -> None:
-    """Raise TypeError for a tensor with more dimensions than the kernel's array."""
-    parameters = kernel.adj.args[-len(values) :] if values else []
-    for parameter, value in zip(parameters, values, strict=False):
-        if isinstance(value, Tensor) and hasattr(parameter.type, "dtype"):
-            expected = parameter.type.ndim + len(getattr(parameter.type.dtype, "_shape_", ()))
-            if value.ndim > expected:
-                raise TypeError(
-                    f"{kernel.key}(): {parameter.label} takes a tensor with {expected} dimensions, "
-                    f"got one of shape {list(value.shape)}"
-                )
 
 
 class _ProgramFunction(torch.autograd.Function):

@@ -104,6 +104,17 @@ def test_imports_go_down_the_line(path, package):
             assert package in ONLY_IN[top], f"{package} may not import {name}"
 
 
+def test_warp_internals_are_used_in_warp_launch_alone():
+    """A minor release of Warp may change them; then one folder needs a look."""
+    internals = {"adj", "hooks", "_shape_", "_wp_scalar_type_", "__ctype__"}
+    for path in [*(PACKAGE / "rasterizer").glob("*.py"), *(ROOT / "kernels").glob("*.py")]:
+        nodes = [*ast.walk(ast.parse(path.read_text()))]
+        names = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+        names |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+        assert not names & internals, f"{path.name}: use internals of Warp in rasterizer/warp_launch"
+        assert not any(name.startswith(("warp._", "warp.context", "warp.codegen")) for name in imports(path)), path
+
+
 def test_no_files_import_each_other():
     """Nor by way of others, nor within functions."""
     files = {}

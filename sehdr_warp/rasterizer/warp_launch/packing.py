@@ -136,3 +136,16 @@ def write_layout(array: Any, tensor: Tensor, kind: wp.array) -> None:
         shape, steps = [1, *shape], [size * tensor.numel(), *steps]
     array.ndim = kind.ndim
     array.shape[: len(shape)], array.strides[: len(steps)] = shape, steps
+
+
+def check_dimensions(kernel: Any, values: Sequence[Any]) -> None:
+    """Raise TypeError for a tensor with more dimensions than its array; values are the kernel's last arguments."""
+    parameters = kernel.adj.args[-len(values) :] if values else []
+    for parameter, value in zip(parameters, values, strict=False):
+        if isinstance(value, Tensor) and hasattr(parameter.type, "dtype"):
+            expected = parameter.type.ndim + len(getattr(parameter.type.dtype, "_shape_", ()))
+            if value.ndim > expected:
+                raise TypeError(
+                    f"{kernel.key}(): {parameter.label} takes a tensor with {expected} dimensions, "
+                    f"got one of shape {list(value.shape)}"
+                )
