@@ -51,7 +51,7 @@ def finish(result: dict, json: Path | None = None, overwrite: bool = False) -> N
         write_json(json, result, overwrite)
     table = markdown_table(result["rows"], COLUMNS[result["benchmark"]])
     parts = [markdown_table(result["parts"], COLUMNS["parts"])] if "parts" in result else []
-    print(machine_line(result), table, *parts, *result["notes"], sep="\n\n")
+    print("\n\n".join([machine_line(result), table, *parts, *result["notes"]]))
     failed = [check for check in result["checks"] if not check["passed"]]
     count = f"{len(failed)} of {len(result['checks'])}"
     if failed and "error" in failed[0]:

@@ -96,7 +96,8 @@ def _bar(total: int) -> Iterator[Callable[[Progress], None]]:
     # rich cuts columns on the right if the terminal is narrow, so the most important ones come first.
     parts = "{task.completed}/{task.total}", "{task.fields[rate]}", "{task.fields[left]} left", "{task.fields[figures]}"
     columns = [TextColumn(part, markup=False) for part in parts]
-    with Bar(*columns[:1], BarColumn(None), *columns[1:], console=console, expand=True) as bar:
+    columns.insert(1, BarColumn(None))
+    with Bar(*columns, console=console, expand=True) as bar:
         task = bar.add_task("train", total=total, rate="", left="-:--", figures="")
 
         def show(progress: Progress) -> None:

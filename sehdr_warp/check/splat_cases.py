@@ -263,8 +263,8 @@ def _poisoned_gaussians(device):
             leaked += not_finite(rendering.image, rendering.alpha)
             gradients += not_finite(*(slope[others] for slope in slopes))
         if not bool(rendering.visible[5]):
-            remaining = [tensor[others] for tensor in tensors[:5]]
-            without = splats.render(*remaining, *tensors[5:])
+            remaining = [*(tensor[others] for tensor in tensors[:5]), *tensors[5:]]
+            without = splats.render(*remaining)
             changed += int((without.image != rendering.image).sum())
     yield count("pixels not finite", leaked)
     yield count("gradients of others not finite", gradients)

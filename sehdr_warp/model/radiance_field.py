@@ -252,8 +252,13 @@ class RadianceField(nn.Module):
         if shares is not None:
             features.append(colors.mean(1, keepdim=True) * shares[:, None])
         image, transmittance = rasterize_directions(
-            *(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities()),
-            *(torch.cat(features, dim=1), origin, directions),
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quaternions,
+            gaussians.opacities(),
+            torch.cat(features, dim=1),
+            origin,
+            directions,
             focal_length=focal_length,
             pixel_angle=pixel_angle,
             antialiased=self.antialiased,
@@ -336,8 +341,15 @@ class RadianceField(nn.Module):
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, features, opacities)
         return self.rasterizer(
-            *(gaussians.means, gaussians.log_scales, gaussians.quaternions, opacities, features),
-            *(camera.world_to_camera, camera.intrinsics, camera.width, camera.height),
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quaternions,
+            opacities,
+            features,
+            camera.world_to_camera,
+            camera.intrinsics,
+            camera.width,
+            camera.height,
             antialiased=self.antialiased,
             max_intersections=max_intersections,
             deterministic=self.deterministic,
@@ -349,8 +361,13 @@ class RadianceField(nn.Module):
         """Rasterize features along a wide camera's directions; the result has no projected means."""
         gaussians, focal = self.gaussians, float(camera.intrinsics[0])
         image, transmittance = rasterize_directions(
-            *(gaussians.means, gaussians.log_scales, gaussians.quaternions, opacities, features),
-            *(camera.position, directions),
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quaternions,
+            opacities,
+            features,
+            camera.position,
+            directions,
             focal_length=focal,
             pixel_angle=1 / focal,
             antialiased=self.antialiased,

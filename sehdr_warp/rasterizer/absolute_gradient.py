@@ -58,9 +58,19 @@ class _Watch(torch.autograd.Function):
         launch(
             absolute_gradient_kernel(warp_scalar(features.dtype)),
             tiles * _PIXELS,
-            *(lists.ranges, lists.gaussians, places, shapes, ellipses, features),
-            *(lists.columns, lists.width, lists.height, ctx.alpha_threshold),
-            *(by_image.contiguous().view(-1, channels), by_transmittance.contiguous().view(-1), rows),
+            lists.ranges,
+            lists.gaussians,
+            places,
+            shapes,
+            ellipses,
+            features,
+            lists.columns,
+            lists.width,
+            lists.height,
+            ctx.alpha_threshold,
+            by_image.contiguous().view(-1, channels),
+            by_transmittance.contiguous().view(-1),
+            rows,
             ranges=even_ranges(tiles, 1) * _PIXELS,
         )
         ctx.store(rows if unsorted is None else gather_by_gaussian(unsorted, rows))

@@ -89,8 +89,9 @@ class Program:
         Raises:
             TypeError: if a tensor's dtype or number of dimensions does not fit the kernel.
         """
-        check_dimensions(kernel, (*inputs, *outputs))
-        launch(kernel, dim, *inputs, *outputs)
+        arguments = [*inputs, *outputs]
+        check_dimensions(kernel, arguments)
+        launch(kernel, dim, *arguments)
         if self._differentiable:
             places = [[self._place(v) if isinstance(v, Tensor) else v for v in part] for part in (inputs, outputs)]
             self._launches.append(_Launch(kernel, dim, *places))
@@ -160,7 +161,8 @@ def _launch_adjoint(forward: _Launch, saved: Sequence[Tensor | None], gradients:
     pairs = zip(values, by_value, strict=False)
     shared = any(gradient is not None and tensor is not None and len(tensor) != dim for tensor, gradient in pairs)
     ranges = single_range(dim) if shared and isinstance(dim, int) else None
-    launch(kernel, dim, *values, *(None,) * len(outputs), gradients=by_value, ranges=ranges)
+    arguments = values + [None] * len(outputs)
+    launch(kernel, dim, *arguments, gradients=by_value, ranges=ranges)
 
 
 @overload

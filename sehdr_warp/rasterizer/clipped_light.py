@@ -73,19 +73,20 @@ def add_clipped_light(image, codes, white, weights, index, mask, estimates, term
         codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
     photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
     photo = image, photos, index, mask, WHITE[codes.dtype], white
-    # The mean is in the weights: it costs no launch, here and for the gradient.
-    numbers = *image.shape[:2], *(part / image.numel() for part in (weights.smoothness, weights.lift, weights.hold))
     rows, columns = (0, 0) if estimates is None else estimates.shape[:2]
     estimates = None if estimates is None else estimates.contiguous().view(-1)
-    outputs = estimates, rows, columns, terms, slopes
+    # The mean is in the weights: it costs no launch, here and for the gradient.
+    scaled = [weight / image.numel() for weight in (weights.smoothness, weights.lift, weights.hold)]
+    energy = [image.shape[0], image.shape[1], *scaled, estimates, rows, columns, terms, slopes]
     scalar, code = warp_scalar(image.dtype), CODES[codes.dtype]
     if patches.in_patches(image.device):
         kernel = clipped_light_patch_kernel(scalar, code)
-        patches.launch_patches(kernel, image, *photo, *numbers, *outputs)
+        arguments = [*photo, *energy]
+        patches.launch_patches(kernel, image, *arguments)
         return
     logarithms = torch.empty_like(image)
     launch(clipped_logarithms_kernel(scalar, code), image.numel(), *photo, logarithms)
-    launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, white, *numbers, *outputs)
+    launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, white, *energy)
 
 
 class _ClippedLight(torch.autograd.Function):

@@ -86,10 +86,10 @@ class _Fusion(torch.autograd.Function):
         mixed = encoded, exposedness, outputs, brackets, scale, results, gradients.contiguous()
         launch(kernels.mix_adjoint, results.shape, *mixed, by_exposedness, by_output)
         units = 3, -(-encoded.shape[1] // POINTS_PER_THREAD), weights[0].shape[2]
-        inputs = encoded, exposedness, by_output, *learned, POINTS_PER_THREAD
-        launch(kernels.unit_adjoint, units, *inputs, *_flat(by_weights))
-        points = encoded, exposedness, by_exposedness, by_output, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION
-        launch(kernels.point_adjoint, encoded.shape, *points, *learned, by_log_sigma)
+        by_unit = encoded, exposedness, by_output, *learned, POINTS_PER_THREAD, *_flat(by_weights)
+        launch(kernels.unit_adjoint, units, *by_unit)
+        by_point = encoded, exposedness, by_exposedness, by_output, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION, *learned
+        launch(kernels.point_adjoint, encoded.shape, *by_point, by_log_sigma)
         return None, by_log_sigma.sum(1), *by_weights, None
 
 

@@ -57,13 +57,24 @@ def matching_costs(photos: PhotoSet, pixels: Tensor, depths: Tensor) -> Tensor:
     pixels: [N, 3] view, column, row; int32. depths: [N, D] float32, along the view's axis.
     """
     costs = torch.empty(depths.shape, device=depths.device)
-    others = photos.offsets, photos.sizes, photos.intrinsics, photos.neighbors, photos.between
-    buffers = pixels.contiguous(), depths.contiguous(), costs
     if depths.device.type == "cpu":
-        rows = -(-depths.shape[1] // plane_sweep_cpu.LANES)
-        launch(plane_sweep_cpu.sweep_rows, len(depths) * rows, photos.codes.view(torch.int32)[:, 0], *others, *buffers)
+        kernel, threads = plane_sweep_cpu.sweep_rows, len(depths) * -(-depths.shape[1] // plane_sweep_cpu.LANES)
+        codes = photos.codes.view(torch.int32)[:, 0]
     else:
-        launch(plane_sweep.sweep, depths.numel(), photos.codes, *others, *buffers)
+        kernel, threads, codes = plane_sweep.sweep, depths.numel(), photos.codes
+    launch(
+        kernel,
+        threads,
+        codes,
+        photos.offsets,
+        photos.sizes,
+        photos.intrinsics,
+        photos.neighbors,
+        photos.between,
+        pixels.contiguous(),
+        depths.contiguous(),
+        costs,
+    )
     return costs
 
 

@@ -74,17 +74,9 @@ def copy_rows(
         samples = SampledRows(places.new_empty(0, dtype=torch.int64), places.new_empty(0, dtype=torch.float64))
     marked = torch.empty(0, dtype=torch.bool, device=places.device) if changed is None else changed
     for start in range(0, len(values), kernels.AT_ONCE):
-        rows = (_rows(tensors[start : start + kernels.AT_ONCE]) for tensors in (sources, values))
-        launch(
-            kernels.copy_rows,
-            len(places),
-            places,
-            begin,
-            end,
-            *samples,
-            *(row for each in rows for row in each),
-            marked,
-        )
+        group = slice(start, start + kernels.AT_ONCE)
+        rows = [*_rows(sources[group]), *_rows(values[group])]
+        launch(kernels.copy_rows, len(places), places, begin, end, samples.rows, samples.total, *rows, marked)
 
 
 @torch.no_grad()

@@ -164,9 +164,9 @@ class _Blend(torch.autograd.Function):
         ctx.frame = lists.columns, width, height, alpha_threshold
         ctx.kernels, ctx.lists = sphere_kernels(warp_scalar(features.dtype), channels), lists
         ctx.pixels = lists.ranges.shape[0] * _PIXELS
-        read = lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *splats
-        results = image.view(-1, channels), transmittance, ends
-        launch(ctx.kernels.blend, ctx.pixels, *read, *ctx.frame, *results, min_range=_PIXELS)
+        ctx.inputs = lists.ranges, lists.gaussians, lists.directions.view(-1, 3)
+        arguments = *ctx.inputs, *splats, *ctx.frame, image.view(-1, channels), transmittance, ends
+        launch(ctx.kernels.blend, ctx.pixels, *arguments, min_range=_PIXELS)
         ctx.save_for_backward(*splats, transmittance, ends)
         return image, transmittance
 
@@ -178,14 +178,10 @@ class _Blend(torch.autograd.Function):
         # On the CPU each entry has a row, and whole tiles go to a thread: sums keep one order.
         places = lists.gaussians if unsorted is None else unsorted.places
         rows = by_image.new_zeros(count if unsorted is None else len(places), channels + 10)
-        launch(
-            ctx.kernels.blend_adjoint,
-            ctx.pixels,
-            *(lists.ranges, lists.gaussians, lists.directions.view(-1, 3), *splats, *ctx.frame),
-            *(transmittance, ends, places, by_image.contiguous().view(-1, channels), by_transmittance.contiguous()),
-            rows,
-            ranges=even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS,
-        )
+        gradients = by_image.contiguous().view(-1, channels), by_transmittance.contiguous()
+        arguments = *ctx.inputs, *splats, *ctx.frame, transmittance, ends, places, *gradients, rows
+        ranges = even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS
+        launch(ctx.kernels.blend_adjoint, ctx.pixels, *arguments, ranges=ranges)
         if unsorted is not None:
             rows = gather_by_gaussian(unsorted, rows)
         by_axis, by_across, by_along, by_opacity, by_features = rows.split((3, 3, 3, 1, channels), dim=1)

@@ -125,8 +125,8 @@ def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -
     derivatives = a.new_empty(3, a.shape[0], a.shape[1] * a.shape[2])
     if patches.in_patches(a.device):
         results = (None, values) if weights else (values.flatten(1), None)
-        images = a.flatten(1), b.flatten(1)
-        _launch_patches("compare", a, weights, *images, *(weights or (0.0, 0.0)), *results, derivatives)
+        arguments = a.flatten(1), b.flatten(1), *(weights or (0.0, 0.0)), *results, derivatives
+        _launch_patches("compare", a, weights, *arguments)
     else:
         _compare_in_runs(a, b, weights, values, derivatives)
     return values, derivatives
@@ -139,7 +139,8 @@ def _gradient(
     result = torch.empty_like(a)
     if patches.in_patches(a.device):
         inputs = derivatives, a.flatten(1), b.flatten(1), scale, None if slopes is None else slopes.flatten(1)
-        _launch_patches("gradient", a, weights, *inputs, *(weights or (0.0, 0.0)), result.flatten(1))
+        arguments = *inputs, *(weights or (0.0, 0.0)), result.flatten(1)
+        _launch_patches("gradient", a, weights, *arguments)
     else:
         _gradient_in_runs(a, b, derivatives, scale, weights, slopes, result)
     return result
@@ -148,7 +149,8 @@ def _gradient(
 def _launch_patches(name: str, image: Tensor, weights: tuple[float, float] | None, *arguments) -> None:
     kernel = getattr(ssim_patch_kernels(warp_scalar(image.dtype), weights is not None), name)
     taps = constant(tuple(window()), image.dtype, image.device)
-    patches.launch_patches(kernel, image, taps, *image.shape[1:], *arguments)
+    _, width, channels = image.shape
+    patches.launch_patches(kernel, image, taps, width, channels, *arguments)
 
 
 def _compare_in_runs(a, b, weights, similarity, derivatives) -> None:

@@ -135,10 +135,20 @@ def pack_splats(splats: Splats, alpha_threshold: float, width: int, height: int)
         means2d.new_empty(count, 4),
         torch.empty(count, dtype=torch.int64, device=means2d.device),
     )
-    tiles = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
-    kernel = tile_kernels(warp_scalar(means2d.dtype)).pack_splats
-    shape = means2d, splats.conics, splats.opacities
-    launch(kernel, count, *shape, features, features.shape[1], alpha_threshold, *tiles, splats.extents, *packed)
+    launch(
+        tile_kernels(warp_scalar(means2d.dtype)).pack_splats,
+        count,
+        means2d,
+        splats.conics,
+        splats.opacities,
+        features,
+        features.shape[1],
+        alpha_threshold,
+        -(-width // TILE_SIZE),
+        -(-height // TILE_SIZE),
+        splats.extents,
+        *packed,
+    )
     return packed
 
 

@@ -54,8 +54,9 @@ def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
     flat = [gradient.reshape(-1) for gradient in gradients if gradient.numel()]
     for start in range(0, len(flat), kernels.CHECKED_AT_ONCE):
         group = flat[start : start + kernels.CHECKED_AT_ONCE]
-        nothing = [result[:0]] * (kernels.CHECKED_AT_ONCE - len(group))
-        launch(kernels.find_nonfinite, max(map(len, group)), *group, *nothing, result)
+        empty = [result[:0]] * (kernels.CHECKED_AT_ONCE - len(group))
+        arguments = group + empty
+        launch(kernels.find_nonfinite, max(map(len, group)), *arguments, result)
     return result
 
 
@@ -145,7 +146,9 @@ def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, live=No
         arguments += nothing * (kernels.AT_ONCE - len(group))
         most = max(step.parameter.numel() for step in group)
         widths = [step.width for step in group] + [0] * (kernels.AT_ONCE - len(group))
-        launch(kernels.update_by_adam, most, skipped.view(1), live, *widths, *_numbers(betas), epsilon, *arguments)
+        numbers = *widths, *_decays(betas), epsilon
+        arguments = [*numbers, *arguments]
+        launch(kernels.update_by_adam, most, skipped.view(1), live, *arguments)
 
 
 @torch.no_grad()
@@ -171,12 +174,13 @@ def harmonics_adam_step(
     """
     if not parameter.numel():
         return
-    numbers = step, _rate(rate, skipped), skipped, _live(live, skipped), *_numbers(betas), epsilon
-    changed = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
+    options = step, _rate(rate, skipped), skipped, _live(live, skipped), *_decays(betas), epsilon
+    values = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
     in_turn = parameter.numel() if turns == 1 else -(-parameter.numel() // (kernels.TURN * turns)) * kernels.TURN
     stride = -(-in_turn // kernels.NUMBERS)
-    launch(kernel, stride, gradients.basis, gradients.by_values, start, stride, turns, *numbers, *changed)
+    arguments = gradients.basis, gradients.by_values, start, stride, turns, *options, *values
+    launch(kernel, stride, *arguments)
 
 
 def _live(live: Tensor | None, like: Tensor) -> Tensor:
@@ -187,7 +191,7 @@ def _rate(rate: Tensor | float, like: Tensor) -> Tensor:
     return rate if isinstance(rate, Tensor) else torch.full_like(like, rate)
 
 
-def _numbers(betas: tuple[float, float]) -> tuple[float, ...]:
+def _decays(betas: tuple[float, float]) -> tuple[float, ...]:
     """Return what Adam's kernels need of the decays: 1 - beta and log(beta) of each."""
     return *(1 - beta for beta in betas), *(math.log(beta) for beta in betas)
 

@@ -139,8 +139,15 @@ class RunOutput:
             log.warning(
                 "%d regions in %d photos are not explained by the scene; the worst: %s at column %.0f, row %.0f, "
                 "%d pixels %.1f stops %s than the photo (summary.json names %d)",
-                *(len(regions), photos, worst.photo, worst.column, worst.row, worst.pixels, abs(worst.stops)),
-                *("darker" if worst.stops > 0 else "brighter", min(len(regions), MAX_LISTED)),
+                len(regions),
+                photos,
+                worst.photo,
+                worst.column,
+                worst.row,
+                worst.pixels,
+                abs(worst.stops),
+                "darker" if worst.stops > 0 else "brighter",
+                min(len(regions), MAX_LISTED),
             )
 
     def _log(self, trainer: TrainingState, split: str, figures: dict[str, float]) -> None:
