@@ -41,6 +41,7 @@ COMMANDS = {
         "report": Command("output.commands", "Report", "run_report"),
         "envmap": Command("output.commands", "EnvironmentMap", "run_environment_map"),
         "lights": Command("output.commands", "Lights", "run_lights"),
+        "meter": Command("output.commands", "Meter", "run_meter"),
         "export": Command("output.splat_commands", "Export", "run_export"),
         "convert": Command("output.splat_commands", "Convert", "run_convert"),
     },

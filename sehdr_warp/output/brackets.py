@@ -144,6 +144,7 @@ class Brackets:
         captured: Local time.
         provenance: Text by key, for the EXR attributes.
         group_by: "view" or "exposure": what one folder holds. Folders by exposure hold image sequences.
+        luminance_of_one: cd/m^2 of a radiance of 1; None if it is not known.
     """
 
     exposures: tuple[Exposure, ...]
@@ -156,6 +157,7 @@ class Brackets:
     captured: datetime | None = None
     provenance: Mapping[str, str] | None = None
     group_by: str = "view"
+    luminance_of_one: float | None = None
 
     def __post_init__(self):
         """Raise SehdrError for options that contradict each other."""
@@ -173,7 +175,8 @@ class Brackets:
     def header(self, view: str, exposure_time: float, camera: Camera | None, **facts: str) -> dict[str, Any]:
         """Return the EXR attributes of a picture."""
         facts = {**(self.provenance or {}), **facts, "view": view, "baseExposureTime": repr(self.base_time)}
-        return exr_header(self.colorspace, exposure_time, camera, self.captured, facts)
+        luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
+        return exr_header(self.colorspace, exposure_time, camera, self.captured, facts, luminance)
 
     @contextmanager
     def open(self, out: Path, overwrite: bool = False) -> Iterator["BracketWriter"]:

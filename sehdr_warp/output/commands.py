@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 from tyro.conf import Positional
 
-from ..arguments import require_positive
+from ..arguments import parse_numbers, require_positive
 from ..errors import InputError, UsageError
 from ..files import check_absent
 from ..runs.open import load_run_photos_with_confidence, open_run, open_scene
@@ -174,13 +174,56 @@ class Lights:
     """cpu or cuda:N; by default the first GPU if there is one."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Meter:
+    """Set the unit of a scene's light by one reading of a meter or a grey card, and keep it with the run.
+
+    Pictures and environment maps then state cd/m^2, and lights are written in cd/m^2.
+    """
+
+    run: Positional[Path]
+    """Folder of a run."""
+    view: str | None = None
+    """View in which the reading was taken. Without it, the unit that is kept is printed."""
+    pixel: str | None = None
+    """x,y of the place from the upper left corner, in the size that the run has the view in."""
+    luminance: float | None = None
+    """Reading of a spot meter there, in cd/m^2."""
+    illuminance: float | None = None
+    """Reading of a lux meter on a matte surface there, such as a grey card."""
+    reflectance: float = 0.18
+    """Reflectance of that surface."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+def run_meter(args: Meter) -> None:
+    """Run `sehdr-warp meter`."""
+    from .light_unit import meter, read_light_unit
+
+    run = open_run(args.run, args.device)
+    if args.view is None:
+        if flags := [flag for flag in ("pixel", "luminance", "illuminance") if getattr(args, flag) is not None]:
+            raise UsageError(f"--{flags[0]}: needs the view of the reading; name it with --view")
+        print(read_light_unit(run) or "no unit is kept: radiance is relative")
+        return
+    if args.pixel is None:
+        raise UsageError(f"--view {args.view}: needs the place of the reading; add --pixel x,y")
+    x, *rest = parse_numbers("--pixel", args.pixel, float)
+    if len(rest) != 1:
+        raise UsageError(f"--pixel {args.pixel}: is not two numbers; write for example --pixel 812,440")
+    reading = {"luminance": args.luminance, "illuminance": args.illuminance, "reflectance": args.reflectance}
+    print(meter(run, args.view, (x, rest[0]), **reading))
+
+
 def run_lights(args: Lights) -> None:
     """Run `sehdr-warp lights`."""
+    from .light_unit import luminance_of_one
     from .lights import lights_table, write_lights
 
     run = open_run(args.run, args.device)
     if args.out is None:
-        print(lights_table(run.find_lights()))
+        print(lights_table(run.find_lights(), luminance_of_one(run)))
         return
     for path in write_lights(run, args.out, axes=args.axes, up=args.up, overwrite=args.overwrite):
         print(path)

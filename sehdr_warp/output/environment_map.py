@@ -19,6 +19,7 @@ from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr
 from .images import as_array
 from .light_pictures import exposure_of_white
 from .light_shares import light_shares
+from .light_unit import EFFICACY, luminance_of_one
 from .radiance_file import write_radiance
 from .render_views import provenance
 from .world_transform import AXES, world_transform
@@ -138,8 +139,10 @@ def write_environment_map(
     log.info("%s: %.0f %% of all directions seen", path.name, coverage)
     log.info("its light is\n%s", shares.table())
     hdr = exposure * from_rec709(hdr + added, colorspace)
+    luminance = luminance_of_one(run)
     if path.suffix.lower() == ".hdr":
-        write_radiance(path, hdr, exposure=exposure, overwrite=overwrite)
+        absolute = 1.0 if luminance is None else EFFICACY / luminance
+        write_radiance(path, hdr, exposure=exposure * absolute, overwrite=overwrite)
         return path
     data = {"distance.Z": distance * transform.scale}
     if surroundings.confidence is not None:
@@ -148,7 +151,8 @@ def write_environment_map(
         data["clipped"] = clipped
     facts = {**provenance(run), "position": json.dumps(position.tolist()), "axes": axes}
     facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(asdict(shares))}
-    header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts)
+    white_luminance = None if luminance is None else luminance / exposure
+    header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
     header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
     parts = [Part(rgb_channels(hdr) | {"A": alpha}, header, "rgba"), Part(data, as_data(header), "data")]

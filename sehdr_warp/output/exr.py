@@ -48,6 +48,7 @@ def exr_header(
     camera: Camera | None = None,
     captured: datetime | None = None,
     provenance: Mapping[str, str] | None = None,
+    white_luminance: float | None = None,
 ) -> dict[str, Any]:
     """Return OpenEXR attributes for a picture.
 
@@ -57,6 +58,7 @@ def exr_header(
         camera: Camera of the picture.
         captured: Local time.
         provenance: Text by key, written as `sehdr:<key>`.
+        white_luminance: cd/m^2 of a value of 1 in R, G and B.
     """
     space = color_space(colorspace)
     header: dict[str, Any] = {"chromaticities": chromaticities(space.name), "sehdr:colorSpace": space.name}
@@ -69,12 +71,14 @@ def exr_header(
         header.update(_camera_attributes(camera))
     if captured is not None:
         header["capDate"] = captured.strftime(EXIF_TIME)
+    if white_luminance is not None:
+        header["whiteLuminance"] = float(white_luminance)
     return header | {f"sehdr:{key}": str(value) for key, value in (provenance or {}).items()}
 
 
 def as_data(header: Mapping[str, Any]) -> dict[str, Any]:
     """Return the attributes of a picture's part, for a part that holds no colors."""
-    colors = ("chromaticities", "sehdr:colorSpace", "colorInteropID")
+    colors = ("chromaticities", "whiteLuminance", "sehdr:colorSpace", "colorInteropID")
     return {key: value for key, value in header.items() if key not in colors} | {"colorInteropID": "data"}
 
 

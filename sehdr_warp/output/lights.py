@@ -14,6 +14,7 @@ from ..files import atomic_path, check_absent
 from .environment_map import envmap, latlong
 from .exr import exr_header, rgb_channels, write_exr
 from .images import as_array
+from .light_unit import luminance_of_one
 from .render_views import provenance
 from .world_transform import WorldTransform, world_transform
 
@@ -48,7 +49,7 @@ _LIGHT = """    def {kind} "{name}"
 _DOME = """    def DomeLight "Rest"
     {{
         color3f inputs:color = (1, 1, 1)
-        float inputs:intensity = 1
+        float inputs:intensity = {intensity}
         asset inputs:texture:file = @./{file}@
         token inputs:texture:format = "latlong"
     }}"""
@@ -66,7 +67,8 @@ def write_lights(
 
     A light is a group of Gaussians that the photos clipped. With its size, its radiance gives the light that the
     training views show. A USD file has a SphereLight or RectLight for each, and a DomeLight for everything else: a
-    map from the middle of the training cameras, `<stem>_rest.exr`, in which the lights are dark.
+    map from the middle of the training cameras, `<stem>_rest.exr`, in which the lights are dark. If the unit of the
+    run's light is known, lights and dome are in cd/m^2, as USD has them.
 
     Args:
         run: From load_run or train.
@@ -93,38 +95,53 @@ def write_lights(
         log.warning(
             "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest", run.path
         )
-    rows = [_described(f"light_{index}", light, transform) for index, light in enumerate(lights)]
+    unit = luminance_of_one(run)
+    rows = [_described(f"light_{index}", light, transform, unit or 1.0) for index, light in enumerate(lights)]
     if suffix == ".usda":
         _write_rest(run, rest, lights, transform, overwrite)
-        text = usd_lights(rows, run.scene_name, rest.name)
+        text = usd_lights(rows, run.scene_name, rest.name, unit or 1.0)
     else:
-        facts = {**provenance(run), "units": "relative radiance, linear Rec.709", "axes": axes}
+        units = f"{'relative radiance' if unit is None else 'cd/m^2'}, linear Rec.709"
+        facts = {**provenance(run), "units": units, "axes": axes}
         text = json.dumps({**facts, "lights": rows}, indent=1)
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return files
 
 
-def lights_table(lights: Sequence[Any]) -> str:
-    """Return lights as lines of text: shape, place, size, radiance, how sure it is, and share of the scene's light."""
-    lines = ["  share  shape   radiance  at least  stops   place, size"]
+def lights_table(lights: Sequence[Any], unit: float | None = None) -> str:
+    """Return lights as lines of text: shape, place, size, radiance, how sure it is, and share of the scene's light.
+
+    Args:
+        lights: As from find_lights().
+        unit: cd/m^2 of a radiance of 1; None if it is not known.
+    """
+    lines = [f"  share  shape  {'radiance' if unit is None else 'cd / m^2':>10}  at least  stops   place, size"]
     for light in lights:
         size = " x ".join(f"{side:.3g}" for side in light.shape.size[: 2 if light.shape.kind == "rect" else 1])
         place = ", ".join(f"{value:.3g}" for value in light.shape.position)
         sure = "    -" if light.deviation is None else f"{light.deviation:5.2f}"
-        figures = f"{float(np.mean(light.radiance)):9.3g} {float(np.mean(light.lower_bound)):9.3g}"
+        radiances = (unit or 1.0) * np.mean([light.radiance, light.lower_bound], axis=1)
+        figures = " ".join(f"{value:9.3g}" for value in radiances)
         lines.append(f"{100 * light.share:5.1f} %  {light.shape.kind:6} {figures}  {sure}   ({place}), {size}")
     return "\n".join(lines)
 
 
-def usd_lights(rows: Sequence[dict], scene: str, rest: str) -> str:
-    """Return the text of a stage of the lights that _described() gives, and a dome of a map beside the file."""
-    lights = [_usd(row) for row in rows]
-    return _STAGE.format(scene=json.dumps(scene), lights="\n".join([*lights, _DOME.format(file=rest)]))
+def usd_lights(rows: Sequence[dict], scene: str, rest: str, rest_intensity: float = 1.0) -> str:
+    """Return the text of a stage of the lights that _described() gives, and a dome of a map beside the file.
+
+    Args:
+        rows: Lights.
+        scene: Name of the scene.
+        rest: Name of the map's file.
+        rest_intensity: Factor of the map's values.
+    """
+    lights = [*(_usd(row) for row in rows), _DOME.format(file=rest, intensity=repr(float(rest_intensity)))]
+    return _STAGE.format(scene=json.dumps(scene), lights="\n".join(lights))
 
 
-def _described(name: str, light: Any, transform: WorldTransform) -> dict:
-    """Return a light as plain values, in the coordinates of the file."""
+def _described(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:
+    """Return a light as plain values, in the coordinates and the unit of the file."""
     shape = light.shape
     return {
         "name": name,
@@ -132,8 +149,8 @@ def _described(name: str, light: Any, transform: WorldTransform) -> dict:
         "position": transform.points(shape.position).tolist(),
         "axes": (shape.axes @ transform.rotation.T).tolist(),
         "size": [transform.scale * side for side in shape.size],
-        "radiance": np.asarray(light.radiance, float).tolist(),
-        "lower_bound": np.asarray(light.lower_bound, float).tolist(),
+        "radiance": (unit * np.asarray(light.radiance, float)).tolist(),
+        "lower_bound": (unit * np.asarray(light.lower_bound, float)).tolist(),
         "deviation_stops": light.deviation,
         "share_of_light": light.share,
     }
@@ -175,5 +192,6 @@ def _write_rest(run: Any, path: Path, lights: Sequence[Any], transform: WorldTra
     options = {"focal_length": float(np.median([np.sqrt(c.fx * c.fy) for c in cameras]))}
     options |= {"pixel_angle": 2 * np.pi / MAP_SIZE, "without": [light.members for light in lights]}
     hdr = as_array(run.render_directions(middle, latlong(MAP_SIZE) @ transform.rotation, **options).hdr)
-    header = exr_header("rec709", 1.0, provenance=provenance(run)) | {"envmap": envmap("latlong")}
+    header = exr_header("rec709", 1.0, provenance=provenance(run), white_luminance=luminance_of_one(run))
+    header["envmap"] = envmap("latlong")
     write_exr(path, rgb_channels(hdr), header=header, overwrite=overwrite)

@@ -27,6 +27,7 @@ from .exr import Part, rgb_channels, write_multipart_exr
 from .framing import film_camera, frame_subject
 from .images import as_array, quantize, write_picture
 from .light_pictures import exposure_of_white
+from .light_unit import luminance_of_one, read_light_unit
 from .names import safe_names
 from .ocio import ocio_view
 from .tonemap import ToneMap, fit_tone_map
@@ -116,6 +117,7 @@ def render_views(
         captured=datetime.now().replace(microsecond=0),
         provenance=provenance(run),
         group_by=group_by,
+        luminance_of_one=luminance_of_one(run),
     )
     exposure = exposure_of_white(run, reference_white)
     if (ocio is None) != (view is None):
@@ -289,7 +291,8 @@ def _from_file(run: Any, path: Path, transform: WorldTransform | None) -> list[t
 
 def provenance(run) -> dict[str, str]:
     """Return where a picture came from, as text by key."""
-    known = {"scene": run.scene_name, "iterations": run.iterations, "units": "relative radiance"}
+    unit = read_light_unit(run)
+    known = {"scene": run.scene_name, "iterations": run.iterations, "units": str(unit or "relative radiance")}
     known["response"] = getattr(run.response, "name", None)
     return {key: str(value) for key, value in known.items() if value not in (None, "")}
 

@@ -27,6 +27,7 @@ from .light_pictures import (
     shown_photo,
     side_choices,
 )
+from .light_unit import luminance_of_one, read_light_unit
 from .tonemap import expose, fit_tone_map
 from .ultra_hdr import MOST_STOPS, ultra_hdr
 
@@ -112,6 +113,7 @@ def _header(run: Any, scene: Scene) -> Markup:
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,
         "training": duration(run.train_seconds),
+        "radiance of 1, cd/m\N{SUPERSCRIPT TWO}": None if (unit := luminance_of_one(run)) is None else f"{unit:.4g}",
         "held-out photos": _decibels(last, "psnr_ldr"),
         "held-out HDR, mu-law": _decibels(last, "psnr_mu"),
     }
@@ -313,10 +315,11 @@ def _map(run: Any, comparisons: Sequence[Comparison]) -> Markup:
 def _footer(run: Any, held_out: bool) -> Markup:
     return markup(
         "<footer>\n<p>sehdr-warp {}. Brackets as OpenEXR: <code>sehdr-warp render {} --out views{} --evs=-4,-2,0,2,4"
-        "</code></p>\n<p>Radiance is relative, and clipped light is not in the photos.</p>\n</footer>",
+        "</code></p>\n<p>{}, and clipped light is not in the photos.</p>\n</footer>",
         __version__,
         shlex.quote(str(run.path)),
         "" if held_out else " --cameras train",
+        read_light_unit(run) or "Radiance is relative",
     )
 
 

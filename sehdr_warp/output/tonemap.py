@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 # ITU-R BT.709 luminance weights.
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 # Below this part of the brightest per cent, a pixel says nothing about the scene's key.
 _FLOOR = 1e-6
 # Reinhard 2003 uses the extremes; percentiles keep a lamp's filament from deciding the picture.
@@ -33,7 +33,7 @@ class ToneMap:
     def __call__(self, radiance: np.ndarray) -> np.ndarray:
         """Convert [..., 3] linear Rec.709 radiance to sRGB-encoded float32 in [0, 1]; negative radiance counts as 0."""
         scaled = np.maximum(np.asarray(radiance, np.float32), 0) * np.float32(self.scale)
-        luminance = (scaled @ _LUMINANCE.astype(np.float32))[..., None]
+        luminance = (scaled @ LUMINANCE.astype(np.float32))[..., None]
         displayed = self._curve(luminance)
         by_luminance = scaled * (displayed / np.maximum(luminance, 1e-12))
         weight = np.minimum(displayed, 1)
@@ -49,7 +49,7 @@ def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
     Black scenes get the identity. Raises ValueError without pictures.
     """
     # float64 before the logarithm: radiance may be small in its units.
-    values = np.concatenate([(np.maximum(np.asarray(p, np.float64), 0) @ _LUMINANCE).ravel() for p in pictures])
+    values = np.concatenate([(np.maximum(np.asarray(p, np.float64), 0) @ LUMINANCE).ravel() for p in pictures])
     values = values[np.isfinite(values) & (values > 0)]  # Writers refuse what is not finite, and say where.
     if not values.size:
         return ToneMap(1.0, 1.0)

@@ -79,8 +79,9 @@ class RunFolder:
         self.config, self.scene, self.info, self.plan, self.summary = (
             self.path / f"{name}.json" for name in ("config", "scene", "run", "plan", "summary")
         )
-        # Set after the training began: more iterations, and up and scale for its files.
+        # Set after the training began: more iterations, up and scale for its files, and the unit of light.
         self.extension, self.orientation = self.path / "extension.json", self.path / "orientation.json"
+        self.light_unit = self.path / "light_unit.json"
         self.metrics = self.path / "metrics.jsonl"
         self.checkpoints = self.path / "checkpoints"
         self.confidence = self.path / "confidence.safetensors"
@@ -102,7 +103,7 @@ class RunFolder:
     def refuse_links(self) -> None:
         """Raise InputError if anything of a run in this folder is a link, whose target is not the run's."""
         files = (self.config, self.scene, self.info, self.plan, self.summary, self.metrics, self.confidence)
-        files += (self.extension, self.orientation)
+        files += (self.extension, self.orientation, self.light_unit)
         for path in (*files, self.checkpoints, self.tensorboard, *(self.path / n for n in (".lock", NEW, READY))):
             refuse_links(path, self.path)
         for folder in (*self._checkpoint_folders(), self.path / NEW, self.path / READY):
