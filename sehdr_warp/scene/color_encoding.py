@@ -19,7 +19,8 @@ from PIL import Image
 
 from ..errors import InputError
 from .heif import read_items
-from .icc import converted_to_srgb, read_profile
+from .icc import read_profile, xyz_to_rec709
+from .icc_table import IccTable
 from .images import PILLOW_ERRORS, EncodedImage, exif_of
 from .primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
 
@@ -52,7 +53,7 @@ class ColorEncoding:
         to_rec709: [3, 3] from the primaries of the codes to linear Rec.709; None if they are Rec.709's.
         curves: decoded values at evenly spaced codes from 0 to 1, by channel; empty for sRGB's curve, or a table.
         light: what light the codes state ("linear light", "PQ light", ...); None for a display curve.
-        table: ICC profile that LittleCMS applies.
+        table: of an ICC profile, in place of primaries and curves.
         problem: what is wrong with the statement, if it is not used.
     """
 
@@ -60,7 +61,7 @@ class ColorEncoding:
     to_rec709: np.ndarray | None = None
     curves: tuple[np.ndarray, ...] = ()
     light: str | None = None
-    table: bytes | None = None
+    table: IccTable | None = None
     problem: str | None = None
 
     @property
@@ -80,6 +81,9 @@ class ColorEncoding:
             channels are clipped.
         """
         white = np.iinfo(pixels.dtype).max
+        if self.table is not None:
+            light, clipped = xyz_to_rec709(self.table.to_xyz(pixels / white)).astype(np.float32), pixels == white
+            return light if above is None else np.where(above > 0, above, light), clipped
         tables = _decoding_tables(self.curves or (srgb_to_linear(np.linspace(0, 1, _SAMPLES)),) * 3, int(white))
         light = np.stack([table[pixels[..., channel]] for channel, table in enumerate(tables)], axis=-1)
         clipped = pixels == white
@@ -97,8 +101,6 @@ class ColorEncoding:
         if self.is_srgb:
             return image
         alpha, above, deviation = image.alpha, image.above_white, image.above_white_deviation
-        if self.table is not None:
-            return EncodedImage(converted_to_srgb(image.pixels, self.table), alpha, above, deviation)
         # Light of a gain map is in sRGB's curve already.
         curves = () if above is not None else self.curves
         codes, brighter = encoded_in_bands(image.pixels, above, replace(self, curves=curves).to_linear)
@@ -177,8 +179,8 @@ def encoding_of_profile(data: bytes, colors: str = "RGB") -> ColorEncoding:
     name = f"{profile.name} (ICC profile)"
     if profile.cicp is not None:
         return _from_cicp((*profile.cicp, 1), name)
-    if not profile.curves:
-        return ColorEncoding(name, table=data)
+    if profile.table is not None:
+        return ColorEncoding(name, table=profile.table)
     return _simplified(name, profile.to_rec709, profile.curves)
 
 

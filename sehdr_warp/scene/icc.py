@@ -1,7 +1,6 @@
-"""ICC profiles of photos: LittleCMS (through Pillow) checks them, and their matrix and curves are read for 16 bits.
+"""ICC profiles of photos: LittleCMS (through Pillow) checks them; matrix, curves and tables are read for 16 bits.
 
 Pillow's transforms return 8 bits limited to the target's gamut, which would lose what a profile of a wide gamut states.
-So matrix profiles are applied with the profile's own matrix and curves, and only tables go through LittleCMS.
 """
 
 import io
@@ -11,6 +10,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+
+from .icc_table import IccTable, read_table
 
 _MOST_BYTES = 16 << 20  # Above any profile in use; printer tables have a few megabytes
 # Linear Rec.709 (sRGB, IEC 61966-2-1) from XYZ relative to D50, the connection space of ICC profiles.
@@ -35,7 +36,7 @@ class IccProfile:
         curves: decoded values at evenly spaced codes from 0 to 1, one array for each channel; empty if the profile is
             a table.
         cicp: (primaries, transfer) of ITU-T H.273, if the profile states them.
-        data: the whole profile, for LittleCMS.
+        table: the profile's table, which stands before matrix and curves; None if it has none.
     """
 
     name: str
@@ -43,7 +44,7 @@ class IccProfile:
     to_rec709: np.ndarray | None
     curves: tuple[np.ndarray, ...]
     cicp: tuple[int, int] | None
-    data: bytes
+    table: IccTable | None = None
 
 
 @lru_cache(maxsize=64)
@@ -69,9 +70,11 @@ def read_profile(data: bytes) -> IccProfile:
         tags = _tags(data)
         cicp = (tags[b"cicp"][8], tags[b"cicp"][9]) if len(tags.get(b"cicp", b"")) >= 12 else None
         if colors == "GRAY":
-            return IccProfile(name, colors, None, (_curve(tags[b"kTRC"]),) * 3, cicp, data)
-        if b"A2B0" in tags and cicp is None:
-            return IccProfile(name, colors, None, (), cicp, data)
+            return IccProfile(name, colors, None, (_curve(tags[b"kTRC"]),) * 3, cicp)
+        # Of the relative colorimetric intent, or of the only one, as LittleCMS takes it.
+        if (table := tags.get(b"A2B1") or tags.get(b"A2B0")) is not None and cicp is None:
+            space = profile.connection_space.strip()
+            return IccProfile(name, colors, None, (), cicp, read_table(table, space, _curve))
         curves = tuple(_curve(tags[tag]) for tag in (b"rTRC", b"gTRC", b"bTRC")) if b"rTRC" in tags else ()
         to_xyz = np.stack([_xyz(tags[tag]) for tag in (b"rXYZ", b"gXYZ", b"bXYZ")], axis=1) if curves else np.eye(3)
     except (KeyError, struct.error, IndexError, ValueError, OverflowError):
@@ -83,25 +86,12 @@ def read_profile(data: bytes) -> IccProfile:
         raise ValueError("has primaries that span no colors")
     if any(not np.isfinite(curve).all() or np.ptp(curve) <= 0 or curve[-1] <= curve[0] for curve in curves):
         raise ValueError("has a curve that does not rise")
-    return IccProfile(name, colors, matrix, curves, cicp, data)  # pyright: ignore[reportArgumentType]
+    return IccProfile(name, colors, matrix, curves, cicp)  # pyright: ignore[reportArgumentType]
 
 
-def converted_to_srgb(pixels: np.ndarray, data: bytes) -> np.ndarray:
-    """Convert [H, W, 3] uint8 codes to those of sRGB by a profile that is a table, with LittleCMS.
-
-    Raises:
-        ValueError: if LittleCMS cannot use the profile.
-    """
-    from PIL import Image, ImageCms
-
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(data))
-        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-        target = ImageCms.createProfile("sRGB")
-        picture = ImageCms.profileToProfile(Image.fromarray(pixels), source, target, renderingIntent=intent)
-    except (OSError, ImageCms.PyCMSError, ValueError):
-        raise ValueError("cannot be applied") from None
-    return np.asarray(picture)
+def xyz_to_rec709(xyz: np.ndarray) -> np.ndarray:
+    """Return linear Rec.709 [..., 3] of CIE XYZ relative to D50, the connection space of ICC profiles."""
+    return xyz @ _REC709_FROM_D50.T
 
 
 def _tags(data: bytes) -> dict[bytes, bytes]:

@@ -12,12 +12,13 @@ from PIL import Image, ImageCms
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color_encoding import encoding_of_cicp, encoding_of_profile, stated_encoding
-from sehdr_warp.scene.images import EncodedImage, open_image
+from sehdr_warp.scene.images import EncodedImage, open_image, read_ldr
 from sehdr_warp.scene.primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
 from tests.make_scenes import load, pattern, write_colmap
 
 SPACES = {"sRGB": ("sRGB", None), "Display P3": ("Display P3", None), "Adobe RGB": ("Adobe RGB (1998)", 563 / 256),
-          "ProPhoto": ("ProPhoto RGB", 1.8), "Rec.2020": ("ITU-R BT.2020", 2.4), "ACEScg": ("ACEScg", 2.2)}  # fmt: skip
+          "ProPhoto": ("ProPhoto RGB", 1.8), "Rec.2020": ("ITU-R BT.2020", 2.4), "ACEScg": ("ACEScg", 2.2),
+          "ACES AP0": ("ACES2065-1", 2.2)}  # fmt: skip
 PATCHES = np.array([[230, 60, 40], [40, 200, 60], [30, 60, 220], [128, 128, 128], [250, 240, 10], [3, 7, 20]])
 
 
@@ -84,20 +85,43 @@ def write_set(folder, save):
     return folder
 
 
+def save_as(kind, profile):
+    """Return a function that saves an image with a profile, for write_set(): "jpg", "tif 16", ..."""
+
+    def save(image, path):
+        suffix, _, deep = kind.partition(" ")
+        path = path.with_suffix(f".{suffix}")
+        codes = np.asarray(image).astype(np.uint16) * 257
+        if deep and suffix == "tif":
+            pytest.importorskip("tifffile").imwrite(path, codes, photometric="rgb", iccprofile=profile)
+        elif deep:
+            png16(path, codes / 65535, _iccp(profile))
+        elif suffix == "heic":
+            heif = pytest.importorskip("pillow_heif").from_pillow(image)
+            heif.info["icc_profile"] = profile
+            heif.save(path, quality=100, chroma=444, icc_profile=profile)
+        else:
+            options = {"jpg": {"quality": 100, "subsampling": 0}, "webp": {"lossless": True}, "avif": {"quality": 100}}
+            image.save(path, icc_profile=profile, **options.get(suffix, {}))
+
+    return save
+
+
 @pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp", ".jpg"])
-def test_patches_through_every_format(tmp_path, space, suffix):
+@pytest.mark.parametrize("kind", ["png", "png 16", "tif", "tif 16", "webp", "jpg", "heic", "avif"])
+def test_patches_through_every_format(tmp_path, space, kind):
     name, gamma = SPACES[space]
-    profile = icc_profile(name, gamma, name=space)
-    options = {".jpg": {"quality": 100, "subsampling": 0}, ".webp": {"lossless": True}}.get(suffix, {})
-    save = lambda image, path: image.save(path.with_suffix(suffix), icc_profile=profile, **options)  # noqa: E731
-    scene = load(write_set(tmp_path, save), holdout=0)
-    light = light_of(scene.views[0], scene)
-    expected = rec709_of(name, gamma, PATCHES)
-    tolerance = 0.03 if suffix == ".jpg" else 0.005
-    for k, patch in enumerate(np.maximum(expected, 0)[: 5 if suffix == ".jpg" else None]):
-        error = np.abs(light[16, 8 * k + 4] - patch)
-        assert (error <= tolerance * patch.max() + 1e-4).all(), (patch, light[16, 8 * k + 4])
+    scene = load(write_set(tmp_path, save_as(kind, icc_profile(name, gamma, name=space))), holdout=0)
+    light, suffix = light_of(scene.views[0], scene), f".{kind.partition(' ')[0]}"
+    # Of the codes as they are decoded, because some formats change them.
+    decoded = read_ldr(tmp_path / "images" / f"000{suffix}")
+    for k in range(len(PATCHES)):
+        codes = decoded.pixels[16, 8 * k + 4]
+        assert np.abs(codes * (255 / decoded.levels) - PATCHES[k]).max() < 8
+        expected = np.maximum(rec709_of(name, gamma, codes * (255 / decoded.levels)), 0)
+        error = np.abs(light[16, 8 * k + 4] - expected)
+        clipped = codes == decoded.levels
+        assert (error <= 0.005 * expected.max() + 1e-4)[~clipped].all(), (codes, expected, light[16, 8 * k + 4])
     words = [note for note in scene.notes if note.startswith("colors: ")]
     line = f"colors: 6 of 6 photos are in {space} (ICC profile) and are converted to Rec.709 (000{suffix} ...)"
     assert words == ([] if space == "sRGB" else [line])
