@@ -33,7 +33,7 @@ def write_report(
     """Render some held-out views of a trained run and write the report; return the paths of its files.
 
     `report.html`: one page without a network: figures, what was left out and why, photo, scene and truth as Ultra HDR,
-    brackets with an exposure dial, confidence, unexplained regions, error against time, cameras. For papers:
+    brackets with an exposure dial, lights, confidence, unexplained regions, error against time, cameras. For papers:
     `comparison.png`: photo; photo, HDR scene and truth (if known) some stops darker; a new view. `stops.png`: the view
     with the most clipped light from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
     `training.png`: held-out error against training time; absent for a run without evaluations. A scene without test
@@ -67,7 +67,8 @@ def write_report(
     time = views[0].exposure_time
     compared = comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out)
     figures = [compared, stops_figure(brightest, time)] + [training_chart({scene.name: [metrics]})] * charted
-    page = report_page(run, scene, comparisons, brightest, held_out=held_out, evaluation=evaluation)
+    lights = run.find_lights() if run.clipped_share() is not None else []
+    page = report_page(run, scene, comparisons, brightest, held_out=held_out, evaluation=evaluation, lights=lights)
     with ExitStack() as stack:
         stack.enter_context(atomic_path(paths[0], overwrite)).write_text(page, encoding="utf-8")
         for path, figure in zip(paths[1:], figures, strict=True):

@@ -13,6 +13,7 @@ from sehdr_warp.scene.camera import limited_size
 from sehdr_warp.scene.exposure import shutter
 from sehdr_warp.scene.lens import area_average
 
+from ..model.lights import Light
 from .comparison import Comparison, darker_stops
 from .diagrams import camera_map, training_svg
 from .html import EMPTY, join, markup, page_file, whole_page
@@ -34,6 +35,7 @@ from .ultra_hdr import MOST_STOPS, ultra_hdr
 STOPS = (-4, -2, 0, 2, 4)
 _PICTURE, _DIAL, _STRIP = 880, 420, 220  # Longest sides of pictures, pixels
 _MOST_PHOTOS = 6  # With unexplained regions
+_MOST_LIGHTS = 12  # In the table
 SPACE = "\N{NARROW NO-BREAK SPACE}"
 
 
@@ -45,6 +47,7 @@ def report_page(
     *,
     held_out: bool,
     evaluation: Mapping[str, Any] | None = None,
+    lights: Sequence[Light] = (),
 ) -> str:
     """Return the whole page as HTML.
 
@@ -55,6 +58,7 @@ def report_page(
         brightest: The view with the most clipped light, for the brackets.
         held_out: Whether the views were not trained on.
         evaluation: Result of evaluate(), for the table of held-out views.
+        lights: The lights of the scene, as from run.find_lights().
     """
     gain = display_gain(run.response)
     times = {view.name: view.exposure_time for view in scene.views}
@@ -63,6 +67,7 @@ def report_page(
         _opening(brightest, times[brightest.name], gain),
         _pictures(run, comparisons, times, held_out),
         _brackets(brightest, times[brightest.name], gain),
+        _lights(lights, luminance_of_one(run)),
         _confidence(comparisons),
         _unexplained(run, scene),
         _plan(run.decisions()),
@@ -191,6 +196,27 @@ def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:
         _wide(markup('<div class="strip">{}</div>', join(cells)))
     )
     return _section("Brackets", lead, body)
+
+
+def _lights(lights: Sequence[Light], unit: float | None) -> Markup:
+    """Return the table of the lights that photos clip; unit: cd/m^2 of a radiance of 1, None if it is not known."""
+    rows = []
+    for light in lights[:_MOST_LIGHTS]:
+        radiances = (float((unit or 1.0) * np.mean(values)) for values in (light.radiance, light.lower_bound))
+        sides = light.shape.size if light.shape.kind == "rect" else light.shape.size[:1]
+        size = "\N{THIN SPACE}\N{MULTIPLICATION SIGN}\N{THIN SPACE}".join(f"{side:.3g}" for side in sides)
+        place = ", ".join(f"{value:.3g}" for value in light.shape.position)
+        figures = (f"{light.share:.1%}", *(f"{value:.3g}" for value in radiances), number(light.deviation, 1))
+        rows.append(("panel" if light.shape.kind == "rect" else "lamp", size, place, *figures))
+    measure = "radiance" if unit is None else "cd/m\N{SUPERSCRIPT TWO}"
+    titles = ("", "size", "place", "share of light", measure, "certain at least", "deviation, stops")
+    lead = (
+        "Lamps, windows and other areas that photos clip, those that give most first. Their radiance is an estimate "
+        "with a deviation; photos vouch for what is certain. Share: of the light at the middle of the cameras."
+    )
+    if len(lights) > _MOST_LIGHTS:
+        lead += f" The first {_MOST_LIGHTS} of {len(lights)}."
+    return _section("Lights", lead, _rows(titles, rows, first_number=3))
 
 
 def _confidence(comparisons: Sequence[Comparison]) -> Markup:

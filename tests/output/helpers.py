@@ -85,6 +85,9 @@ class AnalyticRun:
     def render_clipped(self, view):
         return np.full((view.height, view.width), 0.25, np.float32) if self.confident else None
 
+    def clipped_share(self):
+        return None
+
     def render(self, view):
         self.rendered += 1
         y, x = np.mgrid[: view.height, : view.width] + 0.5

@@ -28,6 +28,7 @@ from sehdr_warp.output.report_page import smaller
 
 from ..viewer.browser import browser
 from .helpers import AnalyticRun
+from .test_lights import LIGHTS
 from .test_report import make
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -76,6 +77,21 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     for told in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
         assert told in text
     assert '<rect x="3.8" y="5.8"' in text  # Around the box, by three units of a 32-pixel photo
+
+
+def test_lights_are_listed_with_what_is_certain_of_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(AnalyticRun, "clipped_share", lambda self: True)
+    monkeypatch.setattr(AnalyticRun, "find_lights", lambda self: LIGHTS * 7, raising=False)
+    text = page(tmp_path)
+    validate(text)
+    assert "Lights" in headings(text) and "The first 12 of 14." in text
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", text[text.index("<h2>Lights") : text.index("<h2>Confidence")])
+    assert len(cells) == 12 * 7
+    assert [cell.replace("\N{THIN SPACE}", "") for cell in cells[:7]] == [
+        *("panel", "0.4\N{MULTIPLICATION SIGN}0.2", "1, 0.5, 2"),
+        *("50.0%", "4.67", "1", "0.7"),
+    ]
+    assert cells[7] == "lamp" and cells[13] == "\N{EN DASH}"
 
 
 def test_exposures_that_gains_changed_are_marked(tmp_path, monkeypatch):
