@@ -89,13 +89,13 @@ def _log_line(total: int, progress: Progress) -> None:
 def _bar(total: int) -> Iterator[Callable[[Progress], None]]:
     """Show a bar, and yield the function that updates it."""
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn
+    from rich.progress import BarColumn, ProgressColumn, TextColumn
     from rich.progress import Progress as Bar
 
     console = Console(file=sys.stderr)
     # rich cuts columns on the right if the terminal is narrow, so the most important ones come first.
     parts = "{task.completed}/{task.total}", "{task.fields[rate]}", "{task.fields[left]} left", "{task.fields[figures]}"
-    columns = [TextColumn(part, markup=False) for part in parts]
+    columns: list[ProgressColumn] = [TextColumn(part, markup=False) for part in parts]
     columns.insert(1, BarColumn(None))
     with Bar(*columns, console=console, expand=True) as bar:
         task = bar.add_task("train", total=total, rate="", left="-:--", figures="")

@@ -75,10 +75,21 @@ def light_regions(
             direction = camera.world_to_camera[:3, :3].T @ (ray / np.linalg.norm(ray))
             share = float(render[window][inside].mean() / truth[window][inside].mean())
             wide = tuple(slice(max(0, part.start - MARGIN), part.stop + MARGIN) for part in window)
-            around = ndimage.binary_dilation(labels[wide] == index, np.ones((3, 3)), iterations=MARGIN)
-            energies = (float(image[wide][around].sum()) for image in (truth, render))
+            dilated = ndimage.binary_dilation(labels[wide] == index, np.ones((3, 3)), iterations=MARGIN)
+            around = np.asarray(dilated, bool)
             white = clipped is not None and bool(clipped[window][inside].mean() > 0.5)
-            regions.append(LightRegion(camera, np.array([column, row]), area, direction, share, *energies, white))
+            regions.append(
+                LightRegion(
+                    camera=camera,
+                    center=np.array([column, row]),
+                    area=area,
+                    direction=direction,
+                    share=share,
+                    true_energy=float(truth[wide][around].sum()),
+                    rendered_energy=float(render[wide][around].sum()),
+                    clipped=white,
+                )
+            )
     return regions
 
 

@@ -93,11 +93,6 @@ def apply_opcodes(data: bytes, image: np.ndarray, source: Path, *, cell: int = 1
     return image
 
 
-def moves_pixels(data: bytes, source: Path) -> bool:
-    """Return whether an opcode list corrects lens distortion."""
-    return any(number in (1, 2) for number, _, _ in _opcodes(data, source))
-
-
 def _opcodes(data: bytes, source: Path) -> Iterator[tuple[int, int, bytes]]:
     """Yield number, flags and parameters of each opcode."""
     if not data:
