@@ -75,32 +75,34 @@ def run_interruptibly(function: Callable[[], Result], waiting: Callable[[], None
     if threading.current_thread() is not threading.main_thread():
         return function()
     done: Future[Result] = Future()
+    # Not the thread itself: Python 3.11 takes one for ended if a signal interrupts its join().
+    ended = threading.Event()
 
     def run() -> None:
         try:
             done.set_result(function())
         except BaseException as error:  # noqa: BLE001 - It is raised where the result is waited for.
             done.set_exception(error)
+        finally:
+            ended.set()
 
-    thread = threading.Thread(target=run, name="sehdr-warp waits", daemon=True)
-    thread.start()
+    threading.Thread(target=run, name="sehdr-warp waits", daemon=True).start()
     started = time.monotonic()
     try:
-        while thread.is_alive():
-            thread.join(_LOOK_EVERY)
+        while not ended.wait(_LOOK_EVERY):
             if waiting is not None and time.monotonic() - started > WAITING_NOTICE:
                 waiting()
                 waiting = None
     except BaseException as error:
         code = error.code if isinstance(error, SystemExit) else 130 if isinstance(error, KeyboardInterrupt) else 1
-        atexit.register(_leave, thread, code if isinstance(code, int) else 1)
+        atexit.register(_leave, ended, code if isinstance(code, int) else 1)
         raise
     return done.result()
 
 
-def _leave(thread: threading.Thread, code: int) -> None:
+def _leave(ended: threading.Event, code: int) -> None:
     """End the process at once if a thread is in native code, which must not run while Python ends."""
-    if thread.is_alive():
+    if not ended.is_set():
         with suppress(Exception):
             logging.shutdown()
             sys.stdout.flush()

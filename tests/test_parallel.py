@@ -40,10 +40,11 @@ def test_an_exception_comes_where_its_turn_is(monkeypatch):
 
 
 WAITS = """
-import ctypes, os, signal, sys, threading, time
+import atexit, ctypes, os, signal, sys, threading, time
 from sehdr_warp.parallel import run_interruptibly
 from sehdr_warp.process import prepare
 prepare()
+atexit.register(print, "Python ends while native code runs")
 threading.Timer(0.3, lambda: os.kill(os.getpid(), getattr(signal, sys.argv[1]))).start()
 run_interruptibly(lambda: ctypes.CDLL(None).sleep(60), lambda: None)
 print("went on")
