@@ -55,6 +55,8 @@ class Transfer:
 
 
 _X265 = "log-level=error:repeat-headers=1"
+# x265 4 writes beyond its arrays for adaptive quantization of pictures narrower than 50 pixels.
+_X265_SMALL, _X265_SMALLEST_SIDE = ":aq-mode=0:no-cutree=1", 64
 # As if mastered on a Rec.2020 display of PEAK; the steps are 0.00002 and 0.0001 cd/m2.
 _MASTER = (
     "hdr-opt=1:master-display=G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)L(10000000,50):max-cll=1000,400"
@@ -128,7 +130,7 @@ def write_film(
             with av.open(name, "w", format=container_format, options=options) as container:
                 stream = container.add_stream(kind.codec, rate=Fraction(fps).limit_denominator(1001))
                 stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
-                stream.options = kind.options
+                stream.options = _encoder_options(kind, min(width, height))
                 if kind.codec == "libx265":
                     stream.codec_context.codec_tag = "hvc1"  # What Apple's players look for.
                 context = stream.codec_context
@@ -145,6 +147,13 @@ def write_film(
             remedy = f"choose {'.mov' if transfer in LOGS else '.mp4'} or another size"
             raise SehdrError(f"{out}: cannot be written as a film ({error}); {remedy}") from error
     return out
+
+
+def _encoder_options(kind: Transfer, side: int) -> dict[str, str]:
+    """Return options of the encoder for pictures whose shorter side has so many pixels."""
+    if kind.codec != "libx265" or side >= _X265_SMALLEST_SIDE:
+        return kind.options
+    return kind.options | {"x265-params": kind.options["x265-params"] + _X265_SMALL}
 
 
 def film_format(out: Path | str) -> str:

@@ -1,5 +1,9 @@
 """Films read back by FFmpeg: frames, tags, and the light in their codes."""
 
+import ctypes
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -177,3 +181,22 @@ def test_names_that_ffmpeg_takes_for_more_are_names(tmp_path, monkeypatch, name)
 def test_rates_that_no_film_has_are_refused(tmp_path, fps):
     with pytest.raises(SehdrError, match="frames a second are not between"):
         write_film(AnalyticRun(), tmp_path / "f.mp4", [AnalyticRun().cameras[0].camera], fps=fps)
+
+
+def test_small_hevc_films_leave_memory_whole(tmp_path):
+    """In a process whose allocator checks each block when it is freed."""
+    checker = "libc_malloc_debug.so.0"
+    try:
+        ctypes.CDLL(checker)
+    except OSError:
+        pytest.skip("this C library has no checking allocator")
+    code = f"""
+from tests.output.helpers import AnalyticRun
+from sehdr_warp.output.film import write_film
+run = AnalyticRun()
+cameras = [entry.camera.resized(34, 24) for entry in run.cameras] * 3
+write_film(run, {str(tmp_path / "f.mp4")!r}, cameras, transfer="hlg", exposed=True)
+"""
+    environment = {**os.environ, "LD_PRELOAD": checker, "MALLOC_CHECK_": "3", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr[-300:]
