@@ -35,7 +35,8 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
         OCIO: Any = import_module("PyOpenColorIO")  # Its stubs lack what it loads from its library.
     except ImportError:
         raise SehdrError("--ocio needs OpenColorIO; run `pip install sehdr-warp[ocio]`") from None
-    refused = (OCIO.Exception, OCIO.ExceptionMissingFile)
+    # Messages quote the files, whose bytes need not be UTF-8.
+    refused = (OCIO.Exception, OCIO.ExceptionMissingFile, UnicodeDecodeError)
     try:
         read, files = _open_config(OCIO, config)
         read.validate()

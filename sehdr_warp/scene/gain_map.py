@@ -29,6 +29,7 @@ DEVIATION = 0.05
 _HEAD_BYTES = 1 << 18  # In which a file names a second picture: behind EXIF and a profile
 _ISO_JPEG = b"urn:iso:std:iso:ts:21496:-1\0"
 _APPLE_AUX = "urn:com:apple:photo:2020:aux:hdrgainmap"
+_MOST_XMP = 1 << 22  # Bytes that describe a gain map; phones write about a thousand
 _MOST_STOPS = 16.0  # Between white and the largest light; encoders state 1 to 6
 
 
@@ -218,6 +219,9 @@ def _pixels(image: Image.Image, photo: tuple[int, int]) -> np.ndarray:
 
 
 def _text(data: Any) -> str:
+    """Return XMP as text. Raises ValueError for more than a gain map needs."""
+    if len(data) > _MOST_XMP:
+        raise ValueError(f"{len(data)} bytes of XMP")
     return data.decode("utf-8", "replace") if isinstance(data, bytes) else str(data)
 
 
@@ -264,11 +268,13 @@ def _made(stated: _Parameters, encoded: np.ndarray) -> GainMap | None:
 
 def _of_xmp(xmp: str) -> _Parameters:
     """Return the parameters of Ultra HDR's XMP (hdrgm 1.0)."""
-    attributes = _xmp_values(xmp, "hdrgm")
+
+    def values(name: str) -> list[str]:
+        return _xmp_values(xmp, f"hdrgm:{name}")
 
     def numbers(name: str, default: float) -> tuple[float, ...]:
-        values = tuple(float(value) for value in attributes.get(name, ()))
-        return values if len(values) in (1, 3) else (default,)
+        stated = tuple(float(value) for value in values(name))
+        return stated if len(stated) in (1, 3) else (default,)
 
     return _Parameters(
         minimum=numbers("GainMapMin", 0.0),
@@ -277,16 +283,20 @@ def _of_xmp(xmp: str) -> _Parameters:
         base_offset=numbers("OffsetSDR", 1 / 64),
         alternate_offset=numbers("OffsetHDR", 1 / 64),
         headroom=numbers("HDRCapacityMax", 1.0)[0],
-        base_is_hdr=attributes.get("BaseRenditionIsHDR", [""])[0].lower() == "true",
+        base_is_hdr=[value.lower() for value in values("BaseRenditionIsHDR")[:1]] == ["true"],
     )
 
 
-def _xmp_values(xmp: str, prefix: str) -> dict[str, list[str]]:
-    """Return the simple values and sequences of one namespace, by name."""
-    attributes = {name: [value] for name, value in re.findall(rf'\b{prefix}:(\w+)\s*=\s*["\']([^"\']*)["\']', xmp)}
-    for name, body in re.findall(rf"<{prefix}:(\w+)[^>/]*>(.*?)</{prefix}:\1>", xmp, re.DOTALL):
-        attributes[name] = re.findall(r"<rdf:li[^>]*>([^<]*)</rdf:li>", body) or [body.strip()]
-    return attributes
+def _xmp_values(xmp: str, name: str) -> list[str]:
+    """Return what an XMP element or attribute such as `hdrgm:Gamma` states: one value, or those of its sequence.
+
+    Takes time in proportion to the length of `xmp`, whatever it holds.
+    """
+    if start := re.search(rf"<{name}(?:\s[^<>]*)?(?<!/)>", xmp):
+        body, closed, _ = xmp[start.end() :].partition(f"</{name}>")
+        if closed:
+            return re.findall(r"<rdf:li[^<>]*>([^<]*)</rdf:li>", body) or [body.strip()]
+    return re.findall(rf"""\b{name}\s*=\s*["']([^"']*)["']""", xmp)[-1:]
 
 
 def _of_iso(data: bytes) -> _Parameters:
@@ -324,9 +334,8 @@ def _of_apple(xmp: str, exif: Any) -> _Parameters:
 
     Raises ValueError if neither states it.
     """
-    headroom_text = _xmp_values(xmp, "HDRGainMap").get("HDRGainMapHeadroom")
-    if headroom_text is not None:
-        headroom = float(headroom_text[0])
+    if stated := _xmp_values(xmp, "HDRGainMap:HDRGainMapHeadroom"):
+        headroom = float(stated[0])
     else:
         note = _apple_note(exif.get_ifd(0x8769).get(0x927C, b""))
         if 33 not in note or 48 not in note:

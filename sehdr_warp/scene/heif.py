@@ -111,15 +111,18 @@ def read_items(path: Path) -> HeifItems:
 
 
 def item_bytes(path: Path, item: Item) -> bytes:
-    """Return the bytes of an item. Raises InputError if they reach beyond the file."""
+    """Return the bytes of an item. Raises InputError if they reach beyond the file, or are more than it holds."""
     if item.inside is not None:
         return item.inside
-    size, parts = path.stat().st_size, []
+    size, parts, total = path.stat().st_size, [], 0
     with path.open("rb") as file:
         for offset, length in item.extents:
             length = length or size - offset
-            if not 0 <= offset <= offset + length <= size or length > _LARGEST_ITEM:
+            total += length
+            if not 0 <= offset <= offset + length <= size:
                 raise InputError(path, f"an item reaches to byte {offset + length} of {size}", _DAMAGED)
+            if total > min(size, _LARGEST_ITEM):
+                raise InputError(path, f"the parts of an item have {total} bytes or more", _DAMAGED)
             file.seek(offset)
             parts.append(file.read(length))
     return b"".join(parts)
@@ -158,11 +161,14 @@ def _items(data: bytes, start: int, end: int) -> HeifItems:
     places = _places(data, *boxes["iloc"]) if "iloc" in boxes else {}
     inner = boxes.get("idat")
     properties = _properties(data, *boxes["iprp"]) if "iprp" in boxes else {}
-    items = {}
+    items, taken = {}, 0
     for number, (kind, flags_place) in kinds.items():
         method, extents = places.get(number, (0, ()))
         inside = None
         if method == 1 and inner is not None:
+            taken += sum(length for _, length in extents)
+            if taken > len(data):  # Parts may overlap, and be many.
+                raise ValueError(f"{taken} bytes of items in {len(data)} bytes")
             inside = b"".join(data[inner[0] + at : inner[0] + at + length] for at, length in extents)
         items[number] = Item(kind, extents, inside, properties.get(number, ()), flags_place)
     references = tuple(_references(data, *boxes["iref"])) if "iref" in boxes else ()

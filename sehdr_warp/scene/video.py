@@ -15,12 +15,15 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, SehdrError
-from .images import check_size
+from ..sandbox import read_sandboxed
+from .images import MAX_PIXELS, check_size
 
 _log = logging.getLogger("sehdr_warp.scene")
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mxf")
 _REMEDY = "copy the clip again, or convert it with FFmpeg"
+# FFmpeg's demuxers of VIDEO_SUFFIXES, by content. Others, such as playlists, would open the files that they name.
+_OPTIONS = {"format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mxf", "protocol_whitelist": "file"}
 # Codes of ITU-T H.273: transfer characteristics, color primaries and matrix coefficients.
 _HLG, _PQ, _LOG100, _LOG316 = 18, 16, 9, 10
 _UNSPECIFIED = 2
@@ -125,21 +128,43 @@ def is_video(path: Path) -> bool:
 def open_clip(path: Path) -> Clip:
     """Return what a video file states.
 
+    A process of its own reads it first, with bounds on memory and time, because FFmpeg believes the counts in a file.
+
     Raises:
         InputError: if it cannot be read, has no picture, or its frames are too large.
         SehdrError: if PyAV is not installed.
     """
+    _require_library(path)
+    read_sandboxed(first_frame_size, path, "video", _REMEDY)
     with _container(path) as container:
         stream = _stream(container, path)
-        try:
-            frame = next(iter(container.decode(stream)))
-        except StopIteration:
-            raise InputError(path, "has no frames", _REMEDY) from None
+        frame = _first_frame(container, stream, path)
         width, height = frame.width, frame.height
         check_size(path, width, height)
         size = (height, width) if _rotation(frame) % 180 else (width, height)
         seconds = float(container.duration or 0) / 1e6
         return Clip(path, size, seconds, _color(container, stream, frame))
+
+
+def first_frame_size(path: Path) -> dict[str, np.ndarray]:
+    """Return `size`, the width and height of a clip's first frame as stored; raise ValueError if it has none."""
+    try:
+        with _container(path, threads=False) as container:
+            frame = _first_frame(container, _stream(container, path), path)
+            return {"size": np.array([frame.width, frame.height])}
+    except InputError as error:
+        raise ValueError(error.problem) from None
+
+
+def _first_frame(container: Any, stream: Any, path: Path) -> Any:
+    import av
+
+    try:
+        return next(iter(container.decode(stream)))
+    except (StopIteration, EOFError):
+        raise InputError(path, "has no frames", _REMEDY) from None
+    except av.error.FFmpegError as error:  # pyright: ignore[reportAttributeAccessIssue]
+        raise InputError(path, f"its first frame is damaged ({error.strerror:.80})", _REMEDY) from None
 
 
 def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
@@ -164,7 +189,7 @@ def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
                 frames = packet.decode()
             except StopIteration:
                 return
-            except (errors.EOFError, errors.InvalidDataError) as error:
+            except errors.FFmpegError as error:
                 if isinstance(error, EOFError) or number < 0:
                     return
                 _log.warning("%s: is damaged or ends early behind frame %d", clip.path, number + 1)
@@ -213,20 +238,28 @@ def _rotation(frame: Any) -> int:
     return round(getattr(frame, "rotation", 0) or 0) % 360
 
 
-def _container(path: Path) -> Any:
-    """Return PyAV's open container. Raises InputError for a file that is none, SehdrError without PyAV."""
+def _require_library(path: Path) -> None:
+    """Raise SehdrError if PyAV is not installed."""
     try:
-        import av
+        import av  # noqa: F401
     except ImportError:
         raise SehdrError(f"{path}: video needs PyAV; run `pip install sehdr-warp[film]`") from None
+
+
+def _container(path: Path, *, threads: bool = True) -> Any:
+    """Return PyAV's open container. Raises InputError for a file that is none."""
+    import av
+
     try:
-        container = av.open(str(path))
+        # FFmpeg takes what stands before a colon for a protocol.
+        container = av.open(f"file:{path.absolute()}", options=_OPTIONS)
         for stream in container.streams.video:
-            stream.thread_type = "AUTO"
+            stream.thread_type = "AUTO" if threads else "NONE"
+            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         return container
     except (OSError, av.error.FFmpegError, ValueError) as error:  # pyright: ignore[reportAttributeAccessIssue]
         reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(path, f"cannot be read as video ({reason:.80})", _REMEDY) from None
+        raise InputError(path, f"cannot be opened ({reason:.80})", _REMEDY) from None
 
 
 def _stream(container: Any, path: Path) -> Any:

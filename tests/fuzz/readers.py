@@ -1,10 +1,12 @@
 """Every reader of files, with small real files to start from."""
 
+import gzip
 import hashlib
 import json
 import os
 import shutil
 import struct
+import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,6 +24,7 @@ from sehdr_warp.model.confidence import Evidence
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.output.camera_exchange import usd_cameras
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
+from sehdr_warp.output.ocio import ocio_view
 from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.own_files import LIST
 from sehdr_warp.response import response_by_name
@@ -29,22 +32,33 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import assemble_field, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter, write_confidence
+from sehdr_warp.runs.values import FORMAT
 from sehdr_warp.scene import load_cameras, load_scene
 from sehdr_warp.scene.colmap_model import read_ply_points
+from sehdr_warp.scene.color_encoding import stated_encoding
 from sehdr_warp.scene.exposure import exif_exposure
+from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
+from sehdr_warp.scene.images import open_image
 from sehdr_warp.scene.linear_photos import color_matrix, raw_exposure
 from sehdr_warp.scene.masks import read_mask
 from sehdr_warp.scene.photos import photo_sizes, read_photo
 from sehdr_warp.scene.read_folders import read_colmap, read_hdr_nerf_real, read_llff
+from sehdr_warp.scene.read_opensfm import read_opensfm
 from sehdr_warp.scene.read_transforms import read_hdr_nerf, read_transforms
-from sehdr_warp.splats import USD_SUFFIXES, GaussianArrays, read_gaussians, write_gaussians
+from sehdr_warp.scene.video import codes, decode, open_clip
+from sehdr_warp.scene.video_frames import choose_frames
+from sehdr_warp.splats import LOSSY_SUFFIXES, USD_SUFFIXES, GaussianArrays, read_gaussians, write_gaussians
 from sehdr_warp.synth.expose import RadianceView
 from sehdr_warp.training.train import create_trainer
 from sehdr_warp.training.trainer import Trainer
 from tests.make_scenes import pattern, write_blender, write_colmap, write_llff, write_reinhard
 from tests.output.helpers import camera
+from tests.scene.clips import pan, write_clip
+from tests.scene.dng_files import area, gain_map, mosaic, opcodes, write_tagged_dng
+from tests.scene.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
 from tests.scene.raw_files import write_dng
+from tests.scene.test_color_encoding import icc_profile
 from tests.training.toy import orbit_camera, toy_scene
 
 
@@ -238,7 +252,8 @@ def _splats(*suffixes: str) -> Callable[[Path], None]:
         arrays = [np.full((3, *shape), 0.25, np.float32) for shape in ((3,), (3,), (4,), (), (4, 3))]
         for suffix in suffixes:
             write_gaussians(
-                folder / f"a{suffix}", GaussianArrays(*arrays, {".glb": "display"}.get(suffix, "linear"), 0.5)
+                folder / f"a{suffix}",
+                GaussianArrays(*arrays, "display" if suffix in (".glb", *LOSSY_SUFFIXES) else "linear", 0.5),
             )
         if ".usda" in suffixes:
             (folder / "b.usda").write_text(
@@ -291,6 +306,190 @@ def _llff_seconds(folder: Path) -> None:
     np.save(folder / "poses_bounds_exps.npy", np.c_[rows, np.full(len(rows), 0.5)])
 
 
+def _heif(folder: Path, name: str, pixels: np.ndarray, **options) -> Path:
+    """A photo as .heic or .avif."""
+    image = Image.fromarray(pixels)
+    if name.endswith(".avif"):
+        image.save(folder / name, quality=90, **options)
+    else:
+        import pillow_heif
+
+        pillow_heif.from_pillow(image).save(folder / name, quality=90, **options)
+    return folder / name
+
+
+def _gain_maps(folder: Path) -> None:
+    base, gain = pattern(16, 12), pattern(8, 6)[..., 0]
+    iso = 0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0" + iso_metadata(2.5, channels=3)
+    write_jpeg_pair(folder / "iso.jpg", base, gain, [iso])
+    write_jpeg_pair(folder / "xmp.jpg", base, gain, [xmp_segment({"GainMapMax": "2.5", "HDRCapacityMax": "2.5"})])
+    apple = xmp_segment({"HDRGainMapHeadroom": "4"}, "HDRGainMap", "http://ns.apple.com/HDRGainMap/1.0/")
+    write_jpeg_pair(folder / "apple.jpg", base, gain, [apple])
+    for suffix in (".heic", ".avif"):
+        files = [_heif(folder, f"{n}{suffix}", p) for n, p in (("b", base), ("g", np.repeat(gain[..., None], 3, 2)))]
+        write_heif_pair(folder / f"iso{suffix}", *files, iso=iso_metadata(2.5))
+        if suffix == ".heic":
+            write_heif_pair(folder / "apple.heic", *files, apple_xmp=apple[1].partition(b"\0")[2])
+        for file in files:
+            file.unlink()
+
+
+def _read_light(path: Path):
+    found = read_gain_map(path, oriented=True)
+    return has_gain_map(path), light_of(read_photo(path), found) if found is not None else None
+
+
+def _heic(folder: Path) -> None:
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    tags.get_ifd(0x8769)[33434] = 0.01
+    for name in ("a.heic", "a.avif"):
+        _heif(folder, name, pattern(16, 12), exif=tags.tobytes())
+    import pillow_heif
+
+    deep = np.linspace(0, 65535, 16 * 12 * 3).astype(np.uint16)
+    pillow_heif.from_bytes("RGB;16", (16, 12), deep.tobytes()).save(folder / "deep.heic", quality=90)
+
+
+def _icc(folder: Path) -> None:
+    (folder / "matrix.icc").write_bytes(icc_profile("Display P3"))
+    (folder / "gamma.icc").write_bytes(icc_profile("Adobe RGB (1998)", 2.2))
+    table = b"curv\0\0\0\0" + struct.pack(">I9H", 9, *range(0, 65536, 8191))
+    (folder / "table.icc").write_bytes(icc_profile("sRGB", curve=table))
+
+
+def _read_icc(path: Path):
+    """Through a photo that holds it, which is read all the same if the profile is damaged."""
+    photo = path.with_suffix(".jpg")
+    try:
+        Image.fromarray(pattern(8, 6)).save(photo, icc_profile=path.read_bytes())
+    except (ValueError, OSError):  # A profile that no JPEG holds
+        return None
+    pixels = read_photo(photo).pixels
+    with open_image(photo) as image:
+        encoding = stated_encoding(image)
+    return encoding.to_linear(pixels) if encoding is not None else None
+
+
+def _video(folder: Path) -> None:
+    frames = list(pan(12, 48, 64, 4))  # x265 damages memory below 50 pixels.
+    for name in ("a.mp4", "a.mkv", "a.avi", "a.mts"):
+        write_clip(folder / name, frames, codec="libx264", pixels="yuv420p")
+    write_clip(folder / "hlg.mov", frames, tags=(18, 9, 9), pixels="yuv420p10le", rotation=90)
+    write_clip(folder / "lossless.mkv", frames, codec="ffv1")
+
+
+def _read_video(path: Path):
+    clip = open_clip(path)
+    chosen = choose_frames(clip)
+    return [codes(frame, clip.color) for _, frame in decode(clip, set(chosen.numbers[:2]))]
+
+
+def _sog(folder: Path) -> None:
+    _splats(".sog")(folder)
+    with zipfile.ZipFile(folder / "a.sog") as archive:
+        archive.extractall(folder / "parts")
+
+
+def _read_sog(folder: Path):
+    """The file, and one of its parts whose checksums fit."""
+    with zipfile.ZipFile(folder / "b.sog", "w") as archive:
+        for part in sorted((folder / "parts").iterdir()):
+            archive.write(part, part.name)
+    problem = None
+    for name in ("a.sog", "b.sog"):
+        try:
+            read_gaussians(folder / name)
+        except SehdrError as error:
+            problem = problem or error
+    if problem:
+        raise problem
+
+
+def _spz(folder: Path) -> None:
+    _splats(".spz")(folder)
+    (folder / "plain.spz").write_bytes(gzip.decompress((folder / "a.spz").read_bytes()))
+
+
+def _ocio(folder: Path) -> None:
+    rows = "".join(f"{r} {g} {b}\n" for b in (0, 1) for g in (0, 1) for r in (0, 1))
+    (folder / "look.cube").write_text(f"LUT_3D_SIZE 2\n{rows}")
+    (folder / "curve.spi1d").write_text("Version 1\nFrom 0 1\nLength 3\nComponents 1\n{\n0\n0.4\n1\n}\n")
+    (folder / "own.ocio").write_text("""ocio_profile_version: 2
+search_path: .
+roles: {default: raw, scene_linear: raw, aces_interchange: raw, cie_xyz_d65_interchange: raw}
+file_rules:
+  - !<Rule> {name: Default, colorspace: default}
+displays:
+  D:
+    - !<View> {name: V, colorspace: out}
+colorspaces:
+  - !<ColorSpace>
+    name: raw
+  - !<ColorSpace>
+    name: out
+    from_scene_reference: !<GroupTransform>
+      children:
+        - !<FileTransform> {src: look.cube, interpolation: linear}
+        - !<FileTransform> {src: curve.spi1d}
+        - !<MatrixTransform> {matrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
+        - !<ExponentTransform> {value: [2.2, 2.2, 2.2, 1]}
+""")
+
+
+def _read_ocio(folder: Path):
+    return ocio_view(str(folder / "own.ocio"), "V")(np.full((2, 2, 3), 0.18, np.float32))
+
+
+def _dng_opcodes(folder: Path) -> None:
+    size, stored = (24, 32), np.full((24, 32), 9000, np.uint16)
+    rows = struct.pack(">I", 24) + np.linspace(0.5, 1.5, 24).astype(">f4").tobytes()
+    lists = {
+        "map": {51009: opcodes(gain_map(np.full((3, 4), 1.5), size))},
+        "row": {51009: opcodes((12, area(size) + rows), (8, area(size) + struct.pack(">I2d", 1, 0.05, 0.8)))},
+        "bad": {51008: opcodes((5, struct.pack(">3I", 0, 1, 1) + struct.pack(">6I", 4, 6, 2, 3, 4, 5)))},
+        "lens": {
+            51022: opcodes((3, struct.pack(">7d", 1, 0, 0, 0, 0, 0.5, 0.5)),
+                           (1, struct.pack(">I8d", 1, 0.9, 0, 0, 0, 0, 0, 0.5, 0.5)))
+        },
+    }  # fmt: skip
+    for name, tags in lists.items():
+        write_tagged_dng(folder / f"{name}.dng", stored, tags)
+    write_tagged_dng(folder / "linear.dng", np.repeat(stored[..., None], 3, 2))
+    write_tagged_dng(folder / "mosaic.dng", (mosaic(np.full((24, 32, 3), 0.3)) * 65535).astype(np.uint16))
+
+
+def _summary(folder: Path) -> None:
+    (folder / "summary.json").write_text(json.dumps({"format": FORMAT} | SUMMARY))
+
+
+def _plan(folder: Path) -> None:
+    (folder / "plan.json").write_text(json.dumps({"format": FORMAT} | PLAN))
+
+
+def _metrics(folder: Path) -> None:
+    lines = [{"iteration": n, "seconds": 0.5, "psnr_ldr": 20.0, "psnr_hdr": None} for n in range(3)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def _opensfm(folder: Path) -> None:
+    (folder / "images").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        Image.fromarray(pattern(16, 12)).save(folder / "images" / name)
+    perspective = {"projection_type": "perspective", "width": 16, "height": 12, "focal": 0.8, "k1": 0.01, "k2": 0.0}
+    shots = {
+        name: {"camera": "c", "rotation": [0.1, 0.2, 0.3 * n], "translation": [0.5, 0.25, 2.0], "gps_dop": 5}
+        for n, name in enumerate(("a.jpg", "b.jpg"))
+    }
+    points = {"1": {"coordinates": [1.0, 2.0, 3.0], "color": [255, 0, 0]}}
+    model = {"cameras": {"c": perspective}, "shots": shots, "points": points}
+    (folder / "reconstruction.json").write_text(json.dumps([model]))
+
+
+def _chan(folder: Path) -> None:
+    (folder / "own.chan").write_text("".join(f"{n} 0.5 1.5 {n}.0 10 20 30 45.5\n" for n in range(1, 5)))
+
+
 _RUN_FILES = ("*.json", "metrics.jsonl")
 READERS = {
     "colmap-binary": Reader(_colmap(True), ("sparse/0/*.bin",), read_colmap, cost=3),
@@ -317,6 +516,20 @@ READERS = {
     "cameras-of-others": Reader(_cameras_of_others, ("*.json",), each(load_cameras), text=True, cost=0.7),
     "ply": Reader(_splats(".ply"), ("*",), each(read_gaussians), text=True, cost=0.7),
     "glb": Reader(_splats(".glb"), ("*",), each(read_gaussians), text=True, repair=_rechunk, cost=0.5),
+    "compressed-ply": Reader(_splats(".compressed.ply"), ("*",), each(read_gaussians), text=True, cost=0.7),
+    "sog": Reader(_sog, ("*.sog", "parts/*"), _read_sog, text=True, cost=3),
+    "spz": Reader(_spz, ("*",), each(read_gaussians), cost=0.4),
+    "gain-maps": Reader(_gain_maps, ("*",), each(_read_light), cost=2),
+    "heic": Reader(_heic, ("*",), each(photo_sizes, exif_exposure, _read_photo), cost=2),
+    "icc": Reader(_icc, ("*.icc",), each(_read_icc), cost=2),
+    "video": Reader(_video, ("*",), each(_read_video), cost=60),
+    "dng-opcodes": Reader(_dng_opcodes, ("*",), each(photo_sizes, raw_exposure, _read_photo), cost=4),
+    "summary": Reader(_summary, ("*",), lambda folder: RunFolder(folder).read_summary(), text=True, cost=0.3),
+    "plan": Reader(_plan, ("*",), lambda folder: RunFolder(folder).read_decisions(), text=True, cost=0.3),
+    "metrics": Reader(_metrics, ("*",), lambda folder: RunFolder(folder).read_metrics(), text=True, cost=0.3),
+    "ocio": Reader(_ocio, ("*",), _read_ocio, text=True, cost=3),
+    "opensfm": Reader(_opensfm, ("reconstruction.json",), read_opensfm, text=True, cost=1),
+    "chan": Reader(_chan, ("*",), each(load_cameras), text=True, cost=0.5),
     "usd": Reader(_splats(*USD_SUFFIXES), ("*",), each(_read_usd), text=True, cost=20),
 }
 

@@ -48,6 +48,28 @@ def forked(words, seconds: float) -> sandbox.Result:
         return sandbox.Result(code, out.read(), told.read())
 
 
+def fork_server():
+    """What stands for sandbox.start: a copy of this process as it is now forks for each sandbox.
+
+    Decoders that a process has used leave threads and locks behind, which do not survive its fork.
+    """
+    ours, theirs = get_context("fork").Pipe()
+    if os.fork() == 0:
+        ours.close()
+        try:
+            while True:
+                theirs.send(tuple(forked(*theirs.recv())))
+        finally:
+            os._exit(0)
+    theirs.close()
+
+    def start(words, seconds: float) -> sandbox.Result:
+        ours.send((words, seconds))
+        return sandbox.Result(*ours.recv())
+
+    return start
+
+
 def seed_of(name: str, seed: int, index: int) -> int:
     """The random seed of one input: (reader, seed, index) makes it again."""
     return zlib.crc32(f"{name}/{seed}/{index}".encode())
@@ -111,7 +133,7 @@ def _child(pipe, name: str, folder: Path, options, first: int, inputs: int) -> N
     torch.set_num_threads(1)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + (options.memory << 20),) * 2)
-    sandbox.start = forked
+    sandbox.start = fork_server()
     for message in fuzz(name, folder, options.seed, first, inputs - first, options.seconds):
         pipe.send(message)
 

@@ -9,12 +9,12 @@ from sehdr_warp.errors import InputError
 
 from .mutate import mutate
 from .readers import READERS, Reader, Workspace
-from .run import forked, fuzz, make_input, share, try_input
+from .run import fork_server, fuzz, make_input, share, try_input
 
 
 @pytest.fixture(autouse=True)
 def quick_children(monkeypatch):
-    monkeypatch.setattr(sandbox, "start", forked)
+    monkeypatch.setattr(sandbox, "start", fork_server())
 
 
 @pytest.mark.parametrize("name", list(READERS))

@@ -22,7 +22,9 @@ HELD_BY = {
     "trial/test_cases.py::test_sparse_files_of_4_gib_are_not_read_whole runs/test_run_folder.py::test_sparse_files",
     "Pipes and devices are not read": "trial/test_cases.py::test_inputs_that_are_pipes_are_not_waited_for",
     "Names in a data set stay inside": "test_files.py::test_",
-    "OpenUSD and MATLAB files": "test_sandbox.py::test_bounds test_sandbox.py::test_a_stage_leads_to_no_other_folder",
+    "OpenUSD and MATLAB files": "test_sandbox.py::test_bounds test_sandbox.py::test_a_stage_leads_to_no_other_folder "
+    "scene/test_video.py::test_counts_beyond_the_file_take_no_memory "
+    "scene/test_video.py::test_a_clip_that_names_other_files_is_refused",
     "TOML presets, OpenColorIO configs": "output/test_ocio.py::test_luts_that_cannot_be_read_are_told_in_a_line",
     "It reads the paths": "trial/test_cases.py::test_obstacles_are_kept",
     "It writes only to the paths": "trial/test_strangers.py::test_names_of_output",

@@ -93,7 +93,7 @@ def test_luts_beside_a_config_are_read(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "kind", ["missing", "damaged", "no lut", "cycle", "pipe", "device", "folder", "sparse", "empty"]
+    "kind", ["missing", "damaged", "no lut", "cycle", "pipe", "device", "folder", "sparse", "empty", "not text"]
 )
 def test_luts_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
     lut = tmp_path / "x.cube"
@@ -109,6 +109,8 @@ def test_luts_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
     transform = f"!<FileTransform> {{src: {source}}}"
     if kind == "cycle":
         transform = "!<ColorSpaceTransform> {src: out, dst: raw}"
+    if kind == "not text":
+        lut.write_bytes(b"LUT_3D_SIZE \xff\n0 0 0\n")
     with pytest.raises(InputError) as error:
         ocio_view(config_of(tmp_path, transform), "V")
     assert "\n" not in str(error.value) and len(str(error.value)) < 900

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import time
 
 import numpy as np
 import pytest
@@ -238,3 +239,24 @@ def test_light_of_a_display_p3_photo_ends_in_rec709(tmp_path):
     matrix = colour.matrix_RGB_to_RGB(spaces["Display P3"], spaces["sRGB"])
     found = np.where(view.codes == 65535, view.light_above_white, linear(view.codes))
     assert_light(found, light @ matrix.T, channels=3)
+
+
+@pytest.mark.parametrize(
+    "text", ["<hdrgm:a>", "<hdrgm:Gamma>", "<hdrgm:Gamma ", "hdrgm:Gamma=", "<rdf:li", "<hdrgm:" + "a" * 50]
+)
+def test_long_metadata_take_no_long_time(tmp_path, text):
+    _, base, gain = pair()
+    marker, body = hdrgm()
+    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [(marker, body + (text * (64000 // len(text))).encode()[:64000])])
+    started = time.process_time()
+    assert read_gain_map(tmp_path / "a.jpg") is not None
+    assert time.process_time() - started < 1
+
+
+def test_values_as_elements_and_sequences(tmp_path):
+    _, base, gain = pair()
+    listed = "".join(f"<rdf:li>{value}</rdf:li>" for value in (1.0, 2.0, 3.0))
+    inner = f"<hdrgm:GainMapMax><rdf:Seq>{listed}</rdf:Seq></hdrgm:GainMapMax><hdrgm:Gamma>2</hdrgm:Gamma>"
+    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [(0xFFE1, b"http://ns.adobe.com/xap/1.0/\0" + inner.encode())])
+    found = read_gain_map(tmp_path / "a.jpg")
+    assert found.maximum.tolist() == [1, 2, 3] and found.gamma.tolist() == [2, 2, 2]

@@ -1,5 +1,7 @@
 """HEIC and AVIF photos: pixels, orientation, EXIF, depth, and what is wrong with damaged ones."""
 
+import struct
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -85,3 +87,32 @@ def test_boxes_that_cannot_be(tmp_path):
         broken = heif.read_items(tmp_path / "b.heic")
         for item in broken.items.values():
             heif.item_bytes(tmp_path / "b.heic", item)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_parts_of_an_item_that_overlap_take_no_memory(tmp_path, inside):
+    """A thousand parts, each of them the whole file or all of its inner data."""
+    file, extents = tmp_path / "a.heic", ((0, 1000),) * 1000
+    file.write_bytes(bytes(2000))
+    if not inside:
+        with pytest.raises(InputError, match="parts of an item have"):
+            heif.item_bytes(file, heif.Item("mime", extents))
+        return
+
+    def full(kind, payload, version=0):
+        return struct.pack(">I4sI", 12 + len(payload), kind, version << 24) + payload
+
+    places = struct.pack(">BBHHHHH", 0x44, 0, 1, 1, 1, 0, len(extents)) + b"".join(
+        struct.pack(">II", *e) for e in extents
+    )
+    boxes = (
+        full(b"pitm", struct.pack(">H", 1))
+        + full(b"iloc", places, 1)
+        + struct.pack(">I4s", 1008, b"idat")
+        + bytes(1000)
+    )
+    listed = full(b"infe", struct.pack(">HH4s", 1, 0, b"mime") + b"\0", 2)
+    boxes += full(b"iinf", struct.pack(">H", 1) + listed)
+    file.write_bytes(struct.pack(">I4s", 16, b"ftyp") + b"heic" + bytes(4) + full(b"meta", boxes))
+    with pytest.raises(InputError, match="1000000 bytes of items"):
+        heif.read_items(file)

@@ -1,6 +1,9 @@
 """Clips that the test encodes: what their streams state, and which of their frames are used."""
 
 import logging
+import resource
+import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,11 +116,40 @@ def test_clips_that_cannot_be_used(tmp_path):
         with pytest.raises(InputError, match=match):
             choose_frames(open_clip(tmp_path / "a.mp4"))
 
-    refused("cannot be read as video", b"\0\0\0\x18ftypisom" + bytes(500))
+    refused(r"cannot be read as video \(ValueError: cannot be opened", b"\0\0\0\x18ftypisom" + bytes(500))
     write_clip(tmp_path / "a.mp4", [next(iter(pan(1)))] * 30, codec="libx264", pixels="yuv420p")
     refused("its camera hardly moves .* that shows no depth; walk with the camera")
     write_clip(tmp_path / "a.mp4", pan(2), codec="libx264", pixels="yuv420p")
     refused("holds 2 frames")
+
+
+@pytest.mark.parametrize("text", ["ffconcat version 1.0\nfile other.mp4\n", "#EXTM3U\n#EXTINF:10,\nother.mp4\n"])
+def test_a_clip_that_names_other_files_is_refused(tmp_path, text):
+    write_clip(tmp_path / "other.mp4", pan(4), codec="libx264", pixels="yuv420p")
+    (tmp_path / "clip.mp4").write_text(text)
+    with pytest.raises(InputError, match="cannot be opened"):
+        open_clip(tmp_path / "clip.mp4")
+
+
+def test_a_name_with_a_colon_is_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_clip(tmp_path / "12:30.mp4", pan(4), codec="libx264", pixels="yuv420p")
+    assert open_clip(Path("12:30.mp4")).size == (128, 96)
+
+
+def test_counts_beyond_the_file_take_no_memory(tmp_path):
+    """A table of 50 million samples, for which FFmpeg would take 3 GB."""
+    file = tmp_path / "a.mp4"
+    write_clip(file, pan(8), codec="libx264", pixels="yuv420p")
+    data = bytearray(file.read_bytes())
+    sizes, chunks = data.index(b"stsz"), data.index(b"stsc")
+    data[sizes + 8 : sizes + 16] = struct.pack(">II", 1, 50_000_000)
+    data[chunks + 16 : chunks + 20] = struct.pack(">I", 50_000_000)
+    file.write_bytes(data)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="cannot be read as video"):
+        open_clip(file)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 << 10
 
 
 def test_a_clip_that_ends_early_gives_what_it_has(tmp_path):
