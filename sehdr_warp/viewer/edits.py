@@ -1,5 +1,7 @@
-"""Edits of a page: crops with undo, and the up direction and scale that are kept with a run."""
+"""Edits of a page: crops and gains of lights with undo, and the up direction and scale that are kept with a run."""
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,9 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..errors import SehdrError
+from ..model.lights import Light
 from ..output.splat_edits import SplatEdits
 from ..output.world_transform import world_transform, write_orientation
+from ..splats.arrays import HARMONIC_0
 
+MOST_GAIN = 20.0
+"""Largest gain of a light, in stops up or down."""
 _HIDDEN_LOGIT = -30.0  # Of an opacity below 1/255, which is not drawn
 
 
@@ -42,6 +49,50 @@ class EditedOpacities:
             logits[torch.from_numpy(~stays).to(logits.device)] = _HIDDEN_LOGIT
         self.original = None if edits is None else original
         return int(stays.sum())
+
+
+@dataclass
+class LightGains:
+    """Makes lights of a model brighter or darker by the colors of their Gaussians.
+
+    Attributes:
+        original: The harmonics before the first gain: [N, 3] and [N, K, 3]; None without gains.
+    """
+
+    original: tuple[Tensor, Tensor] | None = None
+
+    def apply(self, run: Any, lights: Sequence[Light], stops: Mapping[int, float]) -> None:
+        """Show lights with gains, and all others as they were trained.
+
+        Args:
+            run: The run that is shown.
+            lights: Its lights.
+            stops: Gain of each light that has one, by its index.
+
+        Raises:
+            SehdrError: For a gain that cannot be, or a model whose lights cannot be scaled.
+        """
+        model = run.model
+        if model.color_model.encoded or model.fusion is not None:
+            raise SehdrError("gains need radiance without fusion, such as that of the default preset")
+        for index, gain in stops.items():
+            if not 0 <= index < len(lights):
+                raise SehdrError(f"light {index} is not one of the {len(lights)} lights")
+            if not abs(gain) <= MOST_GAIN:  # NaN is not.
+                raise SehdrError(f"gain {gain} is not between -{MOST_GAIN:g} and {MOST_GAIN:g} stops")
+        parts = model.gaussians.harmonics_dc, model.gaussians.harmonics_rest
+        original = self.original or tuple(part.detach().clone() for part in parts)
+        with torch.no_grad():
+            for part, values in zip(parts, original, strict=True):
+                part.copy_(values)
+            for index, gain in stops.items():
+                members = lights[index].members.to(parts[0].device)
+                if model.color_model.name == "log":
+                    parts[0][members] += gain * math.log(2) / HARMONIC_0
+                else:
+                    for part in parts:
+                        part[members] *= 2.0**gain
+        self.original = original if stops else None
 
 
 def edits_of(request: dict) -> SplatEdits | None:

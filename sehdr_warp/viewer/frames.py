@@ -5,16 +5,19 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sehdr_warp.scene import Camera
 
+from ..model.lights import Light
 from ..output.camera_paths import facts_of_cameras
 from ..output.light_pictures import curve_table, display_gain
+from ..output.light_unit import luminance_of_one
 from ..output.splat_edits import SplatEdits
 from ..output.world_transform import world_transform
-from .edits import EditedOpacities
+from .edits import EditedOpacities, LightGains
 
 MOST_PIXELS = 4096 * 2304
 _HALF_MOST = 65504.0
@@ -36,13 +39,53 @@ class ViewerScene:
         self.run, self.name, self.clipped = run, name, clipped
         self.lock, self.version = threading.Lock(), 0
         self.opacities, self.shown_count = EditedOpacities(), None
+        self._start_lights()
+
+    def _start_lights(self) -> None:
+        """Forget lights and gains, because another scene is shown."""
+        self.light_gains, self._lights = LightGains(), None
+        self._stops: dict[int, float] = {}
 
     def replace(self, run: Any, clipped: Tensor | None) -> None:
         """Show another run from now on."""
         with self.lock:
             self.run, self.clipped = run, clipped
             self.opacities, self.shown_count = EditedOpacities(), None
+            self._start_lights()
             self.version += 1
+
+    def lights(self) -> list[Light]:
+        """Return the lights of the scene, found at the first call; none if it does not state what clipped."""
+        with self.lock:
+            if self._lights is None:
+                self._lights = [] if self.clipped is None else self.run.find_lights()
+            return self._lights
+
+    def set_gain(self, light: int, stops: float) -> None:
+        """Show a light brighter by so many stops than it was trained; see LightGains.apply."""
+        lights = self.lights()
+        with self.lock:
+            gains = {index: value for index, value in (self._stops | {light: stops}).items() if value != 0}
+            self.light_gains.apply(self.run, lights, gains)
+            self._stops = gains
+            self.version += 1
+
+    def describe_lights(self) -> dict[str, Any]:
+        """Return what the page lists of the lights, as plain values."""
+        rows = [
+            {
+                "shape": light.shape.kind,
+                "position": light.shape.position.tolist(),
+                "size": max(light.shape.size),
+                "radiance": float(np.mean(light.radiance)),
+                "certain": float(np.mean(light.lower_bound)),
+                "deviation": light.deviation,
+                "share": light.share,
+                "stops": self._stops.get(index, 0.0),
+            }
+            for index, light in enumerate(self.lights())
+        ]
+        return {"lights": rows, "unit": luminance_of_one(self.run)}
 
     def edit(self, edits: SplatEdits | None) -> None:
         """Show what edits leave of the scene, or all of it for None; see EditedOpacities.apply."""

@@ -116,6 +116,12 @@ class Viewer:
             )
             run.turned()
             return "application/json", json.dumps(run.facts()).encode()
+        if path in ("/lights", "/gain") and self.training is None:
+            run = self._run(request)
+            if path == "/gain":
+                light, stops = int(request["light"]), float(request["stops"])
+                self._on_renderer(client, partial(run.set_gain, light, stops))
+            return "application/json", json.dumps(self._on_renderer(client, run.describe_lights)).encode()
         if path in ("/path", "/save"):
             cameras = [camera_of(camera) for camera in request["cameras"][:MOST_VIEWS]]
             if not cameras:

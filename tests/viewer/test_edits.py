@@ -1,14 +1,21 @@
+"""Edits in the viewer: crops, gains of lights, up and scale."""
+
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.world_transform import world_transform
+from sehdr_warp.scene import Camera
 from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Server, Viewer
 
 from ..output.test_splat_edits import run_of, splats
+from .browser import browser, page_of
 from .test_server import ask, frame
 
 
@@ -22,6 +29,76 @@ def server(tmp_path):
     yield server
     server.shutdown()
     server.server_close()
+
+
+@pytest.fixture
+def lamps(tmp_path):
+    """A viewer of two Gaussians, of which the second is a light."""
+    run = run_of(tmp_path, replace(splats([(-1, 0, 0), (1, 0, 0)], [0.9, 0.9]), color_model="log"), "lamps")
+    run.path = tmp_path
+    shape = LightShape("sphere", np.array([1.0, 0, 0]), np.eye(3), (0.3, 0.3))
+    run.find_lights = lambda: [Light(shape, np.full(3, 8.0), np.ones(3), 0.75, 0.4, torch.tensor([1]))]
+    server = Server(Viewer([ViewerScene(run, "run", torch.tensor([0.0, 1.0]))]), port=18500)
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_light_is_listed_and_made_brighter(lamps):
+    view = lamps.viewer.runs[0].cameras[1].camera
+    before = frame(lamps, view)[0]
+    found = json.loads(ask(lamps, "/lights", {})[2])
+    assert found["unit"] is None and found["lights"][0] == {
+        "shape": "sphere",
+        "position": [1, 0, 0],
+        "size": 0.3,
+        "radiance": 8,
+        "certain": 1,
+        "deviation": 0.75,
+        "share": 0.4,
+        "stops": 0,
+    }
+    status, _, content = ask(lamps, "/gain", {"light": 0, "stops": 2})
+    assert status == 200 and json.loads(content)["lights"][0]["stops"] == 2
+    ratio = frame(lamps, view)[0][..., :3] / np.maximum(before[..., :3], 1e-6)
+    half = view.width // 2
+    sides = sorted(float(np.median(side[side > 0])) for side in (ratio[:, :half], ratio[:, half:]))
+    assert sides == pytest.approx([1, 4], rel=0.01)
+    ask(lamps, "/gain", {"light": 0, "stops": 1})  # Of what was trained, not of the last gain.
+    assert frame(lamps, view)[0][..., :3].max() == pytest.approx(2 * before[..., :3].max(), rel=0.01)
+    assert ask(lamps, "/gain", {"light": 0, "stops": 0})[0] == 200
+    np.testing.assert_array_equal(frame(lamps, view)[0], before)
+
+
+def test_gains_that_cannot_be_are_refused(lamps, server):
+    for request in ({"light": 1, "stops": 1}, {"light": 0, "stops": 99}, {"light": -1, "stops": 1}):
+        assert ask(lamps, "/gain", request)[0] == 409
+    assert ask(lamps, "/gain", {"light": 0})[0] == 400
+    assert json.loads(ask(server, "/lights", {})[2])["lights"] == []  # Nothing states what clipped.
+    status, _, words = ask(server, "/gain", {"light": 0, "stops": 1})
+    assert status == 409 and b"gains need radiance" in words
+
+
+def test_the_page_flies_to_a_light_and_sets_its_gain(lamps):
+    move = "range => ['input', 'change'].forEach(name => { range.value = 3; range.dispatchEvent(new Event(name)); })"
+    with browser() as chromium, page_of(chromium, lamps.url) as page:
+        page.wait_for_selector("#stage[data-frame=full]")
+        page.click("#findLights")
+        page.click(".light button")
+        page.evaluate(
+            "async () => { while (!(Math.abs(camera.pivot[0] - 1) < 1e-6)) await new Promise(requestAnimationFrame); }"
+        )
+        page.wait_for_selector("#stage[data-frame=full]")
+        listed = page.text_content(".light")
+        assert "lamp 1: 40 % of the light" in listed and "0.8 stops" in listed
+        seen = Camera.from_dict(page.evaluate("window.viewer.camera()"))
+        x, y, z, _ = seen.world_to_camera @ np.array([1, 0, 0, 1])
+        assert z > 0 and abs(x) < 1e-6 and abs(y) < 1e-6
+        with page.expect_response("**/gain") as answer:
+            page.locator(".light input").evaluate(move)
+        assert answer.value.ok and page.text_content(".light output") == "+3.0 EV"
+    assert lamps.viewer.runs[0].describe_lights()["lights"][0]["stops"] == 3
 
 
 def edit(server, **request):

@@ -43,6 +43,12 @@ class FlyingCamera {
     this.ahead *= factor;
     this.position = add(about, this.forward, -this.ahead);
   }
+  // Stands at a place and looks at another, upright.
+  face(place, target) {
+    const away = add(target, place, -1), ahead = Math.hypot(...away), forward = unit(away), side = cross(forward, this.up);
+    this.position = place, this.ahead = ahead, this.forward = forward;
+    this.right = unit(Math.hypot(...side) > 1e-3 ? side : this.right), this.down = cross(forward, this.right);
+  }
   fly(right, up, forward) {
     this.position = add(add(add(this.position, this.right, right), this.down, -up), this.forward, forward);
   }

@@ -31,7 +31,7 @@ async function start() {
     if (runs.length > 1) $("left").add(new Option(run.name, "run" + i));
   });
   $("runRow").hidden = runs.length < 2;
-  $("edit").hidden = $("share").hidden = told.training;
+  $("edit").hidden = $("lights").hidden = $("share").hidden = told.training;
   if (told.training) startTraining();
   else setInterval(renew, 2000);
   useRun(0);
@@ -58,7 +58,9 @@ function useRun(index) {
   light.putCurve(facts.curve);
   light.settings.grey = facts.grey;
   $("overlay").querySelector("[value=clipped]").disabled = !facts.clipped;
+  if (state.run !== index) listLights(null);
   state.run = index;
+  $("findLights").disabled = !facts.clipped;
   measured();
   expose();
 }
@@ -436,6 +438,41 @@ for (const name of ["crop", "cut"]) $(name).addEventListener("click", () => {
 });
 $("undo").addEventListener("click", () => { state.region = {}; change("edit", {}, () => "all of it is shown"); });
 measured();
+
+// Lights: a list to fly to, with a gain for each
+function listLights(told) {
+  const unit = told && told.unit, value = x => unit ? `${figure(unit * x)} cd/m\u00b2` : figure(x);
+  $("lightList").replaceChildren(...(told ? told.lights : []).map((lamp, i) => {
+    const make = (kind, values = {}) => Object.assign(document.createElement(kind), values), row = make("div", {className: "light"});
+    const name = `${lamp.shape === "rect" ? "panel" : "lamp"} ${i + 1}: ${(100 * lamp.share).toFixed(lamp.share < 0.1 ? 1 : 0)} % of the light`;
+    const sure = lamp.deviation === null ? "" : ` \u00b1 ${lamp.deviation.toFixed(1)} stops`, button = make("button", {textContent: name, title: "fly there"});
+    const range = make("input", {type: "range", min: -6, max: 6, step: 0.1, value: lamp.stops, ariaLabel: `gain of light ${i + 1}, stops`});
+    const stops = make("output", {textContent: stopsText(lamp.stops)});
+    row.append(button, stops, make("span", {className: "quiet", textContent: `${value(lamp.radiance)}, certain ${value(lamp.certain)}${sure}`}), make("span"), range);
+    button.addEventListener("click", () => flyTo(lamp));
+    range.addEventListener("input", () => { stops.textContent = stopsText(Number(range.value)); });
+    range.addEventListener("change", () => gain(i, Number(range.value)));
+    return row;
+  }));
+  $("lightNote").textContent = told && !told.lights.length ? "the photos clip no light" : "";
+}
+// From the side of the photos, near enough to see the light large.
+function flyTo(lamp) {
+  const places = facts.views.map(view => centerOf(view.camera)), middle = places[0] ? [0, 1, 2].map(i => places.reduce((sum, p) => sum + p[i], 0) / places.length) : camera.position;
+  const away = add(middle, lamp.position, -1), distance = Math.hypot(...away), near = Math.min(0.9 * distance, 5 * lamp.size);
+  camera.face(add(lamp.position, away, near / (distance || 1)), lamp.position);
+  moved();
+}
+async function gain(light, stops) {
+  try {
+    await ask("gain", {run: state.run, light, stops});
+    moved();
+  } catch (error) { $("lightNote").textContent = error.message; }
+}
+$("findLights").addEventListener("click", async () => {
+  $("lightNote").textContent = "\u2026";
+  try { listLights(await (await ask("lights", {run: state.run})).json()); } catch (error) { $("lightNote").textContent = error.message; }
+});
 $("asPhoto").addEventListener("click", () => {
   const view = facts.views[Number($("view").value)];
   if (view) { state.stops = bounded(Math.log2(view.time / facts.base_time)); expose(); }
