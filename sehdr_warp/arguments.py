@@ -200,6 +200,22 @@ def parse_numbers(flag: str, text: str, kind: type = float, minimum: float = -ma
     raise InputError(f"{flag} {text}", f"not {expected} separated by commas", f"write for example {flag}=1,2")
 
 
+def parse_pairs(flag: str, text: str | None) -> dict[str, str] | None:
+    """Return the pairs of a list such as partition=gpu,time=240; None for None.
+
+    Raises:
+        InputError: for anything else.
+    """
+    if text is None:
+        return None
+    pairs = dict(item.partition("=")[::2] for item in text.split(","))
+    if not all(name and value for name, value in pairs.items()):
+        raise InputError(
+            f"{flag} {text}", "not NAME=VALUE separated by commas", f"write for example {flag}=partition=gpu"
+        )
+    return pairs
+
+
 def require_positive(flag: str, value):
     """Return the value of a flag if it is above 0.
 

@@ -56,12 +56,12 @@ def load_photos(data: Mapping[str, Any], **options: Any) -> Scene:
     """Load the scene that saved arguments of load_scene describe, and log its notes.
 
     Args:
-        data: "path" and any of LOAD_OPTIONS.
+        data: "path" and any of LOAD_OPTIONS, and "views" if only some views are to be read.
         options: Further arguments of load_scene, such as response.
     """
     from ..scene import load_scene
 
-    scene = load_scene(data["path"], **{name: data.get(name) for name in LOAD_OPTIONS}, **options)
+    scene = load_scene(data["path"], **{name: data.get(name) for name in (*LOAD_OPTIONS, "views")}, **options)
     for note in scene.notes:
         log.info("%s", note)
     return scene
@@ -85,7 +85,7 @@ def load_run_photos(run: Run, data: str | None) -> Scene:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).is_dir():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    return load_photos({**run.data, "path": place}, response=_response_for_loading(run.config, run.response))
+    return load_photos({**run.data, "path": place}, response=response_for_loading(run.config, run.response))
 
 
 def load_run_photos_with_confidence(run: Run, data: str | None) -> Scene:
@@ -105,11 +105,11 @@ def enclosing_run_response(folder: Path) -> Response | str | None:
     for place in map(RunFolder, folder.resolve().parents):
         if place.info.is_file() and place.checkpoints.is_dir():
             with suppress(InputError):  # A run.json of another program.
-                return _response_for_loading(place.read_config(), Response.from_dict(place.read_info()["response"]))
+                return response_for_loading(place.read_config(), Response.from_dict(place.read_info()["response"]))
     return None
 
 
-def _response_for_loading(config: Config, response: Response) -> Response | str:
+def response_for_loading(config: Config, response: Response) -> Response | str:
     """Return the response to load a run's photos with.
 
     A learned response is not known at load time, and linear photos were encoded anew when they were loaded: for both

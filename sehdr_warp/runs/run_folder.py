@@ -19,7 +19,7 @@ import json
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from ..errors import InputError, SehdrError
 from ..files import UnreadableError, refuse_links
+from ..model.confidence import Evidence
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.images import MAX_PIXELS
@@ -159,9 +160,13 @@ class RunFolder:
             raise InputError(self.info, str(error), REMEDY) from None
         return info
 
+    def read_scene(self) -> dict:
+        """Return the values of scene.json, see describe_scene()."""
+        return self._read(self.scene, lambda path: read_values(path, SceneValues))
+
     def read_cameras(self) -> tuple[CameraEntry, ...]:
         """Return the views of the scene, in its order."""
-        views = self._read(self.scene, lambda path: read_values(path, SceneValues))["views"]
+        views = self.read_scene()["views"]
         try:
             return tuple(_camera_entry(view) for view in views)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -169,7 +174,7 @@ class RunFolder:
 
     def check_same_scene(self, scene: Scene) -> None:
         """Raise InputError if the run was trained on other views, cameras or photos than a scene's."""
-        saved = self._read(self.scene, lambda path: read_values(path, SceneValues))
+        saved = self.read_scene()
         current = json.loads(json.dumps(describe_scene(scene)))
         photos, current_photos = _split_photos(saved), _split_photos(current)
         for name in ("layout", "views"):
@@ -247,7 +252,22 @@ class RunFolder:
         tensors = self._confidence_tensors(None)
         return None if tensors is None else tensors.get("clipped")
 
-    def _confidence_tensors(self, checkpoint_hash: str | None) -> dict[str, Tensor] | None:
+    def read_evidence(self, checkpoint: Checkpoint) -> Evidence:
+        """Return the evidence of the training photos for a checkpoint's Gaussians.
+
+        Raises:
+            InputError: If it was not measured for this checkpoint, or is damaged.
+        """
+        names = tuple(field.name for field in fields(Evidence))
+        tensors = self._confidence_tensors(checkpoint.values["sha256"], names)
+        count = checkpoint.tensors["gaussians.means"].shape[:1]
+        if tensors is None or any(tensors[name].shape != count for name in names):
+            raise InputError(self.confidence, "is not of the newest checkpoint", "continue with --resume")
+        return Evidence(**tensors)
+
+    def _confidence_tensors(
+        self, checkpoint_hash: str | None, names: tuple[str, ...] = ("confidence", "clipped")
+    ) -> dict[str, Tensor] | None:
         """Return the tensors beside a checkpoint; None if there are none, or they are another checkpoint's."""
         from safetensors import SafetensorError, safe_open
 
@@ -260,7 +280,7 @@ class RunFolder:
                 metadata = json.loads((file.metadata() or {}).get("sehdr_warp", "{}"))
                 if checkpoint_hash and metadata != confidence_metadata(checkpoint_hash):
                     return None
-                return {name: file.get_tensor(name) for name in ("confidence", "clipped")}
+                return {name: file.get_tensor(name) for name in names}
         except PermissionError as error:
             raise UnreadableError(path, error) from None
         except (SafetensorError, OSError, ValueError, KeyError, RuntimeError, RecursionError) as error:

@@ -129,25 +129,40 @@ class RunWriter(RunFolder):
 
         All of it is on the disk before anything of a run to be overwritten is removed.
         """
-        from .. import __version__
-
         for name in (scene.name, data.get("path") or "", *(view.name for view in scene.views)):
             require_text(name)
         require_readable(data)
         self.lock()
         self.check(resume=False, overwrite=overwrite)  # Reading the photos took time.
-        info = {"format": FORMAT, "version": __version__, "scene": scene.name, "data": data}
+        info = {"scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
         info["normalization"] = field.normalization.to_dict()
         if scene.color_matrix is not None:
             info["color_matrix"] = scene.color_matrix.tolist()
         if gains is not None:
             info["exposure_compensation"] = gains.to_dict()
+        self.begin_described(describe_scene(scene), info, config, plan, state)
+
+    def begin_described(
+        self, scene: dict, info: dict, config: Config, plan: dict | None, state: tuple[dict[str, Tensor], dict]
+    ) -> None:
+        """Write the files of a new run in the locked folder, in place of those of an earlier one.
+
+        Args:
+            scene: As from describe_scene().
+            info: Values of run.json, without format and version.
+            config: The config.
+            plan: Values of plan.json, if there is a plan.
+            state: Tensors and values of its first checkpoint.
+        """
+        from .. import __version__
+
+        info = {"format": FORMAT, "version": __version__} | info
         with atomic_folder(self.path / NEW, ours=True) as beside:
             new = RunWriter(beside)
             if plan is not None:
                 write_json(new.plan, plan)
-            write_json(new.scene, describe_scene(scene))
+            write_json(new.scene, scene)
             write_json(new.info, info)
             write_json(new.config, config.model_dump())
             new.write_checkpoint(*state, kept=1)

@@ -48,6 +48,7 @@ class DataValues(Values):
     exposure_index: _Photos | None = None
     max_size: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     holdout: _Photos | None = None
+    views: Annotated[list[Text], Field(max_length=1_000_000)] | None = None
 
 
 class GainValues(Values):

@@ -1,7 +1,7 @@
 """Load a scene: parse a data folder of any layout, choose the response, preprocess the photos."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -48,6 +48,7 @@ def load_scene(
     holdout: int | None = None,
     cache: Path | str | None = None,
     photos: str = "auto",
+    views: Collection[str] | None = None,
 ) -> Scene:
     """Read a folder of posed or bare photos, whatever its layout.
 
@@ -71,6 +72,7 @@ def load_scene(
         cache: a folder for results of structure from motion; None is the user's ($SEHDR_CACHE).
         photos: where they are stored: "memory", "disk" (in a nameless file beside the cache, removed with the process),
             or "auto" for the disk if they would take more than half of the free memory.
+        views: names of the views to read; None reads all. Response, splits and colors are those of the whole set.
 
     Returns:
         A Scene in the set's own world coordinates, with the points that the set has.
@@ -108,8 +110,16 @@ def load_scene(
         curve, chosen_by = choose_response(dataset, method, candidates), (method, tuple(map(str, candidates)))
     elif str(curve) == "learned":
         curve = response_by_name("srgb")
-    scene = preprocess(dataset, curve, max_size, photos)  # pyright: ignore[reportArgumentType]
-    named_views = zip(unique_names(dataset.records), dataset.records, strict=True)
+    names = unique_names(dataset.records)
+    if views is not None:
+        chosen = [index for index, name in enumerate(names) if name in views]
+        if missing := sorted(set(views) - set(names)):
+            problem = f"{len(missing)} of the views that were named are missing, {missing[0]} first"
+            raise InputError(path, problem, "put the photos back as they were")
+        names = [names[index] for index in chosen]
+        dataset = replace(dataset, records=tuple(dataset.records[index] for index in chosen))
+    scene = preprocess(dataset, curve, max_size, photos, names)  # pyright: ignore[reportArgumentType]
+    named_views = zip(names, dataset.records, strict=True)
     if guessed := {name for name, record in named_views if not record.time_known}:
         from .exposure_estimate import with_estimated_times
 

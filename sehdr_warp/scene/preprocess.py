@@ -37,7 +37,11 @@ _PIXELS_AT_ONCE = 64_000_000  # Pixels of the photos that are read in parallel, 
 
 
 def preprocess(
-    dataset: DataparserOutputs, response: "Response", max_size: int | None = None, photos: str = "auto"
+    dataset: DataparserOutputs,
+    response: "Response",
+    max_size: int | None = None,
+    photos: str = "auto",
+    names: Sequence[str] | None = None,
 ) -> Scene:
     """Undistort and resize the photos of a dataset.
 
@@ -48,11 +52,13 @@ def preprocess(
         response: decodes codes to the light in which averages are taken.
         max_size: longest side of the views in pixels; None keeps the photos' sizes.
         photos: where views are stored, see PhotoKeeper.
+        names: of the views; by default unique_names() of the records.
 
     Raises:
         InputError: if a file is damaged, sizes disagree, or the photos show nothing but black or white.
     """
-    preprocessor, names = _Preprocessor(max_size, response, dataset.alpha), unique_names(dataset.records)
+    preprocessor = _Preprocessor(max_size, response, dataset.alpha)
+    names = unique_names(dataset.records) if names is None else names
     keeper = PhotoKeeper(photos, len(names), sum(record.lens.width * record.lens.height for record in dataset.records))
     # OpenEXR and LibRaw are read one at a time: their output to the terminal is suppressed for the whole process.
     quiet = any(record.hdr is not None or kind_of(record.image) != "encoded" for record in dataset.records)
@@ -65,9 +71,8 @@ def preprocess(
         else:
             views.append(keeper.store(view))
     damaged = left_out(problems, len(names))
-    deque(
-        require_content(((view.codes, view.mask) for view in views if view.split == "train"), dataset.folder), maxlen=0
-    )
+    training = [view for view in views if view.split == "train"] or views
+    deque(require_content(((view.codes, view.mask) for view in training), dataset.folder), maxlen=0)
     masks = mask_note(list(preprocessor.mask_shares.values()))
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud

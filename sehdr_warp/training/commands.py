@@ -6,16 +6,17 @@ torch is imported when they run.
 import json
 import logging
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
 import tyro
 from tyro.conf import Positional
 
-from ..errors import SehdrError, UsageError
+from ..errors import InputError, SehdrError, UsageError
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.open import LOAD_OPTIONS, load_photos
@@ -47,6 +48,8 @@ class TrainingOptions:
     """Steps; by default planned from the photos."""
     seed: int | None = None
     """Seed of every random number."""
+    blocks: str | None = None
+    """Divide the photos by space into N blocks, trained one by one and merged; auto chooses N."""
     plan_only: bool = False
     """Print what the scene does not need, and why; train nothing."""
 
@@ -76,7 +79,9 @@ class MachineOptions:
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
     gpus: int = 1
-    """GPUs of this machine to train on."""
+    """GPUs of this machine to train on; with --blocks, blocks to train at once."""
+    slurm: str | None = None
+    """Train blocks as SLURM jobs with these parameters, such as partition=gpu,time=240 (minutes)."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +137,11 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     gpus, place = args.machine.gpus, launched_as()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
-    if place is None and gpus > 1 and not args.training.plan_only:
+    if _in_blocks(args):
+        if place is not None:
+            raise UsageError("--blocks starts its own processes; leave torchrun out")
+        _train_blocks(args)
+    elif place is None and gpus > 1 and not args.training.plan_only:
         from .launch import launch
 
         device_of_rank(gpus - 1, args.machine.device)
@@ -177,12 +186,11 @@ def _train(args: Train, ranks=None) -> None:
         resumed = folder
     elif output.resume:
         log.info("%s holds no run yet: a training begins there", out)
-    data = _data(args, resumed)
-    config = _config(args, resumed)
+    data = _data(args, None if resumed is None else resumed.read_info()["data"])
+    config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     options = config.response
-    photos = {"device": "memory"}.get(config.schedule.photo_cache, config.schedule.photo_cache)
-    selection = {"method": options.method, "candidates": options.candidates, "photos": photos}
+    selection = {"method": options.method, "candidates": options.candidates, "photos": _photo_storage(config)}
     if out is not None:
         check_dataset_truth(data, config)
     with nullcontext() if out is None or device.type != "cpu" else _precompiling(config):
@@ -205,10 +213,79 @@ def _train(args: Train, ranks=None) -> None:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
         with viewed(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
             follow(steps, trainer.total)
-    run = trainer.run
+    _print_result(args, trainer.run, partial(advice, train_photos=len(trainer.scene.train_views)))
+
+
+def _photo_storage(config) -> str:
+    """Return where load_scene() stores the photos of a training."""
+    return {"device": "memory"}.get(config.schedule.photo_cache, config.schedule.photo_cache)
+
+
+def _print_result(args: Train, run, advice: Callable[[Path, dict], list[str]] | None = None) -> None:
+    """Print what a training wrote, and advice for a finished one."""
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
-    hints = advice(run.path, summary, len(trainer.scene.train_views)) if summary.get("finished") else []
-    print(json.dumps(summary | {"advice": hints}) if output.json else "\n".join([_ending(run.path, summary), *hints]))
+    hints = advice(run.path, summary) if advice is not None and summary.get("finished") else []
+    lines = [_ending(run.path, summary), *hints]
+    print(json.dumps(summary | {"advice": hints}) if args.output.json else "\n".join(lines))
+
+
+def _in_blocks(args: Train) -> bool:
+    """Return whether a command line trains in blocks, which --resume continues without --blocks too."""
+    from ..blocks.train import is_in_blocks
+
+    options, output = args.training, args.output
+    if options.blocks is not None:
+        if options.blocks != "auto" and not (options.blocks.isdecimal() and int(options.blocks) >= 2):
+            raise UsageError(f"--blocks {options.blocks} is neither auto nor a number of 2 or more")
+        if output.view or output.tensorboard:
+            raise UsageError("--view and --tensorboard are without effect with --blocks; view the run when it is done")
+        return not options.plan_only
+    if args.machine.slurm is not None:
+        raise UsageError("--slurm is of --blocks, whose blocks become SLURM jobs")
+    if output.out is None or not is_in_blocks(output.out) or options.plan_only:
+        return False
+    if output.overwrite:
+        raise InputError(output.out, "holds a training in blocks", "choose another folder, or add --blocks")
+    return output.resume
+
+
+def _train_blocks(args: Train) -> None:
+    """Train or resume a run in blocks, or one training if the number is `auto` and one training does."""
+    from ..arguments import parse_pairs
+    from ..blocks.block_plan import BlockPlan
+    from ..blocks.train import is_in_blocks, train_in_blocks
+    from ..runs.device import pick_device
+    from .ranks import device_of_rank
+
+    output, machine = args.output, args.machine
+    if output.out is None:
+        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
+    device = pick_device(machine.device)
+    if machine.gpus > 1:
+        device_of_rank(machine.gpus - 1, machine.device)
+    plan = BlockPlan.read(output.out) if output.resume and is_in_blocks(output.out) else None
+    data, config = (
+        (_data(args, None), _config(args, None))
+        if plan is None
+        else (_data(args, plan.data), _config(args, plan.config))
+    )
+    blocks = args.training.blocks
+    run = train_in_blocks(
+        data,
+        output.out,
+        config,
+        int(blocks) if blocks not in (None, "auto") else None,
+        device=device,
+        gpus=machine.gpus,
+        slurm=parse_pairs("--slurm", machine.slurm),
+        resume=output.resume,
+        overwrite=output.overwrite,
+        photos=_photo_storage(config),
+    )
+    if run is None:
+        _train(args)
+    else:
+        _print_result(args, run)
 
 
 def _precompiling(config):
@@ -237,8 +314,8 @@ def run_config(args: ShowConfig) -> None:
     print(json.dumps(config.model_dump()) if args.json else configs.config_as_toml(config, args.diff))
 
 
-def _data(args: Train, resumed) -> dict:
-    """Return the arguments of load_scene() of the command line, or else of the run that is resumed."""
+def _data(args: Train, known: Mapping | None) -> dict:
+    """Return the arguments of load_scene() of the command line, or else those of the run that is resumed."""
     from ..scene import is_embedded
 
     path = args.data
@@ -246,9 +323,9 @@ def _data(args: Train, resumed) -> dict:
         path = str(Path(path).absolute())
         require_text(path)
     options = {"path": path} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
-    if resumed is not None:
-        known = resumed.read_info()["data"]
+    if known is not None:
         options = {name: known.get(name) if value is None else value for name, value in options.items()}
+        options |= {"views": known["views"]} if known.get("views") else {}
     if options["path"] is None and args.output.resume:
         raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
     if options["path"] is None:
@@ -256,16 +333,16 @@ def _data(args: Train, resumed) -> dict:
     return options
 
 
-def _config(args: Train, resumed):
-    """Return the config of the preset, or of the run that is resumed, with the fields of the command line."""
+def _config(args: Train, saved):
+    """Return the config of the preset, or that of the run that is resumed, with the fields of the command line."""
     options = args.training
     shortcuts = {"response.name": args.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}
     named = {path: value for path, value in shortcuts.items() if value is not None}
     flags = {"response.name": "--response", "schedule.iterations": "--iterations", "seed": "--seed"}
     for path, text in configs.named_fields(args.fields).items():
         named[path], flags[path] = configs.value_of(path, text), configs.flag_of(path)
-    if resumed is not None and options.preset is None:
-        return configs.override_config(resumed.read_config(), named, flags=flags)
+    if saved is not None and options.preset is None:
+        return configs.override_config(saved, named, flags=flags)
     config = configs.load_config(options.preset or "default", named, flags)
     user_fields = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
     return configs.override_config(config, {"plan.keep": sorted(user_fields)})

@@ -103,6 +103,27 @@ class Compensation:
     decision: Decision
 
 
+@dataclass(frozen=True)
+class SharedDecisions:
+    """Decisions that several trainings of one set of photos share, so that their Gaussians have the same colors.
+
+    Attributes:
+        base_time: Exposure time dt_1 that colors refer to, seconds.
+        gains: The compensation of all photos; None if there is no drift.
+    """
+
+    base_time: float
+    gains: ExposureCompensation | None
+
+    def gains_of(self, views: Sequence[View]) -> ExposureCompensation | None:
+        """Return the compensation of some views alone."""
+        if self.gains is None:
+            return None
+        names = {view.name for view in views}
+        parts = ({name: value for name, value in part.items() if name in names} for part in vars(self.gains).values())
+        return ExposureCompensation(*parts)
+
+
 def estimates_compensation(scene: Scene, config: Config, response: Response) -> bool:
     """Return whether a training estimates a compensation.
 

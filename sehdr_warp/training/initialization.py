@@ -72,6 +72,7 @@ def make_field(
     response: Response,
     device: torch.device | str,
     matcher: Callable[[], Matcher] | None = None,
+    time: float | None = None,
 ) -> RadianceField:
     """Return the field at iteration 0, in the normalized coordinates of the scene.
 
@@ -81,18 +82,20 @@ def make_field(
         response: of the camera.
         device: that the field is on.
         matcher: makes what matches the photos, in normalized coordinates.
+        time: exposure time that colors refer to, seconds; by default base_time().
 
     Raises:
         InputError: for a scene that cannot be trained.
     """
     check_views(scene)
+    time = time or base_time(scene)
     normalization = normalization_of(scene)
     scene = normalization.scene(scene)
     scene = replace(scene, views=perspective_views(scene.train_views))
     rng = np.random.default_rng(config.seed)
     if config.model.init_file:
-        gaussians = start_gaussians(scene, config, response, rng, normalization)
-        return assemble_field(gaussians, config, response, base_time(scene), normalization).to(device)
+        gaussians = start_gaussians(scene, config, response, rng, normalization, time)
+        return assemble_field(gaussians, config, response, time, normalization).to(device)
     matcher = matcher or partial(make_matcher, scene, response, device)
     points, colors = start_points(scene, config, matcher, rng)
     most = config.densification.cap_max
@@ -102,18 +105,23 @@ def make_field(
     dc = color_model(config.model.radiance).start(colors, response)
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
     gaussians = Gaussians.from_points(points, dc, config.model.sh_degree)
-    return assemble_field(gaussians, config, response, base_time(scene), normalization).to(device)
+    return assemble_field(gaussians, config, response, time, normalization).to(device)
 
 
 def start_gaussians(
-    scene: Scene, config: Config, response: Response, rng: np.random.Generator, normalization: Normalization
+    scene: Scene,
+    config: Config,
+    response: Response,
+    rng: np.random.Generator,
+    normalization: Normalization,
+    time: float,
 ) -> Gaussians:
     """Return the Gaussians of the file that model.init_file names, in the config's color model and degree.
 
     Display colors count as codes of the scene's own photos; radiance is in the scene's units. The file is in the
     scene's own coordinates; the scene and the result are in normalized ones.
     """
-    read, time = to_normalized(read_gaussians(config.model.init_file), normalization), base_time(scene)
+    read = to_normalized(read_gaussians(config.model.init_file), normalization)
     if read.count > config.densification.cap_max:
         read = read.rows(np.sort(rng.choice(read.count, config.densification.cap_max, replace=False)))
     degree = config.model.sh_degree

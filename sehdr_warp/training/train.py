@@ -18,7 +18,7 @@ from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
 from ..scene import Scene
 from ..scene.normalization import normalization_of
-from .compensation import estimate_compensation, estimates_compensation
+from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from .following import send_training, several_ranks_notes
 from .hdr_truth import check_scene_truth
 from .initialization import choose_response, make_field, make_matcher, sizes_of
@@ -64,6 +64,7 @@ def create_trainer(
     tensorboard: bool = False,
     data: dict[str, Any] | None = None,
     ranks: Ranks | None = None,
+    shared: SharedDecisions | None = None,
 ) -> Trainer:
     """Create the trainer of a scene, or of a run to resume.
 
@@ -79,6 +80,7 @@ def create_trainer(
         tensorboard: Write event files to out/tensorboard (needs the extra `tensorboard`).
         data: Arguments of load_scene() ("path", "exposure_index", "max_size", ...), saved to load the photos again.
         ranks: Processes that train together, of which this one leads.
+        shared: Decisions of a larger set that this scene is part of; by default they are made for this scene.
 
     Raises:
         InputError: If scene, folder or config cannot be used.
@@ -93,8 +95,9 @@ def create_trainer(
             if resumes:
                 trainer = _resume(scene, folder, config, device, ranks, tensorboard)
             else:
+                config = config or Config()
                 trainer = _begin(
-                    scene, folder, config or Config(), device, ranks, tensorboard, data or {}, overwrite=overwrite
+                    scene, folder, config, device, ranks, tensorboard, data or {}, shared, overwrite=overwrite
                 )
             if ranks is not None:
                 send_training(ranks, trainer.scene, trainer)
@@ -116,6 +119,7 @@ def _begin(
     ranks: Ranks | None,
     tensorboard: bool,
     data: dict[str, Any],
+    shared: SharedDecisions | None,
     *,
     overwrite: bool,
 ) -> Trainer:
@@ -127,14 +131,19 @@ def _begin(
     response = choose_response(scene, config)
     matcher, gains = cache(partial(make_matcher, normalized, response, device)), None
     compensated = scene
-    if plan is not None and estimates_compensation(scene, config, response):
+    if shared is not None:
+        gains = shared.gains_of(scene.views)
+        compensated = scene if gains is None else gains.normalize_photos(scene, response)
+        matcher = cache(partial(make_matcher, normalization_of(scene).scene(compensated), response, device))
+    elif plan is not None and estimates_compensation(scene, config, response):
         with watch:
             result = estimate_compensation(normalized, config, response, device)
         gains, plan = result.gains, plan.with_decision(result.decision)
         matcher = lambda: result.matcher  # noqa: E731
         compensated = scene if gains is None else gains.normalize_photos(scene, response)
     with watch:
-        field = make_field(compensated, config, response, device, matcher)
+        time = None if shared is None else shared.base_time
+        field = make_field(compensated, config, response, device, matcher, time)
     output = RunOutput(folder, config, tensorboard=tensorboard)
     trainer = Trainer(compensated, config, field, matcher=matcher, ranks=ranks, output=output)
     trainer.seconds = watch.seconds

@@ -57,6 +57,7 @@ ALLOWED = {
         "evaluation.metrics",
         "evaluation.protocols",
     },
+    "blocks": ANY | {"training", "runs", "scene", "response", "model", "splats", "evaluation.metrics", "process"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "model.exposure"},
     "check": ANY | {"kernels.constants", "rasterizer", "runs.device"},
 }

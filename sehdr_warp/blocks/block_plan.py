@@ -1,0 +1,338 @@
+"""What all blocks of a set share, decided once and written to blocks.json in the folder of the merged run.
+
+Response, exposure times, exposure compensation, base time and coordinates are those of the whole set, measured on
+reduced photos. They are decided before any block is trained, so colors agree at the borders between blocks.
+"""
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from PIL import Image
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from ..errors import InputError, SehdrError
+from ..files import read_json, write_json
+from ..response import Response
+from ..runs.config import REFERENCE_ITERATIONS, Config
+from ..runs.config_files import config_from_dict, field_and_problem, override_config
+from ..runs.open import load_photos
+from ..runs.values import DataValues, GainValues, NormalizationValues
+from ..scene import Scene
+from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.normalization import Normalization, normalization_of
+from ..training.compensation import SharedDecisions, estimate_compensation, estimates_compensation
+from ..training.initialization import base_time, check_views, choose_response, match_points
+from ..training.matching import LARGEST_SIDE
+from ..training.plan import STEPS_PER_PHOTO
+from .division import Cell, Division, divide, largest_count, weights_of
+
+log = logging.getLogger(__name__)
+
+FORMAT = 1
+FILE = "blocks.json"
+FEWEST_POINTS, MATCHED = 500, 4000  # With fewer points in the set, pixels are matched to divide by
+MOST_MATCHED = 400  # Photos that are matched for that
+OVERLAP = 1.3  # Photos and Gaussians of all blocks together, relative to the whole set, for the choice of their number
+
+
+class BlockValues(BaseModel):
+    """A block in blocks.json."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=True)
+    name: str
+    views: list[str]
+    fraction: Annotated[float, Field(gt=0, le=1)]
+    low: list[float | None]
+    high: list[float | None]
+    margin: list[FiniteFloat]
+
+
+class BlockPlanValues(BaseModel):
+    """The object in blocks.json."""
+
+    model_config = ConfigDict(strict=True)
+    format: int
+    scene: str
+    data: DataValues
+    response: dict[str, Any]
+    base_time: Annotated[float, Field(gt=0)]
+    normalization: NormalizationValues
+    exposure_compensation: GainValues | None
+    exposure_times: dict[str, Annotated[float, Field(gt=0)]]
+    config: dict[str, Any]
+    axes: list[list[FiniteFloat]]
+    blocks: list[BlockValues]
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block.
+
+    Attributes:
+        name: Folder of its run, below `blocks/`.
+        views: Names of its views, training and held-out.
+        fraction: Pixels of its training photos, relative to those of all.
+        cell: Its core, in the axes of the plan.
+        margin: [3] enlargement of the core.
+    """
+
+    name: str
+    views: tuple[str, ...]
+    fraction: float
+    cell: Cell
+    margin: np.ndarray
+
+
+@dataclass(frozen=True)
+class BlockPlan:
+    """The blocks of a set, and what they share.
+
+    Attributes:
+        scene: Name of the set.
+        data: Arguments of load_scene() for the whole set.
+        response: The camera response.
+        normalization: Coordinates of the merged run.
+        shared: Base time and exposure compensation.
+        exposure_times: By view, seconds, before the compensation.
+        config: Requested options of each block, before its own plan.
+        axes: [3, 3] rows are the axes of the cells in scene coordinates.
+        blocks: The blocks.
+    """
+
+    scene: str
+    data: dict[str, Any]
+    response: Response
+    normalization: Normalization
+    shared: SharedDecisions
+    exposure_times: Mapping[str, float]
+    config: Config
+    axes: np.ndarray
+    blocks: tuple[Block, ...]
+
+    @property
+    def division(self) -> Division:
+        """The division of space, without the photos."""
+        margins = np.stack([block.margin for block in self.blocks])
+        return Division(self.axes, tuple(block.cell for block in self.blocks), margins, ())
+
+    def config_of(self, block: Block) -> Config:
+        """Return the config of a block: its part of the budget of Gaussians."""
+        root, fields = math.sqrt(block.fraction), {}
+        # These are multiples of the root of the block's pixels, and the budget of the set is divided by its pixels.
+        for path in ("mcmc.cap_density", "model.initial_density"):
+            table, name = path.split(".")
+            fields[path] = getattr(getattr(self.config, table), name) * root
+        if "densification.cap_max" in self.config.plan.keep:
+            fields["densification.cap_max"] = max(1, round(self.config.densification.cap_max * block.fraction))
+        return override_config(self.config, fields, block.name)
+
+    def write(self, folder: Path) -> None:
+        """Write blocks.json."""
+        gains = self.shared.gains
+        values = {
+            "format": FORMAT,
+            "scene": self.scene,
+            "data": self.data,
+            "response": self.response.to_dict(),
+            "base_time": self.shared.base_time,
+            "normalization": self.normalization.to_dict(),
+            "exposure_compensation": None if gains is None else gains.to_dict(),
+            "exposure_times": dict(self.exposure_times),
+            "config": self.config.model_dump(),
+            "axes": self.axes.tolist(),
+            "blocks": [_block_values(block) for block in self.blocks],
+        }
+        write_json(folder / FILE, values, ours=True)
+
+    @staticmethod
+    def read(folder: Path) -> "BlockPlan":
+        """Read blocks.json; raise InputError if it cannot be used."""
+        path = folder / FILE
+        values, remedy = read_json(path, 256 << 20), "train again, with --overwrite"
+        try:
+            BlockPlanValues.model_validate(values)
+            response = Response.from_dict(values["response"])
+            blocks = tuple(_block_from(each) for each in values["blocks"])
+        except ValidationError as error:
+            raise InputError(path, field_and_problem(error)[1], remedy) from None
+        except (SehdrError, ValueError) as error:
+            raise InputError(path, str(error), remedy) from None
+        if values["format"] != FORMAT:
+            raise InputError(path, f"is of format {values['format']}, not {FORMAT}", remedy)
+        gains = values["exposure_compensation"]
+        shared = SharedDecisions(values["base_time"], None if gains is None else ExposureCompensation.from_dict(gains))
+        return BlockPlan(
+            values["scene"],
+            values["data"],
+            response,
+            Normalization.from_dict(values["normalization"]),
+            shared,
+            values["exposure_times"],
+            config_from_dict(values["config"], path),
+            np.array(values["axes"], np.float64),
+            blocks,
+        )
+
+
+def make_block_plan(
+    data: dict[str, Any], config: Config, device: torch.device, count: int | None, **selection: Any
+) -> BlockPlan | None:
+    """Decide what all blocks of a set share, and divide the set.
+
+    Args:
+        data: Arguments of load_scene() for the set.
+        config: Options of the training.
+        device: Device to measure on.
+        count: Number of blocks; None chooses it.
+        selection: Further arguments of load_scene(): method, candidates, photos.
+
+    Returns:
+        The plan; None if `count` is None and one training does.
+
+    Raises:
+        InputError: If the set cannot be divided, or nothing can be shared between its blocks.
+    """
+    _check(config, data)
+    size = min(data.get("max_size") or LARGEST_SIDE, LARGEST_SIDE)
+    scene = load_photos(data | {"max_size": size}, response=config.response.name, **selection)
+    check_views(scene)
+    response = choose_response(scene, config)
+    times = {view.name: view.exposure_time for view in scene.views}
+    normalization = normalization_of(scene)
+    gains = None
+    if config.plan.enabled and estimates_compensation(scene, config, response):
+        result = estimate_compensation(normalization.scene(scene), config, response, device)
+        gains = result.gains
+        log.info("plan: %s: %s (%s)", result.decision.name, result.decision.choice, result.decision.reason)
+    compensated = scene if gains is None else gains.normalize_photos(scene, response)
+    shared = SharedDecisions(base_time(compensated), gains)
+    views = scene.train_views
+    cameras = [view.camera for view in views]
+    points = _places(compensated, response, device)
+    if count is None:
+        count = blocks_for(len(views), _pixels(scene, data.get("max_size")), config)
+        division = largest_count(scene.name, cameras, points, count) if count > 1 else None
+        if division is None:
+            reason = "its photos do not show different places" if count > 1 else "its photos are few enough"
+            log.info("plan: blocks: none: one training does for this set: %s", reason)
+            return None
+    else:
+        division = divide(scene.name, cameras, points, count)
+    plan = BlockPlan(
+        scene.name,
+        data,
+        response,
+        normalization,
+        shared,
+        times,
+        config,
+        division.axes,
+        _blocks(scene, division, points),
+    )
+    sizes = ", ".join(str(len(own)) for own in division.photos)
+    log.info("plan: blocks: %d, with %s of %d training photos", len(plan.blocks), sizes, len(views))
+    return plan
+
+
+def blocks_for(photos: int, pixels: float, config: Config) -> int:
+    """Return the number of blocks for a set: what one training has steps and Gaussians for goes into each.
+
+    Args:
+        photos: Number of training photos.
+        pixels: Of these photos.
+        config: Options of the training.
+    """
+    by_photos = OVERLAP * photos * STEPS_PER_PHOTO / REFERENCE_ITERATIONS
+    wanted = config.mcmc.cap_density * math.sqrt(pixels)
+    by_gaussians = OVERLAP * wanted / config.densification.cap_max
+    if "densification.cap_max" in config.plan.keep or config.densification.strategy != "mcmc":
+        by_gaussians = 0.0
+    return max(1, math.ceil(max(by_photos, by_gaussians) - OVERLAP + 1))
+
+
+def _check(config: Config, data: Mapping[str, Any]) -> None:
+    """Raise InputError for options whose networks would differ between blocks."""
+    path = data.get("path") or "photos"
+    if config.response.name == "learned":
+        problem = "each block would learn a response of its own, and colors would differ at borders"
+        raise InputError(path, f"--blocks with a learned response: {problem}", "use --response auto or a name")
+    if config.fusion.enabled and not config.plan.enabled:
+        problem = "--blocks with fusion.enabled: each block would train a fusion of its own"
+        raise InputError(path, problem, "leave the fusion out, or train without --blocks")
+    if config.model.init_file:
+        problem = "--blocks with model.init_file: all blocks would start from the whole file"
+        raise InputError(path, problem, "leave the file out, or train without --blocks")
+
+
+def _places(scene: Scene, response: Response, device: torch.device) -> np.ndarray:
+    """Return points [P, 3] of what the training photos show: those of the set, or matched ones if it has few."""
+    if len(scene.points) >= FEWEST_POINTS or any(not view.camera.is_pinhole for view in scene.train_views):
+        if len(scene.points) == 0:
+            return np.stack([view.camera.position for view in scene.train_views])
+        return scene.points
+    views = scene.train_views[:: -(-len(scene.train_views) // MOST_MATCHED)]
+    part = replace(scene, views=views)
+    return match_points(part, MATCHED, response=response, device=device)[0]
+
+
+def _pixels(scene: Scene, max_size: int | None) -> float:
+    """Return the approximate number of pixels of all training photos at the size of the training."""
+    view = scene.train_views[0]
+    width, height = view.camera.width, view.camera.height
+    factor = 1.0
+    if view.source is not None and max(width, height) == LARGEST_SIDE:
+        try:
+            with Image.open(view.source) as photo:
+                longest = max(photo.size)
+            factor = (min(longest, max_size or longest) / LARGEST_SIDE) ** 2
+        except OSError:
+            pass  # RAW and float photos: as many as the reduced ones.
+    return factor * sum(each.camera.width * each.camera.height for each in scene.train_views)
+
+
+def _blocks(scene: Scene, division: Division, points: np.ndarray) -> tuple[Block, ...]:
+    """Return the blocks of a division; a held-out view belongs to the block that it shows most of."""
+    views = scene.train_views
+    sizes = np.array([view.camera.width * view.camera.height for view in views], np.float64)
+    names: list[list[str]] = [[views[index].name for index in own] for own in division.photos]
+    owner = division.block_of(points)
+    for view in scene.test_views:
+        shown = np.bincount(owner, weights_of(view.camera, points), len(division.cells))
+        names[int(shown.argmax())].append(view.name)
+    digits = max(2, len(str(len(names))))
+    return tuple(
+        Block(
+            f"block_{index + 1:0{digits}d}",
+            tuple(sorted(each)),
+            float(sizes[own].sum() / sizes.sum()),
+            division.cells[index],
+            division.margins[index],
+        )
+        for index, (each, own) in enumerate(zip(names, division.photos, strict=True))
+    )
+
+
+def _block_values(block: Block) -> dict[str, Any]:
+    """Return plain values of a block; an infinite bound is None."""
+    faces = block.cell.low, block.cell.high
+    low, high = ([float(bound) if np.isfinite(bound) else None for bound in face] for face in faces)
+    values = {"name": block.name, "views": list(block.views), "fraction": block.fraction, "low": low, "high": high}
+    return values | {"margin": block.margin.tolist()}
+
+
+def _block_from(values: dict[str, Any]) -> Block:
+    """Return the block that _block_values() described."""
+    low, high = (
+        np.array([end if bound is None else bound for bound in values[name]], np.float64)
+        for name, end in (("low", -np.inf), ("high", np.inf))
+    )
+    if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
+        raise ValueError(f"the core of {values['name']:.60} is not a box")
+    margin = np.array(values["margin"], np.float64)
+    return Block(values["name"], tuple(values["views"]), values["fraction"], Cell(low, high), margin)

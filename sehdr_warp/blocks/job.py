@@ -1,0 +1,96 @@
+"""Train one block: an ordinary training in a run folder of its own, which continues from its newest checkpoint."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import SehdrError, as_user_error
+from ..runs.open import load_photos, response_for_loading
+from ..runs.run_folder import RunFolder
+from ..scene import Scene
+from .block_plan import BlockPlan
+from .division import weights_of
+
+log = logging.getLogger(__name__)
+
+FOLDER = "blocks"
+"""Folder of the blocks' runs, in that of the merged run."""
+FEWEST_VIEWS = 2  # Photos of a block that must contain a sparse point for the block to start from it
+MOST_POINTS = 4  # Sparse points that are looked at, relative to the largest number of Gaussians
+
+
+class BlockResult(NamedTuple):
+    """How the training of a block ended."""
+
+    index: int
+    error: str | None
+    """One line, if the training cannot be done; None if it is done."""
+
+
+def folder_of(out: Path, plan: BlockPlan, index: int) -> Path:
+    """Return the run folder of a block."""
+    return out / FOLDER / plan.blocks[index].name
+
+
+def is_finished(folder: Path) -> bool:
+    """Return whether the run of a block has been trained to its end, and its confidence measured."""
+    run = RunFolder(folder)
+    return run.info.is_file() and run.confidence.is_file() and bool(run.read_summary().get("finished"))
+
+
+def train_block(out: Path, index: int, device: str | None, photos: str) -> BlockResult:
+    """Train a block to its end, or continue its training.
+
+    Args:
+        out: Folder of the merged run, with blocks.json.
+        index: Number of the block.
+        device: Device to train on; None for the first GPU.
+        photos: Where its photos are stored, see load_scene().
+
+    Returns:
+        The result. Errors that a user can act on are returned, so that a job that ran is told from one that died.
+    """
+    from ..process import calm_threads
+    from ..training.train import create_trainer
+
+    calm_threads()
+    plan = BlockPlan.read(out)
+    block, folder = plan.blocks[index], folder_of(out, plan, index)
+    if is_finished(folder):
+        return BlockResult(index, None)
+    try:
+        data = plan.data | {"views": list(block.views)}
+        config = plan.config_of(block)
+        response = response_for_loading(config, plan.response)
+        scene = shared_scene(plan, index, load_photos(data, response=response, photos=photos))
+        trainer = create_trainer(scene, folder, config, device=device, resume=True, data=data, shared=plan.shared)
+        trainer.train()
+    except Exception as error:
+        message = as_user_error(error)
+        if message is None:
+            raise
+        return BlockResult(index, str(message))
+    return BlockResult(index, None)
+
+
+def shared_scene(plan: BlockPlan, index: int, scene: Scene) -> Scene:
+    """Return the scene of a block with the response and exposure times of the plan, and the points that it shows."""
+    if missing := [name for name in plan.blocks[index].views if name not in {view.name for view in scene.views}]:
+        raise SehdrError(f"{plan.scene}: {missing[0]} of {plan.blocks[index].name} cannot be read any more")
+    options = plan.config.response
+    chosen_by = scene.chosen_by if scene.light_known else (options.method, tuple(map(str, options.candidates)))
+    views = tuple(replace(view, exposure_time=plan.exposure_times[view.name]) for view in scene.views)
+    most = MOST_POINTS * plan.config.densification.cap_max
+    points = np.arange(len(scene.points))[:: -(-len(scene.points) // most) or 1]
+    positions = scene.points[points]
+    counts = np.zeros(len(points), np.int64)
+    for view in scene.train_views:
+        counts += weights_of(view.camera, positions) > 0
+    inside = plan.division.enlarged(index).contains(positions @ plan.axes.T)
+    points = points[(counts >= FEWEST_VIEWS) | (inside & (counts > 0))]
+    return replace(
+        scene, views=views, points=scene.points[points], point_colors=scene.point_colors[points], chosen_by=chosen_by
+    )

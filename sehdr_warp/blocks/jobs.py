@@ -1,0 +1,138 @@
+"""Run the blocks of a plan as jobs of submitit: processes of this machine, or jobs of a SLURM cluster.
+
+A finished block is never run again. A job that dies (a crash, a lost node) is submitted again and continues from
+its newest checkpoint; SLURM jobs that reach their time limit or are preempted are requeued by submitit.
+"""
+
+import logging
+import time
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import SehdrError
+from .block_plan import BlockPlan
+from .job import BlockResult, folder_of, is_finished, train_block
+
+log = logging.getLogger(__name__)
+
+TRIES = 3  # Times that a block is started; a training that dies each time has a cause that another try does not remove
+POLL = 1.0  # Seconds between looks at running jobs
+MONTH = 30 * 24 * 60  # Minutes, for jobs of this machine, which have no time limit of their own
+
+
+class BlockJob:
+    """A block's training as submitit runs it; checkpoint() makes SLURM requeue a job whose time is over."""
+
+    def __call__(self, *arguments: Any) -> BlockResult:
+        """Train the block; arguments as of train_block()."""
+        return train_block(*arguments)
+
+    def checkpoint(self, *arguments: Any) -> Any:
+        """Return the same job: its training continues from its newest checkpoint."""
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(self, *arguments)
+
+
+def run_blocks(
+    out: Path,
+    plan: BlockPlan,
+    *,
+    device: str | None,
+    gpus: int,
+    photos: str = "auto",
+    slurm: Mapping[str, str] | None = None,
+) -> None:
+    """Train all blocks of a plan that are not finished.
+
+    Args:
+        out: Folder of the merged run, with blocks.json.
+        plan: The plan.
+        device: "cpu", "cuda:N" or None for GPUs if there are any.
+        gpus: Blocks to train at once on this machine, each on a GPU of its own.
+        photos: Where photos are stored, see load_scene().
+        slurm: Parameters of SLURM jobs, such as {"partition": "gpu"}; None for this machine.
+
+    Raises:
+        SehdrError: If submitit is missing, or if blocks cannot be trained, after all others have been.
+    """
+    waiting = deque(index for index in range(len(plan.blocks)) if not is_finished(folder_of(out, plan, index)))
+    finished = len(plan.blocks) - len(waiting)
+    if finished:
+        log.info("%d of %d blocks are finished already", finished, len(plan.blocks))
+    if not waiting:
+        return
+    executors = _executors(out, device, gpus, slurm, len(waiting))
+    tries, errors = dict.fromkeys(waiting, 0), {}
+    running: dict[int, tuple[int, Any]] = {}
+    try:
+        while waiting or running:
+            for slot in range(len(executors)):
+                if slot in running or not waiting:
+                    continue
+                index = waiting.popleft()
+                tries[index] += 1
+                running[slot] = index, executors[slot].submit(BlockJob(), out.absolute(), index, device, photos)
+                log.info("%s: training begins, %d photos", plan.blocks[index].name, len(plan.blocks[index].views))
+            time.sleep(POLL)
+            for slot, (index, job) in list(running.items()):
+                if not job.done():
+                    continue
+                del running[slot]
+                name, error = plan.blocks[index].name, _error_of(job)
+                if error is None:
+                    finished += 1
+                    log.info("%s: finished, %d of %d", name, finished, len(plan.blocks))
+                elif job.exception() is not None and tries[index] < TRIES:
+                    log.warning("%s: %s; it continues from its newest checkpoint", name, error)
+                    waiting.append(index)
+                else:
+                    log.info("%s: cannot be trained: %s", name, error)
+                    errors[name] = error
+    except BaseException:
+        for _, job in running.values():
+            job.cancel(check=False)
+        raise
+    if errors:
+        name, error = next(iter(errors.items()))
+        others = f" and {len(errors) - 1} more blocks" if len(errors) > 1 else ""
+        remedy = f"{finished} blocks are finished; --resume trains the others (logs in {out / 'blocks' / 'logs'})"
+        raise SehdrError(f"{name}{others}: {error}; {remedy}")
+
+
+def _executors(out: Path, device: str | None, gpus: int, slurm: Mapping[str, str] | None, count: int) -> list[Any]:
+    """Return an executor of submitit for each job that may run at the same time."""
+    try:
+        import submitit
+    except ImportError:
+        problem = "submitit, which runs blocks as jobs, is not installed"
+        raise SehdrError(f"{problem}; run `pip install sehdr-warp[blocks]`") from None
+    logs = out / "blocks" / "logs"
+    if slurm is not None:
+        executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
+        own = {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
+        one = {} if device == "cpu" else {"gpus_per_node": 1}
+        executor.update_parameters(name="sehdr-warp", timeout_min=MONTH, **one)
+        executor.update_parameters(**own)
+        return [executor] * count
+    executors = []
+    for slot in range(min(gpus, count)):
+        executor = submitit.LocalExecutor(folder=logs)
+        executor.update_parameters(timeout_min=MONTH)
+        if gpus > 1 and device != "cpu":
+            executor.update_parameters(gpus_per_node=1, visible_gpus=[slot])
+        executors.append(executor)
+    return executors
+
+
+def _error_of(job: Any) -> str | None:
+    """Return why a job ended without a trained block, in one line; None if the block is trained."""
+    exception = job.exception()
+    if exception is None:
+        return job.result().error
+    lines = [line for line in str(exception).strip().splitlines() if line.strip()]
+    return (
+        f"its process died ({lines[-1].strip()[:200]})" if lines else f"its process died ({type(exception).__name__})"
+    )

@@ -1,0 +1,147 @@
+"""Merge the trained blocks of a plan into one run.
+
+Inside a block's core, its Gaussians are those of the merged run; those beyond, which its photos show too, are dropped,
+because another block has them. Rows are in an order in which neighbours in space are neighbours in memory, so that a
+part of the scene is a few ranges of rows.
+"""
+
+import logging
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import InputError
+from ..model.confidence import Evidence
+from ..model.gaussians import PARAMETER_NAMES
+from ..runs.config_files import override_config
+from ..runs.run_folder import RunFolder
+from ..runs.run_writer import RunWriter, write_confidence
+from ..scene.normalization import Normalization
+from ..splats.packing import morton_order
+from .block_plan import BlockPlan
+from .job import folder_of
+
+log = logging.getLogger(__name__)
+
+
+class TrainedBlock(NamedTuple):
+    """What the merged run takes from a block.
+
+    Attributes:
+        gaussians: Parameters of the Gaussians in its core, in the coordinates of the merged run.
+        evidence: Of its photos for these.
+        values: Plain values of its newest checkpoint.
+        info: Its run.json.
+        views: Its views as in scene.json.
+        summary: Its summary.json.
+    """
+
+    gaussians: dict[str, Tensor]
+    evidence: Evidence
+    values: dict[str, Any]
+    info: dict[str, Any]
+    views: list[dict[str, Any]]
+    summary: dict[str, Any]
+
+
+def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
+    """Write the merged run of trained blocks to a folder, in place of an earlier merged run.
+
+    Args:
+        out: Run folder, with the blocks' runs in `blocks/`.
+        plan: The plan of the blocks.
+
+    Raises:
+        InputError: If a block is damaged or was trained with other options, or if no Gaussian is in any core.
+    """
+    blocks = [_trained_block(out, plan, index) for index in range(len(plan.blocks))]
+    empty = [plan.blocks[index].name for index, block in enumerate(blocks) if not len(block.evidence.seen)]
+    if empty:
+        log.warning("%s: no Gaussian is in its core; the merged run has nothing there", ", ".join(empty))
+    tensors = {name: torch.cat([block.gaussians[name] for block in blocks]) for name in PARAMETER_NAMES}
+    if not len(tensors["means"]):
+        raise InputError(out, "no Gaussian of any block is in its core", "train again, with --overwrite")
+    parts = [vars(block.evidence) for block in blocks]
+    evidence = Evidence(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+    iterations = max(block.values["iteration"] for block in blocks)
+    first = RunFolder(folder_of(out, plan, 0)).read_config()
+    config = override_config(
+        first,
+        {"schedule.iterations": iterations, "densification.cap_max": len(tensors["means"]), "plan.keep": []},
+    )
+    views = {view["name"]: view for block in blocks for view in block.views}
+    description = RunFolder(folder_of(out, plan, 0)).read_scene()
+    description |= {"name": plan.scene, "views": [views[name] for name in plan.exposure_times if name in views]}
+    info = {name: blocks[0].info[name] for name in ("base_time", "response")}
+    info |= {"scene": plan.scene, "data": plan.data, "normalization": plan.normalization.to_dict()}
+    info |= {"color_matrix": matrix} if (matrix := blocks[0].info.get("color_matrix")) else {}
+    info |= {"exposure_compensation": gains.to_dict()} if (gains := plan.shared.gains) else {}
+    seconds = sum(block.values["seconds"] for block in blocks)
+    named = {f"gaussians.{name}": tensor for name, tensor in tensors.items()}
+    state = named, {"iteration": iterations, "seconds": seconds}
+    folder = RunWriter(out)
+    folder.lock()
+    try:
+        folder.begin_described(description, info, config, None, state)
+        folder.write_summary(_summary(blocks, iterations, seconds, len(tensors["means"])))
+        checkpoint = folder.newest_checkpoint()
+        assert checkpoint is not None
+        write_confidence(folder, evidence, checkpoint.values["sha256"])
+    finally:
+        folder.unlock()
+    log.info("merged %d Gaussians of %d blocks", len(tensors["means"]), len(blocks))
+    return folder
+
+
+def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:
+    """Read what the merged run takes from a block."""
+    folder = RunFolder(folder_of(out, plan, index))
+    folder.require()
+    checkpoint = folder.newest_checkpoint()
+    if checkpoint is None:
+        raise InputError(folder.checkpoints, "holds no complete checkpoint", "continue with --resume")
+    info = folder.read_info()
+    if info["base_time"] != plan.shared.base_time:
+        problem = f"base_time = {info['base_time']}, and the blocks share {plan.shared.base_time}"
+        raise InputError(folder.info, problem, "remove the folder of this block, and continue with --resume")
+    own = Normalization.from_dict(info["normalization"])
+    gaussians = {name: checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES}
+    points = own.scene_points(gaussians["means"].numpy())
+    inside = np.flatnonzero(plan.division.block_of(points) == index)
+    points = plan.normalization.points(points[inside]).astype(np.float32)
+    order = morton_order(points)
+    rows = torch.from_numpy(inside[order])
+    gaussians = {name: tensor[rows] for name, tensor in gaussians.items()}
+    gaussians["means"] = torch.from_numpy(points[order])
+    gaussians["log_scales"] = gaussians["log_scales"] + math.log(own.unit / plan.normalization.unit)
+    views = folder.read_scene()["views"]
+    evidence = folder.read_evidence(checkpoint).rows(rows)
+    return TrainedBlock(gaussians, evidence, checkpoint.values, info, views, folder.read_summary())
+
+
+def _summary(blocks: list[TrainedBlock], iterations: int, seconds: float, gaussians: int) -> dict[str, Any]:
+    """Return the values of summary.json: times are sums over the blocks, memory is that of the largest."""
+    summary: dict[str, Any] = {
+        "iteration": iterations,
+        "finished": True,
+        "train_seconds": round(seconds, 3),
+        "gaussians": gaussians,
+        "skipped_steps": sum(block.summary.get("skipped_steps", 0) for block in blocks),
+        "device": blocks[0].summary.get("device", ""),
+        "blocks": [
+            {"gaussians": len(block.evidence.seen)}
+            | {
+                name: block.summary.get(name)
+                for name in ("train_seconds", "peak_memory_bytes", "peak_gpu_memory_bytes")
+            }
+            for block in blocks
+        ],
+    }
+    for name in ("peak_memory_bytes", "peak_gpu_memory_bytes"):
+        if peaks := [peak for block in blocks if (peak := block.summary.get(name))]:
+            summary[name] = max(peaks)
+    return summary

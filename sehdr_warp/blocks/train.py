@@ -1,0 +1,135 @@
+"""Train a set of photos in blocks: plan, jobs, merged run, and its figures on the held-out photos."""
+
+import logging
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..errors import InputError
+from ..files import make_parents, writing
+from ..runs.config import Config
+from ..runs.open import load_photos, response_for_loading
+from ..runs.run import Run, load_run
+from ..runs.run_writer import RunWriter
+from .block_plan import FILE, BlockPlan, make_block_plan
+from .job import FOLDER
+from .jobs import run_blocks
+from .merge import merge_blocks
+from .seams import SeamErrors, measure_seams
+
+log = logging.getLogger(__name__)
+
+MOST_VIEWS = 200  # Held-out photos that the merged run is measured on
+
+
+def is_in_blocks(out: Path) -> bool:
+    """Return whether a folder holds a training in blocks."""
+    return (out / FILE).is_file()
+
+
+def train_in_blocks(
+    data: dict[str, Any],
+    out: Path,
+    config: Config,
+    count: int | None,
+    *,
+    device: torch.device,
+    gpus: int = 1,
+    slurm: Mapping[str, str] | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    photos: str = "auto",
+) -> Run | None:
+    """Train a set of photos in blocks and merge them into one run.
+
+    Args:
+        data: Arguments of load_scene() for the set.
+        out: Folder of the merged run; the blocks' runs are in `blocks/` below it.
+        config: Options of the training, the same for each block.
+        count: Number of blocks; None chooses it.
+        device: Device to measure and merge on; blocks train on the same, or on the first GPUs of this machine.
+        gpus: Blocks to train at once.
+        slurm: Parameters of SLURM jobs; None trains on this machine.
+        resume: Continue; finished blocks are not run again.
+        overwrite: Replace a training in blocks in `out`.
+        photos: Where photos are stored, see load_scene().
+
+    Returns:
+        The merged run; None if `count` is None and one training does for the set.
+
+    Raises:
+        InputError: If the folder is in use, the set cannot be divided, or a resumed training differs.
+        SehdrError: If blocks could not be trained.
+    """
+    plan = _continued(out, data, config, count) if _check(out, resume=resume, overwrite=overwrite) else None
+    if plan is None:
+        options = config.response
+        selection = {"method": options.method, "candidates": options.candidates, "photos": photos}
+        plan = make_block_plan(data, config, device, count, **selection)
+        if plan is None:
+            return None
+        if overwrite:
+            shutil.rmtree(out / FOLDER, ignore_errors=True)
+        with writing(out):
+            make_parents(out / FILE)
+        plan.write(out)
+    run_blocks(out, plan, device="cpu" if device.type == "cpu" else None, gpus=gpus, photos=photos, slurm=slurm)
+    folder = merge_blocks(out, plan)
+    run = load_run(out, device=device)
+    errors = _measure(run, plan, photos)
+    if errors is not None:
+        line = {"iteration": run.iterations, "seconds": round(run.train_seconds, 3), "split": "test"}
+        folder.append_metrics(line | {"psnr_ldr": round(errors.psnr, 4), "gaussians": run.gaussian_count})
+        figures = {"border": errors.border, "elsewhere": errors.elsewhere, "share": errors.share}
+        rounded = {name: round(value, 4) if value == value else None for name, value in figures.items()}
+        folder.write_summary(run.summary() | {"borders": rounded})
+        if errors.share > 0:
+            message = "held-out photos: %.2f dB near the borders of blocks (%.1f %% of the pixels), %.2f dB elsewhere"
+            log.info(message, errors.border, 100 * errors.share, errors.elsewhere)
+    return run
+
+
+def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
+    """Return whether the folder holds a training in blocks to continue; raise InputError if it cannot be used."""
+    if out.exists() and not out.is_dir():
+        raise InputError(out, "is a file", "choose another folder for the run")
+    if not out.exists() or not any(out.iterdir()):
+        return False
+    if is_in_blocks(out):
+        if not (resume or overwrite):
+            raise InputError(out, "exists and is not empty", "choose another, or use --resume or --overwrite")
+        return resume
+    RunWriter(out).check(resume=False, overwrite=overwrite)
+    return False
+
+
+def _continued(out: Path, data: dict[str, Any], config: Config, count: int | None) -> BlockPlan:
+    """Return the plan of a training in blocks to continue; raise InputError if something else was asked for."""
+    plan = BlockPlan.read(out)
+    remedy = "continue with the same photos and options, or train anew with --overwrite"
+    if data != plan.data:
+        name = next(name for name in {**data, **plan.data} if data.get(name) != plan.data.get(name))
+        problem = f"{name} = {plan.data.get(name)!r}, but {data.get(name)!r} was asked for"
+        raise InputError(out / FILE, problem, remedy)
+    if count is not None and count != len(plan.blocks):
+        raise InputError(out / FILE, f"has {len(plan.blocks)} blocks, but {count} were asked for", remedy)
+    if config.model_dump() != plan.config.model_dump():
+        before, now = plan.config.model_dump(), config.model_dump()
+        table = next(name for name in now if now[name] != before[name])
+        problem = f"{table} = {before[table]!r}, but {now[table]!r} was asked for"
+        raise InputError(out / FILE, problem, remedy)
+    return plan
+
+
+def _measure(run: Run, plan: BlockPlan, photos: str) -> SeamErrors | None:
+    """Return the errors of the merged run on held-out photos; None if there are none."""
+    names = [entry.name for entry in run.cameras if entry.split == "test" and entry.camera.is_pinhole]
+    names = names[:: -(-len(names) // MOST_VIEWS) or 1]
+    if not names:
+        return None
+    response = response_for_loading(plan.config, plan.response)
+    scene = run.normalize_photos(load_photos(plan.data | {"views": names}, response=response, photos=photos))
+    return measure_seams(run, scene.views, plan.division)

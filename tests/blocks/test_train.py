@@ -1,0 +1,173 @@
+"""A survey trained in blocks through the command line: jobs, kills, merging, and uses of the merged run."""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.survey import write_survey
+from sehdr_warp.blocks import jobs
+from sehdr_warp.blocks.block_plan import BlockPlan, blocks_for, make_block_plan
+from sehdr_warp.blocks.job import folder_of
+from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.runs.run import load_run
+from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.splats import read_gaussians
+
+from ..refusals import call, refused
+
+pytest.importorskip("submitit")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+
+FLAGS = ["--device", "cpu", "--response", "srgb", "--iterations", "200", "--preset", "fast"]
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("survey") / "town"
+    write_survey(folder, views=32, size=48, gaussians=6000)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def merged(survey, tmp_path_factory):
+    """Trained in two blocks; the process of the first one to begin is killed once."""
+    out = tmp_path_factory.mktemp("merged") / "run"
+    killer = threading.Thread(target=kill_first, args=(out,))
+    killer.start()
+    assert call("train", survey, "--out", out, "--blocks", "2", *FLAGS, "--schedule.checkpoint-every", "3000") == 0
+    killer.join()
+    return out
+
+
+def kill_first(out):
+    """Kills the job of the first block as soon as its training has begun."""
+    deadline = time.monotonic() + 90
+    while time.monotonic() < deadline:
+        for checkpoint in out.glob("blocks/block_01/checkpoints/iteration_*[1-9]*"):
+            for place in Path("/proc").glob("[0-9]*"):
+                with suppress(OSError):
+                    words = (place / "cmdline").read_text()
+                    if "submitit.core._submit" in words and str(out) in words:
+                        os.kill(int(place.name), signal.SIGKILL)
+            assert checkpoint
+            return
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def hasty_submitit():
+    """submitit waits for what a dead process may still write."""
+    submitit = pytest.importorskip("submitit")
+    before, submitit.LocalJob._results_timeout_s = submitit.LocalJob._results_timeout_s, 1
+    yield
+    submitit.LocalJob._results_timeout_s = before
+
+
+def test_a_killed_job_goes_on_and_both_blocks_are_finished(merged):
+    plan = BlockPlan.read(merged)
+    logs = list((merged / "blocks" / "logs").glob("*_log.err"))
+    assert len(plan.blocks) == 2 and len(logs) == 3, "one of them twice"
+    for index in (0, 1):
+        assert RunFolder(folder_of(merged, plan, index)).read_summary()["finished"]
+
+
+def test_the_merged_run_is_as_good_as_one_training(merged, survey, tmp_path):
+    """Blocks train as many steps on each photo as the whole."""
+    assert call("train", survey, "--out", tmp_path / "whole", *FLAGS, "--iterations", "340") == 0
+    whole, blocks = (load_run(path).metrics()[-1]["psnr_ldr"] for path in (tmp_path / "whole", merged))
+    assert blocks > whole - 0.2
+    borders = json.loads((merged / "summary.json").read_text())["borders"]
+    assert borders["border"] > borders["elsewhere"] - 1 and borders["share"] > 0.01
+
+
+def test_each_place_has_the_gaussians_of_one_block(merged):
+    plan, run = BlockPlan.read(merged), load_run(merged)
+    means = run.model.normalization.scene_points(run.model.gaussians.means.numpy())
+    owner, start = plan.division.block_of(means), 0
+    for index in range(2):
+        block = load_run(folder_of(merged, plan, index))
+        assert block.base_time == run.base_time and block.response.to_dict() == run.response.to_dict()
+        own = block.model.normalization.scene_points(block.model.gaussians.means.numpy())
+        inside = plan.division.block_of(own) == index
+        mine = owner == index
+        assert 0 < inside.sum() < len(own), "Gaussians beyond the border are dropped"
+        assert abs(int(mine.sum()) - int(inside.sum())) <= 2 and np.allclose(mine.nonzero()[0].min(), start, atol=2)
+        sizes, merged_sizes = (
+            np.sort((each.gaussians.log_scales.numpy()[rows] + np.log(each.normalization.unit)).ravel())
+            for each, rows in ((block.model, inside), (run.model, mine))
+        )
+        assert np.quantile(sizes, 0.5) == pytest.approx(np.quantile(merged_sizes, 0.5), abs=1e-3)
+        start += int(mine.sum())
+    assert run.model.confidence is not None and len(run.model.confidence) == run.gaussian_count
+    assert torch.equal(run.clipped_share() >= 0, torch.ones(run.gaussian_count, dtype=torch.bool))
+
+
+def test_other_commands_take_the_merged_run(merged, tmp_path):
+    assert call("render", merged, "--out", tmp_path / "views", "--device", "cpu") == 0
+    assert len(list((tmp_path / "views").rglob("*.exr"))) == 4
+    assert call("envmap", merged, "--out", tmp_path / "map.exr", "--size", "32", "--device", "cpu") == 0
+    assert call("export", merged, "--out", tmp_path / "town.ply", "--device", "cpu") == 0
+    assert read_gaussians(tmp_path / "town.ply").count > 0.9 * load_run(merged).gaussian_count
+    assert call("eval", merged, "--device", "cpu", "--json", tmp_path / "eval.json") == 0
+    assert "psnr" in (tmp_path / "eval.json").read_text()
+
+
+def test_finished_blocks_are_not_run_again(merged, monkeypatch):
+    monkeypatch.setattr(jobs, "_executors", lambda *_: pytest.fail("a job was started"))
+    before = (merged / "checkpoints").stat().st_mtime_ns
+    assert call("train", "--resume", "--out", merged, "--device", "cpu") == 0
+    assert (merged / "checkpoints").stat().st_mtime_ns != before, "merged again"
+
+
+def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capfd):
+    def line(*words):
+        return refused(capfd, "train", survey, *words, "--device", "cpu", "--response", "srgb")
+
+    assert "exists and is not empty" in line("--out", merged, "--blocks", "2")
+    assert "has 2 blocks, but 3 were asked for" in line("--out", merged, "--blocks", "3", "--resume", *FLAGS)
+    assert "schedule = " in line("--out", merged, "--resume", "--iterations", "999", "--preset", "fast")
+    assert "too few for 9 blocks" in line("--out", tmp_path / "run", "--blocks", "9")
+    assert "learned response" in refused(
+        capfd, "train", survey, "--out", tmp_path / "run", "--blocks", "2", "--response", "learned", "--device", "cpu"
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_number_of_blocks_follows_photos_and_gaussians():
+    config = Config()
+    assert blocks_for(400, 400 * 1e6, config) == 1
+    assert blocks_for(1200, 1200 * 1e6, config) == 4, "30,000 steps are for 400 photos"
+    assert blocks_for(20_000, 20_000 * 20e6, config) == 65
+    assert blocks_for(300, 300 * 100e6, config) == 9, "3 million Gaussians for each"
+    named = override_config(config, {"densification.cap_max": 10**6, "plan.keep": ["densification.cap_max"]})
+    assert blocks_for(300, 300 * 100e6, named) == 1
+
+
+def test_a_block_that_cannot_be_trained_does_not_end_the_others(tmp_path, survey, capfd):
+    """One block's photos are gone when it begins; the other is trained, and --resume goes on once they are back."""
+    out = tmp_path / "run"
+    data = {"path": str(survey), "exposure_index": None, "max_size": None, "holdout": None}
+    config = override_config(Config(), {"response.name": "srgb", "schedule.iterations": 20})
+    plan = make_block_plan(data, config, torch.device("cpu"), 2)
+    only = min(set(plan.blocks[0].views) - set(plan.blocks[1].views))
+    out.mkdir()
+    plan.write(out)
+    photo = survey / "images" / f"{only}.png"
+    photo.rename(survey / "hidden.png")
+    try:
+        assert "block_01" in refused(capfd, "train", "--resume", "--out", out, "--device", "cpu")
+    finally:
+        (survey / "hidden.png").rename(photo)
+    assert RunFolder(folder_of(out, plan, 1)).read_summary()["finished"]
+    assert call("train", "--resume", "--out", out, "--device", "cpu") == 0
+    assert load_run(out).iterations == 20
