@@ -146,7 +146,7 @@ def _run(argv: list[str]) -> None:
     calm_threads()
     if shutil.get_terminal_size().columns < MIN_COLUMNS:
         os.environ["COLUMNS"] = str(MIN_COLUMNS)
-    from .console import show_logs
+    from .console import show_logs, stages_on_terminal
     from .quiet import silence_exit
 
     silence_exit()
@@ -162,10 +162,11 @@ def _run(argv: list[str]) -> None:
     run, options = parse_command(words)
     if words[0] not in _WITHOUT_TORCH:
         _check_address_space()
-    if "argv" in inspect.signature(run).parameters:
-        run(options, argv=argv)
-    else:
-        run(options)
+    with stages_on_terminal():
+        if "argv" in inspect.signature(run).parameters:
+            run(options, argv=argv)
+        else:
+            run(options)
 
 
 def _check_address_space() -> None:

@@ -1,6 +1,7 @@
 """Progress of a command on the terminal.
 
-The library's log goes to standard error as plain lines; a training on a terminal has a progress bar.
+The library's log goes to standard error as plain lines; stages of long work and a training have a progress bar on a
+terminal.
 """
 
 import logging
@@ -12,10 +13,14 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
-LINE_INTERVAL = 10.0
-"""Seconds between lines about a training if standard error is not a terminal."""
+from .progress import LINE_INTERVAL, Stage, format_seconds, shown_by
+
 BAR_INTERVAL = 0.25
 """Least seconds between updates of the bar. Each reads the loss, which waits for the device."""
+READ_INTERVAL = 1.0
+"""Least seconds between two readings of the figures for plain lines, of which a line shows the mean."""
+MEAN_OF = 20
+"""Readings of loss and PSNR that their running mean is over: each is of one photo, and photos differ by decibels."""
 MAX_READING_SHARE = 1 / 20
 """Part of the time that reading figures for updates may take."""
 
@@ -28,8 +33,9 @@ class Progress(NamedTuple):
     """Iterations a second."""
     seconds_left: float | None
     loss: float
+    """Running mean of the loss."""
     psnr: float
-    """PSNR of the last photo, dB."""
+    """Running mean of the PSNR of the photos trained on, dB."""
     gaussians: int
 
 
@@ -65,24 +71,82 @@ def follow(steps: Iterable[Any], total: int) -> None:
         deque(steps, maxlen=0)
         return
     terminal = sys.stderr.isatty()
-    interval, due, start = (BAR_INTERVAL if terminal else LINE_INTERVAL), 0.0, None
+    read_interval, read_due, show_due, start = (BAR_INTERVAL if terminal else READ_INTERVAL), 0.0, 0.0, None
+    losses, psnrs = deque[float](maxlen=MEAN_OF), deque[float](maxlen=MEAN_OF)
     with _bar(total) if terminal else nullcontext(partial(_log_line, total)) as show:
         for step in steps:
             now = time.monotonic()
             # The rate is counted from the first step on, because that one waits for the compilation of kernels.
             start = start or (step.iteration, now)
-            if now < due and step.iteration < total:
+            if now < read_due and step.iteration < total:
                 continue
-            rate = (step.iteration - start[0]) / max(now - start[1], 1e-9)
-            show(Progress(step.iteration, rate, step.seconds_left, step.loss, step.psnr, step.gaussians))
+            losses.append(step.loss)
+            psnrs.append(step.psnr)
+            if terminal or now >= show_due or step.iteration >= total:
+                rate = (step.iteration - start[0]) / max(now - start[1], 1e-9)
+                loss, psnr = sum(losses) / len(losses), sum(psnrs) / len(psnrs)
+                show(Progress(step.iteration, rate, step.seconds_left, loss, psnr, step.gaussians))
+                show_due = now + LINE_INTERVAL
             reading = time.monotonic() - now
-            due = time.monotonic() + max(interval, min(reading / MAX_READING_SHARE, LINE_INTERVAL))
+            read_due = time.monotonic() + max(read_interval, min(reading / MAX_READING_SHARE, LINE_INTERVAL))
 
 
 def _log_line(total: int, progress: Progress) -> None:
     figures = f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, {progress.gaussians} Gaussians"
     log = logging.getLogger("sehdr_warp.training")
     log.info("iteration %d/%d, %s, %s left", progress.iteration, total, figures, format_seconds(progress.seconds_left))
+
+
+@contextmanager
+def stages_on_terminal() -> Iterator[None]:
+    """Show each stage of the work within the block as a line that changes, if standard error is a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    lines = _StageLines()
+    try:
+        with shown_by(lines.show):
+            yield
+    finally:
+        lines.close()
+
+
+class _StageLines:
+    """Shows stages on a terminal, one line each."""
+
+    def __init__(self):
+        self._bar, self._stage = None, None
+
+    def show(self, stage: Stage) -> None:
+        """Show a stage that starts, goes on or ends."""
+        if stage is not self._stage and not stage.ended:
+            self.close()
+            self._open(stage)
+        if stage is self._stage and self._bar is not None:
+            left = format_seconds(stage.seconds) if stage.ended else f"{format_seconds(stage.seconds_left)} left"
+            training = "" if stage.ended or stage.training_in is None else format_seconds(stage.training_in)
+            training = training and f"training in {training}"
+            self._bar.update(self._bar.task_ids[0], completed=stage.done, left=left, training=training)
+            if stage.ended:
+                self.close()
+
+    def close(self) -> None:
+        """Leave the line as it is; what follows comes below it."""
+        if self._bar is not None:
+            self._bar.stop()
+        self._bar, self._stage = None, None
+
+    def _open(self, stage: Stage) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn
+        from rich.progress import Progress as Bar
+
+        parts = "{task.description}", "{task.completed}/{task.total}", "{task.fields[left]}", "{task.fields[training]}"
+        columns = [TextColumn(part, markup=False) for part in parts]
+        columns.insert(1, BarColumn(20))
+        self._bar, self._stage = Bar(*columns, console=Console(file=sys.stderr)), stage
+        self._bar.add_task(stage.activity, total=stage.total or None, left="", training="")
+        self._bar.start()
 
 
 @contextmanager
@@ -109,14 +173,7 @@ def _bar(total: int) -> Iterator[Callable[[Progress], None]]:
             rate = f"{progress.rate:.3g} it/s" if progress.rate else ""
             left = format_seconds(progress.seconds_left)
             bar.update(task, completed=progress.iteration, rate=rate, left=left, figures=figures)
+            if progress.iteration >= total:
+                bar.stop()  # The stages of the end have lines of their own.
 
         yield show
-
-
-def format_seconds(seconds: float | None) -> str:
-    """Return `1:23` or `1:02:03`, or `-:--` for None."""
-    if seconds is None:
-        return "-:--"
-    minutes, seconds_part = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds_part:02}" if hours else f"{minutes}:{seconds_part:02}"

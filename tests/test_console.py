@@ -2,11 +2,13 @@
 
 import io
 import logging
+import re
 from types import SimpleNamespace
 
 import pytest
 
 from sehdr_warp import console
+from sehdr_warp.progress import stage, tracked
 
 
 class Terminal(io.StringIO):
@@ -82,6 +84,34 @@ def test_debug_names_the_logger(monkeypatch):
     assert stream.getvalue() == "sehdr_warp.scene: a detail\n"
 
 
-@pytest.mark.parametrize("seconds,text", [(None, "-:--"), (5, "0:05"), (63.4, "1:03"), (3723, "1:02:03")])
-def test_seconds(seconds, text):
-    assert console.format_seconds(seconds) == text
+def test_psnr_is_a_running_mean(monkeypatch):
+    values, stream, clock = iter([10.0, 20.0, 30.0] * 100), io.StringIO(), iter(range(100_000))
+
+    class Uneven(Step):
+        psnr = property(lambda self: next(values))
+
+    monkeypatch.setattr("sys.stderr", stream)
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock) / 10)
+    console.show_logs()
+    console.follow((Uneven(iteration=i) for i in range(1, 301)), 300)
+    shown = [float(line.split("PSNR ")[1].split(" dB")[0]) for line in stream.getvalue().splitlines()]
+    assert shown[0] == 10 and len(shown) > 2 and all(19 <= value <= 21 for value in shown[2:])
+
+
+def test_a_stage_on_a_terminal_is_one_line(monkeypatch):
+    stream = Terminal()
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setattr("sys.stderr", stream)
+    console.show_logs()
+    log = logging.getLogger("sehdr_warp.scene")
+    with console.stages_on_terminal():
+        for i, _ in tracked("reading photos", range(40), log):
+            if i == 20:
+                log.info("a note")
+        with stage("matching", 10, log) as matching:
+            matching.later = 60.0
+            matching.update(5)
+    lines = [line for line in re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())) if line]
+    kept = stream.getvalue().count("\n")
+    assert "a note" in lines and lines[-1].startswith("matching") and "5/10" in lines[-1]
+    assert kept == 3, "one line for each stage, and the note above them"

@@ -5,6 +5,7 @@ image with respect to that Gaussian's feature, so one backward pass per view gat
 the uncertainty of the pixel's light in stops; see pixel_uncertainty.
 """
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +13,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..progress import tracked
 from ..response import Response
 from ..response.curve import HALF_CODE
 from ..scene import View
 from .radiance_field import RadianceField
 from .residual_regions import MAX_VIEWS, high_residual_mask
+
+log = logging.getLogger(__name__)
 
 CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels, stops
 PARTLY_CLIPPED_STOPS = 0.25  # Uncertainty of a clipped channel next to unclipped ones, which bound the brightness
@@ -119,7 +123,7 @@ def gather_evidence(
     total = torch.zeros(field.gaussians.count, 3, device=device)
     peak = torch.zeros(field.gaussians.count, device=device)
     every = -(-len(views) // MAX_VIEWS) or 1
-    for index, view in enumerate(views):
+    for index, view in tracked("measuring confidence on photos", views, log):
         if index % every:
             peak = torch.maximum(peak, _blending_weights(field, view))
             continue

@@ -1,15 +1,19 @@
 """Regions in which a trained scene differs from its photos by a stop or more."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
 
+from ..progress import tracked
 from ..response import Response
 from ..response.curve import HALF_CODE
 from ..scene import View
 from .radiance_field import RadianceField
+
+log = logging.getLogger(__name__)
 
 # A pixel differs if both are exceeded: noise in dark areas is many stops, and a code in bright areas much light.
 MIN_STOPS, MIN_CODE_DIFFERENCE = 1.0, 0.1
@@ -47,7 +51,8 @@ def find_residual_regions(field: RadianceField, views: Sequence[View], *, degree
     as edges leave them, are ignored.
     """
     regions = []
-    for view in views[:: -(-len(views) // MAX_VIEWS) or 1]:
+    compared = views[:: -(-len(views) // MAX_VIEWS) or 1]
+    for _, view in tracked("comparing photos with the scene", compared, log):
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         for row, column, stops in _regions(view, exposure, field.response):
             first_column, top = int(column.min()), int(row.min())

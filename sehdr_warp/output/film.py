@@ -6,7 +6,6 @@ grading.
 
 import logging
 import re
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -18,8 +17,8 @@ import numpy as np
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 
-from ..console import format_seconds
 from ..files import atomic_path
+from ..progress import stage
 from .colorspace import matrix_from_rec709, matrix_to
 from .images import as_array
 from .light_pictures import display_gain
@@ -28,7 +27,6 @@ from .tonemap import encode_srgb
 
 log = logging.getLogger(__name__)
 
-TELL_EVERY = 10.0
 REFERENCE_WHITE, PEAK = 203.0, 1000.0
 """cd/m^2 of the photos' white in HDR (ITU-R BT.2408), and of the brightest that is shown."""
 
@@ -211,14 +209,13 @@ def _frame(av: Any, encoded: np.ndarray, kind: Transfer) -> Any:
 
 
 def _with_progress(cameras: Sequence[Camera], out: Path, tell: Callable[[str], None] | None) -> Iterator[Camera]:
-    """Yield the cameras, and report progress through `tell`, or through the log now and then."""
-    started = due = time.monotonic()
-    for index, camera in enumerate(cameras):
-        now = time.monotonic()
-        if index and (tell or now > due + TELL_EVERY):
-            due, left = now, (now - started) / index * (len(cameras) - index)
-            (tell or log.info)(f"{out.name}: frame {index} of {len(cameras)}, {format_seconds(left)} left")
-        yield camera
+    """Yield the cameras, and report progress as a stage and through `tell`."""
+    with stage(f"{out.name}: frames", len(cameras), log) as progress:
+        for index, camera in enumerate(cameras):
+            progress.update(index)
+            if tell and index:
+                tell(progress.line())
+            yield camera
 
 
 def film_library() -> Any:

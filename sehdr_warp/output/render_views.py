@@ -18,6 +18,7 @@ from sehdr_warp.scene.images import MAX_PIXELS
 
 from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
+from ..progress import tracked
 from .aovs import ViewData, data_parts, read_aovs
 from .brackets import Brackets, bracket_exposures
 from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
@@ -138,10 +139,10 @@ def render_views(
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
         bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if bracketed else None
         tone_map = look or shared_tone_map(run, [camera for _, camera in views])
-        for index, (name, view_camera) in enumerate(views, start=1):
+        for index, (name, view_camera) in tracked("rendering views", views, log):
             rendered, confidence = run.render(view_camera), run.render_confidence(view_camera)
             hdr = as_array(rendered.hdr)
-            if confidence is None and index == 1:
+            if confidence is None and index == 0:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
             camera_in_file = transform.camera(view_camera)
             depth = as_array(rendered.depth) * np.float32(transform.scale)
@@ -159,7 +160,6 @@ def render_views(
                 bracket_writer.write(name, hdr, camera_in_file)
             if channels["A"].mean() < _LEAST_ALPHA:
                 empty.append(name)
-            log.info("%s (%d of %d)", name, index, len(views))
     if empty:
         names = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
         problem = "see nothing of the scene, or next to nothing: are they in its coordinates, and do they look at it?"

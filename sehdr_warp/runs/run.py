@@ -330,7 +330,6 @@ def ensure_confidence(run: Run, scene: Scene) -> None:
     """Measure the confidence of a run that has none, and save it if the folder can be written to."""
     if run.model.confidence is not None or not scene.train_views:
         return
-    log.info("measuring confidence on the training photos")
     evidence = run.measure_confidence(scene)
     try:
         write_confidence(run.folder, evidence, run.checkpoint_hash)

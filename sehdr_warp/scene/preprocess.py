@@ -6,12 +6,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import InputError
 from ..parallel import prefetch_map
+from ..progress import tracked
 from .camera import Camera
 from .color_encoding import ColorEncoding
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
@@ -63,7 +64,7 @@ def preprocess(
     # OpenEXR and LibRaw are read one at a time: their output to the terminal is suppressed for the whole process.
     quiet = any(record.hdr is not None or kind_of(record.image) != "encoded" for record in dataset.records)
     most = 1 if quiet else _PIXELS_AT_ONCE // max(record.lens.width * record.lens.height for record in dataset.records)
-    jobs = ((record, names[i]) for i, record in log_progress("reading views", dataset.records))
+    jobs = ((record, names[i]) for i, record in tracked("reading views", dataset.records, _log))
     views, problems = [], []
     for view in prefetch_map(lambda job: preprocessor.view_or_error(*job), jobs, most):
         if isinstance(view, InputError):
@@ -107,14 +108,6 @@ def require_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], fold
         )
         remedy = "expose them so that the scene shows, or choose another exposure index"
         raise InputError(folder, f"the training photos are {state}", remedy)
-
-
-def log_progress(activity: str, items: Sequence) -> Iterator[tuple[int, Any]]:
-    """Enumerate items, with a log line before every tenth."""
-    for i, item in enumerate(items):
-        if i % 10 == 0:
-            _log.info("%s %d to %d of %d", activity, i + 1, min(i + 10, len(items)), len(items))
-        yield i, item
 
 
 def read_codes(record: ImageRecord, *, oriented: bool = False) -> EncodedImage:

@@ -12,7 +12,10 @@ import logging
 import math
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,11 +30,11 @@ from ..errors import InputError, SehdrError
 from ..files import atomic_folder
 from ..own_files import is_sealed
 from ..parallel import run_interruptibly, signals_kept
+from ..progress import Stage, stage, tracked
 from .colmap_model import SparseModel, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from .photo_checks import left_out
 from .photos import read_photo
-from .preprocess import log_progress
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -43,6 +46,8 @@ MOST_ERROR = 1.0  # Pixels; sound sets have 0.2 to 0.8
 _VERSION = 3
 # Up to so many photos every pair is matched; in larger sets each photo is matched with its neighbors by name.
 EXHAUSTIVE_LIMIT = 150
+OVERLAP = 20  # Neighbors on each side with which a photo of a larger set is matched, and as many powers of two
+_PAIR_COST, _PLACE_COST = 0.1, 0.45  # Time to match a pair and to place a photo, as parts of that of a photo's features
 
 
 @dataclass(frozen=True)
@@ -104,10 +109,18 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
             if not (work / "images" / image_name(i)).is_file():
                 continue
             groups.setdefault((sizes[i], small[i], _device(photo)), []).append(i)
-        for (_, (width, height), device), group in groups.items():
-            params = (_focal_prior(device[-1], width, height), width / 2, height / 2, 0.0)
-            _extract(database, work / "images", [image_name(i) for i in group], "SIMPLE_RADIAL", params)
-        _match(database, len(photos))
+        count = sum(len(group) for group in groups.values())
+        with (
+            stage("finding features in photos", count, _log) as progress,
+            counted_rows(database, "keypoints", partial(_show_features, progress)),
+        ):
+            for (_, (width, height), device), group in groups.items():
+                params = (_focal_prior(device[-1], width, height), width / 2, height / 2, 0.0)
+                names = [image_name(i) for i in group]
+                _extract(database, work / "images", names, "SIMPLE_RADIAL", params)
+            photo_seconds = progress.seconds / count
+            progress.update(count)
+        _match(database, count, photo_seconds)
         model = _map(database, work, len(photos), photos[0].parent)
         model.write_binary(result)
         (result / "sizes.json").write_text(json.dumps(sizes))
@@ -198,7 +211,7 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
     """
     folder.mkdir()
     sizes, small, problems, visible = [], [], [], False
-    for i, photo in log_progress("reading photos", photos):
+    for i, photo in tracked("reading photos", photos, _log):
         try:
             codes = read_photo(photo, oriented=True).pixels
         except InputError as error:
@@ -253,8 +266,6 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params)
     reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=camera_params)
     for start in range(0, len(names), 8):  # Eight photos at a time, one on each core.
         part = names[start : start + 8]
-        if len(names) > 1:
-            _log.info("finding features in photos %d to %d of %d", start + 1, start + len(part), len(names))
         with quiet_colmap():
             options = (database, images, part, pycolmap.CameraMode.SINGLE, reader)
             run_interruptibly(partial(pycolmap.extract_features, *options, device=pycolmap.Device.cpu))
@@ -263,18 +274,81 @@ def _extract(database: Path, images: Path, names: list[str], model: str, params)
                 reader.existing_camera_id = max(image.camera_id for image in opened.read_all_images())
 
 
-def _match(database: Path, count: int) -> None:
+def _show_features(progress: Stage, done: int) -> None:
+    """Show how many photos have features, and estimate when the training starts from the time that they took."""
+    if done:
+        count, seconds = progress.total, progress.seconds / done
+        progress.later = seconds * (_PAIR_COST * len(_pairs(count)) + _PLACE_COST * count)
+        progress.update(done)
+
+
+@contextlib.contextmanager
+def counted_rows(database: Path, table: str, show: Callable[[int], None]) -> Iterator[None]:
+    """Call show() with the rows of a table of COLMAP's database every half second while the block writes to it.
+
+    Another process reads them: two copies of SQLite in one process, COLMAP's and Python's, break each other's locks.
+    """
+    words = (sys.executable, "-I", "-S", "-c", _COUNT_ROWS, database.resolve().as_uri(), table)
+    try:
+        counter = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    except OSError:  # As where no more processes may be started: the work goes on without.
+        yield
+        return
+
+    def read() -> None:
+        for line in counter.stdout or ():
+            show(int(line))
+
+    reader = threading.Thread(target=read, name="sehdr-warp counts", daemon=True)
+    with counter:
+        reader.start()
+        try:
+            yield
+        finally:
+            counter.kill()
+            reader.join()
+
+
+_COUNT_ROWS = """
+import contextlib, sqlite3, sys, time
+place, table = sys.argv[1:]
+while True:
+    with contextlib.suppress(sqlite3.Error):
+        with contextlib.closing(sqlite3.connect(place + "?mode=ro", uri=True, timeout=0.1)) as database:
+            print(database.execute("SELECT COUNT(*) FROM " + table).fetchone()[0], flush=True)
+    time.sleep(0.5)
+"""
+
+
+def _pairs(count: int) -> set[tuple[int, int]]:
+    """Return the pairs of photos that are matched: all, or in large sets neighbors by name at these distances."""
+    if count <= EXHAUSTIVE_LIMIT:
+        return set(itertools.combinations(range(count), 2))
+    steps = {*range(1, OVERLAP + 1), *(2**power for power in range(OVERLAP))}
+    return {(i, i + step) for i in range(count) for step in steps if i + step < count}
+
+
+def _match(database: Path, count: int, photo_seconds: float) -> None:
+    """Match features between photos.
+
+    Args:
+        database: COLMAP's database, with the features.
+        count: number of photos.
+        photo_seconds: time that the features of a photo took, to estimate the time of what follows.
+    """
     import pycolmap
 
     options = {"verification_options": pycolmap.TwoViewGeometryOptions(), "device": pycolmap.Device.cpu}
     options["verification_options"].ransac.random_seed = SEED
-    _log.info("matching features between %d photos", count)
-    with quiet_colmap():
-        if count <= EXHAUSTIVE_LIMIT:
-            run_interruptibly(partial(pycolmap.match_exhaustive, database, **options))
-        else:
-            pairing = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
-            run_interruptibly(partial(pycolmap.match_sequential, database, pairing_options=pairing, **options))
+    match = partial(pycolmap.match_exhaustive, database, **options)
+    if count > EXHAUSTIVE_LIMIT:
+        pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
+        match = partial(pycolmap.match_sequential, database, pairing_options=pairing, **options)
+    with quiet_colmap(), stage("matching pairs of photos", len(_pairs(count)), _log) as progress:
+        progress.later = photo_seconds * _PLACE_COST * count
+        with counted_rows(database, "two_view_geometries", progress.update):
+            run_interruptibly(match)
+        progress.update(progress.total)
 
 
 def _map(database: Path, work: Path, count: int, source: Path):
@@ -291,16 +365,15 @@ def _map(database: Path, work: Path, count: int, source: Path):
             options.mapper.init_min_num_inliers = 50
             options.mapper.abs_pose_min_num_inliers = 15
             _log.info("placing the photos again with weaker conditions")
-        placed = itertools.count(3)
-
-        def next_image(placed=placed) -> None:
-            _log.info("placed %d of %d photos", next(placed), count)
-
         output = work / f"model{int(patient)}"
         output.mkdir()
-        with quiet_colmap():
+        with quiet_colmap(), stage("placing photos", count, _log) as progress:
+            progress.later = 0.0
+            placed = itertools.count(3)
             place: Any = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
-            models = run_interruptibly(partial(place, next_image_callback=next_image))
+            models = run_interruptibly(
+                partial(place, next_image_callback=lambda: progress.update(next(placed)))  # noqa: B023
+            )
         candidates = [*([] if best is None else [best]), *models.values()]
         best = max(candidates, key=lambda model: model.num_reg_images(), default=None)
         if best is not None and best.num_reg_images() == count:

@@ -1,7 +1,9 @@
 """Structure from motion of panoramas: through pinhole views cut from each, which COLMAP moves as one rigid rig."""
 
+import itertools
 import json
 import logging
+import math
 import re
 from collections.abc import Sequence
 from functools import partial
@@ -13,14 +15,24 @@ from PIL import Image
 
 from ..errors import InputError
 from ..parallel import run_interruptibly
+from ..progress import stage, tracked
 from .colmap_model import ModelImage, SparseModel, read_points
 from .dataparser import PointCloud
 from .images import open_image
 from .lens import Lens
 from .linear_photos import kind_of
 from .photos import photo_sizes, read_photo
-from .preprocess import log_progress
-from .sfm import EXHAUSTIVE_LIMIT, SEED, Reconstruction, cache_key, cached_result, file_digest, image_name, quiet_colmap
+from .sfm import (
+    EXHAUSTIVE_LIMIT,
+    SEED,
+    Reconstruction,
+    cache_key,
+    cached_result,
+    counted_rows,
+    file_digest,
+    image_name,
+    quiet_colmap,
+)
 from .types import View, encoded_values
 from .wide_camera import FACE_ANGLE, face_rotations, faces_of
 
@@ -105,7 +117,7 @@ def _write_faces(photos: Sequence[Path], folder: Path) -> None:
     """Write the cut views of each photo: face0/00000.png, face1/00000.png, ..."""
     for number in range(len(face_rotations())):
         (folder / f"face{number}").mkdir(parents=True)
-    for index, photo in log_progress("cutting panoramas", photos):
+    for index, photo in tracked("cutting panoramas", photos, _log):
         pixels = read_photo(photo, oriented=True).pixels
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
         height, width = pixels.shape[:2]
@@ -122,7 +134,6 @@ def _match_rigs(database: Path, images: Path, count: int) -> None:
     side = Image.open(images / "face0" / image_name(0)).size[0]
     focal = side / 2 / np.tan(np.radians(FACE_ANGLE / 2))
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE", camera_params=f"{focal},{side / 2},{side / 2}")
-    _log.info("finding features in the cut views of %d panoramas", count)
     turns = face_rotations()
     cameras = []
     for number, turn in enumerate(turns):
@@ -134,16 +145,25 @@ def _match_rigs(database: Path, images: Path, count: int) -> None:
     options["verification_options"].ransac.random_seed = SEED
     with quiet_colmap():
         arguments = (database, images, [], pycolmap.CameraMode.PER_FOLDER, reader)
-        run_interruptibly(partial(pycolmap.extract_features, *arguments, device=pycolmap.Device.cpu))
+        extract = partial(pycolmap.extract_features, *arguments, device=pycolmap.Device.cpu)
+        with (
+            stage("finding features in views of panoramas", count * len(turns), _log) as progress,
+            counted_rows(database, "keypoints", progress.update),
+        ):
+            run_interruptibly(extract)
         with pycolmap.Database.open(database) as opened:
             pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=cameras)], opened)
-        _log.info("matching features between %d panoramas", count)
-        if count * len(turns) <= EXHAUSTIVE_LIMIT:
-            run_interruptibly(partial(pycolmap.match_exhaustive, database, matching_options=matching, **options))
-        else:
+        match = partial(pycolmap.match_exhaustive, database, matching_options=matching, **options)
+        pairs = len(turns) ** 2 * math.comb(count, 2)
+        if count * len(turns) > EXHAUSTIVE_LIMIT:
             pairing = pycolmap.SequentialPairingOptions(overlap=10, quadratic_overlap=True)
             options |= {"matching_options": matching, "pairing_options": pairing}
-            run_interruptibly(partial(pycolmap.match_sequential, database, **options))
+            match, pairs = partial(pycolmap.match_sequential, database, **options), 0
+        with (
+            stage("matching pairs of views", pairs, _log) as progress,
+            counted_rows(database, "two_view_geometries", progress.update),
+        ):
+            run_interruptibly(match)
 
 
 def _map_rigs(database: Path, work: Path, count: int, source: Path):
@@ -162,12 +182,14 @@ def _map_rigs(database: Path, work: Path, count: int, source: Path):
             options.mapper.init_min_tri_angle = 4.0
             options.mapper.init_min_num_inliers = 50
             options.mapper.abs_pose_min_num_inliers = 15
-        _log.info("placing %d panoramas", count)
         output = work / f"model{int(patient)}"
         output.mkdir()
-        with quiet_colmap():
+        with quiet_colmap(), stage("placing views of panoramas", count * len(face_rotations()), _log) as progress:
+            placed = itertools.count(3)
             place: Any = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
-            models = run_interruptibly(place)
+            models = run_interruptibly(
+                partial(place, next_image_callback=lambda: progress.update(next(placed)))  # noqa: B023
+            )
         candidates = [*([] if best is None else [best]), *models.values()]
         best = max(candidates, key=lambda model: model.num_reg_frames(), default=None)
         if best is not None and best.num_reg_frames() == count:

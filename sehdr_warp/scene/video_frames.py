@@ -5,8 +5,10 @@ import logging
 import os
 import shutil
 import tempfile
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -15,6 +17,7 @@ from ..caches import usable, user_cache
 from ..errors import InputError, SehdrError
 from ..files import atomic_folder
 from ..own_files import is_sealed
+from ..progress import stage
 from .dataparser import DataparserOutputs
 from .names import list_images
 from .png16 import png16
@@ -62,12 +65,10 @@ def choose_frames(clip: Clip) -> FrameChoice:
     reference: np.ndarray | None = None
     before = 0.0  # Movement up to the reference
     total = 0
-    for number, frame in decode(clip):
+    for number, frame in _shown(decode(clip)):
         total = number + 1
         if number % stride:
             continue
-        if number % (100 * stride) == 0:
-            _log.info("looking at frame %d", number + 1)
         small = grey(frame, _SHARPNESS_WIDTH)
         tiny = grey(frame, _MOVEMENT_WIDTH)
         # From a reference some pixels back: a slow camera moves by less than a pixel between frames.
@@ -89,6 +90,14 @@ def choose_frames(clip: Clip) -> FrameChoice:
     intervals = np.minimum(np.array(moved) / movement * count, count - 1e-6).astype(int)
     best = {int(i): max(np.flatnonzero(intervals == i), key=lambda k: sharp[k]) for i in np.unique(intervals)}
     return FrameChoice(tuple(numbers[k] for k in sorted(best.values())), total, movement)
+
+
+def _shown(frames: Iterable[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
+    """Yield numbered frames as a stage; a clip does not state reliably how many it has."""
+    with stage("looking at frames", 0, _log) as progress:
+        for number, frame in frames:
+            yield number, frame
+            progress.update(number + 1)
 
 
 def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
@@ -135,14 +144,14 @@ def _temporary() -> Path:
 
 def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
     numbers = frozenset(choice.numbers)
-    for done, (number, frame) in enumerate(decode(clip, numbers)):
-        if done % 10 == 0:
-            _log.info("keeping frames %d to %d of %d", done + 1, min(done + 10, len(numbers)), len(numbers))
-        pixels, file = codes(frame, clip.color), folder / f"frame_{number:06d}.png"
-        if pixels.dtype == np.uint8:
-            Image.fromarray(pixels).save(file, compress_level=1)
-        else:
-            file.write_bytes(png16(pixels, level=1))
+    with stage("keeping frames", len(numbers), _log) as progress:
+        for done, (number, frame) in enumerate(decode(clip, numbers), start=1):
+            pixels, file = codes(frame, clip.color), folder / f"frame_{number:06d}.png"
+            if pixels.dtype == np.uint8:
+                Image.fromarray(pixels).save(file, compress_level=1)
+            else:
+                file.write_bytes(png16(pixels, level=1))
+            progress.update(done)
     facts = {"total": choice.total, "movement": choice.movement}
     (folder / "frames.json").write_text(json.dumps(facts))
 

@@ -12,8 +12,8 @@ import torch
 
 from sehdr_warp.scene import Camera
 
-from ..console import format_seconds
 from ..errors import SehdrError
+from ..progress import format_seconds
 from .frames import ViewerScene
 from .server import Server, Viewer
 

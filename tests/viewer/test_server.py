@@ -93,7 +93,7 @@ def test_what_is_saved_is_what_render_writes(serve, tmp_path):
         server.viewer._tell = lambda line: (tell(line), told.append(ask(server, "/saving")[2].decode()))
         film = ask(server, "/save", {"cameras": [view.to_dict(), other], "kind": "film", "count": 3, "stops": -1})
         assert film[:2] == (200, "video/mp4") and b"ftyp" in film[2][:16]
-        assert [line.partition(", ")[0] for line in told] == ["film.mp4: frame 1 of 3", "film.mp4: frame 2 of 3"]
+        assert [line.partition(", ")[0] for line in told] == ["film.mp4: frames: 1 of 3", "film.mp4: frames: 2 of 3"]
         assert ask(server, "/saving")[2] == b""
 
 
