@@ -19,6 +19,8 @@ log = logging.getLogger(__name__)
 MIN_STOPS, MIN_CODE_DIFFERENCE = 1.0, 0.1
 MIN_PIXELS = 6
 MAX_LISTED = 20
+_EXPOSED = 0.1, 0.95  # Codes of pixels whose brightness a photo tells well
+_LEAST_EXPOSED = 0.05  # Part of such pixels, from which the brightness of a photo is compared
 MAX_VIEWS = 200  # Training views that are compared, evenly chosen; more change the means little
 
 
@@ -60,6 +62,25 @@ def find_residual_regions(field: RadianceField, views: Sequence[View], *, degree
             box = first_column, top, int(column.max()) - first_column + 1, int(row.max()) - top + 1
             regions.append(Region(view.name, *middle, len(row), round(float(stops.mean()), 2), box))
     return sorted(regions, key=lambda region: -region.pixels * abs(region.stops))
+
+
+@torch.no_grad()
+def brightness_offsets(field: RadianceField, views: Sequence[View], *, degree: int | None = None) -> dict[str, float]:
+    """Return the stops by which whole photos are brighter than the scene, by the views' names.
+
+    It is the median over pixels that are neither clipped nor dark, less the median over photos. Photos with few such
+    pixels are left out. At most MAX_VIEWS photos are compared, evenly chosen.
+    """
+    medians = {}
+    for view in views[:: -(-len(views) // MAX_VIEWS) or 1]:
+        exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
+        stops, _ = _differences(view, exposure, field.response)
+        exposed = ((view.image > _EXPOSED[0]) & (view.image < _EXPOSED[1])).all(2)
+        exposed &= True if view.mask is None else view.mask > 0.5
+        if exposed.mean() > _LEAST_EXPOSED:
+            medians[view.name] = float(np.median(stops[exposed]))
+    middle = float(np.median(list(medians.values()))) if medians else 0.0
+    return {name: round(value - middle, 2) for name, value in medians.items()}
 
 
 def high_residual_mask(view: View, exposure: torch.Tensor, response: Response) -> torch.Tensor:

@@ -120,6 +120,7 @@ class SummaryValues(Values):
     peak_gpu_memory_bytes: Count | None = None
     plan: dict[str, Text] | None = None
     unexplained: UnexplainedValues | None = None
+    brightness_offsets: dict[str, _Decibels] | None = None
 
 
 class DecisionValues(Values):

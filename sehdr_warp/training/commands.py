@@ -213,7 +213,8 @@ def _train(args: Train, ranks=None) -> None:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
         with viewed(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
             follow(steps, trainer.total)
-    _print_result(args, trainer.run, partial(advice, train_photos=len(trainer.scene.train_views)))
+    photos = len(trainer.scene.train_views)
+    _print_result(args, trainer.run, partial(advice, train_photos=photos, scene=data["path"]))
 
 
 def _photo_storage(config) -> str:

@@ -8,7 +8,7 @@ import torch
 
 from ..errors import SehdrError
 from ..model.confidence import Evidence, gather_evidence
-from ..model.residual_regions import MAX_LISTED, find_residual_regions, regions_to_dict
+from ..model.residual_regions import MAX_LISTED, brightness_offsets, find_residual_regions, regions_to_dict
 from ..runs.checkpoint import first_not_finite
 from ..runs.config import Config
 from ..runs.light_estimates import light_estimates
@@ -132,8 +132,11 @@ class RunOutput:
 
     def _report_residuals(self, run: Run, trainer: TrainingState) -> None:
         """Compare the training photos with the scene, and list the regions that differ in summary and log."""
-        regions = find_residual_regions(run.model, trainer.scene.train_views, degree=run.degree)
-        self.folder.write_summary(run.summary() | {"unexplained": regions_to_dict(regions)})
+        views = trainer.scene.train_views
+        regions = find_residual_regions(run.model, views, degree=run.degree)
+        offsets = brightness_offsets(run.model, views, degree=run.degree)
+        unexplained = {"unexplained": regions_to_dict(regions), "brightness_offsets": offsets}
+        self.folder.write_summary(run.summary() | unexplained)
         if regions:
             worst, photos = regions[0], len({region.photo for region in regions})
             log.warning(

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sehdr_warp.model.confidence import gather_evidence
-from sehdr_warp.model.residual_regions import find_residual_regions
+from sehdr_warp.model.residual_regions import brightness_offsets, find_residual_regions
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.train import train
 
@@ -74,6 +74,12 @@ def test_what_does_not_count_is_not_missing_and_light_that_is_not_there_is(tmp_p
     }
     masked = [replace(view, mask=np.zeros((64, 64), np.float32)) for view in dark.views]
     assert find_residual_regions(run.model, dark.views) and not find_residual_regions(run.model, masked)
+    # A whole photo of another exposure is told by its offset; clipped pixels do not count.
+    names = [view.name for view in scene.views]
+    longer = [replace(scene.views[0], exposure_time=scene.views[0].exposure_time / 2), *scene.views[1:]]
+    offsets = brightness_offsets(run.model, longer)
+    assert list(offsets) == names and offsets[names[0]] == pytest.approx(1.0, abs=0.1)
+    assert all(abs(offsets[name]) < 0.1 for name in names[1:])
     # A training reports what its photos show and the scene does not hold.
     spoiled = replace(scene, views=(*scene.views[:8], dark.views[8]))
     worst = train(spoiled, tmp_path / "spoiled", CONFIG, device="cpu").summary()["unexplained"]["worst"][0]

@@ -25,6 +25,18 @@ def test_photos_that_hold_no_more_are_named():
     assert "2.0 dB better at iteration 44" in line and "12 photos" in line
 
 
+def test_photos_of_another_exposure_are_named_with_the_command():
+    figures = summary([28, 28, 28], regions=100) | {"brightness_offsets": {"a": 0.1, "b": -0.9, "c": 0.5}}
+    [line] = advice(Path("r"), figures, 10, "my photos")
+    assert line.startswith("2 photos are brighter or darker") and "b -0.9, c +0.5" in line
+    assert line.endswith("or leave them out: sehdr-warp train 'my photos' --out r --overwrite")
+
+
+def test_a_training_that_is_too_short_blames_nothing_that_moved():
+    [line] = advice(Path("r"), summary([20, 22, 24], regions=100), 10)
+    assert "more steps help" in line
+
+
 def test_few_photos_and_movement():
     assert "photos are few" in advice(Path("r"), summary([20, 21, 21.05]), 8)[0]
     [line] = advice(Path("r"), summary([28, 28, 28], regions=100), 10)
