@@ -50,20 +50,20 @@ def main(
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     result = new_result("bits", torch.device(device), {"iterations": iterations, "max_size": max_size})
     result["command"] = "python -m benchmarks.bits --json docs/reports/results/bits.json"
-    given = partial(row, iterations=iterations, max_size=max_size, device=device)
+    measure_row = partial(row, iterations=iterations, max_size=max_size, device=device)
     # Kernels are compiled once, not by each worker.
     row((scenes[0], exposures[0], *PHOTOS[0]), iterations=30, max_size=max_size, device=device)
     with ProcessPoolExecutor(jobs, get_context("spawn")) as workers:
         asked = [(scene, exposure, *photos) for exposure, scene, photos in product(exposures, scenes, PHOTOS)]
-        for found in workers.map(given, asked):
-            result["rows"].append(found)
+        for result_row in workers.map(measure_row, asked):
+            result["rows"].append(result_row)
             write_json(json, result, overwrite=True)  # What has ended outlives an interruption.
     finish(result, json, overwrite=True)
 
 
-def row(asked: tuple[str, int, int, str, str], *, iterations: int, max_size: int | None, device: str) -> dict:
+def row(job: tuple[str, int, int, str, str], *, iterations: int, max_size: int | None, device: str) -> dict:
     """Held-out figures of one training."""
-    name, exposure, bits, kind, noise = asked
+    name, exposure, bits, kind, noise = job
     curve = response_by_name("srgb")
     truth = load_scene(f"embedded:{name}", max_size=max_size, response="srgb")
     time = exposure_ladder(truth, curve)[exposure]
@@ -71,8 +71,8 @@ def row(asked: tuple[str, int, int, str, str], *, iterations: int, max_size: int
     config = load_config("default", {"schedule.iterations": iterations, "response.name": "srgb"})
     with tempfile.TemporaryDirectory() as folder:
         figures = evaluate(train(scene, Path(folder) / "run", config, device=device), scene)
-    shown, regions = figures["protocol"]["gt-max"]["psnr_mu"], figures["regions"]
-    place = {"scene": name, "exposure": exposure, "bits": bits, "kind": kind, "noise": noise, "hdr": shown}
+    psnr_mu, regions = figures["protocol"]["gt-max"]["psnr_mu"], figures["regions"]
+    place = {"scene": name, "exposure": exposure, "bits": bits, "kind": kind, "noise": noise, "hdr": psnr_mu}
     LOG.info("%s", place)
     return place | {region.replace("-", "_"): regions[region]["psnr_mu"]["gt-max"] for region in regions}
 

@@ -124,7 +124,7 @@ def figures(image: Tensor, view: View, response: Response, metric, device: str) 
     values = {"psnr": psnr(image, photo, mask), "ssim": ssim(image, photo, mask)}
     light = response.decode(image)
     exposed = (torch.lerp(photo, response.encode(light * 2**stops), mask.float()[..., None]) for stops in STOPS)
-    values["psnr_fitted"] = max(psnr(shown.clamp(0, 1), photo, mask) for shown in exposed)
+    values["psnr_fitted"] = max(psnr(exposed_render.clamp(0, 1), photo, mask) for exposed_render in exposed)
     return values | ({"lpips": metric(image, photo)} if metric else {})
 
 

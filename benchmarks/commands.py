@@ -148,13 +148,15 @@ class Quality(Output):
 
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
         lpips = os.environ.get("SEHDR_LPIPS") or None
-        asked: dict[str, Any] = {
+        options: dict[str, Any] = {
             name: _words(getattr(self, name)) for name in ("scenes", "methods", "curves", "responses")
         }
         for name in ("exposures", "seeds"):
-            asked[name] = tuple(dict.fromkeys(parse_numbers(f"--{name}", getattr(self, name), int, minimum=0)))
+            options[name] = tuple(dict.fromkeys(parse_numbers(f"--{name}", getattr(self, name), int, minimum=0)))
         iterations = self.iterations and require_positive("--iterations", self.iterations)
-        jobs = plan_jobs(**asked, iterations=iterations, max_size=self.max_size, device=device, lpips=lpips is not None)
+        jobs = plan_jobs(
+            **options, iterations=iterations, max_size=self.max_size, device=device, lpips=lpips is not None
+        )
         how = {"at_once": require_positive("--jobs", self.jobs), "slurm": _pairs("--slurm", self.slurm)}
         rows = run_jobs(jobs, self.out, device=device, lpips=lpips and os.path.abspath(lpips), **how)
         result = new_result("quality", torch.device(device), {"jobs": self.jobs})

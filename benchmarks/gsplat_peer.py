@@ -56,5 +56,11 @@ def _matrix(intrinsics: torch.Tensor) -> torch.Tensor:
 
 def gsplat_renderer(scene: SplatScene) -> Callable[[], torch.Tensor]:
     """A function that renders [H, W, C]; what does not change between calls is prepared."""
-    given: Any = (*scene.leaves, scene.world_to_camera, _matrix(scene.intrinsics), scene.size.width, scene.size.height)
-    return lambda: rasterize_with_gsplat(*given).image
+    arguments: Any = (
+        *scene.leaves,
+        scene.world_to_camera,
+        _matrix(scene.intrinsics),
+        scene.size.width,
+        scene.size.height,
+    )
+    return lambda: rasterize_with_gsplat(*arguments).image

@@ -42,13 +42,13 @@ def read_light_maps(folder: Path) -> list[LightMap]:
         height, width = next(iter(channels.values())).shape
         try:
             position = np.array(json.loads(header["sehdr:position"]), float).reshape(3)
-            radiance, seen = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
+            radiance, coverage = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
         except (LookupError, ValueError, TypeError):
-            position, radiance, seen = np.full(3, np.nan), np.zeros(0), np.zeros(0)
+            position, radiance, coverage = np.full(3, np.nan), np.zeros(0), np.zeros(0)
         if width != 2 * height or not np.isfinite(position).all() or not np.isfinite(radiance).all():
             problem = "is no lat-long map with R, G, B, A and sehdr:position"
             raise InputError(path, problem, f"remove it, or make {FOLDER}/ again by scenes.generator")
-        maps.append(LightMap(position, radiance, seen))
+        maps.append(LightMap(position, radiance, coverage))
     return maps
 
 
@@ -61,13 +61,13 @@ def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Came
     that face too little of it do not count. cameras: the training's. scale: of the run's radiance to the truth's.
     """
     focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras])) if cameras else 1.0
-    found = [_errors(run, each, focal, scale) for each in maps]
-    errors = np.concatenate([*found, np.zeros(0)])
-    told = {"median": None, "percentile_90": None, "places": [], "directions": len(errors)}
+    per_map = [_errors(run, each, focal, scale) for each in maps]
+    errors = np.concatenate([*per_map, np.zeros(0)])
+    summary = {"median": None, "percentile_90": None, "places": [], "directions": len(errors)}
     if len(errors):
-        told |= {"median": float(np.median(errors)), "percentile_90": float(np.percentile(errors, 90))}
-        told["places"] = [float(np.median(each)) if len(each) else None for each in found]
-    return told
+        summary |= {"median": float(np.median(errors)), "percentile_90": float(np.percentile(errors, 90))}
+        summary["places"] = [float(np.median(each)) if len(each) else None for each in per_map]
+    return summary
 
 
 def _errors(run: Any, truth: LightMap, focal: float, scale: float) -> np.ndarray:
@@ -78,6 +78,6 @@ def _errors(run: Any, truth: LightMap, focal: float, scale: float) -> np.ndarray
     light = scale * light.reshape(height, FINER, width, FINER).mean(axis=(1, 3))
     weight = truth.seen * solid_angles(width, "latlong")
     facing = np.maximum(sphere_directions(NORMALS) @ latlong(width).reshape(-1, 3).T, 0)
-    given, wanted, shown = (facing @ (each * weight).ravel() for each in (light, truth.radiance.mean(2), 1.0))
-    counted = shown > LEAST_SEEN * (facing @ solid_angles(width, "latlong").ravel())
-    return np.abs(given[counted] / np.maximum(wanted[counted], np.finfo(np.float32).tiny) - 1)
+    rendered, true, coverage = (facing @ (each * weight).ravel() for each in (light, truth.radiance.mean(2), 1.0))
+    covered = coverage > LEAST_SEEN * (facing @ solid_angles(width, "latlong").ravel())
+    return np.abs(rendered[covered] / np.maximum(true[covered], np.finfo(np.float32).tiny) - 1)

@@ -70,14 +70,14 @@ def against_gsplat(scene: SplatScene) -> dict:
 
 def _checks(scene: SplatScene, peer: bool) -> list[dict]:
     """Against float64; on a GPU also against the CPU's kernels at full size."""
-    made = against_float64(scene, REFERENCE_GAUSSIANS)
+    checks = against_float64(scene, REFERENCE_GAUSSIANS)
     if scene.device.type == "cuda":
         cpu, recorded = _image_and_gradients(scene.to("cpu")), _recorded(scene, scene.cotangent())()
         # The last of as many calls as are launched before a picture of this size is replayed.
-        called = [_image_and_gradients(scene) for _ in range(WARMUP_CALLS + 2)][-1]
-        for name, ours in ((OURS, called), (RECORDED, recorded)):
-            made += _compared(name, "the CPU's kernels", ours, cpu)
-    return [*made, against_gsplat(scene)] if peer else made
+        repeated = [_image_and_gradients(scene) for _ in range(WARMUP_CALLS + 2)][-1]
+        for name, ours in ((OURS, repeated), (RECORDED, recorded)):
+            checks += _compared(name, "the CPU's kernels", ours, cpu)
+    return [*checks, against_gsplat(scene)] if peer else checks
 
 
 def _image_and_gradients(scene: SplatScene, rasterizer: Callable | None = None) -> list[torch.Tensor]:
@@ -88,8 +88,8 @@ def _image_and_gradients(scene: SplatScene, rasterizer: Callable | None = None) 
 def _compared(name: str, against: str, ours: list[torch.Tensor], truth: list[torch.Tensor]) -> list[dict]:
     """Checks of an image and the gradients of NAMES."""
     labels, bounds = ["image", *(f"gradient of {leaf}" for leaf in NAMES)], [IMAGE_BOUND] + [GRADIENT_BOUND] * 5
-    given = zip(labels, ours, truth, bounds, strict=True)
-    return [check(f"{name}: {label}", against, _difference(a, b), bound) for label, a, b, bound in given]
+    pairs = zip(labels, ours, truth, bounds, strict=True)
+    return [check(f"{name}: {label}", against, _difference(a, b), bound) for label, a, b, bound in pairs]
 
 
 def _difference(value: torch.Tensor, other: torch.Tensor) -> float:
@@ -142,8 +142,8 @@ def _rows(scene: SplatScene, peer: bool, repetitions: int) -> list[dict]:
         timings = time_variants(variants, scene.device, repetitions=repetitions)
         for key, timing in timings.items():
             row = place | {"channels": scene.channels, "pass": name, "implementation": key, "entries": entries}
-            measured = variants[key] if scene.device.type == "cpu" else _from_the_start(variants[key])
-            row |= timing | {"peak_memory_bytes": peak_memory(measured, scene.device)}
+            variant = variants[key] if scene.device.type == "cpu" else _from_the_start(variants[key])
+            row |= timing | {"peak_memory_bytes": peak_memory(variant, scene.device)}
             ratio = None if key == OURS else timings[OURS]["median_ms"] / timing["median_ms"]
             rows.append(row | {"ours_over_this": ratio})
     return rows

@@ -98,14 +98,14 @@ def _train_gsplat(scene: Scene, config: Config, device: str) -> dict:
 
 def _means(render: Callable, scene: Scene, device: str) -> dict[str, float]:
     response = response_by_name(RESPONSE)
-    seen = [figures(render(view), view, response, None, device) for view in scene.test_views]
-    return {name: float(np.mean([each[name] for each in seen])) for name in ("psnr", "ssim")}
+    values = [figures(render(view), view, response, None, device) for view in scene.test_views]
+    return {name: float(np.mean([each[name] for each in values])) for name in ("psnr", "ssim")}
 
 
 def _scene(size: Size, photos: int, device: str) -> Scene:
-    made = make_photo_scene(size, photos, device)
-    views = [replace(view, split="train" if k % HELD_OUT else "test") for k, view in enumerate(made.views)]
-    return replace(made, views=tuple(views))
+    scene = make_photo_scene(size, photos, device)
+    views = [replace(view, split="train" if k % HELD_OUT else "test") for k, view in enumerate(scene.views)]
+    return replace(scene, views=tuple(views))
 
 
 if __name__ == "__main__":

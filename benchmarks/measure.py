@@ -25,11 +25,11 @@ from .report_pages import PAGES, REPORTS, ROOT, write_readme, write_reports
 
 def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), /, work: Path = Path("measured")) -> None:
     """Measure for pages, by default for all that can be measured."""
-    measured = [name for name, page in PAGES.items() if "command" in page]
-    if wrong := set(pages) - set(measured):
-        sys.exit(f"measure.py: {min(wrong)} is no page to measure: {', '.join(measured)}")
+    names = [name for name, page in PAGES.items() if "command" in page]
+    if wrong := set(pages) - set(names):
+        sys.exit(f"measure.py: {min(wrong)} is no page to measure: {', '.join(names)}")
     failed = []
-    for name in pages or measured:
+    for name in pages or names:
         print(f"== {name}", flush=True)
         try:
             write_json(REPORTS / "results" / f"{name}.json", measure(PAGES[name], work / build() / name), ours=True)

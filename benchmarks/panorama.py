@@ -59,29 +59,29 @@ def main(
     truth = work / "truth.npz"
     if not truth.is_file():
         _render(truth, cameras, judged, width, samples)
-    with np.load(truth) as found:
-        seen, wanted, panorama = found["seen"], found["judged"], found["panorama"]
-    scene = _scene(cameras, seen)
+    with np.load(truth) as arrays:
+        photos, truth_views, panorama = arrays["seen"], arrays["judged"], arrays["panorama"]
+    scene = _scene(cameras, photos)
     settings = {"views": views, "size": size, "width": width, "samples": samples, "iterations": iterations}
     result = new_result("panorama", torch.device(device), settings)
     result["command"] = "python -m benchmarks.panorama --work panorama_work --json docs/reports/results/panorama.json"
     # As the plan of photos has it where cameras look all around; on truth there is no plan.
     config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": WIDEST})
-    kept = (work / "run" / "summary.json").is_file()
-    run = load_run(work / "run", device=device) if kept else train(scene, work / "run", config, device=device)
+    is_trained = (work / "run" / "summary.json").is_file()
+    run = load_run(work / "run", device=device) if is_trained else train(scene, work / "run", config, device=device)
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))
     map_file = write_environment_map(
         run, work / "map.exr", at=at, size=width, axes="scene", pixel="float", overwrite=True
     )
-    peak = float(max(wanted.max(), panorama.max()))
-    shown = np.stack([run.render(camera).hdr.cpu().numpy() for camera in judged])
+    peak = float(max(truth_views.max(), panorama.max()))
+    renders = np.stack([run.render(camera).hdr.cpu().numpy() for camera in judged])
     rays = np.stack([_rays(camera) for camera in judged])
     weight, directions = solid_angles(width, "latlong"), latlong(width)
     errors = _squared(_even(read_hdr(map_file)), _even(panorama), peak)
     column = np.arange(width)
     edge = np.broadcast_to((column < EDGE) | (column >= width - EDGE), errors.shape)
     pole, shown_pole = (np.abs(each[..., 1]) > np.cos(POLE) for each in (directions, rays))
-    plain = _squared(shown, wanted, peak)
+    plain = _squared(renders, truth_views, peak)
     parts = {
         "12 perspective views": (plain, np.ones(plain.shape)),
         "of these, 15 degrees around the map's poles": (plain, 1.0 * shown_pole),
@@ -93,10 +93,10 @@ def main(
     for name, (squared, share) in parts.items():
         psnr = -10 * np.log10((squared * share).sum() / share.sum())
         result["rows"].append({"what": name, "psnr": float(psnr)})
-    given, wanted_light = (_irradiance(image, directions, weight) for image in (read_hdr(map_file), panorama))
-    off = np.abs(given / wanted_light - 1)
-    told = f"{off.mean():.1%} off in the mean, {off.max():.1%} at most"
-    result["notes"].append(f"Irradiance of surfaces that face {len(off)} directions: {told}.")
+    rendered_light, true_light = (_irradiance(image, directions, weight) for image in (read_hdr(map_file), panorama))
+    off = np.abs(rendered_light / true_light - 1)
+    error_text = f"{off.mean():.1%} off in the mean, {off.max():.1%} at most"
+    result["notes"].append(f"Irradiance of surfaces that face {len(off)} directions: {error_text}.")
     result["notes"].append(f"{run.gaussian_count:,} Gaussians; the truth's peak is {peak:.3g}.")
     finish(result, json, overwrite=True)
 
@@ -120,12 +120,12 @@ def _rays(camera: Camera) -> np.ndarray:
     return local / np.linalg.norm(local, axis=2, keepdims=True) @ camera.world_to_camera[:3, :3]
 
 
-def _scene(cameras: list[Camera], seen: np.ndarray) -> Scene:
+def _scene(cameras: list[Camera], photos: np.ndarray) -> Scene:
     curve = response_by_name("srgb")
-    time = ladder_of(RECIPE, list(seen), curve.encode)[2]
+    time = ladder_of(RECIPE, list(photos), curve.encode)[2]
     views = [
         View(f"r_{i}", codes_of(np.asarray(curve.encode(hdr * time)), 8), camera, time, "train", hdr=hdr)
-        for i, (camera, hdr) in enumerate(zip(cameras, seen, strict=True))
+        for i, (camera, hdr) in enumerate(zip(cameras, photos, strict=True))
     ]
     return Scene(RECIPE, "transforms", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32), response=curve)
 
@@ -143,9 +143,11 @@ def _render(path: Path, cameras: list[Camera], judged: list[Camera], width: int,
         LOG.info("view %d", index)
         return np.array(mi.render(scene, sensor=_sensor(mi, camera), integrator=tracer, spp=count, seed=index))[..., :3]
 
-    seen = np.stack([view(i, camera, samples) for i, camera in enumerate(cameras)])
-    wanted = np.stack([view(1000 + i, camera, 4 * samples) for i, camera in enumerate(judged)])
-    np.savez_compressed(path, seen=seen, judged=wanted, panorama=_panorama(mi, scene, tracer, width, 4 * samples))
+    photos = np.stack([view(i, camera, samples) for i, camera in enumerate(cameras)])
+    truth_views = np.stack([view(1000 + i, camera, 4 * samples) for i, camera in enumerate(judged)])
+    np.savez_compressed(
+        path, seen=photos, judged=truth_views, panorama=_panorama(mi, scene, tracer, width, 4 * samples)
+    )
 
 
 def _panorama(mi: Any, scene: Any, tracer: Any, width: int, samples: int) -> np.ndarray:
@@ -180,12 +182,12 @@ def _even(image: np.ndarray) -> np.ndarray:
     """A lat-long map whose rows are averaged over as many pixels as make one of the equator: towards the poles a map
     asks for more than the photos' pixels tell, and truth has it."""
     height, width = image.shape[:2]
-    made = np.empty_like(image)
+    result = np.empty_like(image)
     for row, latitude in enumerate(np.pi * ((np.arange(height) + 0.5) / height - 0.5)):
         starts = np.arange(0, width, min(width, round(1 / np.cos(latitude))))
         counts = np.diff(starts, append=width)[:, None]
-        made[row] = np.repeat(np.add.reduceat(image[row], starts) / counts, counts[:, 0], axis=0)
-    return made
+        result[row] = np.repeat(np.add.reduceat(image[row], starts) / counts, counts[:, 0], axis=0)
+    return result
 
 
 def _mu(image: np.ndarray, peak: float) -> np.ndarray:

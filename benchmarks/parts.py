@@ -83,8 +83,8 @@ and a fourth of a load for each more; the adjoint sums once more."""
 
 def part_of(kernel: str) -> str:
     """The part that a kernel, as the profiler names it, belongs to."""
-    named = kernel.rpartition("__locals__")[2]  # Behind the function that made it
-    return next(part for part, patterns in KERNELS.items() if any(fnmatchcase(named, p) for p in patterns))
+    name = kernel.rpartition("__locals__")[2]  # Behind the function that made it
+    return next(part for part, patterns in KERNELS.items() if any(fnmatchcase(name, p) for p in patterns))
 
 
 def parts_of_step(variant: Variant, work: Work, device: torch.device) -> list[dict]:
@@ -93,13 +93,13 @@ def parts_of_step(variant: Variant, work: Work, device: torch.device) -> list[di
     for _ in range(STEPS):
         variant.once()
     torch.cuda.synchronize(device)
-    with silent_stderr(), profile(activities=[ProfilerActivity.CUDA]) as seen:
+    with silent_stderr(), profile(activities=[ProfilerActivity.CUDA]) as profiler:
         for _ in range(STEPS):
             variant.once()
         torch.cuda.synchronize(device)
     times: dict[str, float] = defaultdict(float)
     launches: dict[str, int] = defaultdict(int)
-    events: Any = seen.events()
+    events: Any = profiler.events()
     for event in events:
         if event.device_type == torch.autograd.DeviceType.CUDA:
             part = part_of(event.name)

@@ -78,9 +78,9 @@ class Job:
 
     def result(self, out: Path) -> dict | None:
         """The complete result; None where there is none, or one that was cut short or is another config's."""
-        found = _read(self.folder(out) / RESULT)
-        whole = "figures" in found and (found.get("format"), found.get("key")) == (FORMAT, self.key)
-        return found if whole else None
+        result = _read(self.folder(out) / RESULT)
+        whole = "figures" in result and (result.get("format"), result.get("key")) == (FORMAT, self.key)
+        return result if whole else None
 
 
 def plan_jobs(
@@ -113,7 +113,7 @@ def plan_jobs(
     for what, names, file in (("scenes", titles, "folder"), ("methods", [Path(m).stem for m in methods], "TOML file")):
         if len(set(names)) < len(names):
             raise SehdrError(f"two {what} have one name; rename a {file} so that tables can tell them apart")
-    found = {place: {"name": name, "sha256": _digest(place)} for place, name in zip(scenes, titles, strict=True)}
+    places = {place: {"name": name, "sha256": _digest(place)} for place, name in zip(scenes, titles, strict=True)}
     jobs = []
     for method, seed, place, curve, exposure, response in product(methods, seeds, scenes, curves, exposures, responses):
         config = _training(method, iterations, seed)
@@ -123,11 +123,11 @@ def plan_jobs(
             response = LEARNED
         elif config.loss.ldr_weight == 0 and response == BLIND:
             continue
-        named = {KNOWN: curve, BLIND: "auto"}.get(response, config.response.name)
-        trained = override_config(config, {"response.name": named}, method)
+        curve_name = {KNOWN: curve, BLIND: "auto"}.get(response, config.response.name)
+        trained = override_config(config, {"response.name": curve_name}, method)
         decided = {
             "format": FORMAT,
-            "scene": found[place] | {"max_size": max_size},
+            "scene": places[place] | {"max_size": max_size},
             "curve": curve,
             "curve_sha256": _digest(curve) if Path(curve).is_file() else None,
             "exposure": exposure,
@@ -150,11 +150,13 @@ def plan_jobs(
 
 def _training(method: str, iterations: int | None, seed: int) -> Config:
     """The method's training, tested on a log scale of its length; what is stated is no plan's to change."""
-    stated = {} if iterations is None else {"schedule.iterations": iterations}
+    changes = {} if iterations is None else {"schedule.iterations": iterations}
     steps = {max(1, round(REFERENCE_ITERATIONS * FIRST_TEST ** (-k / (TESTS - 1)))) for k in range(TESTS)}
-    config = load_config(method, {"seed": seed, **stated})
+    config = load_config(method, {"seed": seed, **changes})
     times = {"schedule.evaluate_at": sorted(steps), "schedule.checkpoint_every": REFERENCE_ITERATIONS}
-    return override_config(config, times | {"plan.keep": sorted({*config.plan.keep, *stated, "response.name"})}, method)
+    return override_config(
+        config, times | {"plan.keep": sorted({*config.plan.keep, *changes, "response.name"})}, method
+    )
 
 
 def _read(path: Path) -> dict:
@@ -312,16 +314,16 @@ def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
     training = config_from_dict(config["training"], job.label)
     # A method that learns from photos alone sees no truth in the training views.
     views = tuple(replace(view, hdr=None) if view.split == "train" else view for view in scene.views)
-    shown = scene if config["sees_truth"] else replace(scene, views=views)
-    _warm_up(shown, training, folder / "warm-up", device)
+    train_scene = scene if config["sees_truth"] else replace(scene, views=views)
+    _warm_up(train_scene, training, folder / "warm-up", device)
     shutil.rmtree(out, ignore_errors=True)
     forget_peaks(torch.device(device))
-    run = train(shown, out, training, device=device)
+    run = train(train_scene, out, training, device=device)
     peak = torch.cuda.max_memory_allocated(device) if device.startswith("cuda") else None
     figures = evaluate(run, scene, lpips_weights=lpips if config["lpips"] else None)
     figures.pop("views")
-    given = read_light_maps(_folder(job.place)), [view.camera for view in scene.train_views]
-    figures["irradiance"] = irradiance_errors(run, *given, figures["protocol"]["aligned"]["scale"] or 1.0)
+    light_inputs = read_light_maps(_folder(job.place)), [view.camera for view in scene.train_views]
+    figures["irradiance"] = irradiance_errors(run, *light_inputs, figures["protocol"]["aligned"]["scale"] or 1.0)
     figures |= {"response": run.response.name, "peak_memory_bytes": peak}
     figures["renders_per_second"] = _render_rate(run, scene)
     curve = run.metrics()

@@ -30,34 +30,34 @@ def write_reports(folder: Path) -> list[Path]:
 
     Raises InputError for a folder without results, and for a result that cannot be read.
     """
-    found = {name: path for name in PAGES if (path := folder / "results" / f"{name}.json").is_file()}
-    if not found:
+    result_files = {name: path for name in PAGES if (path := folder / "results" / f"{name}.json").is_file()}
+    if not result_files:
         raise InputError(folder, "holds no results", "store them as results/*.json")
-    written, index = [], []
-    for name, path in found.items():
+    pages, index = [], []
+    for name, path in result_files.items():
         page, result = PAGES[name], _read(path)
         parts = [f"# {page['title']}", page["text"], f"```sh\n{result['command']}\n```"]
         parts += [f"Measure again: `python -m benchmarks.measure {name}`."] if "command" in page else []
         parts += [machine_line(result) + "."]
         if name in PLOTS:
-            written.append(folder / f"{name}.png")
-            with atomic_path(written[-1], ours=True) as temporary:
+            pages.append(folder / f"{name}.png")
+            with atomic_path(pages[-1], ours=True) as temporary:
                 PLOTS[name](result, temporary)
             parts.append(f"![{page['caption']}]({name}.png)")
-        written.append(_write(folder / f"{name}.md", [*parts, *TABLES[name](result), *result["notes"]]))
+        pages.append(_write(folder / f"{name}.md", [*parts, *TABLES[name](result), *result["notes"]]))
         machine = result["machine"]
         place = machine["gpu"]["name"] if machine["gpu"] else f"{machine['cpu']}, {machine['cores']} cores"
         build = machine.get("build")
         index.append({"report": f"[{page['title']}]({name}.md)", "machine": place, "build": build})
     if (folder / "tried.csv").is_file():
-        written.append(_write(folder / "tried.md", _tried_page(folder / "tried.csv")))
+        pages.append(_write(folder / "tried.md", _tried_page(folder / "tried.csv")))
         index.append({"report": "[Tried and lost](tried.md)"})
     text = (
         "What was measured. `python -m benchmarks.measure PAGE` measures a page again. "
         "`python -m benchmarks.report_pages` writes pages and the README's table from the results."
     )
     table = markdown_table(index, {"report": "", "machine": "", "build": ""})
-    return [*written, _write(folder / "README.md", ["# Reports", text, table])]
+    return [*pages, _write(folder / "README.md", ["# Reports", text, table])]
 
 
 def _read(path: Path) -> dict:
@@ -76,9 +76,11 @@ def _write(path: Path, parts: Sequence[str]) -> Path:
 def _pivot(rows: Sequence[Mapping], places: dict[str, str], over: str, value: str, form: str) -> str:
     """A table with a row for each place, and a column for the value of each `over`. places: as columns of a table."""
     fields = [field for _, field, _ in parted(places)]
-    found = groups(rows, *fields).items()
-    made = [dict(zip(fields, key, strict=True)) | {row[over]: row[value] for row in here} for key, here in found]
-    return markdown_table(made, places | dict.fromkeys((row[over] for row in rows), form))
+    row_groups = groups(rows, *fields).items()
+    pivoted = [
+        dict(zip(fields, key, strict=True)) | {row[over]: row[value] for row in here} for key, here in row_groups
+    ]
+    return markdown_table(pivoted, places | dict.fromkeys((row[over] for row in rows), form))
 
 
 def _kernel_tables(result: dict) -> Iterable[str]:
@@ -206,12 +208,12 @@ def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
     if not rows:
         return
     yield "## Irradiance: off by, and what the photos clip"
-    told = []
+    medians = []
     for (method,), mine in groups(rows, "method").items():
         whole = [row["irradiance"] for row in mine if row["clipped_share"] < NOTHING_CLIPS]
-        told += [f"{method} {median(whole):.1%} ({len(whole)} trainings)"] if whole else []
-    if told:
-        yield f"Where less than {NOTHING_CLIPS:.1%} of the pixels clip, in the median: {', '.join(told)}."
+        medians += [f"{method} {median(whole):.1%} ({len(whole)} trainings)"] if whole else []
+    if medians:
+        yield f"Where less than {NOTHING_CLIPS:.1%} of the pixels clip, in the median: {', '.join(medians)}."
     means = [
         {"scene": scene, "exposure": exposure, "method": method, "off": fmean(row["irradiance"] for row in here)}
         for (scene, exposure, method), here in groups(rows, "scene", "exposure", "method").items()
@@ -234,10 +236,10 @@ def write_readme(path: Path, result: dict) -> None:
 def readme_table(rows: Sequence[Mapping]) -> str:
     """Return the rows of in_short() that the README shows, as Markdown."""
     short, lines = {row["method"]: row for row in in_short(rows)}, []
-    for method, named in PAGES["quality"]["readme"].items():
+    for method, label in PAGES["quality"]["readme"].items():
         row = short[method]
         off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}"
-        cells = named, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", row["lost"].removesuffix(" lights"), off
+        cells = label, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", row["lost"].removesuffix(" lights"), off
         lines.append(f"| {' | '.join(cells)} |")
     heading = "| trained by | HDR | photos | lights lost | irradiance off |"
     return "\n".join([heading, "| --- | -: | -: | -: | -: |", *lines])
@@ -250,8 +252,8 @@ def _seeds_tables(result: dict) -> Iterable[str]:
         line = {"scene": scene, "seeds": len(rows), "lights": rows[0]["lights_count"], "mean": fmean(values)}
         line |= {"lost": sum(row["lights_lost"] for row in rows), "deviation": stdev(values), "worst": min(values)}
         table.append(line | {"below": line["mean"] - line["worst"], "photos": fmean(row["ldr"] for row in rows)})
-    trained, lost = len(result["rows"]), sum(line["lost"] for line in table)
-    yield f"{trained} trainings lost {lost} of {sum(row['lights_count'] for row in result['rows'])} lights."
+    trained, lost_lights = len(result["rows"]), sum(line["lost"] for line in table)
+    yield f"{trained} trainings lost {lost_lights} of {sum(row['lights_count'] for row in result['rows'])} lights."
     yield markdown_table(table, PAGES["seeds"]["columns"])
     # Sets that are not part of the project have seeds of their own.
     own = [row for row in result["rows"] if not row["scene"].startswith("room_")]
@@ -276,8 +278,8 @@ def _readings_tables(result: dict) -> Iterable[str]:
         least = {}
         for protocol in ("gt_max", "self_max", "aligned"):
             mine = [line for line in table if line["truth"] == truth]
-            found = min(mine, key=lambda line: abs(line[protocol] - published))
-            least[protocol] = f"`{found['method']}` under {protocol.replace('_', '-')} ({found[protocol]:.1f} dB)"
+            nearest = min(mine, key=lambda line: abs(line[protocol] - published))
+            least[protocol] = f"`{nearest['method']}` under {protocol.replace('_', '-')} ({nearest[protocol]:.1f} dB)"
         yield f"Nearest to the published {published} dB, {truth} truth: {', '.join(least.values())}."
 
 
@@ -302,8 +304,8 @@ def _rows_table(name: str, result: dict) -> Iterable[str]:
 def _captures_tables(result: dict) -> Iterable[str]:
     table, figures = [], ("psnr", "best", "psnr_fitted", "ssim", "lpips", "seconds", "memory", "gaussians")
     for rows in groups(result["rows"], "capture", "method", "iterations").values():
-        measured = [name for name in figures if all(row.get(name) is not None for row in rows)]
-        means = {name: fmean(row[name] for row in rows) for name in measured}
+        columns = [name for name in figures if all(row.get(name) is not None for row in rows)]
+        means = {name: fmean(row[name] for row in rows) for name in columns}
         spread = stdev(row["psnr"] for row in rows) if len(rows) > 1 else None
         means["gaussians"] = round(means["gaussians"])
         table.append(dict.fromkeys(figures) | {**rows[0], **means, "seeds": len(rows), "spread": spread})
@@ -330,12 +332,12 @@ def _stability_tables(result: dict) -> Iterable[str]:
 
 def trial_table(rows: Iterable[Mapping]) -> tuple[list[dict], dict[str, str]]:
     """The families of the trial and their sum, and the columns that they have."""
-    found = sorted((dict(row) for row in rows), key=lambda row: row["family"])
+    ordered = sorted((dict(row) for row in rows), key=lambda row: row["family"])
     counts = ("cases", "tracebacks", "hangs", "programs", "lost")
-    total = {name: sum(row[name] for row in found) for name in (*counts, "seconds")}
-    total |= {"family": "all", "longest": max(row["longest"] for row in found)}
+    total = {name: sum(row[name] for row in ordered) for name in (*counts, "seconds")}
+    total |= {"family": "all", "longest": max(row["longest"] for row in ordered)}
     columns = {"family": "", **dict.fromkeys(counts, "d"), "seconds": ".0f", "longest": ".1f", "MiB=memory": ""}
-    return [*found, total], columns
+    return [*ordered, total], columns
 
 
 def _trust_tables(result: dict) -> Iterable[str]:

@@ -37,9 +37,11 @@ def plot_scale(result: dict, path: Path) -> None:
         scale = {"ylabel": unit, "yscale": "log", "xscale": "log", "ylim": (min(values) / 1.3, max(values) * 1.3)}
         panels.append([])
         for (sweep,), rows in sweeps.items():
-            found = groups(rows, "implementation", "what")
+            row_groups = groups(rows, "implementation", "what")
             lines = {
-                ": ".join(name): [(row["varied"], factor * row[field]) for row in found.get(name, ()) if row.get(field)]
+                ": ".join(name): [
+                    (row["varied"], factor * row[field]) for row in row_groups.get(name, ()) if row.get(field)
+                ]
                 for name in names
             }
             ticks = sorted({row["varied"] for row in rows})
@@ -53,12 +55,12 @@ def plot_quality(result: dict, path: Path) -> None:
     scenes, exposures and seeds that all methods of a panel have, if there are any."""
     rows, panels = [row for row in result["rows"] if row["tests"]], []
     for curve, response in groups([row for row in rows if row["response"] != "learned"], "curve", "response"):
-        shown = [row for row in rows if row["curve"] == curve and row["response"] in (response, "learned")]
-        places = groups(shown, "scene", "exposure", "seed").values()
-        methods = {row["method"] for row in shown}
+        plotted = [row for row in rows if row["curve"] == curve and row["response"] in (response, "learned")]
+        places = groups(plotted, "scene", "exposure", "seed").values()
+        methods = {row["method"] for row in plotted}
         shared = [row for here in places if {row["method"] for row in here} == methods for row in here]
-        found = groups(shared or shown, "method").items()
-        lines = {method: error_over_time([row["tests"] for row in mine]) for (method,), mine in found}
+        row_groups = groups(shared or plotted, "method").items()
+        lines = {method: error_over_time([row["tests"] for row in mine]) for (method,), mine in row_groups}
         labels = {"xlabel": "training seconds", "ylabel": "held-out HDR PSNR, dB", "xscale": "log"}
         panels.append((lines, labels | {"title": f"{curve}, {response}"}))
     _draw(path, [panels], form="-")

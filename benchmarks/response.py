@@ -45,11 +45,11 @@ def bench_response(
         truth = response_by_name(curve)
         for index, time in enumerate(exposure_ladder(scene, truth, exposures)):
             views = expose(scene, truth, time).train_views
-            known = _decoded_psnr(views, truth, time)
-            for method, chosen in _choices([view.codes for view in views]):
+            psnr_of_truth = _decoded_psnr(views, truth, time)
+            for method, choice in _choices([view.codes for view in views]):
                 trial = {"scene": scene.name, "curve": curve, "exposure": index, "method": method}
-                trial |= {"chosen": chosen.name, "stops": response_error(chosen, truth), "aligned_known": known}
-                trials.append(trial | {"aligned": _decoded_psnr(views, chosen, time)})
+                trial |= {"chosen": choice.name, "stops": response_error(choice, truth), "aligned_known": psnr_of_truth}
+                trials.append(trial | {"aligned": _decoded_psnr(views, choice, time)})
         LOG.info("%s: exposed by %s", scene.name, curve)
     for curve, method in product((*curves, "all"), dict.fromkeys(trial["method"] for trial in trials)):
         fits = [t for t in trials if t["method"] == method and curve in (t["curve"], "all")]

@@ -65,10 +65,10 @@ def finish(result: dict, json: Path | None = None, overwrite: bool = False) -> N
 
 def groups(rows: Iterable[Mapping], *fields: str) -> dict[tuple, list[Mapping]]:
     """Rows by the values of these fields, in the order of their first."""
-    found: dict[tuple, list[Mapping]] = {}
+    result: dict[tuple, list[Mapping]] = {}
     for row in rows:
-        found.setdefault(tuple(row[field] for field in fields), []).append(row)
-    return found
+        result.setdefault(tuple(row[field] for field in fields), []).append(row)
+    return result
 
 
 def parted(columns: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
@@ -81,11 +81,11 @@ def parted(columns: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
 def markdown_table(rows: Sequence[Mapping], columns: Mapping[str, str]) -> str:
     """Aligned Markdown. columns: `field` or `title=field` to a format: as of format(), or MiB, or "" for text; a column
     without any value is left out, and so is a value that a row lacks."""
-    shown = [column for column in parted(columns) if any(row.get(column[1]) is not None for row in rows)]
-    if not shown:
+    used_columns = [column for column in parted(columns) if any(row.get(column[1]) is not None for row in rows)]
+    if not used_columns:
         return "There are no results."
     table = []
-    for title, field, form in shown:
+    for title, field, form in used_columns:
         cells = [title, *(_cell(row.get(field), form) for row in rows)]
         width = max(2, *map(len, cells))
         cells.insert(1, "-" * width if form == "" else "-" * (width - 1) + ":")

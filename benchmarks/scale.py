@@ -33,15 +33,15 @@ LARGE_END = 3
 def sweeps(device_type: str, small: bool = False) -> dict[str, list[tuple[int, Size, int, int]]]:
     """The points of each sweep: what is varied, then size, channels, and photos of the training step (0 for none).
     small: every second point, up to a moderate size."""
-    given = tomllib.loads(Path(__file__).with_name("sweeps.toml").read_text(encoding="utf-8"))[device_type]
-    size = Size(given["count"], *given["small_image"])
-    found = {
-        "gaussians": [(n, Size(n, *given["image"]), COMPARED_CHANNELS, STEP_VIEWS) for n in given["gaussians"]],
-        "pixels": [(w * h, Size(given["count"], w, h), COMPARED_CHANNELS, STEP_VIEWS) for w, h in given["pixels"]],
-        "channels": [(count, size, count, 0) for count in given["channels"]],
-        "photos": [(count, size, COMPARED_CHANNELS, count) for count in given["photos"]],
+    table = tomllib.loads(Path(__file__).with_name("sweeps.toml").read_text(encoding="utf-8"))[device_type]
+    size = Size(table["count"], *table["small_image"])
+    result = {
+        "gaussians": [(n, Size(n, *table["image"]), COMPARED_CHANNELS, STEP_VIEWS) for n in table["gaussians"]],
+        "pixels": [(w * h, Size(table["count"], w, h), COMPARED_CHANNELS, STEP_VIEWS) for w, h in table["pixels"]],
+        "channels": [(count, size, count, 0) for count in table["channels"]],
+        "photos": [(count, size, COMPARED_CHANNELS, count) for count in table["photos"]],
     }
-    return {name: points[:-1:2] if small else points for name, points in found.items()}
+    return {name: points[:-1:2] if small else points for name, points in result.items()}
 
 
 def bench_scale(device: torch.device, *, repetitions: int, small: bool = False) -> dict:
@@ -51,9 +51,9 @@ def bench_scale(device: torch.device, *, repetitions: int, small: bool = False) 
     peer = note_missing(result, device)
     for name, points in sweeps(device.type, small).items():
         for varied, size, channels, photos in points:
-            given = device, peer and channels == COMPARED_CHANNELS, repetitions, result["checks"]
-            rows = [] if name == "photos" else _splat_rows(size, channels, *given)
-            rows += _step_rows(size, photos, *given) if photos else []
+            arguments = device, peer and channels == COMPARED_CHANNELS, repetitions, result["checks"]
+            rows = [] if name == "photos" else _splat_rows(size, channels, *arguments)
+            rows += _step_rows(size, photos, *arguments) if photos else []
             place = {"sweep": name, "varied": varied, "gaussians": size.gaussians, "width": size.width}
             place |= {"height": size.height, "channels": channels, "photos": photos or None}
             result["rows"] += [place | row for row in rows]
@@ -84,8 +84,8 @@ def verdict(slopes: Sequence[dict]) -> str:
     if not ours:
         return "No slopes: a sweep needs two points."
     steep = [row for row in ours if row["slope_large"] > STEEPEST]
-    told = steep or [max(ours, key=lambda row: row["slope_large"])]
-    lines = (f"{row['slope_large']:.2f} ({row['quantity']} of the {row['what']} over {row['sweep']})" for row in told)
+    worst = steep or [max(ours, key=lambda row: row["slope_large"])]
+    lines = (f"{row['slope_large']:.2f} ({row['quantity']} of the {row['what']} over {row['sweep']})" for row in worst)
     head = "Steeper than linear at the large end: " if steep else "Nothing is quadratic: the steepest slope is "
     return head + "; ".join(lines) + "."
 
@@ -93,7 +93,7 @@ def verdict(slopes: Sequence[dict]) -> str:
 def _splat_rows(size: Size, channels: int, device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
     scene = make_splat_scene(size, channels, device)
     name = f"{OURS}, {channels} channels"
-    if not any(made["what"].startswith(f"{name}:") for made in checks):
+    if not any(check["what"].startswith(f"{name}:") for check in checks):
         checks += against_float64(scene, REFERENCE_GAUSSIANS, name)
     variants = {OURS: splat_variant(lambda: render(scene), scene)}
     if peer:

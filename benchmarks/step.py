@@ -152,14 +152,14 @@ def _rows(scene: Scene, config: Config, device: torch.device, repetitions: int) 
 
 def _parts(scene: Scene, config: Config, device: torch.device) -> list[dict]:
     """parts_of_step() of the recorded step."""
-    given: list[tuple] = []
+    calls: list[tuple] = []
 
     def rasterizer(*arguments, **options):
-        given[:] = [arguments]
+        calls[:] = [arguments]
         return rasterize(*arguments, **options)
 
     make_trainer(scene, override_config(config, {"schedule.use_cuda_graph": False}), device, rasterizer).step()
-    work = work_of(given[0], 3 * (config.model.sh_degree + 1) ** 2)
+    work = work_of(calls[0], 3 * (config.model.sh_degree + 1) ** 2)
     return parts_of_step(step_variant(make_trainer(scene, config, device)), work, device)
 
 
@@ -185,11 +185,11 @@ def amortized(trainer: Trainer, step: Callable[[], object]) -> dict:
 def _checks(preset: str, scene: Scene, config: Config, device, against: str, rasterizer=None) -> list[dict]:
     """The loss of the first and of a later step beside that of a training on the CPU with this rasterizer."""
     ours, other = make_trainer(scene, config, device), make_trainer(scene, config, torch.device("cpu"), rasterizer)
-    made = []
+    checks = []
     for step in range(1, CHECKED_STEPS + 1):
         ours.step()
         other.step()
         if bound := {1: FIRST_LOSS_BOUND, CHECKED_STEPS: LATER_LOSS_BOUND}.get(step):
             difference = abs(ours.loss - other.loss) / max(abs(other.loss), 1e-12)
-            made.append(check(f"{preset}: loss of step {step}", against, difference, bound))
-    return made
+            checks.append(check(f"{preset}: loss of step {step}", against, difference, bound))
+    return checks

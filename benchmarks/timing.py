@@ -41,18 +41,18 @@ def time_variants(
     """See summary(). On a GPU events stand around each run with the device idle before, so that the host's time counts
     where it is the limit."""
     samples: dict[str, list[float]] = {name: [] for name in variants}
-    wanted = dict.fromkeys(variants, repetitions)
+    repetitions_left = dict.fromkeys(variants, repetitions)
     for name, variant in variants.items():
         for _ in range(8 if device.type == "cuda" else 2):
             variant.once()
         if device.type == "cpu":
             affordable = int(budget / max(_milliseconds(variant, device) / 1e3, 1e-9))
-            wanted[name] = min(repetitions, max(LEAST_REPETITIONS, affordable))
+            repetitions_left[name] = min(repetitions, max(LEAST_REPETITIONS, affordable))
     for turn in range(TURNS):
         for name, variant in variants.items():
             # The first run of a turn finds caches full of another variant's data, and is not timed.
             variant.once()
-            for _ in range(wanted[name] * (turn + 1) // TURNS - wanted[name] * turn // TURNS):
+            for _ in range(repetitions_left[name] * (turn + 1) // TURNS - repetitions_left[name] * turn // TURNS):
                 samples[name].append(_milliseconds(variant, device))
     return {name: summary(values) for name, values in samples.items()}
 

@@ -120,8 +120,8 @@ def _time_steps(ranks: Ranks | None, size: Size, device: torch.device, repetitio
 
 def _config(size: Size) -> Config:
     most = size.gaussians * 11 // 10 + 1
-    given = {"densification.cap_max": most, "model.initial_density": 0, "response.name": "srgb"}
-    return load_config(PRESET, given)
+    changes = {"densification.cap_max": most, "model.initial_density": 0, "response.name": "srgb"}
+    return load_config(PRESET, changes)
 
 
 @contextmanager

@@ -25,14 +25,14 @@ def memory_left(proc: Path = PROC, mount: Path = MOUNT, environment: Mapping[str
         Bytes, at least 0; None without a limit.
     """
     environment = os.environ if environment is None else environment
-    left = [
-        limit - max(0, used - _number(group / "memory.stat", field))
+    free = [
+        limit - max(0, usage - _number(group / "memory.stat", field))
         for group, names, field in _memory_groups(proc, mount)
-        if (limit := _number(group / names[0])) < _NO_LIMIT and (used := _number(group / names[1])) < _NO_LIMIT
+        if (limit := _number(group / names[0])) < _NO_LIMIT and (usage := _number(group / names[1])) < _NO_LIMIT
     ]
     if (job := _slurm_memory(environment)) is not None:
-        left.append(job - _resident(proc))
-    return max(0, min(left)) if left else None
+        free.append(job - _resident(proc))
+    return max(0, min(free)) if free else None
 
 
 @cache

@@ -30,11 +30,11 @@ def is_sealed(folder: Path) -> bool:
 def first_foreign(path: Path) -> Path | None:
     """Return the first file at or in a path that this program did not write, or that was changed since; else None."""
     folder = path if path.is_dir() else path.parent
-    known = listed(folder)
+    own = listed(folder)
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_symlink() or not (file.is_dir() or file == folder / LIST):
             name = file.relative_to(folder).as_posix()
-            if file.is_symlink() or not file.is_file() or hash_line(file, name) not in known:
+            if file.is_symlink() or not file.is_file() or hash_line(file, name) not in own:
                 return file
     return None
 

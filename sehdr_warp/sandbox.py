@@ -67,10 +67,10 @@ def start(words: Sequence[str], seconds: float) -> Result:
     # The modules of this process, and none that lie where it was started.
     environment = {**os.environ, **_ONE_THREAD, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-P", "-m", __name__, *words]
-    done = subprocess.run(
+    process = subprocess.run(
         command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds, env=environment, check=False
     )
-    return Result(done.returncode, done.stdout, done.stderr)
+    return Result(process.returncode, process.stdout, process.stderr)
 
 
 def main(module: str, name: str, path: str, memory: str) -> int:
@@ -97,11 +97,11 @@ def mat_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return B and I of a MATLAB file."""
     from scipy.io import loadmat
 
-    stored = loadmat(path, variable_names=["B", "I"])
+    arrays = loadmat(path, variable_names=["B", "I"])
     for name in "BI":
-        if stored[name].dtype.kind not in "fui":
+        if arrays[name].dtype.kind not in "fui":
             raise ValueError(f"{name} holds no real numbers")
-    return {name: stored[name].astype(float) for name in "BI"}
+    return {name: arrays[name].astype(float) for name in "BI"}
 
 
 if __name__ == "__main__":

@@ -22,11 +22,11 @@ def choose_cases(names: str | None, quick: bool = False) -> list[Case]:
     """
     if names is None:
         return [case for case in CASES if case.quick or not quick]
-    chosen: dict[str, Case] = {}
+    result: dict[str, Case] = {}
     for name in (part.strip() for part in names.split(",")):
         matches = {case.name: case for case in CASES if name in (case.group, case.name)}
         if not matches:
-            known = ", ".join(dict.fromkeys([case.group for case in CASES] + [case.name for case in CASES]))
-            raise SehdrError(f"--cases {name:.60}: no such case; choose from {known}")
-        chosen |= matches
-    return list(chosen.values())
+            names_text = ", ".join(dict.fromkeys([case.group for case in CASES] + [case.name for case in CASES]))
+            raise SehdrError(f"--cases {name:.60}: no such case; choose from {names_text}")
+        result |= matches
+    return list(result.values())

@@ -104,9 +104,9 @@ def _fused(sigma: float, gain: float, device):
 
     # Each logit is rounded by itself, at its own size; what differs by that much, the softmax sees as a factor.
     yield from compare(fused, tensors, device, gradients=("last",), extra=ROUNDINGS * UNIT * gain / 10)
-    given = {name: t.to(device, torch.float32).requires_grad_() for name, t in tensors.items()}
-    fused(*given.values())["fused"].sum().backward()
-    yield count("derivatives not finite", not_finite(*(t.grad for t in given.values())))
+    leaves = {name: t.to(device, torch.float32).requires_grad_() for name, t in tensors.items()}
+    fused(*leaves.values())["fused"].sum().backward()
+    yield count("derivatives not finite", not_finite(*(t.grad for t in leaves.values())))
 
 
 def _sigma_limits(device):
@@ -131,8 +131,8 @@ def _photos(device):
     spot[11, 7] = 1.0
     tensors = {"prediction": 0.05 + 0.9 * noise}
     for name, photo in (("clipped", torch.ones_like(noise)), ("black", torch.zeros_like(noise)), ("one pixel", spot)):
-        given = {"gradients": ("prediction",), "label": f"{name} {{}}"}
-        yield from compare(lambda x, photo=photo: {"loss": _loss(x, photo)}, tensors, device, **given)
+        options = {"gradients": ("prediction",), "label": f"{name} {{}}"}
+        yield from compare(lambda x, photo=photo: {"loss": _loss(x, photo)}, tensors, device, **options)
     for name, photo, value in (("above white", 1.0, 3.0), ("below black", 0.0, -1.0)):
         prediction = torch.full((8, 8, 3), value, device=device, requires_grad=True)
         _loss(prediction, torch.full((8, 8, 3), photo, device=device)).backward()
@@ -143,8 +143,8 @@ def _loss(prediction, photo):
     """The training's loss between encoded values of a simulated photo [H, W, 3] and a photo of black and white."""
     codes = (255 * photo).to(prediction.device, torch.uint8)
     target = Target(codes, code_scale(255, None, prediction.device, dtype=prediction.dtype))
-    shown = TrainRender(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
-    return ldr_loss(shown, target, LossConfig())
+    render = TrainRender(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
+    return ldr_loss(render, target, LossConfig())
 
 
 def _clipped_light(device):
@@ -162,8 +162,8 @@ def _clipped_light(device):
             return {"energy": clipped_light_energy(image, codes.to(image.device), 1.0, weights)}
 
         # A logarithm of float32 is known to some units of its own, whatever is left of a difference of two.
-        given = {"gradients": ("image",), "extra": 64 * UNIT, "label": f"{name} {{}}"}
-        yield from compare(energy, {"image": image}, device, **given)
+        options = {"gradients": ("image",), "extra": 64 * UNIT, "label": f"{name} {{}}"}
+        yield from compare(energy, {"image": image}, device, **options)
 
 
 def _similarity(device):
@@ -177,8 +177,8 @@ def _similarity(device):
         ("tiny", (16, 16, 3), lambda a: (a, a * 1e-20)),
     ):
         a, b = change(torch.rand(shape, generator=generator, dtype=torch.float64))
-        given = {"gradients": ("a",), "extra": VARIANCE_ERROR, "label": f"{name} {{}}"}
-        yield from compare(lambda a, b: {"ssim": ssim(a, b)}, {"a": a, "b": b}, device, **given)
+        options = {"gradients": ("a",), "extra": VARIANCE_ERROR, "label": f"{name} {{}}"}
+        yield from compare(lambda a, b: {"ssim": ssim(a, b)}, {"a": a, "b": b}, device, **options)
 
 
 _case = partial(Case, group="light")

@@ -157,10 +157,10 @@ class Evaluation:
         for name in PROTOCOLS:
             reason = scale_reason if name == "aligned" else missing
             missing_reason = {"reason": reason} if reason else {}
-            counted = [] if reason else [row for row, has_truth in zip(rows, truths) if has_truth]
-            figures = _mean([row["protocol"][name] for row in counted], *HDR_FIGURES)
-            hdr[name] = figures | {"views": len(counted)} | (missing_reason or self._lpips_reason(figures))
-            pu21[name] = _mean([row["pu21"][name] for row in counted], "psnr", "ssim") | missing_reason
+            rows_with_truth = [] if reason else [row for row, has_truth in zip(rows, truths) if has_truth]
+            figures = _mean([row["protocol"][name] for row in rows_with_truth], *HDR_FIGURES)
+            hdr[name] = figures | {"views": len(rows_with_truth)} | (missing_reason or self._lpips_reason(figures))
+            pu21[name] = _mean([row["pu21"][name] for row in rows_with_truth], "psnr", "ssim") | missing_reason
         hdr["aligned"]["scale"] = scale
         ldr = _mean([row["ldr"] for row in rows], "psnr", "ssim", "lpips")
         without_photos = {"reason": "the folder holds radiance, no simulated photos"}
@@ -235,8 +235,8 @@ class Evaluation:
             compared.append((name, *pair))
         for region, inside in regions.items():
             weight = inside if mask is None else inside * mask
-            counted = weight.numel() if mask is None else float(mask.sum())
-            self.sums[region, "share"] += float(weight.sum()), counted
+            pixel_count = weight.numel() if mask is None else float(mask.sum())
+            self.sums[region, "share"] += float(weight.sum()), pixel_count
             for name, prediction, goal in compared:
                 error, total = metrics.squared_error(prediction, goal, weight)
                 self.sums[region, name] += float(error.mean()), total
@@ -244,13 +244,13 @@ class Evaluation:
 
     def _region(self, region: str, missing: str | None) -> dict:
         """Return the figures of a region over all views; missing: why there is no truth, or None."""
-        inside, counted = self.sums[region, "share"]
+        inside, pixel_count = self.sums[region, "share"]
         reason = missing if inside else "no pixel of the photos lies in this region"
         sums = {name: self.sums[region, name] for name in ("ldr", *PROTOCOLS)}
         psnr = {
             name: metrics.decibels(error / weight if weight else math.nan) for name, (error, weight) in sums.items()
         }
-        figures = {"fraction": float(inside / counted), "psnr_ldr": psnr.pop("ldr"), "psnr_mu": psnr}
+        figures = {"fraction": float(inside / pixel_count), "psnr_ldr": psnr.pop("ldr"), "psnr_mu": psnr}
         return figures | ({"reason": reason} if reason else {})
 
     def _lpips(self, prediction, truth) -> float | None:

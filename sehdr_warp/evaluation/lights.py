@@ -112,12 +112,12 @@ def count_lights(regions: Sequence[LightRegion]) -> dict[str, Any]:
         lights.append(max((group for group in groups if largest in group), key=len, default=[largest]))
         remaining = [region for region in remaining if region not in lights[-1]]
     confirmed = [light for light in lights if len(light) > 1]
-    lost = sum(np.mean([region.share < MIN_SHARE for region in light]) > 0.5 for light in confirmed)
+    missing = sum(np.mean([region.share < MIN_SHARE for region in light]) > 0.5 for light in confirmed)
     clipped = [light for light in confirmed if np.mean([region.clipped for region in light]) > 0.5]
     energies = [
         sum(each.rendered_energy for each in light) / sum(each.true_energy for each in light) for light in clipped
     ]
-    return {"count": len(confirmed), "lost": int(lost), "energies": sorted(energies)}
+    return {"count": len(confirmed), "lost": int(missing), "energies": sorted(energies)}
 
 
 def _intersections(region: LightRegion, others: Sequence[LightRegion]) -> Iterator[np.ndarray]:

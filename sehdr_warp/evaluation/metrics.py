@@ -119,8 +119,8 @@ def pu21_metrics(
 
 def maximum(image: Tensor, mask: Tensor | None) -> float:
     """Return the largest value inside the mask; 1 for an image without light, which then stays black."""
-    counted = image if mask is None else image[mask > 0]
-    largest = float(counted.max()) if counted.numel() else 0.0
+    values = image if mask is None else image[mask > 0]
+    largest = float(values.max()) if values.numel() else 0.0
     return largest if largest > 0 else 1.0
 
 

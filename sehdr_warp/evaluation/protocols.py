@@ -91,9 +91,9 @@ def fit_scale(views: Iterable[tuple[Tensor, Tensor, Tensor | None, Tensor | None
     return median_factor(votes)
 
 
-def log_ratios(prediction: Tensor, truth: Tensor, chosen: Tensor) -> Tensor:
+def log_ratios(prediction: Tensor, truth: Tensor, pixels: Tensor) -> Tensor:
     """Return log(truth / prediction), [K], of at most VOTES_PER_VIEW evenly spaced values."""
-    ratios = (truth[chosen] / prediction[chosen]).log()
+    ratios = (truth[pixels] / prediction[pixels]).log()
     return ratios[:: max(1, -(-len(ratios) // VOTES_PER_VIEW))].cpu()
 
 

@@ -53,11 +53,11 @@ class ErrorRanking:
             black: radiance that the photo shows as black, in the unit of the prediction.
             mask: [H, W]; pixels above 0.5 count.
         """
-        counted = torch.ones_like(well_exposed) if mask is None else mask > 0.5
-        max_truth = float(truth[counted].max()) if bool(counted.any()) else 0.0
-        step = max(1, -(-int(counted.sum()) // MAX_PIXELS))
+        inside = torch.ones_like(well_exposed) if mask is None else mask > 0.5
+        max_truth = float(truth[inside].max()) if bool(inside.any()) else 0.0
+        step = max(1, -(-int(inside.sum()) // MAX_PIXELS))
         images = (confidence.double(), prediction.double().clamp_min(0), truth.double(), well_exposed)
-        pixels = (image[counted][::step].cpu() for image in images)
+        pixels = (image[inside][::step].cpu() for image in images)
         self._views.append(ViewPixels(*pixels, black=black, max_truth=max_truth or 1.0))
 
     def result(self) -> dict:

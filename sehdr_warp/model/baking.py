@@ -78,8 +78,8 @@ def gaussians_of(
         color_matrix: [3, 3] from the field's colors to linear Rec.709, if they are not Rec.709.
     """
     camera_positions = field.normalization.points(camera_positions)
-    stored = _in_colors(field, color_model, camera_positions, exposure_time, color_matrix)
-    return to_scene(stored, field.normalization)
+    arrays = _in_colors(field, color_model, camera_positions, exposure_time, color_matrix)
+    return to_scene(arrays, field.normalization)
 
 
 def to_normalized(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:
@@ -115,28 +115,28 @@ def _in_colors(
     color_matrix: np.ndarray | None,
 ) -> GaussianArrays:
     """Return gaussians_of() in the field's own coordinates, like camera_positions."""
-    stored, to_radiance = _stored(field)
+    arrays, to_radiance = _stored(field)
     if color_matrix is not None:
         to_radiance = _in_rec709(to_radiance or (lambda x: x / field.base_time), color_matrix, field.base_time)
     time = exposure_time or field.base_time
     if color_model == "display":
-        if stored.color_model == "display" and time == field.base_time and color_matrix is None:
-            return stored
+        if arrays.color_model == "display" and time == field.base_time and color_matrix is None:
+            return arrays
         radiance = to_radiance or (lambda exposure: exposure / field.base_time)
         encoded = bake(
-            stored, lambda colors: field.response.encode(radiance(colors) * time), "display", camera_positions
+            arrays, lambda colors: field.response.encode(radiance(colors) * time), "display", camera_positions
         )
         return replace(encoded, base_time=time)  # The exposure that readers need to recover radiance.
-    if to_radiance is None and color_model == stored.color_model:
-        harmonics = stored.harmonics.astype(np.float64)
+    if to_radiance is None and color_model == arrays.color_model:
+        harmonics = arrays.harmonics.astype(np.float64)
         if color_model == "linear":
-            return stored.with_colors(harmonics / field.base_time, "linear")
+            return arrays.with_colors(harmonics / field.base_time, "linear")
         harmonics[:, 0] -= np.log(field.base_time) / HARMONIC_0
-        return stored.with_colors(harmonics, "log")
+        return arrays.with_colors(harmonics, "log")
     radiance = to_radiance or (lambda exposure: exposure / field.base_time)
     if color_model == "linear":
-        return bake(stored, radiance, "linear", camera_positions)
-    return bake(stored, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", camera_positions)
+        return bake(arrays, radiance, "linear", camera_positions)
+    return bake(arrays, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", camera_positions)
 
 
 def _in_rec709(native: Colors, matrix: np.ndarray, base_time: float) -> Colors:

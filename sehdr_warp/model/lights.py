@@ -190,10 +190,10 @@ def _fitted(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]) 
     """
     angles = np.array([shape.solid_angle(camera.position) for camera in cameras])
     whole = np.array([_in_frame(camera, shape) for camera in cameras]) & (angles > 0)
-    used = whole if whole.any() else angles > 0
-    if not used.any():
+    cells = whole if whole.any() else angles > 0
+    if not cells.any():
         return np.zeros(received.shape[1])
-    return angles[used] @ received[used] / (angles[used] @ angles[used])
+    return angles[cells] @ received[cells] / (angles[cells] @ angles[cells])
 
 
 def _in_frame(camera: Camera, shape: LightShape) -> bool:

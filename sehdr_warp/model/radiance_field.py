@@ -316,10 +316,10 @@ class RadianceField(nn.Module):
     def _values(self, position: Tensor, degree: int | None, factored: bool = False) -> Tensor:
         """Return the sums [N, 3] of the Gaussians' harmonics towards a position [3]."""
         gaussians = self.gaussians
-        used = gaussians.degree if degree is None else min(degree, gaussians.degree)
+        sh_degree = gaussians.degree if degree is None else min(degree, gaussians.degree)
         constant, rest = gaussians.harmonics_dc, gaussians.harmonics_rest
         coefficients = (constant.detach(), rest.detach()) if factored else (constant, rest)
-        return spherical_harmonics(used, coefficients, gaussians.means, position)
+        return spherical_harmonics(sh_degree, coefficients, gaussians.means, position)
 
     def _exposures(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return exposures [N, 3] at the base time of each Gaussian's base color and of its HDR color."""

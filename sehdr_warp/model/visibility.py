@@ -25,10 +25,10 @@ def count_views(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
         cameras: At least one.
     """
     device = field.gaussians.means.device
-    chosen = cameras[:: -(-len(cameras) // MOST_VIEWS)]
+    subset = cameras[:: -(-len(cameras) // MOST_VIEWS)]
     views = torch.zeros(field.gaussians.count, device=device)
-    for camera in chosen:
+    for camera in subset:
         small = camera.within(VIEW_SIZE)
         ones = torch.ones((small.height, small.width, 3), device=device)
         views += field.weighted_sums(CameraTensors.of(small, device), ones)[:, 0] > LEAST_WEIGHT
-    return views * (len(cameras) / len(chosen))
+    return views * (len(cameras) / len(subset))

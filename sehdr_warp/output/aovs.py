@@ -99,16 +99,16 @@ def read_aovs(names: str | Sequence[str]) -> tuple[str, ...]:
     Raises:
         SehdrError: For an unknown or repeated name.
     """
-    listed = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
-    if listed == ["all"]:
+    requested = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
+    if requested == ["all"]:
         return tuple(AOVS)
-    for name in listed:
+    for name in requested:
         if name not in AOVS:
-            known = ", ".join(AOVS)
-            raise SehdrError(f"AOV {name!r} is not one of {known}, all{did_you_mean(name, AOVS)}")
-    if len(set(listed)) < len(listed):
-        raise SehdrError(f"AOVs {', '.join(listed)}: one is named twice; leave it out")
-    return tuple(listed)
+            names_text = ", ".join(AOVS)
+            raise SehdrError(f"AOV {name!r} is not one of {names_text}, all{did_you_mean(name, AOVS)}")
+    if len(set(requested)) < len(requested):
+        raise SehdrError(f"AOVs {', '.join(requested)}: one is named twice; leave it out")
+    return tuple(requested)
 
 
 def data_parts(names: Sequence[str], view: ViewData, header: Mapping[str, Any]) -> list[Part]:

@@ -120,9 +120,9 @@ def _visible_points(cameras: Sequence[Camera], run: Any, up: np.ndarray) -> tupl
 
     What lies higher than the cameras, such as a ceiling, is left out.
     """
-    chosen = evenly(cameras, _MAP_VIEWS)
-    ceiling, points, colors = max(float(camera.position @ up) for camera in chosen), [], []
-    for camera in chosen:
+    views = evenly(cameras, _MAP_VIEWS)
+    ceiling, points, colors = max(float(camera.position @ up) for camera in views), [], []
+    for camera in views:
         small = camera.resized(_SAMPLES, max(1, round(_SAMPLES * camera.height / camera.width)))
         rendered = run.render(small)
         depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)

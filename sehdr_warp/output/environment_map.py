@@ -96,9 +96,9 @@ def write_environment_map(
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise SehdrError(f"{path}: an environment map is one of {', '.join(SUFFIXES)}; choose a suffix")
-    for name, value, known in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):
-        if value not in known:
-            raise SehdrError(f"{name} {value!r} is not one of {', '.join(known)}")
+    for name, value, allowed in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):
+        if value not in allowed:
+            raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")
     if size < 16 or size % 2 or size > _LARGEST:
         raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
     transform = world_transform(run, axes, up=up)
@@ -156,8 +156,8 @@ def write_environment_map(
     header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
     parts = [Part(rgb_channels(hdr) | {"A": alpha}, header, "rgba"), Part(data, as_data(header), "data")]
-    stored = write_multipart_exr(path, parts, pixel=pixel, overwrite=overwrite)
-    if stored != pixel:
+    pixel_type = write_multipart_exr(path, parts, pixel=pixel, overwrite=overwrite)
+    if pixel_type != pixel:
         log.info("%s: holds values above 65504, which half cannot; written as float", path.name)
     return path
 
@@ -212,9 +212,9 @@ def inpainted(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight
     logs = np.log(np.maximum(hdr[covered] / alpha[covered][:, None], _DARKEST))
     values = np.concatenate([logs, np.ones((len(logs), 1))], axis=1) * weight[covered][:, None]
     sums = np.stack([np.bincount(cells[covered], column, rows * columns) for column in values.T], axis=1)
-    known, places = sums[:, 3] > 0, latlong(columns).reshape(-1, 3)
-    near = sums[known, 3] / (2 - 2 * places @ places[known].T + (2 * np.pi / columns) ** 2) ** 2
-    light = np.exp(near @ (sums[known, :3] / sums[known, 3:]) / near.sum(axis=1, keepdims=True))
+    has_light, places = sums[:, 3] > 0, latlong(columns).reshape(-1, 3)
+    near = sums[has_light, 3] / (2 - 2 * places @ places[has_light].T + (2 * np.pi / columns) ** 2) ** 2
+    light = np.exp(near @ (sums[has_light, :3] / sums[has_light, 3:]) / near.sum(axis=1, keepdims=True))
     wrapped = np.pad(light.reshape(rows, columns, 3), ((0, 0), (1, 1), (0, 0)), mode="wrap")
     at = np.stack([down - 0.5, across + 0.5])
     return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)

@@ -126,28 +126,28 @@ def write_multipart_exr(
     for part in parts:
         _check(path, part)
     colors = [array for part in parts for name, array in part.channels.items() if not _is_depth(name)]
-    stored = stored_pixel_type(colors, pixel)
-    written = []
+    pixel_type = stored_pixel_type(colors, pixel)
+    exr_parts = []
     for part in parts:
         header = {
             "compression": OpenEXR.ZIP_COMPRESSION,
             "type": OpenEXR.scanlineimage,
             "software": f"sehdr-warp {__version__}",
             "sehdr:version": __version__,
-            "sehdr:pixelType": stored if stored == pixel else "float, since half would overflow 65504",
+            "sehdr:pixelType": pixel_type if pixel_type == pixel else "float, since half would overflow 65504",
             **part.header,
         }
-        types = {name: np.float32 if _is_depth(name) else _TYPES[stored] for name in part.channels}
+        types = {name: np.float32 if _is_depth(name) else _TYPES[pixel_type] for name in part.channels}
         channels = {name: np.ascontiguousarray(array, types[name]) for name, array in part.channels.items()}
-        written.append(OpenEXR.Part(header, channels, *filter(None, [part.name])))
+        exr_parts.append(OpenEXR.Part(header, channels, *filter(None, [part.name])))
     with atomic_path(path, overwrite) as temporary:
         try:
-            with OpenEXR.File(written) as file:
+            with OpenEXR.File(exr_parts) as file:
                 file.write(str(temporary))
         except (RuntimeError, ValueError, TypeError) as error:
             reason = " ".join(str(error).replace(str(temporary), path.name).split())
             raise SehdrError(f"{path}: cannot be written as OpenEXR ({reason}); check the disk's free space") from error
-    return stored
+    return pixel_type
 
 
 def _check(path: Path, part: Part) -> None:

@@ -138,7 +138,7 @@ aria-label="exposure in stops"><output>0 EV</output></p>
 def side_choices(names: list[str], left: str, right: str) -> Markup:
     """Return the two <select> elements that choose what stands left and right of a split."""
     selects = []
-    for side, chosen in (("left", left), ("right", right)):
-        options = (markup("<option{}>{}</option>", EMPTY if n != chosen else markup(" selected"), n) for n in names)
+    for side, selected in (("left", left), ("right", right)):
+        options = (markup("<option{}>{}</option>", EMPTY if n != selected else markup(" selected"), n) for n in names)
         selects.append(markup('<select aria-label="{}">{}</select>', side, join(options)))
     return markup('<div class="sides">{}</div>\n', join(selects))

@@ -156,12 +156,11 @@ def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, f
         "Held-out views, which the training never saw" if held_out else "Views that were trained on; none is held out"
     )
     lead = f"{what}. Drag across a picture; choose what stands on either side."
-    known = any(each.truth is not None for each in comparisons)
-    lead += (
-        f" {'Scene and truth are' if known else 'The scene is'} Ultra HDR: light up to {MOST_STOPS:g} stops over white "
-    )
-    lead += "on an HDR display, on any other what the camera would have shown."
-    return _section("Photo, scene, truth" if known else "Photo and scene", lead, _views(figures))
+    has_truth = any(each.truth is not None for each in comparisons)
+    subject = "Scene and truth are" if has_truth else "The scene is"
+    lead += f" {subject} Ultra HDR: light up to {MOST_STOPS:g} stops over white on an HDR display, "
+    lead += "on any other what the camera would have shown."
+    return _section("Photo, scene, truth" if has_truth else "Photo and scene", lead, _views(figures))
 
 
 def _opening(comparison: Comparison, time: float, gain: float) -> Markup:
@@ -253,12 +252,12 @@ def _unexplained(run: Any, scene: Scene) -> Markup:
     for name, regions in list(photos.items())[:_MOST_PHOTOS]:
         svg = _boxed_photo(shown_photo(run, views[name]), name, regions)
         figures.append(_figure(svg, f"{name}: {len(regions)} of the worst regions"))
-    counted = (
+    summary = (
         f"{unexplained['regions']} regions in {unexplained['photos']} training photos"
         if unexplained["regions"]
         else "None"
     )
-    lead = f"{counted}: places that photo and scene show at least a stop apart."
+    lead = f"{summary}: places that photo and scene show at least a stop apart."
     if figures:
         lead += " Amber: the photo is brighter than the scene, by so many stops; blue: darker."
     return _section("What stays unexplained", lead, _views(figures))
@@ -306,25 +305,25 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> Markup:
     if evaluation is None:
         return EMPTY
     hdr = evaluation["protocol"]["gt-max"]
-    known = hdr["psnr_mu"] is not None
+    has_hdr = hdr["psnr_mu"] is not None
 
     def figures(ldr: Mapping, protocol: Mapping) -> list[str]:
-        light = [number(protocol["psnr_mu"], 2), number(protocol["ssim_mu"], 3)] if known else []
+        light = [number(protocol["psnr_mu"], 2), number(protocol["ssim_mu"], 3)] if has_hdr else []
         return [number(ldr["psnr"], 2), number(ldr["ssim"], 3), *light]
 
     none = {"psnr_mu": None, "ssim_mu": None}
     rows = [[row["name"], *figures(row["ldr"], row["protocol"].get("gt-max", none))] for row in evaluation["views"]]
-    titles = ["view", "photo PSNR, dB", "photo SSIM", *["HDR mu-law PSNR, dB", "HDR mu-law SSIM"] * known]
+    titles = ["view", "photo PSNR, dB", "photo SSIM", *["HDR mu-law PSNR, dB", "HDR mu-law SSIM"] * has_hdr]
     body = _rows(titles, rows, mean=["mean", *figures(evaluation["ldr"], hdr)], first_number=1)
     regions = [
         [name, f"{values['fraction']:.1%}", number(values["psnr_ldr"], 2)]
-        + [number(values["psnr_mu"]["gt-max"], 2)] * known
+        + [number(values["psnr_mu"]["gt-max"], 2)] * has_hdr
         for name, values in evaluation["regions"].items()
     ]
-    titles = ["part of the photos", "pixels", "photo PSNR, dB", *["HDR mu-law PSNR, dB"] * known]
+    titles = ["part of the photos", "pixels", "photo PSNR, dB", *["HDR mu-law PSNR, dB"] * has_hdr]
     body += markup("\n<br>\n") + _rows(titles, regions, first_number=1)
     split = "Held-out views" if held_out else "Training views, since none is held out: figures flatter"
-    note = markup(" HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others.") if known else EMPTY
+    note = markup(" HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others.") if has_hdr else EMPTY
     return _section("Figures", markup("{}.{}", split, note), body)
 
 

@@ -96,8 +96,10 @@ def combined_estimates(
         precision += (estimate.deviation * math.log(2)) ** -2
         total += precision * estimate.mean * math.log(2)
     if stated is not None and stated_deviation > 0:
-        known = (clipped & (stated >= 1)).to(exposure)
-        share, light = (_averaged(values, size) for values in (known, known * stated.to(exposure).clamp_min(1).log()))
+        has_value = (clipped & (stated >= 1)).to(exposure)
+        share, light = (
+            _averaged(values, size) for values in (has_value, has_value * stated.to(exposure).clamp_min(1).log())
+        )
         weight = (share > 0).to(exposure) / stated_deviation**2
         total += weight * light / share.clamp_min(1e-6)
         precision += weight

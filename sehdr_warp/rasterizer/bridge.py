@@ -112,7 +112,7 @@ class _ProgramFunction(torch.autograd.Function):
         program = Program(plain, True)
         result = body(program, *plain, **options)
         outputs = result if isinstance(result, tuple) else (result,)
-        launches, known = program._launches, program._tensors
+        launches, tensors_of_program = program._launches, program._tensors
         places = [program._places.get(id(tensor), -1) for tensor in outputs]
         if not program._written.issuperset(places):
             raise TypeError(f"{body.__name__}() returns a tensor that program.write() did not make")
@@ -123,7 +123,7 @@ class _ProgramFunction(torch.autograd.Function):
         )
         ctx.set_materialize_grads(False)
         read = {value for each in launches for value in each.inputs if isinstance(value, _Place)}
-        ctx.save_for_backward(*(tensor if place in read else None for place, tensor in enumerate(known)))
+        ctx.save_for_backward(*(tensor if place in read else None for place, tensor in enumerate(tensors_of_program)))
         ctx.launches, ctx.places = launches, places
         ctx.argument_likes = [(tensor.shape, tensor.dtype) for tensor in plain]
         ctx.between = (program._written - program._constant) & read

@@ -34,8 +34,8 @@ def judge_step(
     if incomplete is None:
         incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
     none = torch.empty(0, dtype=torch.int64, device=norms.device) if tally is None or pairs is None else None
-    counted = (none if tally is None else tally), (none if pairs is None else pairs)
-    launch(kernels.judge_step, 1, loss.detach(), norms, incomplete, *counted, verdict)
+    counters = (none if tally is None else tally), (none if pairs is None else pairs)
+    launch(kernels.judge_step, 1, loss.detach(), norms, incomplete, *counters, verdict)
     return verdict[0], verdict[1]
 
 

@@ -164,5 +164,5 @@ def analytic_response(name: str) -> Response:
             raise SehdrError(f"response {name!r}: the exponent of gamma-G must be a number from 1 to 5")
         return AnalyticResponse(key, _gamma(exponent))
     hint = did_you_mean(name, DESCRIPTIONS)
-    known = ", ".join((*DESCRIPTIONS, "gamma-G", "colour:NAME"))
-    raise SehdrError(f"response {name!r} is neither a file nor a known name{hint}; take one of {known}, or a file")
+    names_text = ", ".join((*DESCRIPTIONS, "gamma-G", "colour:NAME"))
+    raise SehdrError(f"response {name!r} is neither a file nor a known name{hint}; take one of {names_text}, or a file")

@@ -66,11 +66,11 @@ def colour_response(encoding: str) -> Response:
     from colour.utilities import suppress_warnings
     from scipy.optimize import bisect
 
-    known = {_key(name): name for name in reversed(list(colour.CCTF_ENCODINGS))}
-    name = known.get(_key(encoding))
+    names = {_key(name): name for name in reversed(list(colour.CCTF_ENCODINGS))}
+    name = names.get(_key(encoding))
     if name is None:
-        near = nearest(_key(encoding), known)
-        hint = f"did you mean {known[near]}?" if near else "colour.CCTF_ENCODINGS lists them"
+        near = nearest(_key(encoding), names)
+        hint = f"did you mean {names[near]}?" if near else "colour.CCTF_ENCODINGS lists them"
         raise SehdrError(f"response 'colour:{encoding:.60}': colour-science has no such encoding; {hint}")
 
     # Of HLG and PQ colour-science knows a camera's encoding of scene light and a display's of its own: the camera's.
@@ -115,8 +115,8 @@ def _select(path: Path, curves: list[Response], selector: str | None) -> Respons
 
 
 def _dorf_mat(path: Path) -> list[Response]:
-    stored = read_sandboxed(mat_arrays, path, "DoRF's B and I", "give 201_CRF_data.mat")
-    values, exposures = stored["B"], stored["I"]
+    arrays = read_sandboxed(mat_arrays, path, "DoRF's B and I", "give 201_CRF_data.mat")
+    values, exposures = arrays["B"], arrays["I"]
     if values.ndim != 2 or values.shape != exposures.shape:
         raise InputError(path, f"B is {values.shape} and I is {exposures.shape}", "give both as [curves, samples]")
     numbered = enumerate(zip(exposures, values, strict=True))

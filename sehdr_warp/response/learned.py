@@ -87,8 +87,8 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     def _logits(self, log_exposure):
         # By products and sums: cuBLAS gains nothing here, and a recorded step would depend on its workspace.
         (inner, outer), (inner_bias, outer_bias) = self.weights, self.biases
-        hidden = torch.addcmul(inner_bias, log_exposure.T[..., None], inner).relu()
-        return ((hidden * outer.mT).sum(2) + outer_bias[..., 0]).T
+        activations = torch.addcmul(inner_bias, log_exposure.T[..., None], inner).relu()
+        return ((activations * outer.mT).sum(2) + outer_bias[..., 0]).T
 
     @torch.no_grad()
     def decode(self, value):

@@ -282,8 +282,8 @@ def _range_and_roughness(bands, logs: np.ndarray) -> tuple[float, float]:
     for values, clear in bands:
         stops = np.interp(values, CODES, logs) / np.log(2)
         ranges.append(stops[clear].ravel())
-        for rows, known in ((stops, clear), (stops.swapaxes(0, 1), clear.T)):
-            bends.append(np.abs(np.diff(rows, 2, axis=0))[known[2:] & known[1:-1] & known[:-2]].ravel())
+        for rows, valid in ((stops, clear), (stops.swapaxes(0, 1), clear.T)):
+            bends.append(np.abs(np.diff(rows, 2, axis=0))[valid[2:] & valid[1:-1] & valid[:-2]].ravel())
     ranges, bends = np.concatenate(ranges), np.concatenate(bends)
     low, high = np.percentile(ranges, (0.1, 99.9)) if len(ranges) else (0.0, 0.0)
     return high - low, bends.mean() if len(bends) else 0.0
@@ -293,12 +293,12 @@ def _edge_colors(image: np.ndarray, clear: np.ndarray) -> np.ndarray:
     """[E, 3, 3] encoded colors (one side, middle, other side) of clean, colored edges along rows and columns."""
     colors, length = [np.zeros((0, 3, 3))], 2 * EDGE_REACH + 3
     planes = np.ascontiguousarray(np.moveaxis(image, 2, 0))  # Sums over the first axis are many times as fast.
-    for rows, known in ((planes, clear), (planes.swapaxes(1, 2), clear.T)):
-        starts = len(known) - length + 1
+    for rows, valid in ((planes, clear), (planes.swapaxes(1, 2), clear.T)):
+        starts = len(valid) - length + 1
         if starts < 1:
             continue
         at = [rows[:, k : k + starts] for k in range(length)]
-        seen = np.logical_and.reduce([known[k : k + starts] for k in range(1, length - 1, EDGE_REACH)])
+        all_valid = np.logical_and.reduce([valid[k : k + starts] for k in range(1, length - 1, EDGE_REACH)])
         first, middle, last = at[1:-1:EDGE_REACH]
         flat = np.maximum(np.abs(at[0] - first), np.abs(at[-1] - last)).max(0) <= (FLAT_CODES + SLACK) * CODE
         apart = np.abs(last - first).max(0) >= (EDGE_CODES - SLACK) * CODE
@@ -307,8 +307,8 @@ def _edge_colors(image: np.ndarray, clear: np.ndarray) -> np.ndarray:
         share = np.linalg.norm(middle - first, axis=0) / np.maximum(np.linalg.norm(last - first, axis=0), CODE)
         cosine = (first * last).sum(0) / (np.linalg.norm(first, axis=0) * np.linalg.norm(last, axis=0) + 1e-12)
         mixed = (share > LEAST_SHARE) & (share < MOST_SHARE) & (cosine < np.cos(EDGE_ANGLE))
-        chosen = seen & flat & apart & between & mixed
-        colors.append(np.stack([side[:, chosen].T for side in (first, middle, last)], axis=1))
+        edges = all_valid & flat & apart & between & mixed
+        colors.append(np.stack([side[:, edges].T for side in (first, middle, last)], axis=1))
     return np.concatenate(colors)
 
 
@@ -329,9 +329,9 @@ def _edges(edges: np.ndarray, logs: np.ndarray, rises: np.ndarray) -> np.ndarray
     exposures = torch.from_numpy(np.exp(logs).T).float().contiguous()
     slopes = 1 / (exposures * torch.from_numpy(rises.T).float())
 
-    def read(table, chosen, between=True):
-        rows = table[below[chosen]]
-        return rows.lerp_(table[below[chosen] + 1], part[chosen]) if between else rows
+    def read(table, where, between=True):
+        rows = table[below[where]]
+        return rows.lerp_(table[below[where] + 1], part[where]) if between else rows
 
     total = torch.zeros(len(EDGE_MISFITS), len(logs), dtype=torch.float64)
     for start in range(0, len(points), BATCH):

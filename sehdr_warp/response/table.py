@@ -144,8 +144,8 @@ class ChannelResponse(TabulatedResponse, kind="channels"):
     def to_dict(self):
         """Return plain values for JSON."""
         columns = [curve.to_dict() for curve in self.curves]
-        stored = {key: [column[key] for column in columns] for key in ("exposures", "values")}
-        return {"kind": "channels", "name": self.name, **stored, "notes": list(self.notes)}
+        curves = {key: [column[key] for column in columns] for key in ("exposures", "values")}
+        return {"kind": "channels", "name": self.name, **curves, "notes": list(self.notes)}
 
 
 def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):

@@ -19,9 +19,9 @@ def pick_device(device: str | torch.device | None) -> torch.device:
     if not str(device).startswith(("cpu", "cuda")):
         raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
     try:
-        chosen = torch.device(device)
-        torch.empty(0, device=chosen)
+        result = torch.device(device)
+        torch.empty(0, device=result)
     except (RuntimeError, AssertionError) as error:
         problem = f"cannot be used ({str(error).splitlines()[0]})"
         raise InputError(f"device {device}", problem, "use cpu, or cuda:N of a GPU that torch sees") from None
-    return torch.device("cuda", chosen.index or 0) if chosen.type == "cuda" else chosen
+    return torch.device("cuda", result.index or 0) if result.type == "cuda" else result

@@ -32,8 +32,8 @@ def light_estimates(
     if response is None or not config.clipping or config.clipped_estimate == 0:
         return None
     masks = [torch.from_numpy(view.codes >= view.levels) for view in views]
-    known = [config.light_prior or view.light_above_white is not None for view in views]
-    if not any(some and bool(mask.any()) for some, mask in zip(known, masks, strict=True)):
+    has_estimate = [config.light_prior or view.light_above_white is not None for view in views]
+    if not any(some and bool(mask.any()) for some, mask in zip(has_estimate, masks, strict=True)):
         return None
     prior = load_prior(device) if config.light_prior else None
     found = []

@@ -132,10 +132,10 @@ def encoded_in_bands(
         encoded = np.rint(65535 * np.clip(linear_to_srgb(light), 0, 1)).astype(np.uint16)
         encoded[clipped] = 65535
         codes[rows] = encoded
-        known = (light > 1) & ~clipped
-        if known.any():
+        measurable = (light > 1) & ~clipped
+        if measurable.any():
             brighter = np.zeros(pixels.shape, np.float16) if brighter is None else brighter
-            brighter[rows] = np.where(known, light, 0)
+            brighter[rows] = np.where(measurable, light, 0)
     return codes, brighter
 
 
@@ -206,7 +206,7 @@ def note_of(encodings: dict[str, ColorEncoding | None]) -> list[str]:
             notes.setdefault(f"are in {encoding.name} and are converted to Rec.709", []).append(name)
     count = len(encodings)
     several = {text: f"{names[0]}{' ...' * (len(names) > 1)}" for text, names in notes.items()}
-    return [f"colors: {len(notes[text])} of {count} photos {text} ({named})" for text, named in several.items()]
+    return [f"colors: {len(notes[text])} of {count} photos {text} ({photos})" for text, photos in several.items()]
 
 
 @lru_cache(maxsize=8)

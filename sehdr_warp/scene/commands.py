@@ -70,5 +70,5 @@ def run_calibrate(args: Calibrate) -> None:
 
     times = None if args.exposures is None else seconds(args.exposures, "--exposures")
     calibrate(args.stack, times=times, channel=args.channel, out=args.out, overwrite=args.overwrite)
-    named = shlex.quote(str(args.out))
-    print(f"{args.out}: take it with --response {named}; the plot is {args.out.with_suffix('.png')}")
+    curve_file = shlex.quote(str(args.out))
+    print(f"{args.out}: take it with --response {curve_file}; the plot is {args.out.with_suffix('.png')}")

@@ -60,20 +60,20 @@ def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorL
     """
     pattern = dng.pattern
     samples = 3 if pattern is None else 1
-    stored = np.asarray(raw.raw_image)
-    stored = stored.reshape(*stored.shape[:2], -1)[:, :, :samples]
-    height, width, channels = stored.shape
-    stored = stored[: dng.size[1], : dng.size[0]]  # LibRaw may pad to whole tiles.
-    if stored.shape != (dng.size[1], dng.size[0], samples):
+    sensor = np.asarray(raw.raw_image)
+    sensor = sensor.reshape(*sensor.shape[:2], -1)[:, :, :samples]
+    height, width, channels = sensor.shape
+    sensor = sensor[: dng.size[1], : dng.size[0]]  # LibRaw may pad to whole tiles.
+    if sensor.shape != (dng.size[1], dng.size[0], samples):
         problem = (
             f"its tags state {dng.size[0]} x {dng.size[1]} pixels, LibRaw decodes {width} x {height} of {channels}"
         )
         raise InputError(path, problem, DAMAGED)
     cell = 1 if pattern is None else len(pattern)
     if dng.opcodes[0]:
-        stored = apply_opcodes(dng.opcodes[0], stored.astype(np.float32) / 65535, path, cell=cell) * 65535
+        sensor = apply_opcodes(dng.opcodes[0], sensor.astype(np.float32) / 65535, path, cell=cell) * 65535
     top, left, bottom, right = dng.active
-    light = _normalized(stored[top:bottom, left:right], dng)
+    light = _normalized(sensor[top:bottom, left:right], dng)
     levels = np.ones(light.shape, np.float32)
     for channel in range(3):
         places = (..., channel) if pattern is None else (_places(light.shape, pattern, channel), 0)
@@ -101,15 +101,15 @@ def _places(shape: tuple[int, ...], pattern: np.ndarray, channel: int) -> np.nda
     return np.tile(pattern == channel, repeats)[:height, :width]
 
 
-def _normalized(stored: np.ndarray, dng: DngRaw) -> np.ndarray:
+def _normalized(sensor: np.ndarray, dng: DngRaw) -> np.ndarray:
     """Return [H, W, samples] float32: 0 at the black level, 1 at the white level of the same pixel and channel."""
     rows, columns, _ = dng.black.shape
-    light = np.empty(stored.shape, np.float32)
+    light = np.empty(sensor.shape, np.float32)
     for row in range(rows):
         for column in range(columns):
             black = dng.black[row, column] + dng.black_rows[row::rows, None, None]
             black = (black + dng.black_columns[column::columns][:, None]).astype(np.float32)
-            part = stored[row::rows, column::columns].astype(np.float32)
+            part = sensor[row::rows, column::columns].astype(np.float32)
             light[row::rows, column::columns] = (part - black) / (dng.white.astype(np.float32) - black)
     return light
 

@@ -52,14 +52,14 @@ def read_exchange_cameras(path: Path) -> ExchangeCameras:
 
 def _read_usd(path: Path) -> ExchangeCameras:
     pxr("Usd")
-    stored = read_sandboxed(usd_camera_arrays, path, "USD", "export it again")
+    arrays = read_sandboxed(usd_camera_arrays, path, "USD", "export it again")
     cameras = []
-    for name, lens, matrix in zip(stored["names"].tolist(), stored["lenses"], stored["matrices"], strict=True):
+    for name, lens, matrix in zip(arrays["names"].tolist(), arrays["lenses"], arrays["matrices"], strict=True):
         try:
             cameras.append((name, _usd_camera(lens, matrix, path, name)))
         except (ValueError, OverflowError, ZeroDivisionError) as error:
             raise InputError(path, f"camera {name} cannot be used ({error!s:.120})", "correct the camera") from None
-    world = stored["world_matrix"]
+    world = arrays["world_matrix"]
     return ExchangeCameras(cameras, world if world.any() else None)
 
 

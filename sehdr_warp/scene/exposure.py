@@ -49,15 +49,15 @@ def choose_exposure(
         if index not in (None, 0):
             raise InputError(source, f"{request}, but each view has one exposure", "leave the exposure index out")
         return list(records), []
-    chosen, notes = keys[len(keys) // 2] if index is None else index, []
-    if chosen not in keys:
+    key, notes = keys[len(keys) // 2] if index is None else index, []
+    if key not in keys:
         raise InputError(source, f"{request}, but the exposures are {keys}", f"choose one of {keys[0]} to {keys[-1]}")
     if index is None and len(keys) > 1:
-        notes = [f"each view has {len(keys)} exposures {keys}; took the middle one, index {chosen}"]
-    selected = [record for record in records if record.exposure_key in (None, chosen)]
+        notes = [f"each view has {len(keys)} exposures {keys}; took the middle one, index {key}"]
+    selected = [record for record in records if record.exposure_key in (None, key)]
     missing = sorted({record.view for record in records} - {record.view for record in selected})
     if missing:
-        notes.append(f"{len(missing)} views without exposure {chosen} were left out: {', '.join(missing[:5])}")
+        notes.append(f"{len(missing)} views without exposure {key} were left out: {', '.join(missing[:5])}")
     return selected, notes
 
 
@@ -82,30 +82,28 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
     """
     times, notes = [record.exposure_time for record in records], []
     if None in times:
-        listed, notes = _listed_times(records, source)
-        times = [
-            listed.get(record.image) if time is None else time for time, record in zip(times, records, strict=True)
-        ]
+        table, notes = _listed_times(records, source)
+        times = [table.get(record.image) if time is None else time for time, record in zip(times, records, strict=True)]
     if None in times:
         unlisted = [record for record, time in zip(records, times, strict=True) if time is None]
         by_exif, more = _exif_times(unlisted)
         exif_times = iter(by_exif)
         times, notes = [next(exif_times) if time is None else time for time in times], [*notes, *more]
-    known = [time for time in times if time is not None]
+    stated_times = [time for time in times if time is not None]
     for record, time in zip(records, times, strict=True):
         if time is not None and not SHORTEST <= time <= LONGEST:
             remedy = f"correct it, or state every image's seconds in {EXPOSURES}"
             raise InputError(record.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", remedy)
-    if 2 * len(known) <= len(records):
-        ignored = f"; those of {len(known)} photos are not counted" if known else ""
-        state = "no exposure times were found" if not known else "most photos state no exposure time"
+    if 2 * len(stated_times) <= len(records):
+        ignored = f"; those of {len(stated_times)} photos are not counted" if stated_times else ""
+        state = "no exposure times were found" if not stated_times else "most photos state no exposure time"
         notes.append(f"{state}: each view counts as 1 s{ignored}")
         return [replace(record, exposure_time=1.0) for record in records], False, notes
-    shortest, longest = min(known), max(known)
+    shortest, longest = min(stated_times), max(stated_times)
     if longest > shortest * 1.01:
         span = f"{shutter(shortest)} to {shutter(longest)}".replace(" s to", " to")
         notes.append(f"exposures differ: {span} ({math.log2(longest / shortest):.1f} stops); each view keeps its own")
-    middle = math.exp(sum(map(math.log, known)) / len(known))
+    middle = math.exp(sum(map(math.log, stated_times)) / len(stated_times))
     timed = [
         replace(record, exposure_time=middle if time is None else time, time_known=time is not None)
         for record, time in zip(records, times, strict=True)

@@ -61,10 +61,10 @@ class ExposureCompensation:
 
     def unexplained_stops(self, views: Sequence[View]) -> float:
         """Return the deviation of exposure in stops that neither stated times nor camera positions explain."""
-        measured, explained = (
+        totals, explained = (
             np.log2([gains.gains[view.name][1] for view in views]) for gains in (self, self.explained_part(views))
         )
-        return float((measured - explained).std())
+        return float((totals - explained).std())
 
     @property
     def white_balance(self) -> float:
@@ -192,8 +192,8 @@ def rough_gains(
     return _from_logarithms(names, gains[:, 0], vignetting)
 
 
-def _mean(values: np.ndarray, known: np.ndarray, axis: int) -> np.ndarray:
-    return values.sum(axis, keepdims=True) / np.maximum(known.sum(axis, keepdims=True), 1)
+def _mean(values: np.ndarray, valid: np.ndarray, axis: int) -> np.ndarray:
+    return values.sum(axis, keepdims=True) / np.maximum(valid.sum(axis, keepdims=True), 1)
 
 
 def disagreement(
@@ -237,8 +237,8 @@ def remaining_vignetting(
     several = np.isfinite(light).sum(0) > 1
     light, predicted = light[:, several], predicted[:, several]
     before, after, predicted = (v - np.nanmedian(v, 0) for v in (light, light - predicted, predicted))
-    known = np.isfinite(predicted)
-    before, after = (_weighted_median(np.abs(v[known]), np.abs(predicted[known])) for v in (before, after))
+    valid = np.isfinite(predicted)
+    before, after = (_weighted_median(np.abs(v[valid]), np.abs(predicted[valid])) for v in (before, after))
     return after / before if before > 0 else 1.0
 
 

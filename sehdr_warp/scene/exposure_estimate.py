@@ -26,13 +26,13 @@ def with_estimated_times(scene: Scene, names: Collection[str], response: Respons
         names: of these views.
         response: of the photos.
     """
-    known = [view for view in scene.views if view.name not in names]
+    timed = [view for view in scene.views if view.name not in names]
     views, notes = [], []
     for view in scene.views:
         if view.name not in names:
             views.append(view)
             continue
-        factor, shared = _factor(view, known, scene.points, response)
+        factor, shared = _factor(view, timed, scene.points, response)
         time = float(np.clip(view.exposure_time * factor, SHORTEST, LONGEST))
         views.append(replace(view, exposure_time=time))
         source = f"by {shared} points that other photos show too" if shared else "by its brightness beside the others"
@@ -40,13 +40,13 @@ def with_estimated_times(scene: Scene, names: Collection[str], response: Respons
     return replace(scene, views=tuple(views), notes=(*scene.notes, *notes))
 
 
-def _factor(view: View, known: list[View], points: np.ndarray, response: Response) -> tuple[float, int]:
+def _factor(view: View, timed: list[View], points: np.ndarray, response: Response) -> tuple[float, int]:
     """Return the factor on a view's time, and the number of points that it is by; 0 if it is by brightness alone."""
-    known = known[:: -(-len(known) // _MOST_VIEWS)]
+    timed = timed[:: -(-len(timed) // _MOST_VIEWS)]
     points = points[:: max(1, len(points) // _MOST)]
     if len(points):
-        visible = np.ones((1 + len(known), len(points)), bool)
-        light, _ = point_light([view, *known], points, visible, response)
+        visible = np.ones((1 + len(timed), len(points)), bool)
+        light, _ = point_light([view, *timed], points, visible, response)
         several = np.isfinite(light[1:]).sum(0) > 0
         shared = np.isfinite(light[0]) & several
         count = int(shared.any(1).sum())
@@ -54,6 +54,6 @@ def _factor(view: View, known: list[View], points: np.ndarray, response: Respons
             others = np.nanmedian(np.where(shared, light[1:], np.nan)[:, shared.any(1)], axis=0)
             difference = light[0][shared.any(1)] - others
             return float(np.exp(np.nanmedian(difference))), count
-    gains = initial_gains([view, *known], response).gains
+    gains = initial_gains([view, *timed], response).gains
     ours = np.log(gains[view.name])
-    return float(np.exp(np.median(ours) - np.median([np.log(gains[other.name]) for other in known]))), 0
+    return float(np.exp(np.median(ours) - np.median([np.log(gains[other.name]) for other in timed]))), 0

@@ -180,11 +180,11 @@ def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int
         header = file.header()
         windows = [[(int(x), int(y)) for x, y in header[key]] for key in ("displayWindow", "dataWindow")]
     sizes = [(high[0] - low[0] + 1, high[1] - low[1] + 1) for low, high in windows]
-    stored = path.stat().st_size
+    file_size = path.stat().st_size
     for size in sizes:
         check_size(path, *size, max_pixels)
-        if size[0] * size[1] > _MOST_PIXELS_PER_BYTE * stored:
-            raise InputError(path, f"states {size[0]} x {size[1]} pixels, but has only {stored} bytes", DAMAGED)
+        if size[0] * size[1] > _MOST_PIXELS_PER_BYTE * file_size:
+            raise InputError(path, f"states {size[0]} x {size[1]} pixels, but has only {file_size} bytes", DAMAGED)
     return windows[0][0], sizes[0]
 
 

@@ -87,9 +87,9 @@ def _of_lut(tag: bytes, space: str) -> IccTable:
     numbers = np.frombuffer(tag, ">u2" if deep else "u1", 3 * (count_in + grid**3 + count_out), at)
     values = numbers / (65535 if deep else 255)
     first, table, last = np.split(values, [3 * count_in, 3 * (count_in + grid**3)])
-    named = "Lab 16" if space == "Lab" and deep else space
+    space_name = "Lab 16" if space == "Lab" and deep else space
     entries = table.reshape(grid, grid, grid, 3)
-    return IccTable(tuple(first.reshape(3, -1)), entries, None, None, tuple(last.reshape(3, -1)), named)
+    return IccTable(tuple(first.reshape(3, -1)), entries, None, None, tuple(last.reshape(3, -1)), space_name)
 
 
 def _of_stages(tag: bytes, space: str, read_curve: _ReadCurve) -> IccTable:
@@ -97,11 +97,11 @@ def _of_stages(tag: bytes, space: str, read_curve: _ReadCurve) -> IccTable:
     output, matrix, middle, table, device = struct.unpack_from(">5I", tag, 12)
 
     def curves(at: int) -> tuple[np.ndarray, ...] | None:
-        found = []
+        curves_of_stage = []
         for _ in range(3 if at else 0):
-            found.append(read_curve(tag[at:]))
+            curves_of_stage.append(read_curve(tag[at:]))
             at += -(-_curve_size(tag, at) // 4) * 4
-        return tuple(found) or None
+        return tuple(curves_of_stage) or None
 
     entries = None
     if table:

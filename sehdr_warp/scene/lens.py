@@ -54,12 +54,12 @@ class Lens:
 
     def __post_init__(self):
         """Check the values."""
-        remedy, wanted, problem = "correct the camera or export it again", PARAMETER_COUNTS.get(self.model), None
-        if wanted is None:
+        remedy, count, problem = "correct the camera or export it again", PARAMETER_COUNTS.get(self.model), None
+        if count is None:
             problem = f"camera model {self.model!r:.40} is not supported"
             remedy = f"use one of {', '.join(PARAMETER_COUNTS)}"
-        elif len(self.params) != wanted:
-            problem = f"camera model {self.model} has {len(self.params)} parameters, not {wanted}"
+        elif len(self.params) != count:
+            problem = f"camera model {self.model} has {len(self.params)} parameters, not {count}"
         elif not (1 <= self.width <= _MAX_SIDE and 1 <= self.height <= _MAX_SIDE):
             problem = f"camera size {self.width} x {self.height} is not in 1..{_MAX_SIDE}"
         elif not np.isfinite(self.params).all():
@@ -176,13 +176,13 @@ class Undistortion:
         """Resample [H, W] or [H, W, C] float32 to the pinhole camera, 0 outside of the lens's image."""
         from scipy.ndimage import map_coordinates
 
-        done = np.empty((*self._places.shape[1:], *image.shape[2:]), np.float32)
+        result = np.empty((*self._places.shape[1:], *image.shape[2:]), np.float32)
         for channel in np.ndindex(image.shape[2:]):
             plane = image[(..., *channel)]
-            done[(..., *channel)] = map_coordinates(plane, self._places, order=1, mode="nearest", output=np.float32)
+            result[(..., *channel)] = map_coordinates(plane, self._places, order=1, mode="nearest", output=np.float32)
         if self.inside is not None:
-            done[~self.inside] = 0.0
-        return done
+            result[~self.inside] = 0.0
+        return result
 
 
 def area_average(

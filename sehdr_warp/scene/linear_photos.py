@@ -45,8 +45,8 @@ def float_codes(radiance: np.ndarray, time: float) -> np.ndarray:
 
 def float_time(photos: Sequence[Path]) -> float:
     """Return the exposure time at which the log-average of a set of float images is middle grey."""
-    chosen = photos[:: -(-len(photos) // _MOST_JUDGED)]
-    return _MIDDLE_GREY / float(np.exp(np.mean([np.log(_log_average(read_hdr(photo))) for photo in chosen])))
+    sample = photos[:: -(-len(photos) // _MOST_JUDGED)]
+    return _MIDDLE_GREY / float(np.exp(np.mean([np.log(_log_average(read_hdr(photo))) for photo in sample])))
 
 
 def tone_mapped(path: Path) -> np.ndarray:
@@ -59,8 +59,8 @@ def raw_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return (width, height) of the developed photo as the sensor lies, and turned upright."""
     dng = read_dng(path)
     with _opened(path) as raw:
-        stored, turned = (raw.sizes.width, raw.sizes.height), (raw.sizes.height, raw.sizes.width)
-        sizes = (stored, turned if raw.sizes.flip in (5, 6) else stored) if dng is None else dng.sizes
+        size, turned = (raw.sizes.width, raw.sizes.height), (raw.sizes.height, raw.sizes.width)
+        sizes = (size, turned if raw.sizes.flip in (5, 6) else size) if dng is None else dng.sizes
     check_size(path, *sizes[0])
     return sizes
 
@@ -88,8 +88,8 @@ def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
             return EncodedImage(linear_codes(linear), None)
         sensor = develop_dng(path, dng, raw, oriented=oriented)
     codes = linear_codes(np.where(sensor.clipped, 1, sensor.light))
-    known = (codes == 65535) & ~sensor.clipped
-    above = np.where(known, np.maximum(sensor.light, 1), 0).astype(np.float16) if known.any() else None
+    overflow = (codes == 65535) & ~sensor.clipped
+    above = np.where(overflow, np.maximum(sensor.light, 1), 0).astype(np.float16) if overflow.any() else None
     return EncodedImage(codes, None, above, _NOISE)
 
 

@@ -44,7 +44,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
     index = [{key: file for file, key in reversed(keys.items())} for keys in files.values()]
     beside = {parent: _masks_beside(parent) for parent in {record.image.parent for record in records}}
-    masked, used = [], set()
+    masked, mask_files = [], set()
     for record in records:
         keys = _photo_keys(record, bases, shared)
         near = beside[record.image.parent]
@@ -52,17 +52,17 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         mask = record.mask or next((masks[key] for masks, names in tables for key in names if key in masks), None)
         if mask is not None and record.mask is None:
             mask = contained(folder, mask.relative_to(folder).as_posix(), folder)
-        used.add(mask)
+        mask_files.add(mask)
         masked.append(replace(record, mask=mask))
     notes = []
     for place, keys in files.items():
         # A mask of a photo that the set leaves out is named with that photo, not here.
-        strange = [file for file, key in keys.items() if file not in used and not _is_photo(key, bases)]
+        strange = [file for file, key in keys.items() if file not in mask_files and not _is_photo(key, bases)]
         names = [file.relative_to(place).as_posix() for file in strange]
         if names:
-            listed = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
+            names_text = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
             count = "1 file that fits" if len(names) == 1 else f"{len(names)} files that fit"
-            notes.append(f"{place.name}/ holds {count} no photo: {listed}; {_REMEDY}")
+            notes.append(f"{place.name}/ holds {count} no photo: {names_text}; {_REMEDY}")
     return masked, notes
 
 

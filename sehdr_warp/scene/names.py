@@ -91,10 +91,10 @@ def unique_names(records: Sequence[ImageRecord]) -> list[str]:
     plain = [re.sub(r"[^\w.+-]", "_", record.view) or "view" for record in records]
     counts = Counter(name.lower() for name in plain)
     shared = [counts[name.lower()] > 1 for name in plain]
-    names, taken = {}, set()
+    names, reserved = {}, set()
     for i in sorted(range(len(records)), key=lambda i: (shared[i], records[i].split != "test")):
         base = f"{records[i].image.parent.name}_{plain[i]}" if shared[i] and records[i].split != "test" else plain[i]
         numbered = (f"{base}_{number}" if number > 1 else base for number in itertools.count(1))
-        names[i] = next(name for name in numbered if name.lower() not in taken)
-        taken.add(names[i].lower())
+        names[i] = next(name for name in numbered if name.lower() not in reserved)
+        reserved.add(names[i].lower())
     return [names[i] for i in range(len(records))]

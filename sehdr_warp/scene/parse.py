@@ -83,8 +83,8 @@ def parse_dataset(
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
-    unused = [] if is_embedded(path) or dataset.format == "video" else unused_notes(folder, every, unplaced)
-    notes = (*dataset.notes, *masks, *exposures, *odd, *times, *split, *unused)
+    notes_unused = [] if is_embedded(path) or dataset.format == "video" else unused_notes(folder, every, unplaced)
+    notes = (*dataset.notes, *masks, *exposures, *odd, *times, *split, *notes_unused)
     return replace(dataset, records=tuple(records), notes=notes, name=name)
 
 
@@ -94,17 +94,17 @@ def _with_times(records: list[ImageRecord], kind: str, folder: Path) -> tuple[li
         return with_exposure_times(records, folder)
     time = float_time([record.image for record in records])
     header_times = [exr_exposure_time(record.image) for record in records]
-    known = [each for each in header_times if each is not None]
-    if len(known) < len(header_times) or max(known) < min(known) * 1.001:
+    times = [each for each in header_times if each is not None]
+    if len(times) < len(header_times) or max(times) < min(times) * 1.001:
         note = "float images: their values are taken as light, at no exposure"
         timed = [replace(record, exposure_time=time, hdr=record.hdr or record.image) for record in records]
         return timed, True, [note]
     timed = []
-    for record, each in zip(records, known, strict=True):
-        factor = each / known[0]
+    for record, each in zip(records, times, strict=True):
+        factor = each / times[0]
         truth = record.hdr or record.image
         timed.append(replace(record, exposure_time=time * factor, hdr=truth, light_scale=1 / factor))
-    note = f"float images: their values are light times expTime, {min(known):g} to {max(known):g} s"
+    note = f"float images: their values are light times expTime, {min(times):g} to {max(times):g} s"
     return timed, True, [note]
 
 
@@ -159,9 +159,9 @@ def _with_splits(
     if not held_out:
         return records, ("no views are held out for testing",)
     names = [name for name, record in zip(unique_names(records), records, strict=True) if record.split == "test"]
-    listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    names_text = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
     are = "is" if len(names) == 1 else "are"
-    return records, (f"{len(names)} of {len(records)} views {are} held out for testing: {listed}",)
+    return records, (f"{len(names)} of {len(records)} views {are} held out for testing: {names_text}",)
 
 
 def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -> set[int]:
@@ -194,9 +194,9 @@ def embedded_folder(path: str) -> Path:
     name = str(path).partition(":")[2] or "room"
     if name in embedded_scenes():
         return next(place / name for place in _places() if (place / name / _MARK).is_file())
-    known = embedded_scenes()
-    present = ", ".join(f"embedded:{each}" for each in known)
-    problem = f"is not here{did_you_mean(name, known)}; present are {present}"
+    scenes = embedded_scenes()
+    present = ", ".join(f"embedded:{each}" for each in scenes)
+    problem = f"is not here{did_you_mean(name, scenes)}; present are {present}"
     raise InputError(path, problem, "get the repository's scenes/ and name it in SEHDR_SCENES")
 
 

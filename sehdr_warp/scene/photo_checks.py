@@ -67,15 +67,15 @@ def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
         InputError: if no orientation and factor fits.
     """
     lens = record.lens
-    stored, turned = photo_sizes(record.image)
-    choices = [(stored, False), (turned, True)] if record.oriented is None else [(turned, True)]
+    size, turned = photo_sizes(record.image)
+    choices = [(size, False), (turned, True)] if record.oriented is None else [(turned, True)]
     for factor in range(1, 17):
         for (width, height), oriented in choices:
             if factor == 1 and (width, height) == (lens.width, lens.height):
                 return lens, oriented
             if factor > 1 and abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
                 return lens.resized(width, height), oriented
-    problem = f"image is {stored[0]} x {stored[1]}, its camera {lens.width} x {lens.height}"
+    problem = f"image is {size[0]} x {size[1]}, its camera {lens.width} x {lens.height}"
     raise InputError(record.image, problem, "use the images that the cameras were solved for")
 
 
@@ -105,9 +105,9 @@ def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRe
     others = [record for record in records if kind_of(record.image) != kind]
     if not others:
         return kind, list(records), []
-    found = " and ".join(name for each, name in _KINDS.items() if each != kind and kinds[each])
+    kind_names = " and ".join(name for each, name in _KINDS.items() if each != kind and kinds[each])
     reason = f"were left out, because most are {_KINDS[kind]}: photos of one set are of one kind"
-    notes = [f"{_listed([record.image.name for record in others])} ({found}) {reason}"]
+    notes = [f"{_listed([record.image.name for record in others])} ({kind_names}) {reason}"]
     return kind, [record for record in records if kind_of(record.image) == kind], notes
 
 

@@ -76,11 +76,13 @@ class PhotoFile:
         offset, data = self.used, np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
         if offset + len(data) > self.most:
             raise ValueError(f"{len(data)} bytes more than the {self.most} of the file")
-        done = 0
+        written_bytes = 0
         try:
             # Written as a file and not as memory: a full disk is then an error and not the end of the process.
-            while done < len(data):
-                done += os.pwrite(self._file.fileno(), data[done : done + (1 << 26)], offset + done)
+            while written_bytes < len(data):
+                written_bytes += os.pwrite(
+                    self._file.fileno(), data[written_bytes : written_bytes + (1 << 26)], offset + written_bytes
+                )
         except OSError as error:
             raise self._refused(error) from None
         self.used = -(-(offset + len(data)) // _ALIGNED) * _ALIGNED

@@ -272,16 +272,16 @@ def place_photos(
     refuse_stack(photos, folder)
     reconstruction = reconstruct_panoramas(photos, cache) if are_panoramas(photos) else reconstruct(photos, cache)
     cameras = {int(Path(image.name).stem): image for image in reconstruction.model.images}
-    placed = [
+    result = [
         replace(record, lens=image.lens, world_to_camera=image.world_to_camera)
         for i, record in enumerate(records)
         if (image := cameras.get(i)) is not None
     ]
-    lost = [record.image.name for i, record in enumerate(records) if i not in cameras]
+    unplaced = [record.image.name for i, record in enumerate(records) if i not in cameras]
     return (
         replace(dataset, cloud=reconstruction.model.cloud, notes=(*dataset.notes, *reconstruction.notes(photos))),
-        placed,
-        lost,
+        result,
+        unplaced,
     )
 
 

@@ -34,9 +34,9 @@ def read_transforms(folder: Path) -> DataparserOutputs:
             continue
         values = read_json(path)
         frames = frames_of(values, path)
-        named = _named_splits(values, frames)
+        splits = _named_splits(values, frames)
         for name, frame in frames:
-            record = _frame_record(folder, path, values, frame, name, split or named.get(name))
+            record = _frame_record(folder, path, values, frame, name, split or splits.get(name))
             (absent if record is None else records).append(record or name)
         if not len(cloud[0]):
             cloud = _points(folder, path, values)
@@ -112,12 +112,12 @@ def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
 
 def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str]:
     """Return splits by file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
-    known = ("train", "test", "val")
-    named = {name: frame["split"] for name, frame in frames if frame.get("split") in known}
+    split_names = ("train", "test", "val")
+    named = {name: frame["split"] for name, frame in frames if frame.get("split") in split_names}
     for split in ("train", "val", "test"):
-        listed = values.get(f"{split}_filenames")
-        if isinstance(listed, list):
-            named.update({name: split for name in listed if isinstance(name, str)})
+        filenames = values.get(f"{split}_filenames")
+        if isinstance(filenames, list):
+            named.update({name: split for name in filenames if isinstance(name, str)})
     splits = {"train": "train", "test" if "test" in named.values() else "val": "test"}
     return {name: splits[split] for name, split in named.items() if split in splits}
 
@@ -131,8 +131,8 @@ def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:
     """
     if not absent:
         return ()
-    listed = ", ".join(absent[:3]) + (" ..." if len(absent) > 3 else "")
-    return (f"{len(absent)} of {len(absent) + count} frames have no photo and were left out: {listed}",)
+    names_text = ", ".join(absent[:3]) + (" ..." if len(absent) > 3 else "")
+    return (f"{len(absent)} of {len(absent) + count} frames have no photo and were left out: {names_text}",)
 
 
 def _frame_record(

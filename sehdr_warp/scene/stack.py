@@ -44,8 +44,8 @@ def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list
         raise InputError(folder, "is no folder of photos", "give a folder of one scene at several exposure times")
     if times is None:
         records = [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in files]
-        records, known, notes = with_exposure_times(records, folder)
-        if not known or not all(record.time_known for record in records):
+        records, times_known, notes = with_exposure_times(records, folder)
+        if not times_known or not all(record.time_known for record in records):
             raise InputError(folder, "its photos state no exposure times", "give --exposures or an exposures.json")
         for note in notes:
             log.info(note)
@@ -63,13 +63,13 @@ def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
     if len(photos) > MOST_OF_STACK or any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
         return
     try:
-        records, known, _ = with_exposure_times(
+        records, times_known, _ = with_exposure_times(
             [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in photos], folder
         )
         records = sorted(records, key=lambda record: record.seconds)
         steps = [b.seconds / a.seconds for a, b in pairwise(records)]
-        known = known and all(record.time_known for record in records)
-        if not known or min(steps) < LEAST_STEP or not all(starmap(_alike, pairwise(_thumbnails(records)))):
+        times_known = times_known and all(record.time_known for record in records)
+        if not times_known or min(steps) < LEAST_STEP or not all(starmap(_alike, pairwise(_thumbnails(records)))):
             return
     except (InputError, *PILLOW_ERRORS):
         return  # The readers of these photos report what is wrong with them.
@@ -151,12 +151,12 @@ def calibrate(
     return response
 
 
-def _joined(name: str, found: Sequence["Calibration"]) -> "ChannelResponse":
+def _joined(name: str, calibrations: Sequence["Calibration"]) -> "ChannelResponse":
     """Return the channels' curves as one response, in which equal middle codes are neutral (Debevec and Malik)."""
     from ..response.table import ChannelResponse
 
     codes = np.arange(256) / 255
-    exposures = [calibration.response.decode(codes) for calibration in found]
+    exposures = [calibration.response.decode(codes) for calibration in calibrations]
     exposures = [each * (exposures[1][128] / each[128]) for each in exposures]
     return ChannelResponse(name, exposures, [codes] * 3)
 
@@ -177,40 +177,42 @@ def _rows(response: "Response") -> Iterator[str]:
         yield ",".join(f"{number:.9g}" for number in row)
 
 
-def _tell(found: "Calibration", files: list[Path], channel: str | None) -> None:
+def _tell(calibration: "Calibration", files: list[Path], channel: str | None) -> None:
     from ..response.calibration import CHANNELS
 
-    log.info("%d photos, residual %.3f stops", len(files), found.residual)
-    spread = {name: value for name, value in zip(CHANNELS, found.channel_spread, strict=True) if value == value}
+    log.info("%d photos, residual %.3f stops", len(files), calibration.residual)
+    spread = {name: value for name, value in zip(CHANNELS, calibration.channel_spread, strict=True) if value == value}
     if channel is None and max(spread.values(), default=0.0) > CHANNELS_DIFFER:
-        said = ", ".join(f"{name} {value:.2f}" for name, value in spread.items())
-        log.warning("the channels' curves differ from the shared one, stops: %s; --channel each keeps them", said)
-    for file, off in zip(files, found.photo_offsets, strict=True):
+        spread_text = ", ".join(f"{name} {value:.2f}" for name, value in spread.items())
+        log.warning(
+            "the channels' curves differ from the shared one, stops: %s; --channel each keeps them", spread_text
+        )
+    for file, off in zip(files, calibration.photo_offsets, strict=True):
         if abs(off) > WRONG_TIME:
             side = "brighter" if off > 0 else "darker"
             log.warning("%s is %.2f stops %s than its time says", file.name, abs(off), side)
 
 
-def _plot(found: Sequence["Calibration"], times: Sequence[float], path: Path) -> None:
+def _plot(calibrations: Sequence["Calibration"], times: Sequence[float], path: Path) -> None:
     """Plot the curves over their samples: encoded value against stops from white."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    exposures, values = np.concatenate([calibration.samples for calibration in found]).T
+    exposures, values = np.concatenate([calibration.samples for calibration in calibrations]).T
     axes.plot(np.log2(exposures), values * 255, ".", color="#9aa4ae", markersize=2, label="samples", rasterized=True)
     codes = np.arange(1, 256)
-    colors = ("#c0392b", "#2e8b57", "#0072b2") if len(found) == 3 else ("#0072b2",)
-    labels = ("red", "green", "blue") if len(found) == 3 else ("response",)
-    for calibration, color, label in zip(found, colors, labels, strict=True):
+    colors = ("#c0392b", "#2e8b57", "#0072b2") if len(calibrations) == 3 else ("#0072b2",)
+    labels = ("red", "green", "blue") if len(calibrations) == 3 else ("response",)
+    for calibration, color, label in zip(calibrations, colors, labels, strict=True):
         stops = np.log2(calibration.response.decode(codes / 255))
         axes.plot(stops, codes, color=color, linewidth=1.8, label=label)
     axes.set(xlabel="exposure, stops from white", ylabel="8-bit code", ylim=(0, 260))
     axes.set_xlim(left=max(axes.get_xlim()[0], -14))
     axes.grid(color="#e1e4e8", linewidth=0.8)
     span = f"{len(times)} photos over {math.log2(max(times) / min(times)):.1f} stops"
-    residual = max(calibration.residual for calibration in found)
-    title = f"{found[0].response.name}: {span}, residual {residual:.3f} stops"
+    residual = max(calibration.residual for calibration in calibrations)
+    title = f"{calibrations[0].response.name}: {span}, residual {residual:.3f} stops"
     axes.set_title(title, loc="left", fontsize=10)
     axes.legend(frameon=False, loc="upper left", markerscale=4)
     figure.savefig(path, dpi=140, facecolor="white", format="png")

@@ -34,13 +34,13 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
     images = [record.image for record in records if not record.derived]
     if not images:
         return []
-    used = {file for record in records for file in (record.image, record.mask, record.hdr)}
+    files_in_use = {file for record in records for file in (record.image, record.mask, record.hdr)}
     files = list(_files_beside(images, folder))
     names = {name for file in files for name in (file.name, file.stem)}
     photos, others = [], []
     for file in files:
         key = without_mask_ending(file.stem)
-        if file in used or file.name in mentioned or (key != file.stem and key in names):
+        if file in files_in_use or file.name in mentioned or (key != file.stem and key in names):
             continue
         suffix = file.suffix.lower()
         if suffix in PHOTO_SUFFIXES:
@@ -50,9 +50,9 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
     notes = []
     if photos:
         place = os.path.commonpath([file.parent for file in photos])
-        said = f"{len(photos)} photos" if len(photos) > 1 else "1 photo"
+        count_text = f"{len(photos)} photos" if len(photos) > 1 else "1 photo"
         where = Path(place).relative_to(folder).as_posix() if Path(place) != folder else "the folder"
-        notes.append(f"{said} of {where} {'are' if len(photos) > 1 else 'is'} in no view: {_listed(photos)}")
+        notes.append(f"{count_text} of {where} {'are' if len(photos) > 1 else 'is'} in no view: {_listed(photos)}")
     if others:
         notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
     return notes

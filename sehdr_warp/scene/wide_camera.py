@@ -128,14 +128,14 @@ def faces_of(view: View, size: int | None = None) -> list[View]:
         if visible.mean() < _LEAST_FILLED:
             continue
         wrap = camera.projection == "equirectangular"
-        stored = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="wrap") if wrap else image
+        padded = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="wrap") if wrap else image
         rows, columns = np.where(visible[..., None], places, 0).transpose(2, 0, 1)  # pyright: ignore[reportIndexIssue]
         at = np.stack([rows, columns + wrap])
-        codes = np.stack([map_coordinates(stored[..., c], at, order=1, mode="nearest") for c in range(3)], axis=2)
-        counted = visible.astype(np.float32)
+        codes = np.stack([map_coordinates(padded[..., c], at, order=1, mode="nearest") for c in range(3)], axis=2)
+        weights = visible.astype(np.float32)
         if mask is not None:
-            counted *= map_coordinates(mask, np.stack([rows, columns]), order=0, mode="nearest")
-        part = None if counted.min() >= 1 else counted
+            weights *= map_coordinates(mask, np.stack([rows, columns]), order=0, mode="nearest")
+        part = None if weights.min() >= 1 else weights
         codes = codes_of(codes, 8 if view.codes.dtype == np.uint8 else 16)
         name = f"{view.name}_{number}"
         faces.append(replace(view, name=name, codes=codes, camera=face, mask=part, hdr=None, light_above_white=None))

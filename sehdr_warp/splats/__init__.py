@@ -78,9 +78,9 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
             format cannot hold these colors (see color_model_of).
         SehdrError: If the file cannot be written.
     """
-    held, suffix = color_model_of(path), check_suffix(path)
-    if held not in (None, gaussians.color_model):
-        problem = f"holds {held} colors, and these are {gaussians.color_model}"
+    color_model, suffix = color_model_of(path), check_suffix(path)
+    if color_model not in (None, gaussians.color_model):
+        problem = f"holds {color_model} colors, and these are {gaussians.color_model}"
         raise InputError(path, problem, "choose another suffix, or let export change the colors")
     gaussians.require_finite(path)
     if gaussians.means.dtype == np.float64:

@@ -97,9 +97,9 @@ def read_glb(path: Path) -> GaussianArrays:
 
 def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path: Path) -> GaussianArrays:
     attributes, extension = primitive["attributes"], primitive["extensions"][EXTENSION]
-    for key, known in (("colorSpace", _SPACE), ("kernel", "ellipse")):
-        if extension.get(key) != known:
-            problem = f"its {key} is {extension.get(key)!r:.60}, not {known}"
+    for key, expected in (("colorSpace", _SPACE), ("kernel", "ellipse")):
+        if extension.get(key) != expected:
+            problem = f"its {key} is {extension.get(key)!r:.60}, not {expected}"
             raise InputError(path, problem, "export it as display colors in sRGB, of ellipses")
 
     def values(name: str, columns: int) -> np.ndarray:
@@ -207,5 +207,5 @@ def _accessor(described: dict, binary: bytes, index: int, columns: int) -> np.nd
     offset, stride = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), view.get("byteStride", row)
     if type(stride) is not int or stride < row:  # Of 0, one element would stand for any number of them.
         raise ValueError(f"a stride of {stride!r:.20} bytes is less than the {row} of an element")
-    stored = np.ndarray((accessor["count"], columns), kind, binary, offset, (stride, row // columns))
-    return np.maximum(stored.astype(np.float32) / one, -np.inf if one == 1 else -1)
+    values = np.ndarray((accessor["count"], columns), kind, binary, offset, (stride, row // columns))
+    return np.maximum(values.astype(np.float32) / one, -np.inf if one == 1 else -1)

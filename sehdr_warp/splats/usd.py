@@ -96,31 +96,31 @@ def _write_stage(path: Path, gaussians: GaussianArrays) -> None:
 def read_usd(path: Path) -> GaussianArrays:
     """Read the one ParticleField3DGaussianSplat of a stage, in world coordinates."""
     pxr("Usd")
-    stored = read_sandboxed(usd_arrays, path, "USD", "export it again")
-    if stored["count"] != 1:
-        problem = f"has {stored['count']} prims of ParticleField3DGaussianSplat, not one"
+    arrays = read_sandboxed(usd_arrays, path, "USD", "export it again")
+    if arrays["count"] != 1:
+        problem = f"has {arrays['count']} prims of ParticleField3DGaussianSplat, not one"
         raise InputError(path, problem, "export Gaussians by OpenUSD's schema")
-    if str(stored["space"]) not in ("", COLOR_SPACE, "lin_rec709"):
-        problem = f"its color space is {stored['space']!s:.60}, not {COLOR_SPACE}"
+    if str(arrays["space"]) not in ("", COLOR_SPACE, "lin_rec709"):
+        problem = f"its color space is {arrays['space']!s:.60}, not {COLOR_SPACE}"
         raise InputError(path, problem, "export it scene-linear in Rec.709")
-    if not np.allclose(stored["matrix"], np.eye(4)):
+    if not np.allclose(arrays["matrix"], np.eye(4)):
         raise InputError(path, "its Gaussians are moved by a transform", "bake the transform into the Gaussians")
 
     def values(name: str, columns: int) -> np.ndarray:
-        if name not in stored or stored[name].size % columns:
+        if name not in arrays or arrays[name].size % columns:
             raise InputError(path, f"has no usable {name}", "export it again")
-        return stored[name].reshape(-1, columns)
+        return arrays[name].reshape(-1, columns)
 
     means, scales = values("positions", 3), values("scales", 3)
     quaternions, opacities = np.roll(values("orientations", 4), 1, axis=1), values("opacities", 1)[:, 0]
-    degree = int(stored["degree"])
+    degree = int(arrays["degree"])
     coefficients = (degree + 1) ** 2
     degree_of(coefficients, path)
     harmonics = values(_HARMONICS, 3 * coefficients).reshape(-1, coefficients, 3)
     harmonics[:, 0] += _BIAS
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
-    matrix = read_matrix(stored["world_matrix"], path)
+    matrix = read_matrix(arrays["world_matrix"], path)
     return GaussianArrays(
         means=means,
         log_scales=log_scales,
@@ -128,7 +128,7 @@ def read_usd(path: Path) -> GaussianArrays:
         opacity_logits=logits,
         harmonics=harmonics,
         color_model="linear",
-        base_time=float(stored["base_time"]),
+        base_time=float(arrays["base_time"]),
         world_matrix=None if np.array_equal(matrix, np.eye(4)) else matrix,  # pyright: ignore[reportArgumentType]
     )
 
@@ -141,7 +141,7 @@ def usd_arrays(path: Path) -> dict[str, Any]:
     if len(prims) != 1:
         return {"count": len(prims)}
     prim, splat = prims[0], UsdVol.ParticleField3DGaussianSplat(prims[0])
-    stored = {
+    arrays = {
         "count": 1,
         "space": str(Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) or ""),
         "matrix": np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())),
@@ -151,8 +151,8 @@ def usd_arrays(path: Path) -> dict[str, Any]:
     }
     for name in ("positions", "scales", "orientations", "opacities", _HARMONICS):
         for value in filter(None, (_value(prim.GetAttribute(each)) for each in (f"{name}h", name))):
-            stored[name] = np.array(value, np.float32)
-    return stored
+            arrays[name] = np.array(value, np.float32)
+    return arrays
 
 
 def _value(attribute: Any) -> Any:

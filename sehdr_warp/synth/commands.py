@@ -32,7 +32,7 @@ class Synth:
     """Replace the folder if it exists."""
 
 
-def run_synth(asked: Synth) -> None:
+def run_synth(args: Synth) -> None:
     """Expose a set with truth and write the photos."""
     from ..files import check_absent
     from ..model.exposure import read_exposures
@@ -40,19 +40,19 @@ def run_synth(asked: Synth) -> None:
     from ..scene import load_scene
     from .expose import SensorNoise, exposure_ladder, write_photo_set
 
-    response = response_by_name(asked.response)
+    response = response_by_name(args.response)
     for note in response.notes:
         LOG.info("%s", note)
     noise = None
-    if asked.noise is not None:
-        figures = parse_numbers("--noise", asked.noise)
+    if args.noise is not None:
+        figures = parse_numbers("--noise", args.noise)
         if len(figures) != 2:
-            raise SehdrError(f"--noise {asked.noise}: give two numbers, full well and read noise in electrons")
+            raise SehdrError(f"--noise {args.noise}: give two numbers, full well and read noise in electrons")
         noise = SensorNoise(*figures)
-    times = asked.exposures and [exposure.time for exposure in read_exposures(asked.exposures, None, "--exposures")]
-    check_absent(asked.out, asked.overwrite, folder=True)
-    scene = load_scene(asked.truth, response="srgb")
+    times = args.exposures and [exposure.time for exposure in read_exposures(args.exposures, None, "--exposures")]
+    check_absent(args.out, args.overwrite, folder=True)
+    scene = load_scene(args.truth, response="srgb")
     times = times or exposure_ladder(scene, response)
-    write_photo_set(scene, asked.out, response, times, noise=noise, seed=asked.seed, overwrite=asked.overwrite)
+    write_photo_set(scene, args.out, response, times, noise=noise, seed=args.seed, overwrite=args.overwrite)
     times_text = ", ".join(f"{time:.4g}" for time in times)
-    print(f"{asked.out}: {len(scene.views)} views at {times_text} s through {response.name}")
+    print(f"{args.out}: {len(scene.views)} views at {times_text} s through {response.name}")

@@ -194,22 +194,22 @@ def write_radiance(path: Path, radiance: np.ndarray, **options) -> None:
     write_exr(path, dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True)), overwrite=True, **options)
 
 
-def write_tables(folder: Path, views: Sequence[RadianceView], times: Sequence[float], points, **stated) -> None:
+def write_tables(folder: Path, views: Sequence[RadianceView], times: Sequence[float], points, **metadata) -> None:
     """Write a set's poses, times and points, without its pictures; `stated` are more fields of transforms_<split>.json.
 
     Raises:
         InputError: for cameras that differ, or have no square pixels or centered principal point.
     """
     for split in ("train", "test"):
-        chosen = [view for view in views if view.split == split]
+        split_views = [view for view in views if view.split == split]
         frames, exposures = [], {}
-        for view in chosen:
+        for view in split_views:
             matrix = view.camera.camera_to_world.copy()
             matrix[:3, 1:3] *= -1  # To OpenGL's axes.
             frames.append({"file_path": f"./{split}/{view.name}", "transform_matrix": matrix.tolist()})
             exposures |= {f"./{split}/{view.name}_{k}.png": float(time) for k, time in enumerate(times)}
-        if chosen:
-            head = {"camera_angle_x": _view_angle(views), **stated, "frames": frames}
+        if split_views:
+            head = {"camera_angle_x": _view_angle(views), **metadata, "frames": frames}
             write_json(folder / f"transforms_{split}.json", head, overwrite=True)
             write_json(folder / f"exposure_{split}.json", exposures, overwrite=True)
     if points is not None:

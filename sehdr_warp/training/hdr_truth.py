@@ -20,8 +20,8 @@ def largest_hdr_truth(scene: Scene, loss: LossConfig) -> float:
     if not loss.uses_hdr:
         return 1.0
     truths = [(view.hdr, view.mask) for view in scene.train_views if view.hdr is not None]
-    counted = (hdr if mask is None else hdr[mask > 0] for hdr, mask in truths)
-    largest = max((float(radiance.max()) for radiance in counted if radiance.size), default=0.0)
+    values = (hdr if mask is None else hdr[mask > 0] for hdr, mask in truths)
+    largest = max((float(radiance.max()) for radiance in values if radiance.size), default=0.0)
     if not largest > 0:
         problem = f"the HDR truth that {_truth_field(loss)} needs is black in every training view"
         raise InputError(scene.name, problem, _REMEDY)
@@ -38,10 +38,10 @@ def check_hdr_truth(scene: str, views: Sequence[tuple[str, bool]], loss: LossCon
     """
     if not loss.uses_hdr:
         return
-    if not any(known for _, known in views):
+    if not any(has_truth for _, has_truth in views):
         problem = f"no training view has the HDR truth that {_truth_field(loss)} needs"
         raise InputError(scene, problem, _REMEDY)
-    if loss.ldr_weight == 0 and (lacking := next((name for name, known in views if not known), None)):
+    if loss.ldr_weight == 0 and (lacking := next((name for name, has_truth in views if not has_truth), None)):
         problem = f"view {lacking} lacks the HDR truth that {_truth_field(loss)} needs where loss.ldr_weight = 0.0"
         raise InputError(scene, problem, _REMEDY)
 
@@ -71,6 +71,6 @@ def check_dataset_truth(data: Mapping[str, Any], config: Config) -> None:
     if not config.loss.uses_hdr or removed:
         return
     dataset = parse_dataset(data["path"], exposure_index=data.get("exposure_index"), holdout=data.get("holdout"))
-    named = zip(unique_names(dataset.records), dataset.records, strict=True)
-    views = [(name, record.hdr is not None) for name, record in named if record.split == "train"]
+    records = zip(unique_names(dataset.records), dataset.records, strict=True)
+    views = [(name, record.hdr is not None) for name, record in records if record.split == "train"]
     check_hdr_truth(dataset.name, views, config.loss)

@@ -93,8 +93,8 @@ class Matcher:
         side = max(1.0, (sum(image.shape[0] * image.shape[1] for image in self._images) / count) ** 0.5)
         photos = zip(self._images, self._masks, strict=True)
         chances = prefetch_map(lambda photo: _probabilities(*photo), photos, len(self._images))
-        chosen = [_sample_squares(chance, side, rng, index) for index, chance in enumerate(chances)]
-        return torch.from_numpy(np.concatenate(chosen).astype(np.int32)).to(self.device)
+        samples = [_sample_squares(chance, side, rng, index) for index, chance in enumerate(chances)]
+        return torch.from_numpy(np.concatenate(samples).astype(np.int32)).to(self.device)
 
     def size(self, index: int) -> tuple[int, int]:
         """Return width and height at which a photo is matched."""

@@ -24,12 +24,12 @@ class PhotoOrder:
 
     def next(self) -> int:
         """Return the index of this rank's next photo."""
-        chosen = []
+        batch = []
         for _ in range(self._ranks):
             if not self._remaining:
                 self._remaining = torch.randperm(self._count, generator=self._generator).tolist()
-            chosen.append(self._remaining.pop())
-        return chosen[self._rank]
+            batch.append(self._remaining.pop())
+        return batch[self._rank]
 
     def peek(self) -> int | None:
         """Return what next() will return, or None if a new order has to be drawn first."""

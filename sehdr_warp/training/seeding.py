@@ -53,8 +53,8 @@ def seed_gaussians(
     pixels, sampled = sample_residual_pixels(
         *(rendered, target.codes, target.index, target.mask, uniform, index, matcher.size(index)), least=MIN_ERROR
     )
-    matches, known = matcher.match_each(pixels)
-    known &= sampled & (torch.arange(bound, device=known.device) < number)
+    matches, valid = matcher.match_each(pixels)
+    valid &= sampled & (torch.arange(bound, device=valid.device) < number)
     starts = _start_values(field.color_model, field.response, matches.colors.device)
     start = starts.gather(0, (matches.colors * 255).round().long())
     rest = field.gaussians.harmonics_rest
@@ -69,8 +69,8 @@ def seed_gaussians(
         "harmonics_dc": (start / HARMONIC_0).to(rest)[:, None, :],
         "harmonics_rest": rest.new_zeros(bound, *rest.shape[1:]),
     }
-    order = known.byte().argsort(descending=True, stable=True)
-    return Seeds({name: values[order] for name, values in rows.items()}, known.sum())
+    order = valid.byte().argsort(descending=True, stable=True)
+    return Seeds({name: values[order] for name, values in rows.items()}, valid.sum())
 
 
 @lru_cache(maxsize=1)

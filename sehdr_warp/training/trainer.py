@@ -148,10 +148,10 @@ class Trainer(TrainingState):
 
     def _step(self, started: float) -> Step:
         """Return the values of the last step, with the time left."""
-        step, done = Step(self), self.iteration - self.first_iteration - self.photos
-        if done == 0:  # The first step compiles kernels and says nothing of the pace.
+        step, steps_before = Step(self), self.iteration - self.first_iteration - self.photos
+        if steps_before == 0:  # The first step compiles kernels and says nothing of the pace.
             return step
-        self._pace += ((self.seconds - started) / self.photos - self._pace) / min(done, 100)
+        self._pace += ((self.seconds - started) / self.photos - self._pace) / min(steps_before, 100)
         # With the largest number of Gaussians, a step takes about twice as long as at the start.
         growing = self.field.gaussians.count < self.strategy.cap_max
         ahead = max(0.0, 1 - self.iteration / self.strategy.schedule.stop) if growing else 0.0

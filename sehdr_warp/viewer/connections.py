@@ -149,7 +149,7 @@ class Connections:
         """
         end = time.monotonic() + _ROOM_WAIT
         with self._changed:
-            while (taken := self._taken_by_others(connection)) and taken + connection.held + size > MOST_BYTES:
+            while (by_others := self._taken_by_others(connection)) and by_others + connection.held + size > MOST_BYTES:
                 now = time.monotonic()
                 if now > end:
                     raise BusyError

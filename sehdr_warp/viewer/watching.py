@@ -41,9 +41,9 @@ class Watch(threading.Thread):
     def look(self) -> None:
         """Load again the scenes whose files have changed."""
         for index, rendering in enumerate(self.shown):
-            path, known = Path(rendering.name), self._states[index]
+            path, last_state = Path(rendering.name), self._states[index]
             self._states[index] = state = _state(path)
-            if state == known:
+            if state == last_state:
                 continue
             try:
                 if not state:

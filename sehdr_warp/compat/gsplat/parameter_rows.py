@@ -14,7 +14,7 @@ def change_rows(
     params: Parameters,
     optimizers: Optimizers,
     statistics: MutableMapping[str, Any],
-    kept: Tensor,
+    keep: Tensor,
     appended: dict[str, Tensor] | None = None,
     sources: Tensor | None = None,
 ) -> None:
@@ -24,14 +24,14 @@ def change_rows(
         params: by name, [N, ...] each.
         optimizers: by name, for those that are trained.
         statistics: values of which tensors with N rows follow.
-        kept: [N] bool.
+        keep: [N] bool.
         appended: by name, rows behind the kept ones.
         sources: for each appended row the row whose statistics it takes over; 0 if None.
     """
-    count = len(kept)
+    count = len(keep)
     for name in list(params):
         parameter = params[name]
-        rows = parameter.detach()[kept]
+        rows = parameter.detach()[keep]
         new = rows if appended is None else torch.cat([rows, appended[name].to(rows.dtype)])
         replacement = torch.nn.Parameter(new, requires_grad=parameter.requires_grad)
         optimizer = optimizers.get(name)
@@ -40,7 +40,7 @@ def change_rows(
             for key, value in state.items():
                 if isinstance(value, Tensor) and value.shape == parameter.shape:
                     fresh = value.new_zeros(len(new) - len(rows), *value.shape[1:])
-                    state[key] = torch.cat([value[kept], fresh])
+                    state[key] = torch.cat([value[keep], fresh])
             optimizer.state[replacement] = state
             optimizer.param_groups[0]["params"] = [replacement]
         params[name] = replacement
@@ -48,7 +48,7 @@ def change_rows(
         if isinstance(value, Tensor) and value.ndim and len(value) == count:
             more = 0 if appended is None else len(next(iter(appended.values())))
             rows = value[sources] if sources is not None else value.new_zeros(more, *value.shape[1:])
-            statistics[name] = torch.cat([value[kept], rows])
+            statistics[name] = torch.cat([value[keep], rows])
 
 
 def write_rows(
