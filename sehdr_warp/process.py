@@ -4,6 +4,7 @@ A failed write to standard error is ignored, because messages about the work mus
 standard output, which was asked for, is an error of one line.
 """
 
+import ctypes
 import gc
 import io
 import os
@@ -11,12 +12,14 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from typing import Any, TextIO
 
 from .errors import SehdrError
 
 _SOON = 3.0  # Seconds within which another Ctrl-C says nothing new
 _LIBRARIES = 400_000  # About as many objects as torch's and Warp's modules are
+_MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of malloc.h
 _interrupted = -_SOON
 _collects_late = False
 
@@ -118,6 +121,15 @@ def collect_late() -> None:
 
     gc.callbacks.append(begin)
     gc.set_threshold(_LIBRARIES, *usual[1:])
+
+
+def return_memory() -> None:
+    """Make glibc return freed blocks of a megabyte and more to the system at once.
+
+    By default it comes to keep blocks of up to 32 MB, and a server that makes pictures of many sizes grows by them.
+    """
+    with suppress(OSError, AttributeError):  # Another C library
+        ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, 1 << 20)
 
 
 def interrupted() -> bool:

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -158,3 +159,32 @@ def test_a_working_directory_that_is_gone_is_told(tmp_path):
     )
     assert done.returncode == 1 and done.stderr.startswith("sehdr-warp: the working directory cannot be used"), done
     assert len(done.stderr.splitlines()) == 1
+
+
+RETURNS = """
+import ctypes, os, sys
+from sehdr_warp.process import return_memory
+if sys.argv[1] == "yes":
+    return_memory()
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]
+pages = lambda: int(open("/proc/self/statm").read().split()[1])
+before = pages()
+for _ in range(3):
+    blocks = [libc.malloc(20 << 20) for _ in range(8)]
+    for block in blocks:
+        ctypes.memset(block, 1, 20 << 20)
+    small = libc.malloc(1000)
+    for block in blocks:
+        libc.free(block)
+print((pages() - before) * os.sysconf("SC_PAGE_SIZE") >> 20)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_large_blocks_go_back_to_the_system():
+    kept = {
+        word: int(subprocess.run([sys.executable, "-c", RETURNS, word], capture_output=True, check=True).stdout)
+        for word in ("yes", "no")
+    }
+    assert kept["yes"] <= 5 and (kept["no"] > 100 or platform.libc_ver()[0] != "glibc"), kept

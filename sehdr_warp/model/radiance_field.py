@@ -21,6 +21,9 @@ from .color_models import color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
 
+_DECODED_AT_ONCE = 1 << 19
+"""Pixels."""
+
 
 @dataclass(frozen=True)
 class TrainRender:
@@ -208,11 +211,14 @@ class RadianceField(nn.Module):
         encoded, values = self.color_model.encoded, self._values(tensors.position, degree)
         colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
         rendering = self._rasterize(tensors, torch.cat([colors, depth], dim=1))
-        colors, depth = rendering.image[..., :3], rendering.image[..., 3]
-        if encoded:
-            colors = self.response.decode(colors.clamp(0, 1))
-        depth = _unpremultiply(depth, rendering.alpha) * self.normalization.unit
-        return RenderedView(colors / self.base_time, rendering.alpha, depth)
+        depth = _unpremultiply(rendering.image[..., 3], rendering.alpha).mul_(self.normalization.unit)
+        # In bands, because decoding takes many times the memory of what it decodes.
+        image, rows = rendering.image, max(1, _DECODED_AT_ONCE // camera.width)
+        hdr = image.new_empty(*image.shape[:2], 3)
+        for colors, band in zip(image[..., :3].split(rows), hdr.split(rows)):
+            decoded = self.response.decode(colors.clamp(0, 1)) if encoded else colors
+            torch.div(decoded, self.base_time, out=band)
+        return RenderedView(hdr, rendering.alpha, depth)
 
     @torch.no_grad()
     def render_directions(
@@ -378,4 +384,4 @@ class RadianceField(nn.Module):
 
 def _unpremultiply(blended: Tensor, alpha: Tensor) -> Tensor:
     """Return blended / alpha if alpha is above 0.001, else 0; [H, W] each."""
-    return torch.where(alpha > 1e-3, blended / alpha.clamp_min(1e-3), torch.zeros_like(blended))
+    return (blended / alpha.clamp_min(1e-3)).masked_fill_(~(alpha > 1e-3), 0)

@@ -1,5 +1,7 @@
 """Clients of requests, and the answer to a request that is refused."""
 
+from contextlib import AbstractContextManager
+
 from .connections import Connection, Connections
 
 
@@ -26,3 +28,7 @@ class Client:
     def reserve(self, size: int) -> None:
         """Wait for room for an answer of so many bytes; see Connections.reserve."""
         self._connections.reserve(self._connection, size)
+
+    def asking(self) -> AbstractContextManager[None]:
+        """Return a context in which the request is received; see Connection.asking."""
+        return self._connection.asking()

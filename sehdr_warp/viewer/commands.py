@@ -37,6 +37,7 @@ def run_view(args: View) -> None:
     from functools import cache
 
     from ..errors import InputError, UsageError
+    from ..process import return_memory
     from ..runs.run import Run
     from .server import Server, Viewer
     from .watching import Watch
@@ -56,6 +57,7 @@ def run_view(args: View) -> None:
             raise InputError(args.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
         return {view.name: view for view in load_run_photos(watch.shown[index].run, args.data).views}
 
+    return_memory()
     watch.start()
     with Server(Viewer(watch.shown, photos), args.host, args.port, args.origin) as server:
         print(f"{server.url}  (Ctrl-C ends it)", flush=True)

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from ..errors import SehdrError
 
 MOST_CONNECTIONS = 100
-MOST_BYTES = 96 << 20
+MOST_BYTES = 64 << 20
 """Memory of all answers that are being made and sent; a single answer may be larger if there is no other."""
 SILENCE = 60.0
 """Seconds that a connection may be open without a request."""
@@ -49,7 +49,7 @@ class Connection:
     def __init__(self, client: socket.socket):
         """Wrap the socket of a client."""
         self.socket = client
-        self.answering = self.sending = self.closed = False
+        self.answering = self.sending = self.receiving = self.closed = False
         self.since, self.held = time.monotonic(), 0
 
     def close(self) -> None:
@@ -82,8 +82,17 @@ class Connection:
             self.socket.settimeout(SILENCE)
 
     def idle_for(self, now: float) -> float:
-        """Return the seconds that nothing has been asked; negative while an answer is made."""
-        return -1.0 if self.answering else now - self.since
+        """Return the seconds that nothing has been asked, or not all; negative while an answer is made."""
+        return -1.0 if self.answering and not self.receiving else now - self.since
+
+    @contextmanager
+    def asking(self) -> Iterator[None]:
+        """Count as idle while a request is received, which its client may never end."""
+        self.since, self.receiving = time.monotonic(), True
+        try:
+            yield
+        finally:
+            self.receiving = False
 
     def stalled_for(self, now: float) -> float:
         """Return the seconds that the client has read nothing of its answer; negative if none is being sent."""

@@ -2,7 +2,7 @@
 
 import json
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -118,23 +118,35 @@ class ViewerScene:
         The planes are [H, W, 4] exposure at the base time and confidence (1 in a draft, or if unknown), [H, W] depth,
         and with `clipped` [H, W] the share of clipped values.
         """
+        return next(made for made in self.frame_parts(camera, draft=draft, clipped=clipped) if made is not None)
+
+    def frame_parts(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> Iterator[memoryview | None]:
+        """Make a frame in parts, between which other pictures can be made: yield None, and the frame at the end."""
+        run, shares, size = self.run, self.clipped if clipped else None, (camera.height, camera.width)
         with torch.no_grad():
             rendered = self.render(camera)
-            light, size = torch.as_tensor(rendered.hdr), (camera.height, camera.width)
-            planes = [torch.as_tensor(rendered.depth)]
-            with self.lock:
-                if clipped and self.clipped is not None:
-                    planes.append(self.run.model.render_mean(camera, self.clipped))
-            confidence = None if draft else self.render_confidence(camera)
-            frame = torch.empty((4 + len(planes), *size), dtype=torch.float16, device=light.device)
+            light, depth = torch.as_tensor(rendered.hdr), torch.as_tensor(rendered.depth)
+            frame = torch.empty((5 + (shares is not None), *size), dtype=torch.float16, device=light.device)
             picture = frame[:4].view(*size, 4)
-            picture[..., :3] = (light * self.base_time).clamp_(0, _HALF_MOST)
-            picture[..., 3] = 1.0 if confidence is None else torch.as_tensor(confidence)
-            for place, plane in zip(frame[4:], planes, strict=True):
-                place.copy_(plane.clamp(0, _HALF_MOST))
-            if frame.is_cuda:  # Into pages that the device writes to itself: several times as fast
-                frame = torch.empty(frame.shape, dtype=frame.dtype, pin_memory=True).copy_(frame)
-            return frame.numpy().data.cast("B")
+            torch.mul(light, self.base_time, out=picture[..., :3])
+            picture[..., :3].clamp_(0, _HALF_MOST)
+            picture[..., 3] = 1.0
+            frame[4].copy_(depth).clamp_(0, _HALF_MOST)
+        del rendered, light, depth  # What is not needed any more must not add to what the next part takes.
+        for part in ("clipped",) * (shares is not None) + ("confidence",) * (not draft):
+            yield None
+            if self.run is not run:  # Another took its place meanwhile.
+                yield from self.frame_parts(camera, draft=draft, clipped=clipped)
+                return
+            with torch.no_grad():
+                if part == "clipped":
+                    with self.lock:
+                        frame[5].copy_(run.model.render_mean(camera, shares)).clamp_(0, _HALF_MOST)
+                elif (confidence := self.render_confidence(camera)) is not None:
+                    picture[..., 3] = torch.as_tensor(confidence)
+        if frame.is_cuda:  # Into pages that the device writes to itself: several times as fast
+            frame = torch.empty(frame.shape, dtype=frame.dtype, pin_memory=True).copy_(frame)
+        yield frame.numpy().data.cast("B")
 
     def facts(self) -> dict[str, Any]:
         """Return what the page knows of the run, as plain values."""

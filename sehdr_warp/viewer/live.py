@@ -61,7 +61,15 @@ class LiveTraining(ViewerScene):
 
     def frame(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> memoryview:
         """Render between two steps; see ViewerScene.frame."""
-        return self._between_steps(lambda: super(LiveTraining, self).frame(camera, draft=draft, clipped=clipped))
+        return self._between_steps(lambda: self._frame(camera, draft=draft, clipped=clipped))
+
+    def _frame(self, camera: Camera, **options: bool) -> memoryview:
+        """Render a frame in the training's thread."""
+        return [*super().frame_parts(camera, **options)][-1]  # pyright: ignore[reportReturnType]
+
+    def frame_parts(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> Iterator[memoryview]:
+        """Yield a frame in one part, since the training goes on between two."""
+        yield self.frame(camera, draft=draft, clipped=clipped)
 
     def _between_steps(self, make: Callable[[], Any]) -> Any:
         """Call `make` in the training's thread and return its result; other threads wait for it."""

@@ -14,7 +14,6 @@ import tempfile
 import threading
 import zipfile
 from collections.abc import Callable, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -34,6 +33,8 @@ from .clients import Client, Refusal
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, orient
 from .frames import ViewerScene, camera_file, camera_of, frame_bytes
+from .renderer import Renderer
+from .saved_run import SavedRun
 
 log = logging.getLogger(__name__)
 PORTS_TRIED = 50
@@ -67,8 +68,7 @@ class Viewer:
         """
         self.runs, self.training, self.saving = list(runs), training, ""
         self._photos, self._reading, self._saving = photos, threading.Lock(), threading.Lock()
-        # All pictures are made on one thread, because memory that libraries keep for each thread would add up.
-        self._renderer = ThreadPoolExecutor(1, thread_name_prefix="sehdr-warp viewer renders")
+        self._renderer = Renderer()
         self._closed = threading.Event()
         page = Path(__file__).parent / "page"
         self.files = {
@@ -108,10 +108,13 @@ class Viewer:
             options = {name: bool(request.get(name)) for name in ("draft", "clipped")}
             run, camera = self._run(request), camera_of(request["camera"])
             client.reserve(frame_bytes(camera, options["clipped"]))
-            return "application/octet-stream", self._on_renderer(client, partial(run.frame, camera, **options))
+            parts, pixels, frame = run.frame_parts(camera, **options), camera.width * camera.height, None
+            while frame is None:
+                frame = self.on_renderer(client, partial(next, parts), pixels)
+            return "application/octet-stream", frame
         if path in ("/edit", "/orientation") and self.training is None:
             run = self._run(request)
-            self._on_renderer(
+            self.on_renderer(
                 client, partial(run.edit, edits_of(request)) if path == "/edit" else partial(orient, run, request)
             )
             run.turned()
@@ -130,19 +133,24 @@ class Viewer:
                 cameras = interpolate(cameras, min(int(request["count"]), MOST_VIEWS))
             if path == "/path":
                 return "application/json", camera_file(cameras).encode()
-            return self._save(_SavedRun(self, self._run(request), client), cameras, str(request["kind"]), request)
+            return self._save(
+                SavedRun(self.on_renderer, self._run(request), client), cameras, str(request["kind"]), request
+            )
         raise Refusal(404, "no such page")
 
     def close(self) -> None:
         """End the work for clients, and wait for it: native code must not run while Python ends."""
         self._closed.set()
-        self._renderer.shutdown(wait=True, cancel_futures=True)
+        self._renderer.close()
         for lock in (self._saving, self._reading):
             if lock.acquire(timeout=_SAVE_END):
                 lock.release()
 
-    def _on_renderer(self, client: Client, make: Callable[[], Any]) -> Any:
-        """Return what `make` returns on the thread of the renderer, unless its client has gone by then."""
+    def on_renderer(self, client: Client, make: Callable[[], Any], pixels: int = 0) -> Any:
+        """Return what `make` returns on the thread of the renderer, unless its client has gone by then.
+
+        pixels: Of the picture, by which others go first.
+        """
 
         def call() -> Any:
             if self._closed.is_set() or client.gone():
@@ -150,8 +158,8 @@ class Viewer:
             return make()
 
         try:
-            return self._renderer.submit(call).result()
-        except (RuntimeError, CancelledError):
+            return self._renderer.call(call, pixels)
+        except RuntimeError:
             if self._closed.is_set():
                 raise ClientGone from None
             raise
@@ -180,7 +188,7 @@ class Viewer:
         client.reserve(buffer.tell())
         return buffer.getvalue()
 
-    def _save(self, run: "_SavedRun", cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
+    def _save(self, run: SavedRun, cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
         """Return files of cameras, as `render` writes them: one EXR, a zip of brackets and all, or a film."""
         stops, evs = _stops(request), str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
         pictures = len(evs.split(",")) + 1 if evs else 1
@@ -192,7 +200,7 @@ class Viewer:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 if kind == "page":
-                    page = self._on_renderer(run.client, partial(write_scene_page, run, Path(folder, "scene.html")))
+                    page = self.on_renderer(run.client, partial(write_scene_page, run, Path(folder, "scene.html")))
                     return "text/html", page.read_bytes()
                 if kind == "film":
                     options = {"ev_ramp": (stops, stops), "exposed": True, "tell": self._tell}
@@ -216,22 +224,6 @@ class Viewer:
     def _tell(self, line: str) -> None:
         """Set the line that a page shows while a film is rendered."""
         self.saving = line
-
-
-class _SavedRun:
-    """A run for a save: every picture is made on the renderer, and the save ends if its client leaves."""
-
-    def __init__(self, viewer: Viewer, run: ViewerScene, client: Client):
-        self._viewer, self._run, self.client = viewer, run, client
-
-    def render(self, camera: Any) -> Any:
-        return self._viewer._on_renderer(self.client, partial(self._run.render, camera))
-
-    def render_confidence(self, camera: Any) -> Any:
-        return self._viewer._on_renderer(self.client, partial(self._run.render_confidence, camera))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._run, name)
 
 
 def _stops(request: dict) -> float:
@@ -329,14 +321,17 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET
 
     def do_POST(self) -> None:
-        self._answer(lambda path, client: self.server.viewer.post(path, self._body(), client))
+        self._answer(lambda path, client: self.server.viewer.post(path, self._body(client), client))
 
-    def _body(self) -> dict:
+    def _body(self, client: Client) -> dict:
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit() and int(length) <= MOST_BODY):
             self.close_connection = True
             raise Refusal(413, f"a request says its length, of at most {MOST_BODY} bytes")
-        data = self.rfile.read(int(length))
+        with client.asking():
+            data = self.rfile.read(int(length))
+        if len(data) < int(length):
+            raise ConnectionError
         if self.headers.get_content_type() != "application/json":
             raise Refusal(415, "a request is JSON")
         values = json.loads(data, parse_constant=_refuse_constant)

@@ -68,6 +68,20 @@ def test_silent_clients_make_room_for_others(serve, monkeypatch):
         client.close()
 
 
+def test_clients_that_never_end_a_request_make_room_for_others(serve, monkeypatch):
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 5)
+    server, begun = serve(), []
+    head = b"POST /frame HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 4000000\r\n"
+    for text in (head + b"\r\n{", head, b"GET /sc") * 4:
+        begun.append(socket.create_connection(server.server_address[:2]))
+        begun[-1].sendall(text)
+    time.sleep(0.2)
+    started = time.monotonic()
+    assert ask(server, "/scene")[0] == 200 and time.monotonic() - started < 5
+    for client in begun:
+        client.close()
+
+
 class _Slow(AnalyticRun):
     """A run whose pictures take a moment."""
 
