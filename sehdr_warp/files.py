@@ -206,6 +206,10 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict:
     return values
 
 
+_LONGEST_NAME = 255
+"""Bytes of the name of a file, on almost all file systems."""
+
+
 def contained(folder: Path, name: str, source: Path) -> Path:
     """Return the file that `name` (read from `source`) means inside `folder`.
 
@@ -219,6 +223,8 @@ def contained(folder: Path, name: str, source: Path) -> Path:
             problem = "is absolute"
         elif ".." in PureWindowsPath(name).parts:
             problem = "contains '..'"
+        elif max(map(len, os.fsencode(name).split(b"/"))) > _LONGEST_NAME:
+            problem = f"has a part of more than {_LONGEST_NAME} bytes"
         elif not (folder / name).resolve().is_relative_to(folder.resolve()):
             problem = "leads outside the data folder"
         else:

@@ -177,5 +177,11 @@ def _read_chan(path: Path) -> ExchangeCameras:
         focal = height / 2 / math.tan(math.radians(fov) / 2)
         pose = pose_from_opengl(matrix, path, f"frame {frame:g}")
         name = f"{path.stem}_{frame:04.10g}"
-        cameras.append((name, Camera(width, height, focal, focal, width / 2, height / 2, pose)))
+        try:
+            camera = Camera(width, height, focal, focal, width / 2, height / 2, pose)
+        except ValueError as error:
+            raise InputError(
+                path, f"line {number} cannot be used ({error!s:.120})", "export the camera again"
+            ) from None
+        cameras.append((name, camera))
     return ExchangeCameras(cameras)

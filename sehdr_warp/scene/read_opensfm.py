@@ -37,7 +37,8 @@ def read_opensfm(folder: Path) -> DataparserOutputs:
         if not image.is_file():
             absent.append(name)
             continue
-        lens = lenses.get(shots[name].get("camera")) if isinstance(shots[name], dict) else None
+        camera = shots[name].get("camera") if isinstance(shots[name], dict) else None
+        lens = lenses.get(camera) if isinstance(camera, str) else None
         if lens is None:
             raise InputError(path, f"shot {name!r:.90} has no camera of the file", _REMEDY)
         records.append(ImageRecord(image.stem, image, lens, _pose(shots[name], path, name), oriented=True))
@@ -107,9 +108,9 @@ def _points(model: dict, path: Path) -> PointCloud:
         return NO_POINTS
     try:
         places = np.array([point["coordinates"] for point in points.values()], np.float64).reshape(-1, 3)
-        colors = np.array([point.get("color", (128, 128, 128)) for point in points.values()]).reshape(-1, 3)
-        if not np.isfinite(places).all():
+        colors = np.array([point.get("color", (128, 128, 128)) for point in points.values()], np.float64).reshape(-1, 3)
+        if not (np.isfinite(places).all() and np.isfinite(colors).all()):
             raise ValueError("not finite")
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise InputError(path, f"its points cannot be used ({error!r:.60})", _REMEDY) from None
-    return PointCloud(places, np.clip(colors.astype(np.float64) / 255, 0, 1).astype(np.float32))
+    return PointCloud(places, np.clip(colors / 255, 0, 1).astype(np.float32))

@@ -34,7 +34,8 @@ FOUND = (
     ("responses", 0, 534), ("responses", 0, 1409), ("responses", 0, 3020), ("cameras", 0, 5937), ("ply", 19, 3736),
     ("ply", 19, 5257), ("glb", 20, 400), ("glb", 19, 218), ("transforms", 20, 3719), ("usd", 20, 21), ("usd", 20, 27),
     ("usd", 20, 751), ("usd", 20, 1068), ("usd", 20, 4737), ("photos", 31, 9228), ("photos", 30, 2656),
-    ("resume", 30, 1091), ("colmap-text", 33, 6037),
+    ("resume", 30, 1091), ("colmap-text", 33, 6037), ("ocio", 1, 11), ("opensfm", 40, 22), ("opensfm", 40, 427),
+    ("opensfm", 40, 471), ("opensfm", 40, 652), ("opensfm", 40, 1019), ("opensfm", 40, 1646), ("chan", 40, 795),
 )  # fmt: skip
 
 
