@@ -78,8 +78,10 @@ def row(job: tuple[str, int, int, str, str], *, iterations: int, max_size: int |
 
 
 def photographed(truth: Scene, curve: Response, time: float, bits: int, kind: str, noise: SensorNoise | None) -> Scene:
-    """The scene in photos of so many bits, rounded before ("linear", read as RAW files are) or behind ("curve") the
-    curve."""
+    """Return the scene in photos of `bits` bits.
+
+    kind: "linear" rounds before the curve, and the photos are read as RAW files are; "curve" rounds behind it.
+    """
     levels, views, random = 2**bits - 1, [], np.random.default_rng(0)
     for view in truth.views:
         assert view.hdr is not None

@@ -37,6 +37,7 @@ class Timed(Output):
     """Timed runs of each variant; slow ones have fewer on the CPU."""
 
     def timing(self) -> dict:
+        """Return the device and the number of repetitions."""
         from sehdr_warp.runs.device import pick_device
 
         return {"device": pick_device(self.device), "repetitions": require_positive("--repetitions", self.repetitions)}
@@ -52,6 +53,7 @@ class Kernels(Timed):
     """Gaussians@WIDTHxHEIGHT such as 20k@200x200, separated by commas."""
 
     def measure(self):
+        """Run the benchmark and return its result."""
         from .kernels import bench_kernels
         from .splats import parse_size
 
@@ -71,6 +73,7 @@ class Step(Timed):
     """Gaussians@WIDTHxHEIGHT; by default 100k@400x400 on a GPU and 20k@200x200 on the CPU."""
 
     def measure(self):
+        """Run the benchmark and return its result."""
         from .splats import parse_size
         from .step import bench_step
 
@@ -87,6 +90,7 @@ class Scale(Timed):
     """Every second point, without the largest."""
 
     def measure(self):
+        """Run the benchmark and return its result."""
         from .scale import bench_scale
 
         return bench_scale(small=self.small, **self.timing())
@@ -101,6 +105,7 @@ class Workers(Timed):
     CPU."""
 
     def measure(self):
+        """Run the benchmark and return its result."""
         from .splats import parse_size
         from .workers import bench_workers
 
@@ -112,8 +117,10 @@ class Workers(Timed):
 
 @dataclass(frozen=True, kw_only=True)
 class Quality(Output):
-    """Train methods on scenes with HDR truth and compare; finished trainings in --out never run again. LPIPS is judged
-    where SEHDR_LPIPS names a folder with its weights."""
+    """Train methods on scenes with HDR truth and compare; finished trainings in --out never run again.
+
+    LPIPS is measured if SEHDR_LPIPS names a folder with its weights.
+    """
 
     out: Path
     """Folder of the jobs and their results."""
@@ -141,6 +148,7 @@ class Quality(Output):
     """Submit to SLURM, with these parameters, such as partition=gpu,time=240 (minutes)."""
 
     def measure(self):
+        """Run the benchmark and return its result."""
         import torch
 
         from .quality import plan_jobs, run_jobs
@@ -181,6 +189,7 @@ class Responses(Output):
     """Longest side of the scenes' photos, in pixels."""
 
     def measure(self):
+        """Run the benchmark and return its result."""
         from .response import bench_response
 
         exposures = require_positive("--exposures", self.exposures)

@@ -31,8 +31,11 @@ def rasterize_with_gsplat(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width: int, height: int, *,
     eps2d: float = EPS2D, antialiased: bool = False, max_intersections: int | None = None, deterministic: bool = False,
 ) -> Rendering:  # fmt: skip
-    """rasterize() by gsplat, also with intrinsics as gsplat takes them, [1, 3, 3]. max_intersections and deterministic
-    mean nothing there; there is no transmittance, and densification by gradients cannot watch its centers."""
+    """Do rasterize() by gsplat, also with intrinsics as gsplat takes them, [1, 3, 3].
+
+    max_intersections and deterministic have no effect. There is no transmittance, and densification by gradients cannot
+    watch gsplat's centers.
+    """
     from gsplat import rasterization  # pyright: ignore[reportMissingImports]
 
     matrix = intrinsics if intrinsics.ndim == 3 else _matrix(intrinsics)
@@ -55,7 +58,7 @@ def _matrix(intrinsics: torch.Tensor) -> torch.Tensor:
 
 
 def gsplat_renderer(scene: SplatScene) -> Callable[[], torch.Tensor]:
-    """A function that renders [H, W, C]; what does not change between calls is prepared."""
+    """Return a function that renders [H, W, C]; what does not change between calls is prepared."""
     arguments: Any = (
         *scene.leaves,
         scene.world_to_camera,

@@ -23,8 +23,13 @@ FINER = 4  # Pixels of a render, across, for one of the truth's
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """The truth of a place: position [3] in the scene; radiance [H, 2 H, 3], lat-long in the scene's axes (see
-    output.environment_map); seen [H, 2 H] in [0, 1], which part of a pixel photos show."""
+    """The true light of a place.
+
+    Attributes:
+        position: [3] in the scene.
+        radiance: [H, 2 H, 3], lat-long in the scene's axes (see output.environment_map).
+        seen: [H, 2 H] in [0, 1], the part of a pixel that photos show.
+    """
 
     position: np.ndarray
     radiance: np.ndarray
@@ -32,9 +37,9 @@ class LightMap:
 
 
 def read_light_maps(folder: Path) -> list[LightMap]:
-    """The maps in a set's folder `light`, which scenes.generator writes; none where there is no such folder.
+    """Read the maps in a set's folder `light`, which scenes.generator writes; none if there is no such folder.
 
-    Raises InputError for a file that is no such map.
+    Raises InputError for a file that is not such a map.
     """
     maps = []
     for path in sorted((folder / FOLDER).glob("*.exr")):
@@ -54,11 +59,20 @@ def read_light_maps(folder: Path) -> list[LightMap]:
 
 @torch.no_grad()
 def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Camera], scale: float = 1.0) -> dict:
-    """{"median": relative error of irradiance over all directions of all places, "percentile_90", "places": the medians
-    of each place, "directions": how many count}; None in place of figures without maps or directions that count.
+    """Return relative errors of irradiance over all directions of all places.
 
-    Light is mean over channels, and only that which photos show: the truth's part `seen` is taken of both. Surfaces
-    that face too little of it do not count. cameras: the training's. scale: of the run's radiance to the truth's.
+    Light is the mean over channels, and only that which photos show: render and truth are multiplied by `seen`. Surfaces
+    that face too little of it do not count.
+
+    Args:
+        run: the loaded run.
+        maps: the true light of each place.
+        cameras: those of the training.
+        scale: from the run's radiance to the truth's.
+
+    Returns:
+        {"median", "percentile_90", "places": the median of each place, "directions": how many count}. Figures are None
+        without maps or directions that count.
     """
     focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras])) if cameras else 1.0
     per_map = [_errors(run, each, focal, scale) for each in maps]

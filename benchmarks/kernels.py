@@ -31,7 +31,7 @@ REFERENCE_GAUSSIANS = 4000
 
 
 def bench_kernels(sizes: Sequence[Size], channels: Sequence[int], device: torch.device, *, repetitions: int) -> dict:
-    """A result: every combination of size and channels, forward, and forward and backward."""
+    """Time every combination of size and channels, forward, and forward and backward; return the result."""
     result = new_result("kernels", device, {"device": str(device), "repetitions": repetitions})
     peer = note_missing(result, device)
     for size, count in product(sizes, channels):
@@ -45,6 +45,7 @@ def bench_kernels(sizes: Sequence[Size], channels: Sequence[int], device: torch.
 
 
 def render(scene: SplatScene, rasterizer: Callable | None = None) -> torch.Tensor:
+    """Render [H, W, C] by a rasterizer, ours by default."""
     return (rasterizer or rasterize)(*scene.arguments).image
 
 
@@ -57,7 +58,7 @@ def splat_variant(call: Callable[[], torch.Tensor], scene: SplatScene, backward:
 
 
 def against_float64(scene: SplatScene, most: int, name: str = OURS) -> list[dict]:
-    """Checks of ours, on a scene like this of at most so many Gaussians."""
+    """Check our kernels in float32 against float64, on a scene like this of at most `most` Gaussians."""
     small = make_splat_scene(scene.size.reduced(most), scene.channels, scene.device)
     truth = _image_and_gradients(small.to("cpu", torch.float64), rasterize_reference)
     return _compared(name, "float64", _image_and_gradients(small), truth)
@@ -65,11 +66,12 @@ def against_float64(scene: SplatScene, most: int, name: str = OURS) -> list[dict
 
 @torch.no_grad()
 def against_gsplat(scene: SplatScene) -> dict:
+    """Compare our image with gsplat's."""
     return check("gsplat: image", OURS, _difference(gsplat_renderer(scene)(), render(scene)), BOUND)
 
 
 def _checks(scene: SplatScene, peer: bool) -> list[dict]:
-    """Against float64; on a GPU also against the CPU's kernels at full size."""
+    """Check our kernels on a scene like this of at most REFERENCE_GAUSSIANS Gaussians."""
     checks = against_float64(scene, REFERENCE_GAUSSIANS)
     if scene.device.type == "cuda":
         cpu, recorded = _image_and_gradients(scene.to("cpu")), _recorded(scene, scene.cotangent())()
@@ -86,7 +88,7 @@ def _image_and_gradients(scene: SplatScene, rasterizer: Callable | None = None) 
 
 
 def _compared(name: str, against: str, ours: list[torch.Tensor], truth: list[torch.Tensor]) -> list[dict]:
-    """Checks of an image and the gradients of NAMES."""
+    """Compare an image and the gradients of NAMES."""
     labels, bounds = ["image", *(f"gradient of {leaf}" for leaf in NAMES)], [IMAGE_BOUND] + [GRADIENT_BOUND] * 5
     pairs = zip(labels, ours, truth, bounds, strict=True)
     return [check(f"{name}: {label}", against, _difference(a, b), bound) for label, a, b, bound in pairs]
@@ -99,7 +101,7 @@ def _difference(value: torch.Tensor, other: torch.Tensor) -> float:
 
 
 def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
-    """A replay: of [image], or with a cotangent of [image, gradients of the leaves]."""
+    """Return a replay of [image], or with a cotangent of [image, gradients of the leaves]."""
     with torch.no_grad():
         max_intersections = rasterize(*scene.arguments).intersection_count * 5 // 4
 

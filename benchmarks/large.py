@@ -49,7 +49,7 @@ def main(sizes: tyro.conf.Positional[tuple[str, ...]], /, json: Path, photos: in
 
 
 def compare(size: Size, photos: int, iterations: int, device: str = "cuda:0") -> list[dict]:
-    """A row for each of ours and gsplat's."""
+    """Train by ours and by gsplat's rasterizer; return a row for each."""
     scene = _scene(size, photos, device)
     fixed = {"densification.cap_max": size.gaussians, "mcmc.cap_density": 0, "model.initial_density": 0}
     fixed |= {"response.name": RESPONSE, "plan.enabled": False, "schedule.iterations": iterations}

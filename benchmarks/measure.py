@@ -43,8 +43,10 @@ def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), /, work: Path = Path
 
 
 def measure(page: Mapping, out: Path) -> dict:
-    """Runs a page's commands in the repository's root and joins their results. Raises SehdrError where they fail or
-    leave results of differing builds."""
+    """Run a page's commands in the repository's root and join their results.
+
+    Raises SehdrError if they fail or leave results of differing builds.
+    """
     command = page["command"].strip()
     out.mkdir(parents=True, exist_ok=True)
     for old in out.glob("*.json"):

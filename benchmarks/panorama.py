@@ -50,8 +50,18 @@ def main(
     iterations: int = 3000,
     device: str = "cpu",
 ) -> None:
-    """Render, train (what is in `work` is kept) and compare. size: of views; width: of the map, pixels; samples: light
-    paths of a training view's pixel, of which the compared pictures take four times as many."""
+    """Render, train and compare; a training in `work` is not repeated.
+
+    Args:
+        json: file of the result.
+        work: folder for views, run and map.
+        views: training views.
+        size: width and height of a view, pixels.
+        width: of the map, pixels.
+        samples: light paths of a training view's pixel; the compared pictures take four times as many.
+        iterations: of the training.
+        device: cpu or cuda:N.
+    """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     work.mkdir(parents=True, exist_ok=True)
     cameras = [_camera(size, PLACE + SPREAD * offset, out) for offset, out in _around(views)]
@@ -179,8 +189,10 @@ def _irradiance(image: np.ndarray, directions: np.ndarray, weight: np.ndarray) -
 
 
 def _even(image: np.ndarray) -> np.ndarray:
-    """A lat-long map whose rows are averaged over as many pixels as make one of the equator: towards the poles a map
-    asks for more than the photos' pixels tell, and truth has it."""
+    """Average the rows of a lat-long map over as many pixels as cover one pixel of the equator.
+
+    Towards the poles a map has more pixels than the photos resolve, and the truth has their detail.
+    """
     height, width = image.shape[:2]
     result = np.empty_like(image)
     for row, latitude in enumerate(np.pi * ((np.arange(height) + 0.5) / height - 0.5)):

@@ -42,8 +42,16 @@ KERNELS = {
 
 @dataclass(frozen=True)
 class Work:
-    """What a step works on: Gaussians, numbers of each one's harmonics, features blended, (Gaussian, tile) pairs,
-    (Gaussian, warp) pairs that are drawn, pixels."""
+    """The amount of work of a step.
+
+    Attributes:
+        gaussians: Gaussians.
+        harmonics: numbers of a Gaussian's harmonics.
+        channels: features that are blended.
+        pairs: pairs of a Gaussian and a tile.
+        drawn: pairs of a Gaussian and a warp that blends it.
+        pixels: of the image.
+    """
 
     gaussians: int
     harmonics: int
@@ -82,14 +90,17 @@ and a fourth of a load for each more; the adjoint sums once more."""
 
 
 def part_of(kernel: str) -> str:
-    """The part that a kernel, as the profiler names it, belongs to."""
+    """Return the part that a kernel belongs to, by its name in the profiler."""
     name = kernel.rpartition("__locals__")[2]  # Behind the function that made it
     return next(part for part, patterns in KERNELS.items() if any(fnmatchcase(name, p) for p in patterns))
 
 
 def parts_of_step(variant: Variant, work: Work, device: torch.device) -> list[dict]:
-    """A row for each part of a step on a GPU: launches, microseconds, and the microseconds that its bytes and its
-    instructions take at least; None where no bound is known."""
+    """Return a row for each part of a step on a GPU.
+
+    A row has launches, microseconds, and the microseconds that its bytes and its instructions take at least; None if no
+    bound is known.
+    """
     for _ in range(STEPS):
         variant.once()
     torch.cuda.synchronize(device)
@@ -127,21 +138,21 @@ def work_of(arguments: Sequence[Any], harmonics: int) -> Work:
 
 
 def bytes_per_microsecond(device: torch.device) -> float:
-    """What the memory gives to a copy: bytes read and written."""
+    """Measure what the memory moves in a copy: bytes read and written."""
     source = torch.zeros(COPIED, dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
     return 2 * COPIED / _microseconds(lambda: target.copy_(source))
 
 
 def instructions_per_microsecond(device: torch.device) -> float:
-    """That all schedulers issue at the clock that the GPU runs at."""
+    """Return the bound at which all schedulers issue at the clock that the GPU runs at."""
     processors = torch.cuda.get_device_properties(device).multi_processor_count
     clock = CYCLES / _microseconds(lambda: torch.cuda._sleep(CYCLES))  # pyright: ignore[reportPrivateUsage]
     return processors * SCHEDULERS * clock
 
 
 def _microseconds(action: Callable[[], object], repetitions: int = 5) -> float:
-    """The least time of an action."""
+    """Measure the least time of an action."""
     action()
     times = []
     for _ in range(repetitions):

@@ -1,5 +1,7 @@
-"""`bench quality`: every combination of methods with scenes and exposures is a job, with its folder and key, trained
-and evaluated once, several at a time; and their results as rows."""
+"""`benchmarks quality`: train and evaluate every combination of methods with scenes and exposures.
+
+A combination is a job with its folder and key. Several jobs run at a time, each once; their results become rows.
+"""
 
 import contextlib
 import hashlib
@@ -63,6 +65,7 @@ class Job:
 
     @property
     def key(self) -> str:
+        """The hash of all that decides the job's result."""
         text = json.dumps(self.config, sort_keys=True, ensure_ascii=False)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -74,10 +77,11 @@ class Job:
         return f"{where} {config['method']} {config['response']} seed {config['seed']}"
 
     def folder(self, out: Path) -> Path:
+        """Return the job's folder."""
         return out / "jobs" / f"{re.sub(r'[^A-Za-z0-9.]+', '-', self.label)[:100].strip('-')}-{self.key}"
 
     def result(self, out: Path) -> dict | None:
-        """The complete result; None where there is none, or one that was cut short or is another config's."""
+        """Return the complete result; None if there is none, or one of another config, or one that was cut short."""
         result = _read(self.folder(out) / RESULT)
         whole = "figures" in result and (result.get("format"), result.get("key")) == (FORMAT, self.key)
         return result if whole else None
@@ -96,8 +100,10 @@ def plan_jobs(
     device: str = "cpu",
     lpips: bool = False,
 ) -> list[Job]:
-    """Every combination. Methods that learn the response have one job for known and blind together; those that take
-    nothing from photos have none that is blind.
+    """Return a job for every combination.
+
+    Methods that learn the response have one job for known and blind together; those that take nothing from photos have
+    none that is blind.
 
     exposures: places in the ladder. iterations: None is the preset's own, or its plan's. device: kind, "cpu" or "cuda".
 
@@ -149,7 +155,7 @@ def plan_jobs(
 
 
 def _training(method: str, iterations: int | None, seed: int) -> Config:
-    """The method's training, tested on a log scale of its length; what is stated is no plan's to change."""
+    """Return the method's training, tested on a log scale of its length; its plan keeps what the caller states."""
     changes = {} if iterations is None else {"schedule.iterations": iterations}
     steps = {max(1, round(REFERENCE_ITERATIONS * FIRST_TEST ** (-k / (TESTS - 1)))) for k in range(TESTS)}
     config = load_config(method, {"seed": seed, **changes})
@@ -160,7 +166,7 @@ def _training(method: str, iterations: int | None, seed: int) -> Config:
 
 
 def _read(path: Path) -> dict:
-    """What a JSON file holds; nothing where it is missing or damaged."""
+    """Read a JSON file; return an empty dictionary if it is missing or damaged."""
     with contextlib.suppress(InputError):
         return read_json(path)
     return {}
@@ -171,7 +177,7 @@ def _folder(place: str) -> Path:
 
 
 def _digest(place: str) -> str:
-    """A hash of a file, or of all files of a folder or embedded scene with their names."""
+    """Return a hash of a file, or of all files of a folder or embedded scene with their names."""
     folder = _folder(place)
     if not folder.exists():
         raise InputError(place, "no such folder", "give folders with HDR truth, or embedded")
@@ -192,8 +198,7 @@ def run_jobs(
     slurm: dict | None = None,
     lpips: str | None = None,
 ) -> list[dict]:
-    """Runs the jobs that have no result in out/jobs, and returns a row for each job of the list: its result, or its
-    label and error.
+    """Run the jobs that have no result in out/jobs; return a row for each job: its result, or its label and error.
 
     device: kind, "cpu" or "cuda". at_once: trainings at one time; more than one, or any on SLURM, by submitit. slurm:
     parameters of SLURM jobs such as {"partition": "gpu"}, None for this machine. lpips: folder of weights.
@@ -216,7 +221,7 @@ def run_jobs(
 
 
 def row_of(result: dict) -> dict:
-    """A result as one flat row: what was trained, its figures, and its held-out tests as [seconds, dB]."""
+    """Return a result as one flat row: what was trained, its figures, and its held-out tests as [seconds, dB]."""
     config, figures = result["config"], result["figures"]
     hdr, regions = figures["protocol"], figures["regions"]
     names = ("curve", "exposure", "method", "sees_truth", "response", "seed", "device")
@@ -276,8 +281,10 @@ def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpip
 
 
 def work(jobs: Sequence[Job], out: Path, device: str, shared_by: int, lpips: str | None) -> None:
-    """A worker: takes the jobs that nobody is at, one after the other. Whoever holds the lock of a job's folder is at
-    it; the operating system lets go of it when a worker dies, however it dies."""
+    """Run as a worker the jobs that no other worker runs, one after the other.
+
+    A worker holds the lock of its job's folder; the operating system releases it when the worker ends, in whatever way.
+    """
     for job in jobs:
         folder = job.folder(out)
         folder.mkdir(parents=True, exist_ok=True)
@@ -352,7 +359,7 @@ def _render_rate(run, scene: Scene) -> float:
 
 @lru_cache(maxsize=8)
 def exposed(place: str, max_size: int | None, curve: str, exposure: int) -> Scene:
-    """A scene with its truth, as a job's camera took it: by a curve, at a place in the ladder of exposures."""
+    """Return a scene with its truth, as a job's camera took it: by a curve, at a place in the ladder of exposures."""
     truth, response = _true_scene(place, max_size), response_by_name(curve)
     return expose(truth, response, exposure_ladder(truth, response, EXPOSURES, FACTOR)[exposure])
 

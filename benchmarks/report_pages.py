@@ -26,7 +26,7 @@ NOTHING_CLIPS = 0.001  # Of the pixels
 
 
 def write_reports(folder: Path) -> list[Path]:
-    """Writes a page, with its plot, for each result in folder/results and for folder/tried.csv, and an index.
+    """Write a page, with its plot, for each result in folder/results and for folder/tried.csv, and an index.
 
     Raises InputError for a folder without results, and for a result that cannot be read.
     """
@@ -74,7 +74,10 @@ def _write(path: Path, parts: Sequence[str]) -> Path:
 
 
 def _pivot(rows: Sequence[Mapping], places: dict[str, str], over: str, value: str, form: str) -> str:
-    """A table with a row for each place, and a column for the value of each `over`. places: as columns of a table."""
+    """Return a table with a row for each place, and a column for the value of each `over`.
+
+    places: as columns of a table.
+    """
     fields = [field for _, field, _ in parted(places)]
     row_groups = groups(rows, *fields).items()
     pivoted = [
@@ -162,7 +165,7 @@ def _quality_tables(result: dict) -> Iterable[str]:
 
 
 def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
-    """The mean over scenes and exposures of each seed that has them all, where several have."""
+    """Return the mean over scenes and exposures of each seed that has them all, if several have."""
     places, table = groups(rows, "scene", "exposure").keys(), []
     for (method, seed), mine in sorted(groups(rows, "method", "seed").items()):
         if groups(mine, "scene", "exposure").keys() == places:
@@ -331,7 +334,7 @@ def _stability_tables(result: dict) -> Iterable[str]:
 
 
 def trial_table(rows: Iterable[Mapping]) -> tuple[list[dict], dict[str, str]]:
-    """The families of the trial and their sum, and the columns that they have."""
+    """Return the families of the trial and their sum, and the columns that they have."""
     ordered = sorted((dict(row) for row in rows), key=lambda row: row["family"])
     counts = ("cases", "tracebacks", "hangs", "programs", "lost")
     total = {name: sum(row[name] for row in ordered) for name in (*counts, "seconds")}

@@ -51,8 +51,10 @@ def plot_scale(result: dict, path: Path) -> None:
 
 
 def plot_quality(result: dict, path: Path) -> None:
-    """Mean held-out PSNR over training seconds, a panel for each curve and response, a line for each method; of the
-    scenes, exposures and seeds that all methods of a panel have, if there are any."""
+    """Plot the mean held-out PSNR over training seconds: a panel for each curve and response, a line for each method.
+
+    Scenes, exposures and seeds that all methods of a panel have count, if there are any; else all.
+    """
     rows, panels = [row for row in result["rows"] if row["tests"]], []
     for curve, response in groups([row for row in rows if row["response"] != "learned"], "curve", "response"):
         plotted = [row for row in rows if row["curve"] == curve and row["response"] in (response, "learned")]
@@ -86,8 +88,10 @@ def error_over_time(trainings: Sequence[Sequence], count: int = 60) -> list[tupl
 
 
 def _draw(path: Path, panels: Sequence[Sequence[tuple[dict, dict]]], form: str = "o-") -> None:
-    """A PNG of 32 colors, which is all that lines need. panels: rows of ({label: points}, what Axes.set() takes); one
-    legend below names all lines."""
+    """Write a PNG of 32 colors, which is all that lines need, with one legend below.
+
+    panels: rows of ({label: points}, what Axes.set() takes).
+    """
     from matplotlib.figure import Figure
     from PIL import Image
 

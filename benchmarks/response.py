@@ -34,8 +34,10 @@ def response_error(response: Response, truth: Response) -> float:
 def bench_response(
     data: Sequence[str], curves: Sequence[str], *, exposures: int = 5, max_size: int | None = None
 ) -> dict:
-    """A result: scenes with HDR truth, exposed by each curve at a ladder of exposures; `trials` are single, `rows` the
-    means by curve and method, and over all. Decibels are mu-law PSNR of the decoded photos, aligned; no 3D is involved.
+    """Expose scenes with HDR truth by each curve at a ladder of exposures, choose responses, and return the result.
+
+    `trials` are single, `rows` the means by curve and method, and over all. Decibels are mu-law PSNR of the decoded
+    photos, aligned; no 3D is involved.
     """
     settings = {"data": list(data), "curves": list(curves), "exposures": exposures, "max_size": max_size}
     result = new_result("response", torch.device("cpu"), settings)

@@ -29,6 +29,7 @@ def _module() -> str:
 
 
 def machine_line(result: dict) -> str:
+    """Return one line with the machine, the versions and the date of a result."""
     machine = result["machine"]
     place = f"{machine['cpu']}, {machine['cores']} cores"
     if machine["gpu"]:
@@ -46,7 +47,7 @@ def check(what: str, against: str, difference: float, bound: float) -> dict:
 
 
 def finish(result: dict, json: Path | None = None, overwrite: bool = False) -> None:
-    """Writes and prints a result. Raises SehdrError for checks that failed, after everything is out."""
+    """Write and print a result; then raise SehdrError if a check failed."""
     if json is not None:
         write_json(json, result, overwrite)
     table = markdown_table(result["rows"], COLUMNS[result["benchmark"]])
@@ -79,8 +80,11 @@ def parted(columns: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
 
 
 def markdown_table(rows: Sequence[Mapping], columns: Mapping[str, str]) -> str:
-    """Aligned Markdown. columns: `field` or `title=field` to a format: as of format(), or MiB, or "" for text; a column
-    without any value is left out, and so is a value that a row lacks."""
+    """Return aligned Markdown without columns that have no value in any row.
+
+    columns: `field` or `title=field` to a format: as of format(), or MiB, or "" for text. A value that a row lacks is
+    empty.
+    """
     used_columns = [column for column in parted(columns) if any(row.get(column[1]) is not None for row in rows)]
     if not used_columns:
         return "There are no results."

@@ -31,8 +31,10 @@ LARGE_END = 3
 
 
 def sweeps(device_type: str, small: bool = False) -> dict[str, list[tuple[int, Size, int, int]]]:
-    """The points of each sweep: what is varied, then size, channels, and photos of the training step (0 for none).
-    small: every second point, up to a moderate size."""
+    """Return the points of each sweep: what is varied, then size, channels, and photos of the training step (0: none).
+
+    small: every second point, up to a moderate size.
+    """
     table = tomllib.loads(Path(__file__).with_name("sweeps.toml").read_text(encoding="utf-8"))[device_type]
     size = Size(table["count"], *table["small_image"])
     result = {
@@ -45,7 +47,7 @@ def sweeps(device_type: str, small: bool = False) -> dict[str, list[tuple[int, S
 
 
 def bench_scale(device: torch.device, *, repetitions: int, small: bool = False) -> dict:
-    """A result: a row for each splat and training step at each point, and `slopes` of their logarithms."""
+    """Time each splat and training step at each point of the sweeps; return rows, and `slopes` of their logarithms."""
     settings = {"device": str(device), "repetitions": repetitions, "small": small, "preset": STEP_PRESET}
     result = new_result("scale", device, settings)
     peer = note_missing(result, device)
@@ -64,8 +66,10 @@ def bench_scale(device: torch.device, *, repetitions: int, small: bool = False) 
 
 
 def fit_slopes(rows: Sequence[dict]) -> list[dict]:
-    """Slopes of log(time) and log(memory) on log(what is varied), over a whole sweep and over its large end; times are
-    the least of their repetitions, which other work disturbs least."""
+    """Fit slopes of log(time) and log(memory) on log(what is varied), over a whole sweep and over its large end.
+
+    Times are the least of their repetitions, which other work disturbs least.
+    """
     fields, slopes = ("sweep", "implementation", "what"), []
     for key, here in groups(rows, *fields).items():
         for quantity, field in (("time", "min_ms"), ("memory", "peak_memory_bytes")):
@@ -108,8 +112,10 @@ def _splat_rows(size: Size, channels: int, device, peer: bool, repetitions: int,
 
 
 def _step_rows(size: Size, photos: int, device, peer: bool, repetitions: int, checks: list[dict]) -> list[dict]:
-    """Without densification, which would watch gradients that gsplat gives in another form; steps of gsplat are
-    launched, since they cannot be recorded."""
+    """Time training steps without densification, whose gradients gsplat gives in another form.
+
+    Steps of gsplat are launched one by one, since they cannot be captured in a CUDA graph.
+    """
     scene = make_photo_scene(size, photos, device)
     rows, losses = [], {}
     for who, rasterizer in ({OURS: None} | ({GSPLAT: rasterize_with_gsplat} if peer else {})).items():

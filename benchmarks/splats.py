@@ -27,10 +27,11 @@ class Size:
     height: int
 
     def __str__(self) -> str:
+        """Return such as `100,000 at 640 x 480`."""
         return f"{self.gaussians}@{self.width}x{self.height}"
 
     def reduced(self, most: int) -> "Size":
-        """The same density, with at most so many Gaussians (but an image of at least 16 pixels a side)."""
+        """Return the size of the same density with at most `most` Gaussians; sides keep 16 pixels."""
         shrink = math.sqrt(max(1.0, self.gaussians / most))
         width, height = (max(16, round(side / shrink)) for side in (self.width, self.height))
         return Size(max(1, round(self.gaussians / shrink**2)), width, height)
@@ -56,22 +57,26 @@ class SplatScene:
 
     @property
     def arguments(self) -> tuple:
+        """The arguments of rasterize()."""
         return (*self.leaves, self.world_to_camera, self.intrinsics, self.size.width, self.size.height)
 
     @property
     def channels(self) -> int:
+        """Channels of the features."""
         return self.leaves[-1].shape[1]
 
     @property
     def device(self) -> torch.device:
+        """The device of all tensors."""
         return self.leaves[0].device
 
     def to(self, device=None, dtype=None) -> "SplatScene":
-        """A copy with leaves of its own, which ask for gradients."""
+        """Return a copy with leaves of its own, which require gradients."""
         leaves = tuple(leaf.detach().to(device, dtype, copy=True).requires_grad_() for leaf in self.leaves)
         return SplatScene(leaves, self.world_to_camera.to(device, dtype), self.intrinsics.to(device, dtype), self.size)
 
     def clear(self) -> None:
+        """Forget the gradients of the leaves."""
         for leaf in self.leaves:
             leaf.grad = None
 
@@ -83,8 +88,11 @@ class SplatScene:
 
 
 def make_splat_scene(size: Size, channels: int, device: torch.device | str = "cpu") -> SplatScene:
-    """float32 Gaussians at depths of 2 to 8 before a centered pinhole camera at the origin. Deviations follow the mean
-    distance between centers, so that any size has some 15 layers over the alpha threshold in a pixel."""
+    """Make float32 Gaussians at depths of 2 to 8 before a centered pinhole camera at the origin.
+
+    Deviations follow the mean distance between centers, so that any size has some 15 layers over the alpha threshold in
+    a pixel.
+    """
     generator = torch.Generator().manual_seed(0)
     uniform = partial(torch.rand, generator=generator)
     count, width, height, focal = size.gaussians, size.width, size.height, 0.8 * size.width
@@ -100,8 +108,10 @@ def make_splat_scene(size: Size, channels: int, device: torch.device | str = "cp
 
 
 def make_photo_scene(size: Size, views: int = 18, device: str | torch.device = "cpu") -> Scene:
-    """8-bit sRGB photos, all for training, of colored balls on a floor, from a circle around them; size.gaussians
-    points lie on the surfaces. device: where the photos are rendered."""
+    """Render 8-bit sRGB photos, all for training, of colored balls on a floor, from a circle around them.
+
+    size.gaussians points lie on the surfaces. device: where the photos are rendered.
+    """
     rng = np.random.default_rng(0)
     points, log_exposure = _surfaces(size.gaussians, rng)
     response = response_by_name("srgb")

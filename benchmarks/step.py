@@ -36,8 +36,11 @@ INTERVALS = {"cuda": 3, "cpu": 1}
 
 
 def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repetitions: int, views: int = 18) -> dict:
-    """A result: steps of each preset in the thick of its training (all degrees of the harmonics, densification going
-    on) on synthetic photos; on a GPU recorded, and launched one by one, and the recorded step's `parts`."""
+    """Time steps of each preset in the thick of its training on synthetic photos; return the result.
+
+    All degrees of the harmonics are on, and densification goes on. On a GPU steps are recorded, and launched one by
+    one; `parts` are those of the recorded step.
+    """
     settings = {"device": str(device), "presets": list(presets), "repetitions": repetitions, "views": views}
     result = new_result("step", device, settings)
     if device.type == "cuda":
@@ -63,7 +66,7 @@ def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repe
 
 
 def thick_of_training(config: Config) -> int:
-    """The first iteration from which on harmonics and densification, whose interval it is a multiple of, cost most."""
+    """Return the first iteration with all harmonics, at a densification step, from which on steps cost most."""
     every = config.scaled(config.densification.refine_every)
     ready = max(config.model.sh_degree * config.schedule.sh_degree_interval, config.densification.refine_start_iter)
     return -(-(config.scaled(ready) + 1) // every) * every
@@ -76,8 +79,10 @@ def make_trainer(
     rasterizer: Callable | None = None,
     ranks: Ranks | None = None,
 ) -> Trainer:
-    """A trainer in the thick of its training, with opacities spread as training spreads them. rasterizer: in place of
-    ours. ranks: that train together, each of which makes the same."""
+    """Return a trainer in the thick of its training, with opacities spread as training spreads them.
+
+    rasterizer: in place of ours. ranks: that train together, each of which makes the same trainer.
+    """
     field = make_field(scene, config, choose_response(scene, config), device)
     field.rasterizer = rasterizer or field.rasterizer
     generator = torch.Generator().manual_seed(config.seed)
@@ -93,7 +98,7 @@ def make_trainer(
 
 
 def step_variant(trainer: Trainer) -> Variant:
-    """Steps between two changes of the count: before the next one the iteration goes back to just after the last."""
+    """Time steps between two changes of the count; the iteration goes back before the next one."""
     first = thick_of_training(trainer.config)
 
     def between_changes():
@@ -114,7 +119,7 @@ def time_step(trainer: Trainer, repetitions: int) -> dict:
 
 
 def _time_row_of_steps(trainer: Trainer, repetitions: int) -> dict:
-    """Steps on a GPU without a pause between them: their spacing on the device, and the host's time for each."""
+    """Time steps on a GPU without a pause between them: their spacing on the device, and the host's time for each."""
     variant, device = step_variant(trainer), trainer.device
     for _ in range(20):
         variant.once()
@@ -168,7 +173,7 @@ def _plain_torch(*arguments, max_intersections=None, deterministic=False, **opti
 
 
 def amortized(trainer: Trainer, step: Callable[[], object]) -> dict:
-    """The mean step over whole densification intervals, changes of the count included."""
+    """Return the mean step over whole densification intervals, changes of the count included."""
     trainer.iteration = thick_of_training(trainer.config) - 1
     step()  # the first change prepares what the others use
     photos = INTERVALS[trainer.device.type] * trainer.config.scaled(trainer.config.densification.refine_every)
@@ -183,7 +188,7 @@ def amortized(trainer: Trainer, step: Callable[[], object]) -> dict:
 
 
 def _checks(preset: str, scene: Scene, config: Config, device, against: str, rasterizer=None) -> list[dict]:
-    """The loss of the first and of a later step beside that of a training on the CPU with this rasterizer."""
+    """Compare the loss of the first and of a later step with that of a training on the CPU by this rasterizer."""
     ours, other = make_trainer(scene, config, device), make_trainer(scene, config, torch.device("cpu"), rasterizer)
     checks = []
     for step in range(1, CHECKED_STEPS + 1):

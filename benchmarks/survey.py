@@ -63,7 +63,7 @@ def _texture(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def make_field(points: np.ndarray, log_exposures: np.ndarray, area: float, device) -> RadianceField:
-    """The truth: round Gaussians of the mean distance of the points."""
+    """Make the truth: round Gaussians of the mean distance of the points."""
     count = len(points)
     size = 0.6 * math.sqrt(area / count)
     means = torch.tensor(points, dtype=torch.float32)
@@ -122,7 +122,7 @@ def write_survey(
 
 
 def _write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """A point cloud as COLMAP and nerfstudio write it."""
+    """Write a point cloud as COLMAP and nerfstudio do."""
     types = [*((name, "f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
     vertices = np.empty(len(points), types)
     for axis, name in enumerate("xyz"):

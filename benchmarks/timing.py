@@ -31,6 +31,7 @@ class Variant:
     prepare: Callable[[], object] = lambda: None
 
     def once(self) -> None:
+        """Run once."""
         self.prepare()
         self.run()
 
@@ -38,8 +39,11 @@ class Variant:
 def time_variants(
     variants: dict[str, Variant], device: torch.device, *, repetitions: int = 30, budget: float = BUDGET
 ) -> dict[str, dict]:
-    """See summary(). On a GPU events stand around each run with the device idle before, so that the host's time counts
-    where it is the limit."""
+    """Time variants in turns; see summary().
+
+    On a GPU an event stands before and after each run, with the device idle before, so that the host's time counts if
+    it is the limit.
+    """
     samples: dict[str, list[float]] = {name: [] for name in variants}
     repetitions_left = dict.fromkeys(variants, repetitions)
     for name, variant in variants.items():
@@ -85,12 +89,13 @@ def _milliseconds(variant: Variant, device: torch.device) -> float:
 
 
 def wait(device: torch.device) -> None:
+    """Wait until a GPU is idle; return at once on the CPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def forget_peaks(device: torch.device) -> None:
-    """What is left of the measurement before must not count as the next one's."""
+    """Reset the peaks of memory, so that earlier measurements do not count."""
     gc.collect()
     if device.type == "cuda":
         torch.cuda.init()  # before a first use torch has no peaks to forget, and says so by an error
@@ -99,7 +104,7 @@ def forget_peaks(device: torch.device) -> None:
 
 
 def held_memory(device: torch.device) -> int | None:
-    """The most that torch and Warp held at once on a GPU since forget_peaks(), bytes; None on the CPU."""
+    """Return the most memory that torch and Warp had at once since forget_peaks(), bytes; None on the CPU."""
     return torch.cuda.max_memory_allocated(device) + warp_memory_bytes(device) if device.type == "cuda" else None
 
 

@@ -35,8 +35,10 @@ BOUND = 1e-12
 
 
 def bench_workers(sizes: Sequence[Size], device: torch.device, *, repetitions: int) -> dict:
-    """A result: a row for each size and 1, 2, 4 ... threads of the CPU, or GPUs; times are by photo, of which each GPU
-    takes one in a step."""
+    """Time a row for each size and 1, 2, 4 ... threads of the CPU, or GPUs; return the result.
+
+    Times are by photo; each GPU takes one photo in a step.
+    """
     result = new_result("workers", device, {"device": str(device), "repetitions": repetitions, "preset": PRESET})
     cpu = device.type == "cpu"
     for size in sizes:
@@ -60,7 +62,7 @@ def doubled(most: int) -> list[int]:
 
 
 def time_threads(size: Size, count: int, repetitions: int) -> dict:
-    """A step's time on so many threads, and the loss after the same few steps."""
+    """Time a step on `count` threads; also return the loss after the same few steps."""
     with _threads(count):
         trainer = make_trainer(make_photo_scene(size, PHOTOS), _config(size), torch.device("cpu"))
         variant = step_variant(trainer)
@@ -73,7 +75,7 @@ def time_threads(size: Size, count: int, repetitions: int) -> dict:
 
 
 def time_ranks(size: Size, count: int, device_type: str, repetitions: int) -> dict:
-    """Times by photo of steps on so many devices, each with a process of its own."""
+    """Time steps by photo on several devices, each with a process of its own."""
     with tempfile.TemporaryDirectory(prefix="sehdr-warp-") as folder:
         arguments = count, Path(folder), size, device_type, repetitions
         try:

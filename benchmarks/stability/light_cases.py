@@ -58,7 +58,7 @@ def _odd_responses(device):
 
 
 def _extremes(device):
-    """A value within [0, 1] and a finite derivative everywhere."""
+    """Check for a value within [0, 1] and a finite derivative everywhere."""
     wrong = 0
     for curve in map(response_by_name, CURVES):
         x = torch.tensor([0.0, 1e-45, 1e-38, 1e-20, 1e20, 3e38, math.inf], device=device, requires_grad=True)
@@ -71,7 +71,7 @@ def _extremes(device):
 
 
 def _zero_radiance(device):
-    """A black photo as a start, and fusion of log 0 = -infinity."""
+    """Start from a black photo, and fuse log 0 = -infinity."""
     logs = torch.tensor([[-math.inf] * 3, [-200.0] * 3, [math.log(EXPOSURE_FLOOR)] * 3], device=device)
     fusion = _Fusion(0.2).to(device)
     yield count("not finite in fusion", not_finite(fusion.exact(logs), fusion(logs)))
@@ -97,7 +97,7 @@ def _fused(sigma: float, gain: float, device):
     tensors = {"log_base": log_base, "log_sigma": fusion.log_sigma.detach().double(), "last": last}
 
     def fused(log_base, log_sigma, last):
-        """The equations in whichever precision their arguments come."""
+        """Evaluate the equations in the precision of the arguments."""
         parameters = {name: value.to(log_base) for name, value in fusion.named_parameters()}
         parameters |= {"log_sigma": log_sigma, "weights.1": last}
         return {"fused": torch.func.functional_call(fusion, parameters, (log_base,))}
@@ -125,7 +125,7 @@ def _sigma_limits(device):
 
 
 def _photos(device):
-    """The loss and its derivative."""
+    """Compare the loss and its derivative."""
     noise = torch.rand(24, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     spot = torch.zeros_like(noise)
     spot[11, 7] = 1.0
@@ -140,7 +140,7 @@ def _photos(device):
 
 
 def _loss(prediction, photo):
-    """The training's loss between encoded values of a simulated photo [H, W, 3] and a photo of black and white."""
+    """Return the training's loss between encoded values of a simulated and a black and white photo, [H, W, 3]."""
     codes = (255 * photo).to(prediction.device, torch.uint8)
     target = Target(codes, code_scale(255, None, prediction.device, dtype=prediction.dtype))
     render = TrainRender(prediction, None, None, None)  # pyright: ignore[reportArgumentType]

@@ -34,7 +34,7 @@ def _photos(clipped: float = 0.0) -> Scene:
 
 
 def _trainer(device, clipped: float = 0.0, fields: Mapping[str, object] | None = None) -> Trainer:
-    """A short training that neither adds nor moves Gaussians by itself. fields: of the config."""
+    """Prepare a short training that neither adds nor moves Gaussians by itself. fields: of the config."""
     still = {"densification.refine_stop_iter": 0, "mcmc.noise_lr": 0.0, "schedule.sh_degree_interval": 30_000}
     config = load_config("default", {"schedule.iterations": STEPS, "seed": 1} | still | dict(fields or {}))
     scene = _photos(clipped)
@@ -85,7 +85,7 @@ def _gradient_norms(device):
 
 
 def _scale_ambiguity(device):
-    """The photo of radiance k at time t / k is the photo at t.
+    """Compare the photo of radiance k at time t / k with the photo at t: they are the same.
 
     With a fixed response that direction is exactly flat; a free response would add its own. The base time takes it out:
     colors are exposures at that time.
@@ -102,7 +102,7 @@ def _scale_ambiguity(device):
 
 
 def _opacity_reset(device):
-    """The steps after a reset of all opacities to 0.01: finite, and the loss is back within twice its value before."""
+    """Check that after a reset of all opacities to 0.01 the loss is finite, and soon within twice its old value."""
     trainer = _trainer(device)
     before = _losses(trainer, STEPS // 2)[-1]
     with torch.no_grad():
@@ -128,7 +128,7 @@ def _clipped_batches(device):
 
 
 def _guard(device):
-    """A step whose gradient is NaN changes nothing; the next one goes on."""
+    """Check that a step whose gradient is NaN changes nothing, and that the next one goes on."""
     trainer = _trainer(device, fields={"schedule.use_cuda_graph": False})  # a hook cannot be recorded
     trainer.step()
     gaussians = trainer.field.gaussians
