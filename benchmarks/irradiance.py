@@ -61,8 +61,8 @@ def read_light_maps(folder: Path) -> list[LightMap]:
 def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Camera], scale: float = 1.0) -> dict:
     """Return relative errors of irradiance over all directions of all places.
 
-    Light is the mean over channels, and only that which photos show: render and truth are multiplied by `seen`. Surfaces
-    that face too little of it do not count.
+    Light is the mean over channels, and only that which photos show: render and truth are multiplied by `seen`.
+    Surfaces that face too little of it do not count.
 
     Args:
         run: the loaded run.
