@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -12,8 +13,8 @@ from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
 from .tile_lists import ONE_SORT, PackedSplats, TileLists, UnsortedIntersections
-from .torch_contract import keeps_graph
-from .warp_launch.launching import launch, warp_scalar
+from .torch_contract import direct_apply, keeps_graph, once_differentiable
+from .warp_launch.launching import fixed_launch, launch, warp_scalar, warp_stream
 
 PIECES_PER_THREAD = 16  # Of the image, on the CPU: their work differs by more than their intersections.
 Adjoint = Callable[[Tensor, Tensor | None], Tensor]
@@ -72,7 +73,9 @@ def blend(
 
 def with_gradient(means2d, conics, opacities, features, result: BlendResult) -> tuple[Tensor, Tensor]:
     """Return a result's image and transmittance as differentiable functions of what they were blended from."""
-    return _Blend.apply(means2d, conics, opacities, features, result)
+    if not torch.is_grad_enabled():
+        return result.image, result.transmittance
+    return _apply_blend(means2d, conics, opacities, features, result)
 
 
 class _Blend(torch.autograd.Function):
@@ -85,7 +88,7 @@ class _Blend(torch.autograd.Function):
         return result.image, result.transmittance
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, by_image, by_transmittance):
         _ = ctx.saved_tensors  # Raises torch's errors for a freed graph and for changes in place.
         adjoint = ctx.adjoint
@@ -103,6 +106,9 @@ class _Blend(torch.autograd.Function):
         by_features, by_conics, by_means2d, by_opacities, _ = gathered.split_with_sizes((channels, 3, 2, 1, rest), 1)
         gradients = by_means2d, by_conics, by_opacities[:, 0], by_features
         return *(part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False)), None
+
+
+_apply_blend = direct_apply(_Blend)
 
 
 def blend_on_cpu(
@@ -179,39 +185,101 @@ def blend_on_cuda(
     transmittance: Tensor,
     alpha_threshold: float,
     deterministic: bool,
-) -> Adjoint:
+) -> "BlockAdjoint":
     """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also on fibers of the CPU)."""
-    scalar, cuda = warp_scalar(features.dtype), features.device.type == "cuda"
-    height, width, channels = image.shape
     rows = pad_features(features)
     last = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
     # Padded features are larger; few are kept so that they need not be padded again.
-    count, features = len(features), rows if len(features) <= ONE_SORT else features
-    shapes, ellipses = packed.shapes, packed.ellipses
-    del rows
+    kept = rows if len(features) <= ONE_SORT else features
+    return BlockAdjoint(kept, image.shape[-1], lists, packed, transmittance, last, alpha_threshold, deterministic)
 
-    def backward(by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
+
+@dataclass(frozen=True)
+class BlockAdjoint:
+    """The adjoint of blend_on_cuda(); see Adjoint.
+
+    Attributes:
+        features: [N, C] or, padded, [N, more].
+        channels: C.
+        lists: that were blended.
+        packed: Gaussians that were blended.
+        transmittance: [H, W], the result.
+        last: of blend_blocks().
+        alpha_threshold: contributions with a smaller alpha were left out.
+        deterministic: sum in a fixed order.
+    """
+
+    features: Tensor
+    channels: int
+    lists: TileLists
+    packed: PackedSplats
+    transmittance: Tensor
+    last: Tensor
+    alpha_threshold: float
+    deterministic: bool
+
+    def __call__(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
+        """Return the gradients by Gaussian."""
         if by_transmittance is None:
-            by_transmittance = transmittance.view(-1)[:0]
-        kernel = blend_cuda_adjoint.backward_kernel(scalar, channels, deterministic, cuda)
-        columns = channels + 6
-        arguments = (
-            *(lists.ranges, lists.gaussians, lists.corners, shapes, ellipses, pad_features(features).reshape(-1, 4)),
-            *(lists.columns, width, height, alpha_threshold, transmittance, last, by_image, by_transmittance),
-            *(blend_cuda_adjoint.ROWS, columns),
-        )
-        if not deterministic:
-            by_rows = blend_cuda_adjoint.adds_rows(scalar, deterministic, cuda)
-            gathered = transmittance.new_zeros(count, blend_cuda.padded_channels(columns) if by_rows else columns)
-            launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *arguments, 0, lists.gaussians, gathered)
+            by_transmittance = self.transmittance.view(-1)[:0]
+        lists = self.lists
+        if not self.deterministic:
+            gathered = self._zeros()
+            arguments = *self._arguments(by_image, by_transmittance), 0, lists.gaussians, gathered
+            launch_blocks(self._kernel(), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
             return gathered
-        unsorted, by_intersection = lists.unsorted, transmittance.new_zeros(lists.intersection_count, columns)
+        by_intersection = self.transmittance.new_zeros(lists.intersection_count, self.channels + 6)
+        unsorted, arguments = lists.unsorted, self._arguments(by_image, by_transmittance)
         assert unsorted is not None, "sums in a fixed order need the intersections as they were emitted"
         for corner in range(blend_cuda.BLOCKS_PER_TILE):
-            launch_blocks(kernel, lists, 1, *arguments, corner, unsorted.places, by_intersection)
+            launch_blocks(self._kernel(), lists, 1, *arguments, corner, unsorted.places, by_intersection)
         return gather_by_gaussian(unsorted, by_intersection)
 
-    return backward
+    def on_fixed_memory(self) -> Adjoint:
+        """Return the adjoint for less host time; for use while all tensors stay where they are."""
+        assert not self.deterministic, "sums in a fixed order are several launches"
+        by_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
+        by_transmittance, gathered = torch.empty_like(self.transmittance), self._zeros()
+        fixed = fixed_launch(
+            self._kernel(),
+            block_threads(self.lists, blend_cuda.BLOCKS_PER_TILE),
+            *self._arguments(by_image, by_transmittance),
+            *(0, self.lists.gaussians, gathered),
+            whole=(by_image, by_transmittance, gathered),
+            block_dim=blend_cuda.BLOCK_DIM,
+        )
+        device, shape = gathered.device, gathered.shape
+
+        def adjoint(by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
+            gathered = by_image.new_zeros(shape)
+            fixed.launch((), (by_image, by_transmittance, gathered), warp_stream(device))
+            return gathered
+
+        return adjoint
+
+    def _zeros(self) -> Tensor:
+        columns = self.channels + 6
+        if blend_cuda_adjoint.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
+            columns = blend_cuda.padded_channels(columns)
+        return self.transmittance.new_zeros(len(self.features), columns)
+
+    @property
+    def _cuda(self) -> bool:
+        return self.features.device.type == "cuda"
+
+    def _kernel(self) -> Any:
+        scalar = warp_scalar(self.features.dtype)
+        return blend_cuda_adjoint.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
+
+    def _arguments(self, by_image: Tensor, by_transmittance: Tensor) -> tuple:
+        lists, packed = self.lists, self.packed
+        height, width = self.transmittance.shape
+        return (
+            *(lists.ranges, lists.gaussians, lists.corners, packed.shapes, packed.ellipses),
+            pad_features(self.features).reshape(-1, 4),
+            *(lists.columns, width, height, self.alpha_threshold, self.transmittance, self.last),
+            *(by_image, by_transmittance, blend_cuda_adjoint.ROWS, self.channels + 6),
+        )
 
 
 def blend_blocks(
@@ -233,8 +301,12 @@ def blend_blocks(
 
 def launch_blocks(kernel: Any, lists: TileLists, blocks_per_tile: int, *arguments: Any) -> None:
     """Launch a block kernel over the tiles."""
-    block = blend_cuda.BLOCK_DIM
-    launch(kernel, lists.columns * lists.rows * blocks_per_tile * block, *arguments, block_dim=block)
+    launch(kernel, block_threads(lists, blocks_per_tile), *arguments, block_dim=blend_cuda.BLOCK_DIM)
+
+
+def block_threads(lists: TileLists, blocks_per_tile: int) -> int:
+    """Return the number of threads of a block kernel over the tiles."""
+    return lists.columns * lists.rows * blocks_per_tile * blend_cuda.BLOCK_DIM
 
 
 def pad_features(features: Tensor) -> Tensor:

@@ -6,19 +6,23 @@ in, outputs are copied out.
 """
 
 import atexit
+import ctypes
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from .blending import Adjoint, BlendResult, blend_on_cuda
+from ..kernels.project import projection_kernel
+from .blending import Adjoint, BlendResult, BlockAdjoint, blend_on_cuda
 from .cuda_graphs import CudaGraphRunner, is_capturing
+from .projection import ProjectedGaussians, ProjectionAdjoint, project_to_camera
+from .render_options import RenderOptions
 from .tile_lists import (
     MAX_INTERSECTIONS,
     ONE_SORT,
@@ -29,7 +33,7 @@ from .tile_lists import (
     order_intersections,
     pack_splats,
 )
-from .warp_launch.launching import stream_handle
+from .warp_launch.launching import fixed_launch, stream_handle, warp_scalar, warp_stream
 
 LOG = logging.getLogger(__name__)
 
@@ -42,115 +46,218 @@ HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captu
 MIN_INTERSECTIONS = 1 << 12
 
 
-class ImageSize(NamedTuple):
-    """Size of an image in pixels, and the alpha below which a contribution is left out."""
+class _Signature(NamedTuple):
+    """What calls of one graph have in common."""
 
-    width: int
-    height: int
-    alpha_threshold: float
-
-
-class GraphRender(NamedTuple):
-    """A render by a CUDA graph, and its number of (Gaussian, tile) intersections."""
-
-    result: BlendResult
-    intersections: int
+    options: RenderOptions
+    stream: int
+    differentiable: bool
+    tensors: tuple  # Shape, dtype and device of each.
 
 
-@torch.no_grad()
-def render_from_graph(splats: Splats, size: ImageSize, differentiable: bool) -> GraphRender | None:
-    """Render by a CUDA graph, or return None if the call is to be launched instead.
+def find_graphs(tensors: Sequence[Any], options: RenderOptions) -> "_CallGraphs | None":
+    """Return the graphs of calls like this one; None if there was none yet, or it is not for a graph.
 
-    Sets splats.extents to 0 in place for Gaussians whose features are not finite.
+    tensors, options: as their user passed them. If calls like this one are known, they fit.
+    """
+    try:
+        if not _on_gpu(tensors[0]):
+            return None
+        signature = _signature(tensors, options)
+        with _lock:
+            graphs = _graphs.get(signature)
+            if graphs is not None:
+                _graphs.move_to_end(signature)
+    except (AttributeError, TypeError, RuntimeError):
+        return None
+    return None if graphs is None or is_capturing(tensors[0].device) else graphs
+
+
+def add_graphs(tensors: Sequence[Tensor], options: RenderOptions) -> "_CallGraphs | None":
+    """Return the graphs of calls like this one, which need not be known; None if it is not for a graph.
 
     Args:
-        splats: the 2D Gaussians, float32.
-        size: of the image.
-        differentiable: whether the adjoint may be called.
+        tensors: as _CallGraphs.replay() takes them, of one device.
+        options: of the image.
     """
-    features, device = splats.features, splats.features.device
-    if device.type != "cuda" or features.dtype != torch.float32:
+    first, features = tensors[0], tensors.features if isinstance(tensors, Splats) else tensors[FEATURES]
+    if not _on_gpu(first) or first.dtype != torch.float32:
         return None
-    small = 0 < len(features) <= (ONE_SORT if differentiable else MAX_GAUSSIANS)
-    if not small or size.width * size.height > MAX_PIXELS or is_capturing(device):
+    if options.max_intersections is not None or options.deterministic:
         return None
-    graphs = _graphs_of((device, stream_handle(device), *features.shape, size, differentiable))
-    graph = graphs.take(lambda intersections: _RenderGraph(splats, size, intersections))
-    if graph is None:
+    signature = _signature(tensors, options)
+    small = 0 < len(features) <= (ONE_SORT if signature.differentiable else MAX_GAUSSIANS)
+    if not small or options.width * options.height > MAX_PIXELS or is_capturing(first.device):
         return None
-    image, transmittance, intersections = graph.replay(splats)
-    if intersections > graph.max_intersections:
-        graphs.grow(intersections)
-        return None
-    if not differentiable:
-        graphs.idle.append(graph)
-        return GraphRender(BlendResult(image, transmittance, graph.adjoint), intersections)
-    lease = _Lease(graphs.idle, graph)
-    return GraphRender(BlendResult(image, transmittance, lease.adjoint), intersections)
+    return _graphs_of(signature)
+
+
+def _on_gpu(tensor: Tensor) -> bool:
+    return tensor.is_cuda
+
+
+def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> _Signature:
+    differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    layouts = tuple((tensor.shape, tensor.dtype, tensor.device) for tensor in tensors)
+    return _Signature(options, stream_handle(tensors[0].device), differentiable, layouts)
+
+
+FEATURES = 4
+"""Place of features among a call's tensors: means, log_scales, quaternions, opacities, features, pose, lens."""
+
+
+class GraphRender:
+    """A render by a CUDA graph, which no other call uses until the adjoints are freed.
+
+    Attributes:
+        projected: 2D Gaussians; None if the graph began with them. Their conics and opacities are the graph's memory.
+        result: of the blend.
+    """
+
+    def __init__(self, graphs: "_CallGraphs", graph: "_RenderGraph", result: tuple[Tensor, ...]) -> None:
+        """Lease the graph."""
+        self._graphs, self._graph = graphs, graph
+        lease = _Lease(graphs.idle, graph)
+        image, transmittance, *others = result
+        self.result = BlendResult(image, transmittance, lease.adjoint)
+        self.projected: ProjectedGaussians | None = None
+        if graph.projection_adjoint is not None:
+            means2d, depths, extents = others
+            conics, opacities = graph.splats.conics.detach(), graph.splats.opacities.detach()
+            self.projected = ProjectedGaussians(means2d, conics, depths, opacities, extents)
+        self.projection_adjoint: ProjectionAdjoint = lease.projection_adjoint
+        self.intersections = 0
+
+    def fits(self) -> bool:
+        """Wait until the GPU has counted the intersections; return whether the graph has memory for them.
+
+        If not, the render is not to be used.
+        """
+        self.intersections = self._graph.count_intersections()
+        if self.intersections <= self._graph.max_intersections:
+            return True
+        self._graphs.grow(self.intersections)
+        return False
 
 
 class _RenderGraph:
     """One render on fixed memory, in two graphs, between which the number of intersections is copied to the host.
 
-    intersections: the least number to allocate memory for.
+    Args:
+        tensors: the seven tensors of a call, or Splats.
+        options: of the image.
+        intersections: the least number to allocate memory for.
+        differentiable: whether adjoints may be called.
     """
 
-    def __init__(self, splats: Splats, size: ImageSize, intersections: int) -> None:
-        width, height, threshold = size
-        self._splats = Splats(*(tensor.detach().clone() for tensor in splats))
-        features, depths, extents = self._splats.features, self._splats.depths, self._splats.extents
-        self._image = features.new_empty(height, width, features.shape[1])
-        self._transmittance = features.new_empty(height, width)
-        self._intersections = torch.empty(1, dtype=torch.int64, pin_memory=True)
-        self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(features.device)
-        self._counting = CudaGraphRunner(features.device)
-        self._blending = CudaGraphRunner(features.device, self._counting.stream)
+    def __init__(
+        self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
+    ) -> None:
+        width, height, threshold = options.width, options.height, options.alpha_threshold
+        inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
+        device = inputs[0].device
+        projects = not isinstance(tensors, Splats)
+        channels = inputs[FEATURES].shape[1] + options.depth if projects else Splats(*inputs).features.shape[1]
+        image, transmittance = inputs[0].new_empty(height, width, channels), inputs[0].new_empty(height, width)
+        counter = torch.empty(1, dtype=torch.int64, pin_memory=True)
+        self._counter, self._count = counter, ctypes.c_int64.from_address(counter.data_ptr())
+        self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(device)
+        self._counting = CudaGraphRunner(device)
+        self._blending = CudaGraphRunner(device, self._counting.stream)
 
-        def count() -> tuple[PackedSplats, IntersectionOffsets]:
-            packed = pack_splats(self._splats, threshold, width, height)
-            offsets = order_intersections(packed.counts, depths, extents, unsorted=False)
-            self._intersections.copy_(offsets.ends[-1:], non_blocking=True)
-            return packed, offsets
+        def count() -> tuple[Splats, PackedSplats, IntersectionOffsets]:
+            splats = _project(inputs, options) if projects else Splats(*inputs)
+            packed = pack_splats(splats, threshold, width, height)
+            offsets = order_intersections(packed.counts, splats.depths, splats.extents, unsorted=False)
+            counter.copy_(offsets.ends[-1:], non_blocking=True)
+            return splats, packed, offsets
 
-        def blend(packed: PackedSplats, offsets: IntersectionOffsets, limit: int) -> Adjoint:
+        def blend(splats: Splats, packed: PackedSplats, offsets: IntersectionOffsets, limit: int) -> BlockAdjoint:
+            depths, extents = splats.depths, splats.extents
             lists = build_tile_lists(packed, offsets, depths, extents, width, height, limit, unsorted=False)
-            return blend_on_cuda(features, lists, packed, self._image, self._transmittance, threshold, False)
+            return blend_on_cuda(splats.features, lists, packed, image, transmittance, threshold, False)
 
         # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
         with self._counting.on_capture_stream():
-            packed, offsets = count()
+            splats, packed, offsets = count()
             limit = int(HEADROOM * max(intersections, int(offsets.ends[-1])))
             self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
-            blend(packed, offsets, self.max_intersections)
-            del packed, offsets
-        packed, offsets = self._counting.capture(None, count)
-        self.adjoint: Adjoint = self._blending.capture(None, lambda: blend(packed, offsets, self.max_intersections))
-        """Confidence of the last render; one launch, which needs no graph."""
+            blend(splats, packed, offsets, self.max_intersections)
+            del splats, packed, offsets
+        self.splats, packed, offsets = self._counting.capture(None, count)
+        limit = self.max_intersections
+        adjoint = self._blending.capture(None, lambda: blend(self.splats, packed, offsets, limit))
+        self.adjoint: Adjoint = adjoint.on_fixed_memory() if differentiable else adjoint
+        """Adjoint of the last render; one launch, which needs no graph."""
+        self.projection_adjoint = _projection_adjoint(inputs, options, self.splats) if projects else None
+        outputs = self.splats.means2d, self.splats.depths, self.splats.extents
+        self._inputs = inputs
+        self._outputs = [image, transmittance, *(outputs if projects else outputs[2:])]
 
-    def replay(self, splats: Splats) -> tuple[Tensor, Tensor, int]:
-        """Return image, transmittance and the number of intersections; those beyond max_intersections are left out."""
-        torch._foreach_copy_(list(self._splats), list(splats))  # pyright: ignore[reportPrivateImportUsage]
+    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> list[Tensor]:
+        """Render; return image and transmittance, and what follows them among the outputs.
+
+        outputs: to write the latter to. By default they are new tensors.
+        """
+        torch._foreach_copy_(self._inputs, tensors)  # pyright: ignore[reportPrivateImportUsage]
         self._counting.replay()
         self._counted.record(self._stream)
         self._blending.replay()
-        outputs = [self._image, self._transmittance, self._splats.extents]
-        image, transmittance = torch.empty_like(self._image), torch.empty_like(self._transmittance)
-        torch._foreach_copy_([image, transmittance, splats.extents], outputs)  # pyright: ignore[reportPrivateImportUsage]
+        known = len(self._outputs) - len(outputs)
+        results = [*map(torch.empty_like, self._outputs[:known]), *outputs]
+        torch._foreach_copy_(results, self._outputs)  # pyright: ignore[reportPrivateImportUsage]
+        return results
+
+    def count_intersections(self) -> int:
+        """Wait for the last render's count; return it. Those beyond max_intersections were left out."""
         self._counted.synchronize()
-        return image, transmittance, int(self._intersections)
+        return self._count.value
+
+
+def _project(inputs: Sequence[Tensor], options: RenderOptions) -> Splats:
+    means, log_scales, quaternions, opacities, features, pose, lens = inputs
+    projected = project_to_camera(means, log_scales, quaternions, opacities, pose, lens, options)
+    if options.depth:
+        features = torch.cat([features, projected.depths[:, None]], 1)
+    return Splats(
+        projected.means2d, projected.conics, projected.opacities, features, projected.depths, projected.extents
+    )
+
+
+def _projection_adjoint(inputs: Sequence[Tensor], options: RenderOptions, splats: Splats) -> ProjectionAdjoint:
+    """Return the adjoint of _project() on fixed memory; it reads the copies of its first and second argument there."""
+    copies = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
+    forward = splats.means2d, splats.conics, splats.depths, splats.opacities
+    rows, whole = [torch.empty_like(tensor) for tensor in forward], [torch.empty_like(tensor) for tensor in copies]
+    kernel = projection_kernel(warp_scalar(splats.depths.dtype), options.antialiased)
+    parameters = options.width, options.height, options.near_plane, options.eps2d, options.alpha_threshold
+    gradients = *whole, *(None,) * (len(parameters) + 1), *rows, None
+    unread = (None,) * (len(rows) + 1)
+    arguments = *copies, *parameters, splats.extents, *unread
+    fixed = fixed_launch(kernel, len(splats.depths), *arguments, gradients=gradients, rows=rows, whole=whole)
+    device = splats.depths.device
+
+    def adjoint(
+        inputs: Sequence[Tensor], culling: Tensor, upstream: Sequence[Tensor | None], results: Sequence[Tensor | None]
+    ) -> None:
+        fixed.launch(upstream[:-1], results, warp_stream(device))
+
+    return adjoint
 
 
 @dataclass
-class _SizeGraphs:
-    """The graphs of calls of one size.
+class _CallGraphs:
+    """The graphs of calls of one kind.
 
     Attributes:
+        differentiable: whether the calls need adjoints.
         launched: calls that were launched.
         captured: graphs that were captured since the memory last grew.
         intersections: the least number that the next graph allocates memory for.
         idle: graphs that no call holds.
     """
 
+    differentiable: bool = False
     launched: int = 0
     captured: int = 0
     intersections: int = 0
@@ -158,8 +265,9 @@ class _SizeGraphs:
 
     def take(self, capture: Callable[[int], _RenderGraph]) -> _RenderGraph | None:
         """Return a graph that is the caller's until it is idle again; None for a call that is to be launched."""
-        with suppress(IndexError):
-            return self.idle.pop()
+        if self.idle:
+            with suppress(IndexError):
+                return self.idle.pop()
         self.launched += 1
         if self.launched <= WARMUP_CALLS or self.captured >= MAX_GRAPHS:
             return None
@@ -170,6 +278,25 @@ class _SizeGraphs:
             LOG.debug("a render could not be captured and is launched", exc_info=True)
             self.captured = MAX_GRAPHS
             return None
+
+    def replay(
+        self, tensors: Sequence[Tensor], options: RenderOptions, outputs: Sequence[Tensor] = ()
+    ) -> GraphRender | None:
+        """Render by a CUDA graph, or return None if the call is to be launched instead.
+
+        Args:
+            tensors: the seven tensors of a call, or Splats.
+            options: of the image.
+            outputs: for Splats (extents,), to be written to.
+        """
+
+        def capture(intersections: int) -> _RenderGraph:
+            with torch.inference_mode(False), torch.no_grad():
+                return _RenderGraph(tensors, options, intersections, self.differentiable)
+
+        with torch.no_grad():
+            graph = self.take(capture)
+            return None if graph is None else GraphRender(self, graph, graph.replay(tensors, outputs))
 
     def grow(self, intersections: int) -> None:
         """Let new graphs be captured, because one had too little memory for this many intersections."""
@@ -185,12 +312,17 @@ class _Lease:
     def adjoint(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
         return self._graph.adjoint(by_image, by_transmittance)
 
+    def projection_adjoint(self, *arguments: Any) -> None:
+        adjoint = self._graph.projection_adjoint
+        assert adjoint is not None, "the graph begins with 2D Gaussians"
+        adjoint(*arguments)
+
     def __del__(self) -> None:
         self._idle.append(self._graph)
 
 
 _lock = threading.Lock()
-_graphs: OrderedDict[tuple, _SizeGraphs] = OrderedDict()
+_graphs: OrderedDict[_Signature, _CallGraphs] = OrderedDict()
 
 
 def clear_graphs() -> None:
@@ -201,10 +333,10 @@ def clear_graphs() -> None:
 atexit.register(clear_graphs)  # Graphs must be freed before CUDA is.
 
 
-def _graphs_of(key: tuple) -> _SizeGraphs:
+def _graphs_of(signature: _Signature) -> _CallGraphs:
     with _lock:
-        graphs = _graphs.setdefault(key, _SizeGraphs())
-        _graphs.move_to_end(key)
+        graphs = _graphs.setdefault(signature, _CallGraphs(signature.differentiable))
+        _graphs.move_to_end(signature)
         while len(_graphs) > MAX_SIZES:
             _graphs.popitem(last=False)
     return graphs

@@ -1,5 +1,6 @@
 """Stage one of a render: 3D Gaussians to 2D Gaussians."""
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -7,6 +8,8 @@ from torch import Tensor
 
 from ..kernels.project import projection_kernel
 from .gradients import kernel_layout, zero_gradients
+from .render_options import RenderOptions
+from .torch_contract import direct_apply, keeps_graph, once_differentiable
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import single_range
 
@@ -74,6 +77,37 @@ def project(
     return ProjectedGaussians(*launch_projection(kernel, inputs, parameters, outputs))
 
 
+def project_to_camera(
+    means: Tensor,
+    log_scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
+    options: RenderOptions,
+) -> ProjectedGaussians:
+    """Project Gaussians, whose means, log_scales and quaternions are contiguous, to one camera; see project()."""
+    return project(
+        means,
+        log_scales,
+        quaternions,
+        opacities.contiguous(),
+        world_to_camera.contiguous(),
+        intrinsics.contiguous(),
+        width=options.width,
+        height=options.height,
+        near_plane=options.near_plane,
+        eps2d=options.eps2d,
+        alpha_threshold=options.alpha_threshold,
+        antialiased=options.antialiased,
+    )
+
+
+ProjectionAdjoint = Callable[[Sequence[Tensor], Tensor, Sequence[Tensor | None], Sequence[Tensor | None]], None]
+"""Takes inputs, the last output, the gradients by all outputs (None for 0) and those by the inputs (None if they are
+not needed), to which it adds."""
+
+
 def launch_projection(
     kernel: Any, inputs: tuple[Tensor, ...], parameters: tuple, outputs: tuple[Tensor, ...]
 ) -> tuple[Tensor, ...]:
@@ -87,32 +121,49 @@ def launch_projection(
         parameters: that are not tensors.
         outputs: with a row for each Gaussian. The last one is 0 if a Gaussian is culled, and not differentiable.
     """
+    count = inputs[0].shape[0]
+    launch(kernel, count, *inputs, *parameters, None, *outputs)
+
+    def adjoint(
+        inputs: Sequence[Tensor], culling: Tensor, upstream: Sequence[Tensor | None], results: Sequence[Tensor | None]
+    ) -> None:
+        gradients = *results, *(None,) * (len(parameters) + 1), *upstream
+        # All Gaussians add to the camera's gradients: on the CPU one thread must.
+        ranges = None if all(result is None for result in results[4:]) else single_range(count)
+        unread = (None,) * len(upstream)
+        launch(kernel, count, *inputs, *parameters, culling, *unread, gradients=gradients, ranges=ranges)
+
+    return with_projection_gradient(inputs, outputs, adjoint)
+
+
+def with_projection_gradient(
+    inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], adjoint: ProjectionAdjoint
+) -> tuple[Tensor, ...]:
+    """Return a projection's outputs as differentiable functions of its inputs, if any input needs a gradient."""
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
-        return _Projection.apply(kernel, parameters, outputs, *inputs)
-    launch(kernel, inputs[0].shape[0], *inputs, *parameters, None, *outputs)
+        return _apply_projection(adjoint, outputs, *inputs)
     return outputs
 
 
 class _Projection(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, kernel, parameters, outputs, *inputs: Tensor):
-        launch(kernel, inputs[0].shape[0], *inputs, *parameters, None, *outputs)
-        ctx.kernel, ctx.parameters = kernel, parameters
-        ctx.leaves = [tensor.is_leaf for tensor in inputs]
+    def forward(ctx, adjoint: ProjectionAdjoint, outputs: tuple[Tensor, ...], *inputs: Tensor):
+        ctx.adjoint, ctx.leaves = adjoint, [tensor.is_leaf for tensor in inputs]
         ctx.save_for_backward(*inputs, outputs[-1])
         ctx.mark_non_differentiable(outputs[-1])
         ctx.set_materialize_grads(False)
         return tuple(outputs)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, *upstream):
         *inputs, culling = ctx.saved_tensors
-        needed, parameters, count = ctx.needs_input_grad[3:], ctx.parameters, inputs[0].shape[0]
-        results = zero_gradients(inputs, needed, ctx.leaves)
-        gradients = *results, *(None,) * (len(parameters) + 1), *map(kernel_layout, upstream)
-        # All Gaussians add to the camera's gradients: on the CPU one thread must.
-        ranges = single_range(count) if any(needed[4:]) else None
-        unread = (None,) * len(upstream)
-        launch(ctx.kernel, count, *inputs, *parameters, culling, *unread, gradients=gradients, ranges=ranges)
-        return None, None, None, *results
+        adjoint = ctx.adjoint
+        if not keeps_graph():
+            ctx.adjoint = None
+        results = zero_gradients(inputs, ctx.needs_input_grad[2:], ctx.leaves)
+        adjoint(inputs, culling, [kernel_layout(gradient) for gradient in upstream], results)
+        return None, None, *results
+
+
+_apply_projection = direct_apply(_Projection)

@@ -1,6 +1,6 @@
 """Differentiable rasterization of 3D Gaussians: project, order, list by tile, blend."""
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -9,13 +9,12 @@ from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .blending import blend, with_gradient
-from .checks import check_opacities, check_tensors, integer
-from .cuda_graphs import is_capturing
-from .graph_cache import ImageSize, render_from_graph
+from .checks import check_opacities, check_tensors
+from .graph_cache import FEATURES, GraphRender, add_graphs, find_graphs
 from .memory import oom_context
-from .projection import ProjectedGaussians, project
+from .projection import ProjectedGaussians, project_to_camera, with_projection_gradient
+from .render_options import RenderOptions
 from .tile_lists import (
-    MAX_INTERSECTIONS,
     PackedSplats,
     Splats,
     TileLists,
@@ -24,8 +23,6 @@ from .tile_lists import (
     pack_splats,
 )
 from .torch_contract import torch_operation
-
-MAX_SIDE = 1 << 20  # Of an image, in pixels.
 
 
 @dataclass(frozen=True)
@@ -135,6 +132,36 @@ def rasterize(
         RuntimeError: while a CUDA graph is captured without max_intersections.
         OutOfMemory: (a SehdrError) with the sizes, if memory does not suffice.
     """
+    options = RenderOptions(
+        width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
+    )
+    tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
+    graphs = find_graphs(tensors, options) if background is None else None
+    if graphs is None:
+        _check_arguments(*tensors, background)
+        options = options.checked(means.device)
+    with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
+        if world_to_camera.ndim == 2:
+            view = _project(tensors, options, graphs or add_graphs(tensors, options))
+            rendering = _render(view, view.projected.means2d, features, options)
+        else:
+            rendering = _render_cameras(tensors, options)
+        if background is None:
+            return rendering
+        behind = background[:, None, None] if background.ndim == 2 else background
+        return replace(rendering, image=rendering.image + rendering.transmittance[..., None] * behind)
+
+
+def _check_arguments(
+    means: Any,
+    log_scales: Any,
+    quaternions: Any,
+    opacities: Any,
+    features: Any,
+    world_to_camera: Any,
+    intrinsics: Any,
+    background: Any,
+) -> None:
     cameras: tuple[str, ...] = ("B",) if isinstance(world_to_camera, Tensor) and world_to_camera.ndim == 3 else ()
     opacity_axes, feature_axes = (
         cameras if isinstance(tensor, Tensor) and tensor.ndim == ndim else ()
@@ -159,132 +186,105 @@ def rasterize(
     if cameras and not len(world_to_camera):
         raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
     check_opacities(opacities)
-    options = RenderOptions(
-        width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
-    ).checked(means.device)
-
-    with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
-        gaussians = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
-        if not cameras:
-            projected = project_to_camera(*gaussians, opacities, world_to_camera, intrinsics, options)
-            rendering = render_projected(projected, features, options)
-        else:
-            each = zip(
-                opacities if opacity_axes else [opacities] * len(world_to_camera),
-                world_to_camera,
-                intrinsics,
-                strict=True,
-            )
-            views = [project_to_camera(*gaussians, *camera, options) for camera in each]
-            # One tensor that every image is rendered from, so that its gradient holds every camera's.
-            means2d = torch.stack([view.means2d for view in views])
-            renderings = [
-                render_projected(view._replace(means2d=own), own_features, options)
-                for view, own, own_features in zip(
-                    views, means2d, features if feature_axes else [features] * len(views), strict=True
-                )
-            ]
-            rendering = join_renderings(means2d, renderings)
-        if background is None:
-            return rendering
-        behind = background[:, None, None] if background.ndim == 2 else background
-        return replace(rendering, image=rendering.image + rendering.transmittance[..., None] * behind)
 
 
-class RenderOptions(NamedTuple):
-    """The arguments of rasterize() that are not tensors."""
+class _View(NamedTuple):
+    """Gaussians projected to a camera, and their render if a CUDA graph made it."""
 
-    width: int
-    height: int
-    near_plane: float = NEAR_PLANE
-    eps2d: float = EPS2D
-    alpha_threshold: float = ALPHA_THRESHOLD
-    antialiased: bool = False
-    depth: bool = False
-    max_intersections: int | None = None
-    deterministic: bool = False
-
-    def checked(self, device: torch.device) -> "RenderOptions":
-        """Return the options with sizes as plain integers; raise TypeError or ValueError for values out of range."""
-        limit = self.max_intersections
-        if limit is not None:
-            limit = integer("max_intersections", limit, 1, MAX_INTERSECTIONS)
-        elif is_capturing(device):
-            raise RuntimeError(
-                "rasterize() waits for the GPU to learn how much memory it needs, which a CUDA graph cannot; "
-                "give max_intersections"
-            )
-        if not 0.0 < self.near_plane < math.inf:
-            raise ValueError(f"near_plane {self.near_plane} is not a positive number")
-        if not 0.0 <= self.eps2d < math.inf:
-            raise ValueError(f"eps2d {self.eps2d} is not a number from 0")
-        if not 0.0 < self.alpha_threshold < 1.0:
-            raise ValueError(f"alpha_threshold {self.alpha_threshold} is not between 0 and 1")
-        width = integer("width", self.width, 1, MAX_SIDE)
-        height = integer("height", self.height, 1, MAX_SIDE)
-        if width is self.width and height is self.height and limit is self.max_intersections:
-            return self
-        return self._replace(width=width, height=height, max_intersections=limit)
+    projected: ProjectedGaussians
+    graph_render: GraphRender | None
 
 
-def project_to_camera(
-    means: Tensor,
-    log_scales: Tensor,
-    quaternions: Tensor,
-    opacities: Tensor,
-    world_to_camera: Tensor,
-    intrinsics: Tensor,
-    options: RenderOptions,
-) -> ProjectedGaussians:
-    """Project Gaussians, whose means, log_scales and quaternions are contiguous, to one camera; see project()."""
-    return project(
-        means,
-        log_scales,
-        quaternions,
-        opacities.contiguous(),
-        world_to_camera.contiguous(),
-        intrinsics.contiguous(),
-        width=options.width,
-        height=options.height,
-        near_plane=options.near_plane,
-        eps2d=options.eps2d,
-        alpha_threshold=options.alpha_threshold,
-        antialiased=options.antialiased,
+def _project(tensors: Sequence[Tensor], options: RenderOptions, graphs: Any) -> _View:
+    """Project to one camera. On a GPU, calls that repeat are replayed as CUDA graphs (graph_cache.py).
+
+    graphs: of calls like this one; None if it is to be launched.
+    """
+    means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
+    gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
+    graph_render = None if graphs is None else graphs.replay(tensors, options)
+    if graph_render is not None and graph_render.projected is not None:
+        outputs = with_projection_gradient(gaussians, graph_render.projected, graph_render.projection_adjoint)
+        if graph_render.fits():
+            return _View(ProjectedGaussians(*outputs), graph_render)
+    means, log_scales, quaternions, *rest = (tensor.contiguous() for tensor in gaussians)
+    return _View(project_to_camera(means, log_scales, quaternions, *rest, options), None)
+
+
+def _render(view: _View, means2d: Tensor, features: Tensor, options: RenderOptions) -> Rendering:
+    """Render a view with features [N, C], as a function of means2d [N, 2]."""
+    projected, graph_render = view
+    if graph_render is None:
+        return render_projected(projected._replace(means2d=means2d), features, options, replays=False)
+    if options.depth:
+        features = torch.cat([features, projected.depths[:, None]], 1)
+    image, transmittance = with_gradient(means2d, projected.conics, projected.opacities, features, graph_render.result)
+    count = graph_render.intersections
+    return _rendering(image, transmittance, projected._replace(means2d=means2d), count, None, None, options)
+
+
+def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
+    """Render to several cameras; opacities and features may have an axis of cameras too."""
+    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
+    count = len(world_to_camera)
+    each = zip(
+        opacities if opacities.ndim == 2 else [opacities] * count,
+        features if features.ndim == 3 else [features] * count,
+        world_to_camera,
+        intrinsics,
+        strict=True,
     )
+    calls = [(means, log_scales, quaternions, *own) for own in each]
+    views = [_project(call, options, add_graphs(call, options)) for call in calls]
+    # One tensor that every image is rendered from, so that its gradient holds every camera's.
+    means2d = torch.stack([view.projected.means2d for view in views])
+    renderings = [
+        _render(view, own, call[FEATURES], options) for view, own, call in zip(views, means2d, calls, strict=True)
+    ]
+    return join_renderings(means2d, renderings)
 
 
-def render_projected(projected: ProjectedGaussians, features: Tensor, options: RenderOptions) -> Rendering:
+def render_projected(
+    projected: ProjectedGaussians, features: Tensor, options: RenderOptions, *, replays: bool = True
+) -> Rendering:
     """Render 2D Gaussians of one camera with features [N, C].
 
-    On a GPU, calls that repeat are replayed as CUDA graphs (graph_cache.py), unless max_intersections or deterministic
-    is given. Sets the extents of Gaussians whose features are not finite to 0, in place.
+    Sets the extents of Gaussians whose features are not finite to 0, in place. replays: on a GPU, replay calls that
+    repeat as CUDA graphs.
     """
     means2d, conics, depths, opacities, extents = projected
     if options.depth:
         features = torch.cat([features, depths[:, None]], 1)
     features = features.contiguous()
     # In place on memory that the projection's graph has saved: as data, so that it is no change of a saved tensor.
-    splats = Splats(means2d, conics, opacities, features.detach(), depths, extents.data)
-    repeated = None
-    if options.max_intersections is None and not options.deterministic:
-        differentiable = torch.is_grad_enabled() and (
-            features.requires_grad or means2d.requires_grad or conics.requires_grad or opacities.requires_grad
-        )
-        size = ImageSize(options.width, options.height, options.alpha_threshold)
-        repeated = render_from_graph(splats, size, differentiable)
-    if repeated is not None:
-        image, transmittance = with_gradient(means2d, conics, opacities, features, repeated.result)
-        count, overflow, needed = repeated.intersections, None, None
-    else:
-        lists, packed = list_splats(splats, options)
-        image, transmittance = blend(
-            means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic
-        )
-        count, overflow = lists.intersection_count, lists.overflow
-        needed = None if options.max_intersections is None else lists.total
-    blended_depth = image[..., -1] if options.depth else None
-    image = image[..., :-1] if options.depth else image
-    return Rendering(image, transmittance, means2d, depths, extents, count, overflow, needed, blended_depth)
+    splats = Splats(means2d, conics, opacities, features, depths, extents.data)
+    graphs = add_graphs(splats, options) if replays else None
+    graph_render = None if graphs is None else graphs.replay(splats, options, (splats.extents,))
+    if graph_render is not None and graph_render.fits():
+        image, transmittance = with_gradient(means2d, conics, opacities, features, graph_render.result)
+        return _rendering(image, transmittance, projected, graph_render.intersections, None, None, options)
+    lists, packed = list_splats(splats._replace(features=features.detach()), options)
+    image, transmittance = blend(
+        means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic
+    )
+    needed = None if options.max_intersections is None else lists.total
+    return _rendering(image, transmittance, projected, lists.intersection_count, lists.overflow, needed, options)
+
+
+def _rendering(
+    image: Tensor,
+    transmittance: Tensor,
+    projected: ProjectedGaussians,
+    count: int,
+    overflow: Tensor | None,
+    needed: Tensor | None,
+    options: RenderOptions,
+) -> Rendering:
+    depth = None
+    if options.depth:
+        image, depth = image[..., :-1], image[..., -1]
+    means2d, _, depths, _, extents = projected
+    return Rendering(image, transmittance, means2d, depths, extents, count, overflow, needed, depth)
 
 
 def list_splats(splats: Splats, options: RenderOptions, *, blocks: bool = False) -> tuple[TileLists, PackedSplats]:

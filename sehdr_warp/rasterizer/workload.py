@@ -9,7 +9,9 @@ from torch import Tensor
 from ..kernels.blend_cuda import BLOCKS_PER_TILE
 from ..kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
 from .blending import blend_blocks, pad_features
-from .rasterization import RenderOptions, list_splats, project_to_camera
+from .projection import project_to_camera
+from .rasterization import list_splats
+from .render_options import RenderOptions
 from .tile_lists import Splats
 
 

@@ -129,7 +129,7 @@ def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
 
 
 def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
-    kind, made = graph_cache._SizeGraphs(), iter("abcdefgh")
+    kind, made = graph_cache._CallGraphs(), iter("abcdefgh")
     assert [kind.take(lambda pairs: next(made)) for _ in range(graph_cache.WARMUP_CALLS)] == [
         None
     ] * graph_cache.WARMUP_CALLS
@@ -145,7 +145,7 @@ def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
 
 
 def test_what_cannot_be_recorded_is_launched():
-    kind, asked = graph_cache._SizeGraphs(), []
+    kind, asked = graph_cache._CallGraphs(), []
 
     def record(pairs):
         asked.append(pairs)

@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ...rasterizer.projection import ProjectedGaussians
-from ...rasterizer.rasterization import RenderOptions, project_to_camera
+from ...rasterizer.projection import ProjectedGaussians, project_to_camera
+from ...rasterizer.render_options import RenderOptions
 
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS = "pinhole", "ortho", "fisheye"

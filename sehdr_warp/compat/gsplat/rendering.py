@@ -11,7 +11,8 @@ from ...rasterizer.blending import blend
 from ...rasterizer.checks import integer
 from ...rasterizer.memory import oom_context
 from ...rasterizer.projection import ProjectedGaussians
-from ...rasterizer.rasterization import MAX_SIDE, RenderOptions, list_splats, render_projected
+from ...rasterizer.rasterization import list_splats, render_projected
+from ...rasterizer.render_options import MAX_SIDE, RenderOptions
 from ...rasterizer.tile_lists import Splats
 from ...rasterizer.torch_contract import torch_operation
 from .inputs import UNSUPPORTED, Inputs, check_supported

@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from . import threads
-from .packing import PackedLaunch
+from .packing import FixedLaunch, PackedLaunch
 
 _SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 _streams: dict[tuple[int, int], wp.Stream] = {}
@@ -54,18 +54,47 @@ def launch(
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
     has_first = takes_range_start(kernel)
-    device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
-    values = list(arguments)
-    if gradients is not None:
-        values += [None, *gradients] if has_first else gradients
-    adjoint = gradients is not None
-    if has_first:
-        values = [0, *values]
-    packed = _packed_launch(kernel, device, block_dim, adjoint, dim, values)
+    device, values = _packed_values(has_first, arguments, gradients)
+    packed = _packed_launch(kernel, device, block_dim, gradients is not None, dim, values)
     if has_first and device.type == "cpu" and isinstance(dim, int):
         packed.launch_ranges(threads.even_ranges(dim, min_range) if ranges is None else ranges, values)
     else:
         packed.launch(dim, values, warp_stream(device))
+
+
+def _packed_values(
+    has_first: bool, arguments: Sequence[Any], gradients: Sequence[Tensor | None] | None
+) -> tuple[torch.device, list]:
+    device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
+    values = [0, *arguments] if has_first else list(arguments)
+    if gradients is not None:
+        values += [None, *gradients] if has_first else gradients
+    return device, values
+
+
+def fixed_launch(
+    kernel: Any,
+    dim: int,
+    *arguments: Any,
+    gradients: Sequence[Tensor | None] | None = None,
+    rows: Sequence[Tensor] = (),
+    whole: Sequence[Tensor],
+    block_dim: int | None = None,
+) -> FixedLaunch:
+    """Return launch()'s launch as an object, for tensors that stay where they are but for some.
+
+    Args:
+        kernel: as launch() takes it, as are dim, arguments, gradients and block_dim.
+        dim: number of threads.
+        *arguments: the kernel's arguments.
+        gradients: for the adjoint.
+        rows: tensors among arguments and gradients whose addresses and distances of rows each launch gives.
+        whole: contiguous ones whose addresses each launch gives.
+        block_dim: threads per block.
+    """
+    device, values = _packed_values(takes_range_start(kernel), arguments, gradients)
+    packed = PackedLaunch(kernel, device, block_dim, gradients is not None, dim, values)
+    return FixedLaunch(packed, dim, values, rows, whole)
 
 
 @cache

@@ -1,0 +1,49 @@
+"""The options of a rendered image, and their ranges."""
+
+import math
+from typing import NamedTuple
+
+import torch
+
+from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
+from .checks import integer
+from .cuda_graphs import is_capturing
+from .tile_lists import MAX_INTERSECTIONS
+
+MAX_SIDE = 1 << 20  # Of an image, in pixels.
+
+
+class RenderOptions(NamedTuple):
+    """The arguments of rasterize() that are not tensors."""
+
+    width: int
+    height: int
+    near_plane: float = NEAR_PLANE
+    eps2d: float = EPS2D
+    alpha_threshold: float = ALPHA_THRESHOLD
+    antialiased: bool = False
+    depth: bool = False
+    max_intersections: int | None = None
+    deterministic: bool = False
+
+    def checked(self, device: torch.device) -> "RenderOptions":
+        """Return the options with sizes as plain integers; raise TypeError or ValueError for values out of range."""
+        limit = self.max_intersections
+        if limit is not None:
+            limit = integer("max_intersections", limit, 1, MAX_INTERSECTIONS)
+        elif is_capturing(device):
+            raise RuntimeError(
+                "rasterize() waits for the GPU to learn how much memory it needs, which a CUDA graph cannot; "
+                "give max_intersections"
+            )
+        if not 0.0 < self.near_plane < math.inf:
+            raise ValueError(f"near_plane {self.near_plane} is not a positive number")
+        if not 0.0 <= self.eps2d < math.inf:
+            raise ValueError(f"eps2d {self.eps2d} is not a number from 0")
+        if not 0.0 < self.alpha_threshold < 1.0:
+            raise ValueError(f"alpha_threshold {self.alpha_threshold} is not between 0 and 1")
+        width = integer("width", self.width, 1, MAX_SIDE)
+        height = integer("height", self.height, 1, MAX_SIDE)
+        if width is self.width and height is self.height and limit is self.max_intersections:
+            return self
+        return self._replace(width=width, height=height, max_intersections=limit)
