@@ -11,6 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+DEVICES = "cpu", "cuda"
+SINGULAR = 1e-9
+"""Least determinant of a camera's rotation, relative to the cube of its largest number."""
+
 
 def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
     """Raise TypeError for an argument that is not a tensor, and ValueError for a wrong shape, dtype or device.
@@ -38,11 +42,15 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
             known = ", ".join(f"{n} = {sizes[n]}" for n in shape if isinstance(n, str) and n in sizes)
             expected += f" with {known}" if known else ""
             raise ValueError(f"{name} has shape {list(value.shape)}, expected {expected}")
+        if value.layout != torch.strided:
+            raise ValueError(f"{name} is a tensor of layout {value.layout}, expected a dense one; use to_dense()")
         if value.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{name} is {value.dtype}, expected torch.float32 or torch.float64")
         if value.dtype != first.dtype or value.device != first.device:
             other = f"{first_name} is {first.dtype} on {first.device}"
             raise ValueError(f"{name} is {value.dtype} on {value.device}, but {other}")
+    if first.device.type not in DEVICES:
+        raise ValueError(f"{first_name} is on {first.device}, expected the CPU or a CUDA device")
 
 
 def _fit(arguments: Iterable[tuple[Any, tuple[int | str, ...]]]) -> bool:
@@ -54,7 +62,11 @@ def _fit(arguments: Iterable[tuple[Any, tuple[int | str, ...]]]) -> bool:
             return False
         if dtype is None:
             dtype, device = value.dtype, value.device
+            if device.type not in DEVICES:
+                return False
         elif value.dtype != dtype or value.device != device:
+            return False
+        if value.layout != torch.strided:
             return False
         actual = value.shape
         if len(actual) != len(shape):
@@ -82,3 +94,25 @@ def check_opacities(opacities: Tensor) -> None:
         low, high = (float(value) for value in opacities.detach().aminmax())
         if -math.inf < low < -1e-6 or math.inf > high > 1 + 1e-6:
             raise ValueError(f"opacities are from {low:g} to {high:g}, expected 0 to 1; give logits through a sigmoid")
+
+
+def check_cameras(world_to_camera: Tensor, intrinsics: Tensor) -> None:
+    """Raise ValueError for a camera on the CPU that is not finite, has a focal length below 0 or cannot be inverted."""
+    if world_to_camera.device.type != "cpu":
+        return
+    lenses, poses = intrinsics.detach().reshape(-1, 4).tolist(), world_to_camera.detach().reshape(-1, 16).tolist()
+    for fx, fy, cx, cy in lenses:
+        if not (0.0 < fx < math.inf and 0.0 < fy < math.inf and math.isfinite(cx + cy)):
+            raise ValueError(
+                f"intrinsics are fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, expected finite numbers and fx, fy above 0"
+            )
+    for pose in poses:
+        if not all(map(math.isfinite, pose)):
+            raise ValueError("world_to_camera has a number that is not finite, expected a rigid transformation")
+        a, b, c, _, d, e, f, _, g, h, i, *_ = pose
+        determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        if abs(determinant) <= SINGULAR * max(map(abs, (a, b, c, d, e, f, g, h, i))) ** 3:
+            raise ValueError(
+                f"world_to_camera has a 3 x 3 part of determinant {determinant:g}, expected a rotation; "
+                "is it the matrix from world to camera?"
+            )

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .blending import blend, with_gradient
-from .checks import check_opacities, check_tensors
+from .checks import check_cameras, check_opacities, check_tensors
 from .graph_cache import FEATURES, GraphRender, add_graphs, find_graphs
 from .memory import oom_context
 from .projection import ProjectedGaussians, project_to_camera, with_projection_gradient
@@ -98,7 +98,7 @@ def rasterize(
     of threads.
 
     A Gaussian with a parameter or feature that is not finite is culled: it contributes nothing, and its gradients are
-    0. A camera that is not finite culls all.
+    0. On a GPU a camera that is not finite culls all; on the CPU it is refused.
 
     B cameras in one call: world_to_camera [B, 4, 4], intrinsics [B, 4]; features may then be [B, N, C] and opacities
     [B, N].
@@ -127,7 +127,8 @@ def rasterize(
 
     Raises:
         TypeError: if an argument is not a tensor or not an integer.
-        ValueError: if a shape, dtype, device or option does not fit, and on the CPU for opacities outside of [0, 1].
+        ValueError: if a shape, dtype, device or option does not fit; on the CPU also for opacities outside of [0, 1]
+            and for a camera that is not finite, cannot be inverted or has a focal length that is not positive.
         NotImplementedError: within torch.func and for forward-mode differentiation.
         RuntimeError: while a CUDA graph is captured without max_intersections.
         OutOfMemory: (a SehdrError) with the sizes, if memory does not suffice.
@@ -186,6 +187,7 @@ def _check_arguments(
     if cameras and not len(world_to_camera):
         raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
     check_opacities(opacities)
+    check_cameras(world_to_camera, intrinsics)
 
 
 class _View(NamedTuple):

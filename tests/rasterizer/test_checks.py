@@ -8,6 +8,8 @@ from sehdr_warp.rasterizer import rasterize, spherical_harmonics, ssim
 
 from .scenes import random_scene
 
+NAN = float("nan")
+
 
 def arguments(**changes):
     names = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
@@ -28,6 +30,34 @@ def arguments(**changes):
         ("features", lambda t: t.to("meta"), ValueError, "features is torch.float64 on meta, but means is .* on cpu"),
         ("means", lambda t: t.half(), ValueError, "means is torch.float16, expected torch.float32 or torch.float64"),
         ("intrinsics", lambda t: [1.0] * 4, TypeError, r"intrinsics is a builtins.list, expected a torch tensor \[4\]"),
+        (
+            "intrinsics",
+            lambda t: t * 0,
+            ValueError,
+            "intrinsics are fx 0, fy 0, .* fx, fy above 0",
+        ),
+        ("intrinsics", lambda t: -t, ValueError, "intrinsics are fx -.*expected finite numbers"),
+        ("intrinsics", lambda t: t * NAN, ValueError, "intrinsics are fx nan, .*expected finite numbers"),
+        ("world_to_camera", lambda t: t * NAN, ValueError, "world_to_camera has a number that is not finite"),
+        (
+            "world_to_camera",
+            lambda t: t * 0,
+            ValueError,
+            "world_to_camera has .* determinant 0, expected",
+        ),
+        (
+            "world_to_camera",
+            lambda t: torch.ones_like(t),
+            ValueError,
+            "world_to_camera has .* determinant 0, expected",
+        ),
+        (
+            "means",
+            lambda t: t.detach().to_sparse(),
+            ValueError,
+            "means is .* layout torch.sparse_coo, expected",
+        ),
+        ("width", lambda _: 1 << 21, ValueError, "width 2097152 is not in 1..1048576"),
         ("width", lambda _: 70.0, TypeError, "width is 70.0, expected a whole number"),
         ("height", lambda _: 0, ValueError, "height 0 is not in 1.."),
         ("max_intersections", lambda _: 2**31, ValueError, "max_intersections 2147483648 is not in 1.."),
@@ -41,6 +71,12 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
     with pytest.raises(kind, match=message) as caught:
         rasterize(**arguments(**{name: change}))
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_device_without_kernels_is_named():
+    given = {name: t.to("meta") if isinstance(t, torch.Tensor) else t for name, t in arguments().items()}
+    with pytest.raises(ValueError, match="means is on meta, expected the CPU or a CUDA device"):
+        rasterize(**given)
 
 
 def test_whole_numbers_of_numpy_are_sizes():

@@ -33,7 +33,7 @@ class PackedLaunch:
         self, kernel: Any, device: torch.device, block_dim: int | None, adjoint: bool, dim: Any, values: list
     ) -> None:
         """Compile or load the kernel. dim and values are of the first launch."""
-        self.arguments = kernel.adj.args
+        self.kernel, self.arguments = kernel.key, kernel.adj.args
         self.kinds = [argument.type for argument in self.arguments] * (1 + adjoint)
         self.packed: list[Any] = [...] * len(self.kinds)  # The last launch's values, and of tensors the layouts.
         count = len(self.arguments)
@@ -103,7 +103,7 @@ class PackedLaunch:
                     or strides != last.strides
                     or dtype != last.dtype
                 ):
-                    write_layout(array, value, self.kinds[index])
+                    write_layout(array, value, self.kinds[index], self._label(index))
                     packed[index] = _Layout(shape, strides, dtype)
                 array.data = value.data_ptr()
             elif value is not packed[index] and (value is None or value != packed[index]):
@@ -112,6 +112,12 @@ class PackedLaunch:
                 elif hasattr(arrays[index], "data"):
                     arrays[index].data = 0
                 packed[index] = value
+
+    def _label(self, index: int) -> str:
+        """Return a parameter's name as error messages give it."""
+        part, place = divmod(index, len(self.arguments))
+        name = f"{self.kernel}(): {self.arguments[place].label}"
+        return f"the gradient of {name}" if part else name
 
     def _set(self, index: int, value: Any) -> None:
         self.command.set_param_at_index(index, value)
@@ -163,8 +169,11 @@ class FixedLaunch:
             self._packed.run(stream)
 
 
-def write_layout(array: Any, tensor: Tensor, kind: wp.array) -> None:
-    """Write a tensor's shape and strides into an array's descriptor; raise TypeError if the kernel takes others."""
+def write_layout(array: Any, tensor: Tensor, kind: wp.array, label: str = "the kernel") -> None:
+    """Write a tensor's shape and strides into an array's descriptor; raise TypeError if the kernel takes others.
+
+    label: what the message calls the array.
+    """
     inner, scalar = getattr(kind.dtype, "_shape_", ()), getattr(kind.dtype, "_wp_scalar_type_", kind.dtype)
     size, outer = tensor.element_size(), tensor.ndim - len(inner)
     shape, steps = list(tensor.shape), [size * stride for stride in tensor.stride()]
@@ -178,11 +187,13 @@ def write_layout(array: Any, tensor: Tensor, kind: wp.array) -> None:
     alike = dtype == expected or (integers and dtype.itemsize == expected.itemsize)
     if not alike or tuple(shape[outer:]) != tuple(inner) or steps[outer:] != whole or surplus < -1:
         actual = f"{dtype} of shape {shape} and strides {list(tensor.stride())}"
-        raise TypeError(f"the kernel takes {kind.ndim} dimensions of {kind.dtype.__name__}, got {actual}")
+        raise TypeError(f"{label} takes {kind.ndim} dimensions of {kind.dtype.__name__}, got {actual}")
     shape, steps = shape[:outer], steps[:outer]
     if surplus > 0:
         if not tensor.is_contiguous():
-            raise TypeError(f"a tensor of shape {list(tensor.shape)} that is not contiguous cannot be passed flattened")
+            raise TypeError(
+                f"{label}: a tensor of shape {list(tensor.shape)} that is not contiguous cannot be flattened"
+            )
         shape, steps = [math.prod(shape[: surplus + 1]), *shape[surplus + 1 :]], steps[surplus:]
     elif surplus < 0:
         shape, steps = [1, *shape], [size * tensor.numel(), *steps]
