@@ -61,7 +61,7 @@ def find_graphs(tensors: Sequence[Any], options: RenderOptions) -> "_CallGraphs 
     tensors, options: as their user passed them. If calls like this one are known, they fit.
     """
     try:
-        if not _on_gpu(tensors[0]):
+        if not on_gpu(tensors[0]):
             return None
         signature = _signature(tensors, options)
         with _lock:
@@ -81,7 +81,7 @@ def add_graphs(tensors: Sequence[Tensor], options: RenderOptions) -> "_CallGraph
         options: of the image.
     """
     first, features = tensors[0], tensors.features if isinstance(tensors, Splats) else tensors[FEATURES]
-    if not _on_gpu(first) or first.dtype != torch.float32:
+    if not on_gpu(first) or first.dtype != torch.float32:
         return None
     if options.max_intersections is not None or options.deterministic:
         return None
@@ -92,7 +92,8 @@ def add_graphs(tensors: Sequence[Tensor], options: RenderOptions) -> "_CallGraph
     return _graphs_of(signature)
 
 
-def _on_gpu(tensor: Tensor) -> bool:
+def on_gpu(tensor: Tensor) -> bool:
+    """Return whether CUDA graphs can render it."""
     return tensor.is_cuda
 
 

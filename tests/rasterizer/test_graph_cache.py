@@ -4,15 +4,21 @@ import pytest
 import torch
 
 from sehdr_warp.rasterizer import graph_cache, rasterize, tile_lists
+from sehdr_warp.rasterizer.render_options import RenderOptions
 
+from .emulated_graphs import emulate
 from .scenes import random_like, random_scene, relative_error
 
-needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+DEVICE = "cuda:0" if torch.cuda.is_available() else "cpu"
 CALLS = graph_cache.WARMUP_CALLS + 3
 
 
 @pytest.fixture(autouse=True)
-def nothing_is_recorded():
+def nothing_is_recorded(monkeypatch):
+    graph_cache.clear_graphs()
+    if DEVICE == "cpu":
+        emulate(monkeypatch)
+    yield
     graph_cache.clear_graphs()
 
 
@@ -21,8 +27,8 @@ def launched(*arguments, **options):
     return rasterize(*arguments, max_intersections=100_000, **options)
 
 
-def scene_of(count=300, channels=3):
-    return random_scene(count=count, channels=channels).to(torch.float32, "cuda:0")
+def scene_of(count=80, channels=3):
+    return random_scene(count=count, channels=channels).to(torch.float32, DEVICE)
 
 
 def recordings():
@@ -46,13 +52,12 @@ def values_and_gradients(splat, scene, *, by_alpha=True, **options):
 
 def assert_alike(ours, truth):
     for mine, true in zip(ours, truth, strict=True):
-        assert relative_error(mine, true) < 1e-5
+        assert relative_error(mine, true) < 5e-5  # Without a GPU, two ways of blending.
 
 
-@needs_gpu
 @pytest.mark.parametrize("options", [{}, {"by_alpha": False}, {"depth": True, "antialiased": True}])
 def test_replays_follow_their_arguments_and_their_need_of_room(options):
-    for count, channels in ((300, 3), (150, 9), (300, 3)):
+    for count, channels in ((80, 3), (40, 9), (80, 3)):
         scene = scene_of(count, channels)
         for growth in (0.0, 0.4, 1.5):
             with torch.no_grad():
@@ -67,7 +72,6 @@ def test_replays_follow_their_arguments_and_their_need_of_room(options):
     assert recordings()
 
 
-@needs_gpu
 def test_pictures_stay_and_backward_passes_come_in_any_order():
     scene = scene_of()
     shifts = [0.02 * call for call in range(CALLS + graph_cache.MAX_GRAPHS)]
@@ -87,7 +91,6 @@ def test_pictures_stay_and_backward_passes_come_in_any_order():
     assert_alike(images, truths)
 
 
-@needs_gpu
 @pytest.mark.parametrize("one_sort", [1 << 18, 0])
 def test_without_gradients_pictures_stay_too(one_sort, monkeypatch):
     monkeypatch.setattr(tile_lists, "ONE_SORT", one_sort)
@@ -101,7 +104,6 @@ def test_without_gradients_pictures_stay_too(one_sort, monkeypatch):
     assert_alike([image / k for k, image in enumerate(images, 1)], [truth] * 8)
 
 
-@needs_gpu
 def test_gradients_add_up_over_calls_and_cameras():
     scene = scene_of()
     cameras = torch.stack([scene.tensors[5]] * 2), torch.stack([scene.tensors[6]] * 2)
@@ -117,7 +119,6 @@ def test_gradients_add_up_over_calls_and_cameras():
     assert_alike(summed(rasterize), summed(launched))
 
 
-@needs_gpu
 def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
     scene = scene_of()
     for value in (1.0, float("nan")):
@@ -155,7 +156,24 @@ def test_what_cannot_be_recorded_is_launched():
 
 
 def test_only_the_latest_kinds_are_remembered():
-    kinds = [graph_cache._graphs_of((n,)) for n in range(graph_cache.MAX_SIZES)]
-    assert graph_cache._graphs_of((0,)) is kinds[0]
-    graph_cache._graphs_of((graph_cache.MAX_SIZES,))
-    assert graph_cache._graphs_of((0,)) is kinds[0] and graph_cache._graphs_of((1,)) is not kinds[1]
+    scene, kinds = scene_of(count=5), []
+    tensors = scene.tensors
+
+    def graphs(width):
+        return graph_cache.add_graphs(tensors, RenderOptions(width, 8))
+
+    assert graph_cache.find_graphs(tensors, RenderOptions(1, 8)) is None
+    kinds = [graphs(1 + n) for n in range(graph_cache.MAX_SIZES)]
+    assert graphs(1) is kinds[0] and graph_cache.find_graphs(tensors, RenderOptions(1, 8)) is kinds[0]
+    graphs(99)
+    assert graphs(1) is kinds[0] and graphs(2) is not kinds[1]
+
+
+def test_only_calls_whose_arguments_were_checked_are_known():
+    scene = scene_of(count=5)
+    for _ in range(CALLS):
+        rasterize(*scene.arguments)
+    for place, change in ((0, torch.Tensor.double), (4, lambda t: t[:-1]), (6, lambda t: t.tolist())):
+        wrong = [change(t) if k == place else t for k, t in enumerate(scene.arguments)]
+        with pytest.raises((ValueError, TypeError), match="means|features|intrinsics"):
+            rasterize(*wrong)
