@@ -39,8 +39,11 @@ def bench_kernels(sizes: Sequence[Size], channels: Sequence[int], device: torch.
         result["checks"] += _checks(scene, peer)
         rows = _rows(scene, peer, repetitions)
         result["rows"] += rows
-        ours = [row["median_ms"] for row in rows if row["implementation"] == OURS]
-        LOG.info("%s, %d channels: %.3f ms forward, %.3f ms with backward", size, count, *ours)
+        ours = [row for row in rows if row["implementation"] == OURS]
+        times = [row["median_ms"] for row in ours]
+        LOG.info("%s, %d channels: %.3f ms forward, %.3f ms with backward", size, count, *times)
+        for row in ours if device.type == "cuda" else ():
+            LOG.info("  %s: host %.3f ms, GPU %.3f ms", row["pass"], row["host_ms"], row["device_ms"])
     return result
 
 

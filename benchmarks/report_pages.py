@@ -91,6 +91,10 @@ def _kernel_tables(result: dict) -> Iterable[str]:
     for (passing,), rows in groups(result["rows"], "pass").items():
         yield f"## {passing.capitalize()}, median ms"
         yield _pivot(rows, places, "implementation", "median_ms", ".3f")
+        for key, what in (("host_ms", "of the host alone"), ("device_ms", "of the GPU's kernels alone")):
+            if all(key in row for row in rows):
+                yield f"### {passing.capitalize()}, ms {what}"
+                yield _pivot(rows, places, "implementation", key, ".3f")
     yield _checks_line(result)
 
 

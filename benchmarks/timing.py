@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch.profiler import ProfilerActivity, profile
@@ -42,23 +42,32 @@ def time_variants(
     """Time variants in turns; see summary().
 
     On a GPU an event stands before and after each run, with the device idle before, so that the host's time counts if
-    it is the limit.
+    it is the limit. A summary then has also `host_ms`, the median until a run returns to Python, and `device_ms`, the
+    time of its kernels without what passes between them.
     """
     samples: dict[str, list[float]] = {name: [] for name in variants}
+    returned: dict[str, list[float]] = {name: [] for name in variants}
     repetitions_left = dict.fromkeys(variants, repetitions)
     for name, variant in variants.items():
         for _ in range(8 if device.type == "cuda" else 2):
             variant.once()
         if device.type == "cpu":
-            affordable = int(budget / max(_milliseconds(variant, device) / 1e3, 1e-9))
+            affordable = int(budget / max(_milliseconds(variant, device).whole / 1e3, 1e-9))
             repetitions_left[name] = min(repetitions, max(LEAST_REPETITIONS, affordable))
     for turn in range(TURNS):
         for name, variant in variants.items():
             # The first run of a turn finds caches full of another variant's data, and is not timed.
             variant.once()
             for _ in range(repetitions_left[name] * (turn + 1) // TURNS - repetitions_left[name] * turn // TURNS):
-                samples[name].append(_milliseconds(variant, device))
-    return {name: summary(values) for name, values in samples.items()}
+                whole, host = _milliseconds(variant, device)
+                samples[name].append(whole)
+                returned[name].append(host)
+    summaries = {name: summary(values) for name, values in samples.items()}
+    if device.type == "cuda":
+        for name, variant in variants.items():
+            apart = {"host_ms": statistics.median(returned[name]), "device_ms": kernel_milliseconds(variant)}
+            summaries[name] |= apart
+    return summaries
 
 
 def summary(samples: list[float]) -> dict:
@@ -73,19 +82,39 @@ def summary(samples: list[float]) -> dict:
     }
 
 
-def _milliseconds(variant: Variant, device: torch.device) -> float:
+class Milliseconds(NamedTuple):
+    """Time of one run, and until it returned to Python."""
+
+    whole: float
+    host: float
+
+
+def _milliseconds(variant: Variant, device: torch.device) -> Milliseconds:
     variant.prepare()
     if device.type == "cpu":
         started = time.perf_counter()
         variant.run()
-        return (time.perf_counter() - started) * 1e3
+        whole = (time.perf_counter() - started) * 1e3
+        return Milliseconds(whole, whole)
     first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     wait(device)
     first.record(torch.cuda.current_stream(device))
+    started = time.perf_counter()
     variant.run()
+    host = (time.perf_counter() - started) * 1e3
     last.record(torch.cuda.current_stream(device))
     last.synchronize()
-    return first.elapsed_time(last)
+    return Milliseconds(first.elapsed_time(last), host)
+
+
+def kernel_milliseconds(variant: Variant, runs: int = 5) -> float:
+    """Return the time of a run's kernels and copies on the GPU, in the mean of some runs."""
+    torch.cuda.synchronize()
+    with silent_stderr(), profile(activities=[ProfilerActivity.CUDA]) as recorded:
+        for _ in range(runs):
+            variant.once()
+        torch.cuda.synchronize()
+    return sum(event.self_device_time_total for event in recorded.key_averages()) / runs / 1e3
 
 
 def wait(device: torch.device) -> None:

@@ -1,4 +1,4 @@
-"""CUDA graphs in their place on the CPU: what is captured is run again, so that tests without a GPU see the same logic."""
+"""CUDA graphs on the CPU: what is captured is run again, so that tests without a GPU see the same logic."""
 
 from collections.abc import Iterator
 from contextlib import nullcontext
