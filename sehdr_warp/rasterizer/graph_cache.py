@@ -115,7 +115,7 @@ class GraphRender:
         result: of the blend.
     """
 
-    def __init__(self, graphs: "_CallGraphs", graph: "_RenderGraph", result: tuple[Tensor, ...]) -> None:
+    def __init__(self, graphs: "_CallGraphs", graph: "_RenderGraph", result: Sequence[Tensor]) -> None:
         """Lease the graph."""
         self._graphs, self._graph = graphs, graph
         lease = _Lease(graphs.idle, graph)
@@ -200,7 +200,7 @@ class _RenderGraph:
 
         outputs: to write the latter to. By default they are new tensors.
         """
-        torch._foreach_copy_(self._inputs, tensors)  # pyright: ignore[reportPrivateImportUsage]
+        torch._foreach_copy_(self._inputs, tuple(tensors))  # pyright: ignore[reportPrivateImportUsage]
         self._counting.replay()
         self._counted.record(self._stream)
         self._blending.replay()

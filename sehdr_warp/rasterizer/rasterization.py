@@ -25,7 +25,7 @@ from .tile_lists import (
 from .torch_contract import torch_operation
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Rendering:
     """One rendered view of N Gaussians; for B cameras in one call, tensors begin with an axis of B unless noted.
 
@@ -53,6 +53,13 @@ class Rendering:
     overflow: Tensor | None = None
     needed_intersections: Tensor | None = None
     depth: Tensor | None = None
+
+    def __repr__(self) -> str:
+        """Return the sizes in one line."""
+        *cameras, height, width, channels = self.image.shape
+        views = "".join(f"{count} cameras, " for count in cameras)
+        parts = f"{width} x {height}, {channels} channels, {self.depths.shape[-1]:,} Gaussians, on {self.image.device}"
+        return f"Rendering({views}{parts})"
 
     @property
     def alpha(self) -> Tensor:
@@ -209,8 +216,8 @@ def _project(tensors: Sequence[Tensor], options: RenderOptions, graphs: Any) -> 
         outputs = with_projection_gradient(gaussians, graph_render.projected, graph_render.projection_adjoint)
         if graph_render.fits():
             return _View(ProjectedGaussians(*outputs), graph_render)
-    means, log_scales, quaternions, *rest = (tensor.contiguous() for tensor in gaussians)
-    return _View(project_to_camera(means, log_scales, quaternions, *rest, options), None)
+    dense = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
+    return _View(project_to_camera(*dense, opacities, world_to_camera, intrinsics, options), None)
 
 
 def _render(view: _View, means2d: Tensor, features: Tensor, options: RenderOptions) -> Rendering:

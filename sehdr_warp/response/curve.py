@@ -2,8 +2,9 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar, TypeAlias, overload
 
 import numpy as np
 import torch
@@ -16,6 +17,8 @@ HALF_CODE = 0.5 / 255
 # white, enough for a gradient.
 EXTENSION_SLOPE = 0.05
 START_FLOOR = 1e-6
+Numbers: TypeAlias = np.ndarray | float | Sequence[Any]
+"""What is turned into an array."""
 
 
 class Response(ABC):
@@ -61,15 +64,15 @@ class Response(ABC):
         """Return the exposure for values within [black, peak), without autograd."""
 
     @abstractmethod
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON that Response.from_dict turns back into the same curve."""
 
     @classmethod
     @abstractmethod
-    def _from_dict(cls, values: dict) -> "Response": ...
+    def _from_dict(cls, values: dict[str, Any]) -> "Response": ...
 
     @staticmethod
-    def from_dict(values: dict) -> "Response":
+    def from_dict(values: dict[str, Any]) -> "Response":
         """Return the curve that to_dict described.
 
         Raises:
@@ -97,11 +100,23 @@ class Response(ABC):
         """The smallest exposure that is stored as the brightest 8-bit code: f(white) = peak - 0.5/255."""
         return float(self._invert(torch.tensor(self.peak - HALF_CODE, dtype=torch.float64)))
 
-    def encode(self, exposure):
+    @overload
+    def encode(self, exposure: torch.Tensor) -> torch.Tensor: ...
+
+    @overload
+    def encode(self, exposure: Numbers) -> np.ndarray: ...
+
+    def encode(self, exposure: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
         """Return f(x) in [black, peak]; the gradient is 0 below exposure 0 and beyond the clip point."""
         return self._through(lambda x: _Pointwise.apply(x, self._encode, 0.0), exposure)
 
-    def encode_extended(self, exposure):
+    @overload
+    def encode_extended(self, exposure: torch.Tensor) -> torch.Tensor: ...
+
+    @overload
+    def encode_extended(self, exposure: Numbers) -> np.ndarray: ...
+
+    def encode_extended(self, exposure: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
         """Return f(x) up to the clip point, and f(clip) + EXTENSION_SLOPE log(x / clip) beyond it.
 
         The extension leaves a gradient and a surplus over 1 that a hinge can weigh. For a curve that never clips this
@@ -109,7 +124,13 @@ class Response(ABC):
         """
         return self._through(lambda x: _Pointwise.apply(x, self._encode, EXTENSION_SLOPE), exposure)
 
-    def decode(self, value):
+    @overload
+    def decode(self, value: torch.Tensor) -> torch.Tensor: ...
+
+    @overload
+    def decode(self, value: Numbers) -> np.ndarray: ...
+
+    def decode(self, value: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
         """Return the exposure of a value, which is limited to [black, peak].
 
         decode(encode(x)) = x for x in [0, clip_exposure].
@@ -125,7 +146,13 @@ class Response(ABC):
         exposure = np.asarray(self.decode(value))
         return 1 / (exposure * np.maximum(np.asarray(self.slope(exposure)), 1e-9))
 
-    def slope(self, exposure):
+    @overload
+    def slope(self, exposure: torch.Tensor) -> torch.Tensor: ...
+
+    @overload
+    def slope(self, exposure: Numbers) -> np.ndarray: ...
+
+    def slope(self, exposure: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
         """Return df/dx of encode, shaped like the exposures and 0 beyond the clip point; it is not differentiable."""
         return self._through(lambda x: self._encode(x.detach(), 0.0)[1], exposure)
 
@@ -143,7 +170,9 @@ class Response(ABC):
         return exposure, torch.where((value < self.black) | (value > self._limit), 0.0, 1.0 / slope)
 
     @staticmethod
-    def _through(function, argument):
+    def _through(
+        function: Callable[[torch.Tensor], torch.Tensor], argument: torch.Tensor | Numbers
+    ) -> torch.Tensor | np.ndarray:
         if isinstance(argument, torch.Tensor):
             if argument.dtype not in (torch.float32, torch.float64):
                 raise TypeError(f"a response takes float32 or float64 tensors, not {argument.dtype}")

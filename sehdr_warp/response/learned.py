@@ -1,6 +1,7 @@
 """A learned tone mapper in place of a camera response: one small perceptron for each channel, as in HDR-GS."""
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,13 +65,13 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
                 falls = (inner * outer * group).sum(1, keepdim=True) < 0
                 outer[group & falls] *= -1
 
-    def encode(self, exposure):
+    def encode(self, exposure: Any) -> Any:
         """Return encoded values in (0, 1) of exposures [..., 3], a tensor for a tensor, else a NumPy array."""
         if isinstance(exposure, torch.Tensor):
             return self.encode_log((exposure.clamp_min(0) + EXPOSURE_FLOOR).log())
         return self._with_arrays(self.encode, exposure)
 
-    def encode_extended(self, exposure):
+    def encode_extended(self, exposure: Any) -> Any:
         """Return encode(exposure), because the sigmoid leaves a gradient everywhere."""
         return self.encode(exposure)
 
@@ -91,7 +92,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return ((activations * outer.mT).sum(2) + outer_bias[..., 0]).T
 
     @torch.no_grad()
-    def decode(self, value):
+    def decode(self, value: Any) -> Any:
         """Exposures [..., 3] whose encoded values these are, within TABLE_RANGE."""
         if not isinstance(value, torch.Tensor):
             return self._with_arrays(self.decode, value)
@@ -105,7 +106,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         exposures = (nodes[after - 1] + part * (nodes[after] - nodes[after - 1])).exp()
         return exposures.T.reshape(value.shape).to(value)
 
-    def slope(self, exposure):
+    def slope(self, exposure: Any) -> Any:
         """df/dx of encode, shaped like the exposures [..., 3]. Not differentiable itself."""
         if not isinstance(exposure, torch.Tensor):
             return self._with_arrays(self.slope, exposure)

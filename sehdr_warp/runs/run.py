@@ -38,6 +38,8 @@ class _RenderedScene:
     Radiance is linear Rec.709; simulated photos have the colors of the photos.
 
     Attributes:
+        path: The run folder, or the file.
+        cameras: Views of the scene.
         model: The radiance field.
         degree: SH degree to render with.
         base_time: Exposure time of the photos, seconds.
@@ -45,6 +47,8 @@ class _RenderedScene:
         exposure_compensation: Exposure compensation of the training photos, if there was one.
     """
 
+    path: Path
+    cameras: tuple[CameraEntry, ...]
     model: RadianceField
     degree: int
     base_time: float
@@ -63,6 +67,11 @@ class _RenderedScene:
             if self.exposure_compensation is None
             else self.exposure_compensation.normalize_photos(scene, self.model.response)
         )
+
+    def __repr__(self) -> str:
+        """Return path, number of Gaussians, views and device in one line."""
+        views = f"{len(self.cameras)} views, " if self.cameras else ""
+        return f"{type(self).__name__}({str(self.path)!r}, {self.gaussian_count:,} Gaussians, {views}on {self.device})"
 
     @property
     def gaussian_count(self) -> int:

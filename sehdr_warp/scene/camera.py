@@ -33,7 +33,7 @@ def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
     return pose
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Camera:
     """A camera in COLMAP's (OpenCV's) convention: +x right, +y down, +z into the scene. Almost all are pinholes.
 
@@ -91,6 +91,12 @@ class Camera:
             raise ValueError("the rotation of world_to_camera is not a proper rotation")
         if not np.allclose(pose[3], (0, 0, 0, 1)):
             raise ValueError("the last row of world_to_camera is not (0, 0, 0, 1)")
+
+    def __repr__(self) -> str:
+        """Return size, focal length, position and projection in one line."""
+        kind = "" if self.is_pinhole else f", {self.projection}"
+        position = ", ".join(f"{value:.4g}" for value in self.position)
+        return f"Camera({self.width} x {self.height}, focal length {self.fx:.5g} pixels, at ({position}){kind})"
 
     @property
     def is_pinhole(self) -> bool:

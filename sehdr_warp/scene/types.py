@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ..response import Response
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class View:
     """One photo with its undistorted pinhole camera.
 
@@ -56,6 +56,11 @@ class View:
             problem = list(self.light_above_white.shape)
             raise ValueError(f"light_above_white of view {self.name} is {problem}, its codes are {list(codes.shape)}")
 
+    def __repr__(self) -> str:
+        """Return name, size, split and exposure time in one line."""
+        height, width = self.codes.shape[:2]
+        return f"View({self.name!r}, {width} x {height}, {self.split}, {self.exposure_time:.3g} s)"
+
     @property
     def levels(self) -> int:
         """The code of white: 255 or 65535."""
@@ -67,7 +72,7 @@ class View:
         return encoded_values(self.codes)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scene:
     """A set of posed views and the sparse points seen in them.
 
@@ -100,6 +105,12 @@ class Scene:
     color_matrix: np.ndarray | None = None
     light_known: bool = False
     photos_normalized: bool = False
+
+    def __repr__(self) -> str:
+        """Return name, format, number of views and their size in one line."""
+        sizes = sorted({view.codes.shape[1::-1] for view in self.views})
+        size = "" if not sizes else f" of {sizes[-1][0]} x {sizes[-1][1]}" + (" at most" if len(sizes) > 1 else "")
+        return f"Scene({self.name!r}, {self.format}, {len(self.views)} views{size}, {len(self.train_views)} to train)"
 
     @property
     def train_views(self) -> tuple[View, ...]:

@@ -21,6 +21,10 @@ class Step:
         self.iteration, self.total, self.seconds = trainer.iteration, trainer.total, trainer.seconds
         self.seconds_left: float | None = None
 
+    def __repr__(self) -> str:
+        """Return iteration and time; nothing is read from the device."""
+        return f"Step({self.iteration} of {self.total}, {self.seconds:.1f} s)"
+
     @property
     def loss(self) -> float:
         """Loss of the step."""

@@ -18,7 +18,7 @@ def test_quickstart_and_hand_off(tmp_path, few_probes):
     import OpenEXR
 
     run = example("quickstart")["main"](tmp_path / "first", max_size=32, iterations=8)
-    assert run.iterations == 8
+    assert run.iterations == 8 and repr(run).startswith("Run(") and "\n" not in repr(run)
     assert len(list((tmp_path / "first" / "views" / "brackets").rglob("*.exr"))) == 5 * len(
         [entry for entry in run.cameras if entry.split == "test"]
     )

@@ -122,7 +122,7 @@ def test_a_failed_allocation_says_the_sizes(device, monkeypatch):
     def fails(*arguments, **options):
         raise errors.pop(0)
 
-    monkeypatch.setattr("sehdr_warp.rasterizer.rasterization.project", fails)
+    monkeypatch.setattr("sehdr_warp.rasterizer.rasterization.project_to_camera", fails)
     with pytest.raises(OutOfMemory) as caught:
         rasterize(*scene.arguments)
     with pytest.raises(RuntimeError, match="a defect"):  # other errors pass

@@ -156,3 +156,8 @@ def test_deterministic_gradients_repeat_bit_for_bit_and_are_the_others(device):
         assert all(torch.equal(a, b) for a, b in zip(first, again))
     for ours, other in zip(first, drawn(deterministic=False)):
         assert relative_error(ours, other) < 1e-5
+
+
+def test_a_rendering_prints_in_one_line():
+    scene = random_scene(count=5, channels=3)
+    assert repr(rasterize(*scene.arguments)) == "Rendering(70 x 50, 3 channels, 5 Gaussians, on cpu)"

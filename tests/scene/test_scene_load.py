@@ -274,3 +274,11 @@ def test_photos_are_found_beside_a_cover_and_told_of_in_folders(tmp_path):
     (tmp_path / "cover.jpg").touch()
     with pytest.raises(InputError, match="images/1.png"):
         load(tmp_path)
+
+
+def test_scenes_views_and_cameras_print_in_one_line():
+    scene = load_scene("embedded", max_size=32)
+    view = scene.views[0]
+    assert repr(scene) == "Scene('embedded', hdr-nerf, 27 views of 32 x 32, 18 to train)"
+    assert repr(view) == "View('train_r_0', 32 x 32, train, 0.5 s)"
+    assert repr(view.camera).startswith("Camera(32 x 32, focal length 32.8") and "\n" not in repr(view.camera)
