@@ -181,7 +181,8 @@ class Trainer(TrainingState):
 
         # Forward, loss, backward, optimizer step; as a CUDA graph if a step of this kind has been launched before.
         # Small counts use other kernels: a sort in a single pass, and an exact learned response.
-        kind = (self.degree, watched, gaussians.reserved < EXACT_BELOW, gaussians.reserved <= ONE_SORT)
+        small = gaussians.reserved < EXACT_BELOW, gaussians.reserved <= ONE_SORT
+        kind = (self.degree, watched, self.opacity_weight > 0, *small)
         fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
         if fixed_time and self.graphs.can_capture(views, kind, counted=self.capacity.known):
             self._index.fill_(index)
@@ -238,7 +239,7 @@ class Trainer(TrainingState):
             max_intersections=max_intersections,
             encode=self._encoded,
             factored=self.factored,
-            opacity_weight=config.opacity_weight,
+            opacity_weight=self.opacity_weight,
         )
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in the step.
         dropped = {"image", "transmittance", "depths"} | (set() if watched else {"means2d", "extents"})
@@ -311,6 +312,11 @@ class Trainer(TrainingState):
             )
 
     # Between steps
+
+    @property
+    def opacity_weight(self) -> float:
+        """Weight of the mean opacity in this step: 0 once no refinement follows."""
+        return 0.0 if self.strategy.schedule.is_over(self.iteration) else self.config.loss.opacity_weight
 
     @property
     def run(self) -> Run:

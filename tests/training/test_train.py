@@ -179,6 +179,17 @@ def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
     assert max(widths[:17]) == 0 < min(widths[17:])
 
 
+def test_opacities_are_not_pulled_down_once_none_are_relocated(scene):
+    config = quick(length=60, **{"densification.refine_stop_iter": 40, "loss.opacity_weight": 10.0})
+    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), torch.device("cpu")))
+    means = []
+    for _ in trainer:
+        means.append(float(trainer.field.gaussians.opacities().detach().mean()))
+    last_refinement = next(i for i in range(60) if trainer.strategy.schedule.is_over(i))
+    assert 20 < last_refinement < 40
+    assert means[last_refinement - 1] < 0.5 * means[0] and means[-1] > means[last_refinement - 1]
+
+
 @pytest.mark.parametrize("variant", ["default", "adc"])
 def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
     config = override_config(VARIANTS[variant], {"schedule.sh_degree_interval": 2})
