@@ -206,8 +206,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict:
     return values
 
 
-_LONGEST_NAME = 255
-"""Bytes of the name of a file, on almost all file systems."""
+_LONGEST_NAME, _LONGEST_PATH = 255, 3000
+"""Bytes of the name of a file on almost all file systems, and of a path below the data folder."""
 
 
 def contained(folder: Path, name: str, source: Path) -> Path:
@@ -223,8 +223,8 @@ def contained(folder: Path, name: str, source: Path) -> Path:
             problem = "is absolute"
         elif ".." in PureWindowsPath(name).parts:
             problem = "contains '..'"
-        elif max(map(len, os.fsencode(name).split(b"/"))) > _LONGEST_NAME:
-            problem = f"has a part of more than {_LONGEST_NAME} bytes"
+        elif max(map(len, (data := os.fsencode(name)).split(b"/"))) > _LONGEST_NAME or len(data) > _LONGEST_PATH:
+            problem = f"has more than {_LONGEST_PATH} bytes, or more than {_LONGEST_NAME} in a part"
         elif not (folder / name).resolve().is_relative_to(folder.resolve()):
             problem = "leads outside the data folder"
         else:

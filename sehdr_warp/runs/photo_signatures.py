@@ -1,7 +1,8 @@
 """Signatures of photos: whether a training is resumed with the photos that it began with.
 
 A signature is the mean of the codes in a grid of GRID x GRID cells, of 8 bits each. It survives another decoder, whose
-codes may differ by one, and changes with a photo that was edited, exchanged or developed anew.
+codes may differ by one, and changes with a photo that was edited, exchanged or developed anew. That of a masked photo
+has a second part, of the mask.
 """
 
 from collections.abc import Mapping
@@ -15,8 +16,14 @@ _TOLERANCE = 2
 """Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded."""
 
 
-def photo_signature(codes: np.ndarray) -> str:
-    """Return the signature of codes [H, W, 3], uint8 or uint16, as hexadecimal digits."""
+def photo_signature(codes: np.ndarray, mask: np.ndarray | None = None) -> str:
+    """Return hexadecimal digits of codes [H, W, 3], uint8 or uint16, and of a mask [H, W] in [0, 1]."""
+    if mask is None:
+        return _means(codes)
+    return f"{_means(codes)}/{_means(np.rint(mask * np.float32(255)).astype(np.uint8)[..., None])}"
+
+
+def _means(codes: np.ndarray) -> str:
     height, width = codes.shape[:2]
     means = np.zeros((GRID, GRID))
     columns = [slice(*edge) for edge in _edges(width)]
@@ -38,6 +45,13 @@ def _edges(length: int) -> list[tuple[int, int]]:
 
 
 def _differ(first: str, second: str) -> bool:
+    parts = first.split("/"), second.split("/")
+    if len(parts[0]) != len(parts[1]):
+        return True
+    return any(map(_cells_differ, *parts))
+
+
+def _cells_differ(first: str, second: str) -> bool:
     try:
         cells = [np.frombuffer(bytes.fromhex(text), np.uint8).astype(int) for text in (first, second)]
     except ValueError:

@@ -183,8 +183,8 @@ class RunFolder:
                 raise InputError(self.scene, problem, "resume with the same data, --max-size and --holdout")
         if changed := changed_photos(photos, current_photos):
             named = f"{changed[0]} and {len(changed) - 1} more" if len(changed) > 1 else changed[0]
-            remedy = "put the photos back as they were, or train anew with --overwrite"
-            raise InputError(self.scene, f"photos were changed since the training began: {named}", remedy)
+            remedy = "put them back as they were, or train anew with --overwrite"
+            raise InputError(self.scene, f"photos or masks were changed since the training began: {named}", remedy)
 
     def read_decisions(self) -> list[dict]:
         """Return the decisions of the run's plan, see DecisionValues; none without a plan."""
@@ -296,7 +296,11 @@ def describe_scene(scene: Scene) -> dict:
     """Return what scene.json holds."""
     views = [
         {name: getattr(view, name) for name in ("name", "split", "exposure_time")}
-        | {"camera": view.camera.to_dict(), "has_hdr": view.hdr is not None, "photo": photo_signature(view.codes)}
+        | {
+            "camera": view.camera.to_dict(),
+            "has_hdr": view.hdr is not None,
+            "photo": photo_signature(view.codes, view.mask),
+        }
         for view in scene.views
     ]
     known = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}

@@ -88,9 +88,9 @@ def read_dng(path: Path) -> DngRaw | None:
     raw = [table for table in tables if table.get(_PHOTOMETRIC) in (_CFA, _LINEAR_RAW) and not _reduced(table)]
     if not raw:
         return None
-    table = max(raw, key=lambda entry: int(entry.get(_WIDTH, 0)) * int(entry.get(_LENGTH, 0)))
-    _check_decodable(path, table)
     try:
+        table = max(raw, key=lambda entry: int(entry.get(_WIDTH, 0)) * int(entry.get(_LENGTH, 0)))
+        _check_decodable(path, table)
         return _raw_of(table, tables[0])
     except (LookupError, TypeError, ValueError, ArithmeticError, OverflowError) as error:
         raise InputError(path, f"its DNG tags cannot be used: {error!s:.90}", DAMAGED) from None
@@ -148,7 +148,7 @@ def _pattern(table: Any) -> np.ndarray:
 
 
 def _samples(table: Any) -> int:
-    return int(table.get(_SAMPLES, 1))
+    return int(_numbers(table, _SAMPLES, 1)[0])
 
 
 def _numbers(table: Any, tag: int, default: Any) -> tuple[float, ...]:

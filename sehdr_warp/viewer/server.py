@@ -378,18 +378,18 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self.send_response(status)
             policy = {"Content-Security-Policy": self.server.security_policy}
-            for name, value in {
-                **_HEADERS,
-                **policy,
-                "Content-Type": kind,
-                "Content-Length": str(len(content)),
-            }.items():
+            of_content = {"Content-Type": kind, "Content-Length": str(len(content))}
+            for name, value in {**_HEADERS, **policy, **of_content}.items():
                 self.send_header(name, value)
             self.end_headers()
             if self.command != "HEAD":
                 connection.send(content)
         except OSError:  # The client has gone, or reads nothing.
             self.close_connection = True
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer a request that is none, without all of its words."""
+        super().send_error(code, None if message is None else message[:100], explain)
 
     def log_message(self, format: str, *args) -> None:
         log.debug(format, *args)

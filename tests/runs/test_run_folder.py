@@ -226,8 +226,22 @@ def test_photos_that_were_changed_are_noticed(run):
     changed = [view.codes.copy() for view in scene.views]
     changed[0][:3, :3] = 255 - changed[0][:3, :3]
     views = tuple(_with_codes(view, codes) for view, codes in zip(scene.views, changed, strict=True))
-    with pytest.raises(InputError, match=f"photos were changed since the training began: {scene.views[0].name};"):
+    with pytest.raises(
+        InputError, match=f"photos or masks were changed since the training began: {scene.views[0].name};"
+    ):
         folder.check_same_scene(_with_views(scene, views))
+
+
+def test_masks_that_were_changed_are_noticed(run):
+    from dataclasses import replace
+
+    scene = toy_scene(2, 8)
+    mask = np.ones(scene.views[0].codes.shape[:2], np.float32)
+    masked = _with_views(scene, tuple(replace(view, mask=mask) for view in scene.views))
+    with pytest.raises(InputError, match="photos or masks were changed"):
+        RunFolder(run).check_same_scene(masked)
+    ones, half = (photo_signature(scene.views[0].codes, mask * part) for part in (1, 0.5))
+    assert changed_photos({"a": ones}, {"a": half}) == ["a"] and not changed_photos({"a": ones}, {"a": ones})
 
 
 def test_a_signature_forgives_rounding_alone():
