@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from contextlib import suppress
 from typing import Any, TextIO
 
@@ -66,6 +67,7 @@ def prepare() -> None:
             stream.reconfigure(errors="backslashreplace")
         setattr(sys, ("stdout", "stderr")[number - 1], _Stream(stream, number, required=number == 1))
     collect_late()
+    warnings.filterwarnings("ignore", module=r"PIL\.")  # Of damaged metadata: photos that cannot be used are named.
     os.environ["MPLBACKEND"] = "agg"  # Pictures go to files, whatever a shell was set up for.
     for each, handler in (("SIGINT", _interrupt), ("SIGTERM", _end), ("SIGHUP", _end)):
         number = getattr(signal, each, None)

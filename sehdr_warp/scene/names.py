@@ -6,10 +6,13 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 from ..files import contained
 from .dataparser import ImageRecord
+from .images import PHOTO_SUFFIXES
+
+_MOST_NAMED = 3
 
 
 def natural_key(name: str) -> tuple:
@@ -40,7 +43,9 @@ def without_mask_ending(stem: str) -> str:
 def find_image(folder: Path, name: str, source: Path) -> Path | None:
     """Return the image of a name that a data file states, None if it is not there.
 
-    Names written on Windows have backslashes, and names that are not UTF-8 are tried as Latin-1 too.
+    Names written on Windows have backslashes, and names that are not UTF-8 are tried as Latin-1 too. A photo with
+    another suffix, as after a conversion, is found by its stem. An absolute name, as of a set that was copied, stands
+    for the file in the folder that its last parts name.
 
     Args:
         folder: of the images.
@@ -56,8 +61,57 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         names |= dict.fromkeys((latin, latin.replace("\\", "/")))
     with suppress(UnicodeError):
         names |= {os.fsdecode(name.encode("latin-1")): None}
+    if inner := _inside(folder, name, source):
+        names = {inner: None}
     places = [contained(folder, each, source) for each in names]
-    return next((place for place in places if os.path.isfile(place)), None)
+    image = next((place for place in places if os.path.isfile(place)), None)
+    return image or next((photo for place in places if (photo := sibling(place, PHOTO_SUFFIXES))), None)
+
+
+def _inside(folder: Path, name: str, source: Path) -> str | None:
+    """Return the longest end of an absolute name that is a photo in the folder, None if there is none."""
+    path = PureWindowsPath(name)
+    if not path.anchor or "\0" in name or ".." in path.parts:
+        return None
+    for start in range(1, len(path.parts)):
+        end = "/".join(path.parts[start:])
+        place = contained(folder, end, source)
+        if os.path.isfile(place) or sibling(place, PHOTO_SUFFIXES) or sibling(Path(f"{place}.png"), PHOTO_SUFFIXES):
+            return end
+    return None
+
+
+def distinct(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[str]]:
+    """Return records without those of a split whose photo another one has already, and a note on these."""
+    keys, unique, names = set(), [], []
+    for record in records:
+        key = record.split, record.image, record.exposure_key
+        if key in keys:
+            names.append(record.image.name)
+        else:
+            unique.append(record)
+        keys.add(key)
+    if not names:
+        return unique, []
+    text = ", ".join(names[:_MOST_NAMED]) + " ..." * (len(names) > _MOST_NAMED)
+    count = f"{len(names)} photos are" if len(names) > 1 else "1 photo is"
+    return unique, [f"{count} listed more than once, and counted once: {text}"]
+
+
+def renamed_note(renamed: Sequence[tuple[str, Path]]) -> list[str]:
+    """Return a note on photos that were found under another suffix.
+
+    Args:
+        renamed: the name that a data file states and the photo, of all photos.
+    """
+    suffixes = [PureWindowsPath(name).suffix.lower() for name, _ in renamed]
+    pairs = zip(suffixes, renamed, strict=True)
+    others = [pair for suffix, pair in pairs if suffix in PHOTO_SUFFIXES and suffix != pair[1].suffix.lower()]
+    if not others:
+        return []
+    name, photo = others[0]
+    count = f"{len(others)} photos have" if len(others) > 1 else "1 photo has"
+    return [f"{count} another suffix than the set states: {PureWindowsPath(name).name} is {photo.name}"]
 
 
 def bases_of(images: Sequence[Path], folder: Path) -> list[Path]:

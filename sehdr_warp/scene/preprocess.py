@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
 from ..errors import InputError
 from ..parallel import prefetch_map
@@ -144,11 +145,12 @@ class _Preprocessor:
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
 
     def view_or_error(self, record: ImageRecord, name: str) -> View | InputError:
-        """Return the view of a photo, or the error if the photo itself is damaged; raises other errors."""
+        """Return the view of a photo, or the error if the photo or its mask cannot be used; raises other errors."""
         try:
             return self.view(record, name)
         except InputError as error:
-            if error.path != str(record.image) or record.derived or record.hdr == record.image:
+            own = str(record.image), str(record.mask)
+            if error.path not in own or record.derived or record.hdr == record.image:
                 raise
             return error
 
@@ -260,7 +262,7 @@ def _shrunk(image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.n
 def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarray:
     size = hdr_size(path)
     # Truth may be larger than the photos, because HDR-NeRF's evaluation averages it down, but never smaller.
-    larger = size[0] >= camera.width and size[1] >= camera.height and _same_aspect(size, lens)
+    larger = size[0] >= camera.width and size[1] >= camera.height and _same_aspect(size, (lens.width, lens.height))
     if size != (lens.width, lens.height) and (bent or not larger):
         problem = f"HDR truth is {size[0]} x {size[1]}, the photo {lens.width} x {lens.height}"
         raise InputError(path, problem, "render the truth at the photo's size, or remove it")
@@ -270,12 +272,15 @@ def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarra
 def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:
     mask = read_mask(path, oriented=oriented)
     height, width = mask.shape
-    larger = width > lens.width and height > lens.height and _same_aspect((width, height), lens)
-    if larger or (width, height) == (lens.width, lens.height):
+    if width >= lens.width and height >= lens.height and _same_aspect((width, height), (lens.width, lens.height)):
         return _shrunk(mask, lens)
+    if width < lens.width and height < lens.height and _same_aspect((lens.width, lens.height), (width, height)):
+        resized = Image.fromarray(mask).resize((lens.width, lens.height), Image.Resampling.BILINEAR)
+        return np.asarray(resized)
     problem = f"mask is {width} x {height}, its image {lens.width} x {lens.height}"
     raise InputError(path, problem, "make the mask at the image's size")
 
 
-def _same_aspect(size: tuple[int, int], lens: Lens) -> bool:
-    return abs(size[0] * lens.height - size[1] * lens.width) <= max(size)
+def _same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return whether the first size is the other one enlarged, within a pixel of it."""
+    return abs(size[0] * other[1] - size[1] * other[0]) <= max(size)

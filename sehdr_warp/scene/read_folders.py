@@ -19,7 +19,7 @@ from .heif import HEIF_SUFFIXES, register_heif
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
 from .linear_photos import color_matrix
-from .names import find_image, list_images, natural_key, sibling, view_and_exposure
+from .names import distinct, find_image, list_images, natural_key, renamed_note, sibling, view_and_exposure
 from .photo_checks import FEWEST_PHOTOS
 from .sfm import reconstruct
 from .sfm_panorama import are_panoramas, reconstruct_panoramas
@@ -46,10 +46,11 @@ def read_colmap(folder: Path) -> DataparserOutputs:
     images = image_folder(folder)
     if images is None:
         raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
-    records, absent = [], []
+    records, absent, photo_names = [], [], []
     truth = _TruthFiles(folder, images)
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
         image = find_image(images, entry.name, source)
+        photo_names += [] if image is None else [(entry.name, image)]
         if image is not None and image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
             hdr, image = image, photo
         elif image is None:
@@ -61,7 +62,8 @@ def read_colmap(folder: Path) -> DataparserOutputs:
     if not records:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         raise InputError(images, problem, _REMEDY)
-    notes = other_models(source)
+    records, repeated = distinct(records)
+    notes = [*other_models(source), *renamed_note(photo_names), *repeated]
     if absent:
         notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
     return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))

@@ -2,7 +2,8 @@
 
 import math
 import re
-from pathlib import Path
+from dataclasses import replace
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecor
 from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
-from .names import find_image, sibling
+from .names import distinct, find_image, renamed_note, sibling
+from .photo_checks import left_out
 from .photos import photo_sizes
 
 _REMEDY = "correct the file or export it again"
@@ -29,6 +31,8 @@ def read_transforms(folder: Path) -> DataparserOutputs:
         other = "test" if (folder / "transforms_test.json").is_file() else "val"
         files = [(folder / "transforms_train.json", "train"), (folder / f"transforms_{other}.json", "test")]
     records, absent, cloud = [], [], NO_POINTS
+    photo_names: list[tuple[str, Path]] = []
+    unusable: list[InputError] = []
     for path, split in files:
         if split == "test" and not path.is_file():
             continue
@@ -36,15 +40,29 @@ def read_transforms(folder: Path) -> DataparserOutputs:
         frames = frames_of(values, path)
         splits = _named_splits(values, frames)
         for name, frame in frames:
-            record = _frame_record(folder, path, values, frame, name, split or splits.get(name))
-            (absent if record is None else records).append(record or name)
+            image = _frame_image(folder, name, path)
+            try:
+                pose = frame_pose(frame, path, name)
+            except InputError as error:
+                unusable.append(error)
+                continue
+            if image is None:
+                absent.append(name)
+                continue
+            photo_names.append((name, image))
+            record = _frame_record(folder, path, values, frame, name, image, split or splits.get(name))
+            records.append(replace(record, world_to_camera=pose))
         if not len(cloud[0]):
             cloud = _points(folder, path, values)
+    notes = tuple(left_out(unusable, len(records) + len(absent) + len(unusable)))
     if not records:
         raise InputError(
             folder / _plain(absent[0]), f"image file not found, nor any of {len(absent)} frames", _INCOMPLETE
         )
-    in_splits, notes = [record for record in records if record.split], _absent_note(absent, len(records))
+    notes += (*_absent_note(absent, len(records)), *renamed_note(photo_names))
+    records, repeated = distinct(records)
+    notes += tuple(repeated)
+    in_splits = [record for record in records if record.split]
     if 0 < len(in_splits) < len(records):
         count = len(records) - len(in_splits)
         notes += (f"{count} frames belong to neither the train nor the test split and were left out",)
@@ -135,26 +153,25 @@ def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:
     return (f"{len(absent)} of {len(absent) + count} frames have no photo and were left out: {names_text}",)
 
 
-def _frame_record(
-    folder: Path, path: Path, values: dict, frame: dict, name: str, split: str | None
-) -> ImageRecord | None:
+def _frame_image(folder: Path, name: str, path: Path) -> Path | None:
     """Return the photo of a frame, None if there is no such file."""
-    image, hdr = contained(folder, name, path), None
-    if image.suffix.lower() not in PHOTO_SUFFIXES:
-        # Blender's file_path has no ending; a dot in the stem is not one.
-        image = sibling(image.with_name(image.name + ".png"), LDR_SUFFIXES)
-    else:
-        image = find_image(folder, name, path)
-    if image is None:
-        frame_pose(frame, path, name)
-        return None
+    # Blender's file_path has no ending; a dot in the stem is not one.
+    has_suffix = PurePath(name).suffix.lower() in PHOTO_SUFFIXES
+    return find_image(folder, name if has_suffix else f"{name}.png", path)
+
+
+def _frame_record(
+    folder: Path, path: Path, values: dict, frame: dict, name: str, image: Path, split: str | None
+) -> ImageRecord:
+    """Return the photo of a frame without its pose."""
+    hdr = None
     if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
         hdr, image = image, photo
-    lens, pose = frame_lens(values, frame, image, path), frame_pose(frame, path, name)
+    lens = frame_lens(values, frame, image, path)
     mask, time = frame.get("mask_path"), frame.get("exposure_time")
     mask = None if mask is None else contained(folder, mask, path)
     time = None if time is None else parse_seconds(time, path, name)
-    return ImageRecord(image.stem, image, lens, pose, exposure_time=time, split=split, mask=mask, hdr=hdr)
+    return ImageRecord(image.stem, image, lens, np.eye(4), exposure_time=time, split=split, mask=mask, hdr=hdr)
 
 
 def _matrix(values) -> np.ndarray:

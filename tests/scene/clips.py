@@ -21,7 +21,7 @@ def pan(count=40, height=96, width=128, step=4, blur=()):
 
 
 def write_clip(path: Path, frames, *, tags=(1, 1, 1), codec="libx265", pixels="yuv444p10le", metadata=None, rotation=0,
-               times=None, full=False) -> None:  # fmt: skip
+               times=None, full=False, lossless=False) -> None:  # fmt: skip
     """tags: transfer, primaries, matrix (ITU-T H.273). frames: [H, W, 3] codes in [0, 1]. times: in thirtieths."""
     av = pytest.importorskip("av")
     transfer, primaries, matrix = tags
@@ -34,7 +34,10 @@ def write_clip(path: Path, frames, *, tags=(1, 1, 1), codec="libx265", pixels="y
             if stream is None:
                 stream = container.add_stream(codec, rate=30)
                 stream.height, stream.width, stream.pix_fmt = *rgb.shape[:2], pixels
-                stream.options = {"crf": "2", "x265-params": "log-level=none"} if codec != "ffv1" else {}
+                # FFmpeg puts chroma samples between luma samples, as the stream then states.
+                params = "log-level=none:chromaloc=1" if "420" in pixels else "log-level=none"
+                params += ":lossless=1" if lossless else ""
+                stream.options = {"crf": "2", "x265-params": params} if codec == "libx265" else {"crf": "2"}
                 context = stream.codec_context
                 context.color_trc, context.color_primaries, context.colorspace = transfer, primaries, matrix
                 context.color_range = 2 if full else 1

@@ -163,3 +163,27 @@ def test_masks_of_the_tankard(shared):
     assert len(dataset.records) == 69
     scene = load(shared / "data" / "tankard_turntable", max_size=100)
     assert "masks: 69 of 69 photos have one" in " ".join(scene.notes)
+
+
+def test_masks_of_another_size_of_the_same_shape(tmp_path):
+    write_colmap(tmp_path)
+    write_mask(tmp_path / "masks" / "000.png", HALF[::2, ::2])
+    write_mask(tmp_path / "masks" / "001.png", HALF.repeat(2, 0).repeat(2, 1))
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == pytest.approx([0.5] * 2 + [1.0] * 4)
+    np.testing.assert_array_equal(scene.views[1].mask, HALF / 255)
+
+
+def test_a_photo_whose_mask_cannot_be_used_is_left_out(tmp_path):
+    from sehdr_warp import InputError
+
+    write_colmap(tmp_path)
+    write_mask(tmp_path / "masks" / "000.png", HALF[:30])
+    (tmp_path / "masks" / "001.png").write_bytes(b"no picture")
+    scene = load(tmp_path, holdout=0)
+    (note,) = (note for note in scene.notes if "left out" in note)
+    assert len(scene.views) == 4 and "2 of 6 photos cannot be used and were left out (000.png: mask is 64 x 30" in note
+    for i in range(6):
+        write_mask(tmp_path / "masks" / f"{i:03d}.png", HALF[:30])
+    with pytest.raises(InputError, match="mask is 64 x 30, its image 64 x 48; make the mask at the image's size"):
+        load(tmp_path)

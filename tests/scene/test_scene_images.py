@@ -1,6 +1,8 @@
 """Pixels: every format against another library's reading, damage, limits, and exact averages."""
 
 import struct
+import subprocess
+import sys
 import zlib
 
 import numpy as np
@@ -12,7 +14,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.camera import limited_size
 from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
-from sehdr_warp.scene.images import exif_of, image_sizes, open_image, read_ldr
+from sehdr_warp.scene.images import exif_of, has_16_bits, image_sizes, open_image, read_ldr
 from sehdr_warp.scene.lens import area_average
 from sehdr_warp.scene.masks import read_mask
 
@@ -117,7 +119,7 @@ RGB = Image.fromarray(RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8))
     "kind, told",
     [
         ("EPS", "is not a readable image, which is one of PNG"),
-        ("GIF", "is not a readable image"),
+        ("GIF", "is a GIF, which is not read as a photo; export it as RGB or grey"),
         ("PPM", "is not a readable image"),
         ("LAB", "holds CIELAB"),
         ("CMYK", r"holds inks \(CMYK\)"),
@@ -232,3 +234,72 @@ def test_exif_of_a_png_is_found_without_its_pixels_or_behind_them(tmp_path, behi
         assert exif_of(image)[0x0112] == 6
         assert behind or image.tile, "the pixels were decoded"
     assert image_sizes(path) == ((7, 5), (5, 7))
+
+
+@pytest.mark.parametrize("kind", ["thumbnail", "page"])
+def test_further_pictures_of_a_tiff(tmp_path, kind):
+    """A thumbnail behind the photo is not a page (NewSubfileType)."""
+    tifffile = pytest.importorskip("tifffile")
+    photo = RNG.integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(photo, photometric="rgb")
+        file.write(photo[::4, ::4], photometric="rgb", subfiletype=1 if kind == "thumbnail" else 2)
+    if kind == "page":
+        with pytest.raises(InputError, match="holds several pictures"):
+            read_ldr(tmp_path / "a.tif")
+    else:
+        np.testing.assert_array_equal(read_ldr(tmp_path / "a.tif").pixels, photo)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("options", [
+    {"planarconfig": "separate"}, {"planarconfig": "separate", "rowsperstrip": 5},
+    {"planarconfig": "separate", "compression": "deflate"}, {"extrasamples": [0]}, {"extrasamples": [2]},
+    {"compression": "lzw", "predictor": True, "tile": (16, 16)},
+], ids=str)  # fmt: skip
+def test_16_bits_of_every_kind_of_tiff(tmp_path, options, order):
+    tifffile = pytest.importorskip("tifffile")
+    pixels = RNG.integers(0, 65536, (21, 34, 4 if "extrasamples" in options else 3), dtype=np.uint16)
+    stored = np.moveaxis(pixels, 2, 0) if "planarconfig" in options else pixels
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", byteorder=order, **options)
+    read = read_ldr(tmp_path / "a.tif")
+    np.testing.assert_array_equal(read.pixels, pixels[..., :3])
+    assert has_16_bits(tmp_path / "a.tif") and (read.alpha is not None) == (options.get("extrasamples") == [2])
+
+
+CONTENTS = {
+    "is JPEG XL, which is not read as a photo; export it": b"\xff\x0a" + bytes(50),
+    "is JPEG 2000": b"\0\0\0\x0cjP  \r\n\x87\n" + bytes(50),
+    "is OpenEXR, which is not read as a photo; name it .exr": b"v/1\x01" + bytes(50),
+    "is a Git LFS pointer, .*; fetch it with `git lfs pull`": b"version https://git-lfs.github.com/spec/v1",
+    "is a web page, .*; download the photo again": b"<!DOCTYPE html><html></html>",
+    "is a JPEG of 12 bits": b"\xff\xd8\xff\xe0\0\x04\0\0\xff\xc1\0\x11\x0c\0\x10\0\x10\x03",
+}
+
+
+@pytest.mark.parametrize("words", CONTENTS)
+def test_what_a_file_is_that_is_not_read(tmp_path, words):
+    (tmp_path / "a.jpg").write_bytes(CONTENTS[words])
+    with pytest.raises(InputError, match=f"a.jpg: {words}"):
+        read_ldr(tmp_path / "a.jpg")
+
+
+def test_a_tiff_of_floats_is_named(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "a.tif", np.ones((8, 8, 3), np.float32), photometric="rgb")
+    with pytest.raises(InputError, match="is a TIFF of floats, .*; export it with 16 bits, or as OpenEXR"):
+        read_ldr(tmp_path / "a.tif")
+
+
+def test_warnings_of_pillow_stay_off_the_terminal(tmp_path):
+    """A stereo photo with a damaged index: the first picture is the photo, and nothing is to be said."""
+    RGB.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[RGB.rotate(180)])
+    data = (tmp_path / "a.jpg").read_bytes()
+    place = data.index(b"MPF\0") + 8
+    (tmp_path / "a.jpg").write_bytes(data[:place] + b"\xff" * 8 + data[place + 8 :])
+    program = "from sehdr_warp.process import prepare; prepare(); from pathlib import Path; import sys; "
+    program += "from sehdr_warp.scene.images import read_ldr; print(read_ldr(Path(sys.argv[1])).pixels.shape)"
+    done = subprocess.run(
+        [sys.executable, "-c", program, tmp_path / "a.jpg"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "(6, 8, 3)\n" and done.stderr == ""

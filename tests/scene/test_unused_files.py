@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.colmap_model import find_model
 from sehdr_warp.scene.parse import parse_dataset
 from tests.make_scenes import load, pattern, write_blender, write_colmap
@@ -117,4 +118,75 @@ def test_names_of_windows_and_in_latin_1(tmp_path, binary):
     scene = load(tmp_path, holdout=0)
     assert len(scene.views) == 6 and not said(scene, "missing")
     os.rename(images + b"/\xe901.png", images + "/é01.png".encode())
+    assert len(load(tmp_path, holdout=0).views) == 6
+
+
+@pytest.mark.parametrize("stated, stored", [(".PNG", ".png"), (".jpg", ".png"), (".jpg", ".exr")])
+def test_photos_under_another_suffix_than_the_model_states(tmp_path, stated, stored):
+    """As after a conversion, or structure from motion on JPEGs of an OpenEXR set."""
+    import OpenEXR
+
+    write_colmap(tmp_path)
+    if stored == ".exr":
+        for file in list((tmp_path / "images").iterdir()):
+            planes = np.moveaxis(np.asarray(Image.open(file)).astype(np.float32) / 255, 2, 0).copy()
+            file.unlink()
+            channels = dict(zip("RGB", planes, strict=True))
+            OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(file.with_suffix(".exr")))
+    path = tmp_path / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text().replace(".png", stated))
+    scene = load_scene(tmp_path, response="auto" if stored == ".exr" else "srgb", holdout=0)
+    note = f"6 photos have another suffix than the set states: 000{stated} is 000{stored}"
+    assert len(scene.views) == 6 and said(scene, "another suffix") == [note] * (stated != ".PNG")
+
+
+@pytest.mark.parametrize("before", ["/home/other/sets/room/", "C:\\sets\\room\\", ""])
+def test_absolute_names_of_a_copied_set(tmp_path, before):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in values["frames"]:
+        name = frame["file_path"].removeprefix("./")
+        frame["file_path"] = (before or f"{tmp_path}/") + (name.replace("/", "\\") if "\\" in before else name)
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    assert len(load(tmp_path, holdout=0).views) == 6
+    for file in (tmp_path / "images").iterdir():
+        file.unlink()
+    with pytest.raises(InputError, match="is absolute; use a path relative to"):
+        load(tmp_path)
+
+
+def test_photos_that_are_listed_twice_count_once(tmp_path):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    values["frames"] += values["frames"][1:3]
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6
+    assert said(scene, "more than once") == ["2 photos are listed more than once, and counted once: r_1.png, r_2.png"]
+
+
+@pytest.mark.parametrize("pose", [None, [[0, 0, 0, 0]] * 4, "nan"])
+def test_a_frame_without_a_usable_pose_is_left_out_and_named(tmp_path, pose):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    matrix = values["frames"][2]["transform_matrix"]
+    values["frames"][2]["transform_matrix"] = np.full_like(matrix, np.nan).tolist() if pose == "nan" else pose
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 5 and said(
+        scene, "1 of 6 photos cannot be used and were left out (transforms.json: pose"
+    )
+    for frame in values["frames"][:4]:
+        frame["transform_matrix"] = None
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match="pose of './images/r_0' is not a finite 4 x 4 matrix"):
+        load(tmp_path)
+
+
+def test_text_models_as_other_tools_write_them(tmp_path):
+    """Names with spaces and brackets, CRLF, a byte order mark, and exponents of three digits."""
+    write_colmap(tmp_path, name="A DJI [1] ({:03d}).png")
+    for file in (tmp_path / "sparse" / "0").glob("*.txt"):
+        text = file.read_text().replace("e-1", "e-01").replace("e-0", "e-00").replace("\n", "\r\n")
+        file.write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert len(load(tmp_path, holdout=0).views) == 6
