@@ -139,7 +139,9 @@ def _quality_tables(result: dict) -> Iterable[str]:
         row["to_bound"] = None if bound is row else row["gt_max"] - bound["gt_max"]
     yield "## In short: the middle exposure, one seed, the curve known"
     yield markdown_table(in_short(rows), SHORT)
-    yield from _irradiance_tables([row for row in rows if row["response"] in (KNOWN, LEARNED)])
+    known = [row for row in rows if row["response"] in (KNOWN, LEARNED)]
+    yield from _irradiance_tables(known)
+    yield from _energy_tables(known)
     for curve, response in groups([row for row in rows if row["response"] != LEARNED], "curve", "response"):
         members = [row for row in rows if row["curve"] == curve and row["response"] in (response, LEARNED)]
         table = []
@@ -181,13 +183,15 @@ def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
         yield markdown_table(table, {"method": "", "seed": "d", "gt-max dB": ".2f", "to U": "+.2f"})
 
 
-SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": "", "irradiance off": ".0%"}
+SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": "", "irradiance off": ".0%", "worst room": ".0%"}
+SHORT |= {"light energy": ".2f", "nine in ten lights": ""}
 
 
 def in_short(rows: Sequence[Mapping]) -> list[dict]:
     """Return a row for each method: means over scenes of one seed at the middle exposure, with the curve known.
 
-    "irradiance off" is a median over scenes, because one lost lamp decides the mean; None without figures.
+    "irradiance off" is a mean over scenes, and "worst room" the largest; "light energy" is the median over lights that
+    clip, and "nine in ten lights" the range of the 5th to the 95th percentile. None and a dash without figures.
     """
     middle = [row for row in rows if (row["exposure"], row["seed"]) == (EXPOSURES // 2, rows[0]["seed"])]
     return [
@@ -196,17 +200,46 @@ def in_short(rows: Sequence[Mapping]) -> list[dict]:
             "HDR dB": fmean(row["gt_max"] for row in mine),
             "photos dB": fmean(row["ldr"] for row in mine),
             "lost": f"{sum(row['lights_lost'] for row in mine)} of {sum(row['lights_count'] for row in mine)} lights",
-            "irradiance off": _median_of(mine, "irradiance"),
+            "irradiance off": _over_rows(mine, "irradiance", fmean),
+            "worst room": _over_rows(mine, "irradiance", max),
+            **_light_energy(mine),
         }
         for (method, response), mine in groups(middle, "method", "response").items()
         if response in (KNOWN, LEARNED)
     ]
 
 
-def _median_of(rows: Sequence[Mapping], field: str) -> float | None:
-    """Return the median of a field over the rows that have it."""
+def _over_rows(rows: Sequence[Mapping], field: str, summary: Callable[[list[float]], float]) -> float | None:
+    """Return the summary of a field over the rows that have it; None if none has."""
     values = [row[field] for row in rows if row.get(field) is not None]
-    return median(values) if values else None
+    return summary(values) if values else None
+
+
+def _light_energy(rows: Sequence[Mapping]) -> dict[str, Any]:
+    """Return the median and the range of the energy of lights that clip, as in_short() has them."""
+    energies = sorted(energy for row in rows for energy in row.get("light_energies") or ())
+    if not energies:
+        return {"light energy": None, "nine in ten lights": "-"}
+    low, high = (energies[round(part * (len(energies) - 1))] for part in (0.05, 0.95))
+    return {"light energy": median(energies), "nine in ten lights": f"{low:.2f} to {high:.2f}"}
+
+
+def _energy_tables(rows: Sequence[Mapping]) -> Iterable[str]:
+    """Energy of the lights that clip, by method and exposure."""
+    table = []
+    for (method, exposure), mine in sorted(groups(rows, "method", "exposure").items()):
+        energies = [energy for row in mine for energy in row.get("light_energies") or ()]
+        if energies:
+            near = (sum(0.5 <= energy <= 2 for energy in energies)) / len(energies)
+            lost = {"lost": sum(row["lights_lost"] for row in mine), "lights": sum(row["lights_count"] for row in mine)}
+            table.append({"method": method, "exposure": exposure, "n": len(energies), "near": near} | lost)
+            table[-1] |= _light_energy(mine)
+    if table:
+        yield "## Energy of the lights that photos clip, over the truth's"
+        columns = {"method": "", "exposure": "d", "lights that clip=n": "d", "median=light energy": ".2f"}
+        columns |= {"nine in ten=nine in ten lights": "", "half to twice=near": ".0%"}
+        columns |= {"all lights=lights": "d", "lost": "d"}
+        yield markdown_table(table, columns)
 
 
 def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
@@ -245,11 +278,13 @@ def readme_table(rows: Sequence[Mapping]) -> str:
     short, lines = {row["method"]: row for row in in_short(rows)}, []
     for method, label in PAGES["quality"]["readme"].items():
         row = short[method]
-        off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}"
+        off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}, {row['worst room']:.0%}"
+        energy = "-" if row["light energy"] is None else f"{row['light energy']:.2f}, {row['nine in ten lights']}"
         cells = label, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", row["lost"].removesuffix(" lights"), off
-        lines.append(f"| {' | '.join(cells)} |")
-    heading = "| trained by | HDR | photos | lights lost | irradiance off |"
-    return "\n".join([heading, "| --- | -: | -: | -: | -: |", *lines])
+        lines.append(f"| {' | '.join((*cells, energy))} |")
+    titles = "trained by", "HDR", "photos", "lights lost"
+    titles += "irradiance off: mean, worst", "light energy: median, nine in ten"
+    return "\n".join([f"| {' | '.join(titles)} |", f"| ---{' | -:' * (len(titles) - 1)} |", *lines])
 
 
 def _seeds_tables(result: dict) -> Iterable[str]:

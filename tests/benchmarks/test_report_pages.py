@@ -60,6 +60,9 @@ def test_quality_is_paired_with_the_upper_bound(tmp_path):
     assert cells["default"][:4] == ["2", "29.00", "28.00", "-3.50"]
     assert cells["hdr-gs"][:4] == ["2", "21.00", "20.00", "-11.50"], "a learned curve stands beside the known one"
     assert cells["truth"][:4] == ["2", "32.50", "32.00", "-"]
+    short = next(line for line in lines if line.startswith("| default") and "of 7 lights" in line)
+    assert short.split("|")[-3].strip() == "0.95" and "0.80 to 1.10" in short  # Of one training's two lights
+    assert "## Energy of the lights that photos clip, over the truth's" in lines
 
 
 def test_error_over_time_is_a_mean_on_a_log_scale():

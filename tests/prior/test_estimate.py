@@ -118,6 +118,51 @@ def test_the_weights_of_the_package_are_small_and_know_lamps_from_white_walls():
     assert wall < 1 and lamp > wall + 1
 
 
+def grain(*size, seed=0):
+    return torch.rand(*size, generator=torch.Generator().manual_seed(seed))
+
+
+def page():
+    """A printed page on a table, lit to a little above white."""
+    picture = 0.15 + 0.05 * grain(120, 160, 1).expand(-1, -1, 3)
+    letters = torch.nn.functional.interpolate((grain(1, 1, 60, 80) > 0.75).float(), size=(120, 160))[0, 0] > 0
+    inside = torch.zeros(120, 160, dtype=torch.bool)
+    inside[25:95, 45:115] = True
+    picture[20:100, 40:120] = 1.05
+    picture[letters & inside] = 0.08
+    return picture
+
+
+def snow():
+    """Snow to a little above white below a sky."""
+    relief = torch.nn.functional.interpolate(grain(1, 1, 20, 26), size=(120, 160), mode="bicubic")[0, 0]
+    picture = (0.75 + 0.35 * relief + 0.05 * grain(120, 160, seed=1))[..., None] * torch.tensor([0.96, 0.98, 1.0])
+    picture[:40] = torch.tensor([0.25, 0.4, 0.7])
+    return picture
+
+
+def leds():
+    """Blue LEDs that clip one channel."""
+    y, x = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    picture = torch.full((120, 160, 3), 0.02)
+    for column in range(20, 150, 25):
+        square = ((x - column) ** 2 + (y - 60) ** 2)[..., None]
+        picture += torch.exp(-square / torch.tensor([40.0, 40, 18])) * torch.tensor([0.02, 0.1, 1.6])
+    return picture
+
+
+@pytest.mark.parametrize("make", [page, snow, leds])
+def test_white_things_and_small_leds_do_not_become_lamps(make):
+    prior, picture = load_prior(), make()
+    clipped = picture >= 1
+    estimate = prior.estimate(picture.clamp_max(1), clipped)
+    lamp = prior.estimate(*lit(0.05, 4)).mean[lit(0.05, 4)[1]].mean()
+    mean, deviation = estimate.mean[clipped], estimate.deviation[clipped]
+    assert mean.mean() < lamp - 1
+    off = (mean - picture[clipped].log2()).abs() / deviation
+    assert off.mean() < 2 and off.quantile(0.9) < 3  # Wrong by up to two stops, and the deviation says so.
+
+
 def test_deviations_of_the_package_are_wide_where_it_must_guess():
     exposure, clipped = lit(0.05, 4)
     estimate = load_prior().estimate(exposure, clipped)
