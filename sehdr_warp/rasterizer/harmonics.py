@@ -1,8 +1,8 @@
 """View-dependent values from spherical harmonics."""
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from .warp_launch.launching import launch, warp_scalar
 MAX_DEGREE = 3
 
 
-@torch_operation
+@partial(torch_operation, compiles=True)
 def spherical_harmonics(
     degree: int, coefficients: Tensor | tuple[Tensor, Tensor], means: Tensor, camera_position: Tensor
 ) -> Tensor:
@@ -42,6 +42,20 @@ def spherical_harmonics(
         TypeError: for what is no tensor.
         ValueError: for a degree out of range, and for shapes, dtypes or devices that do not fit.
     """
+    degree, constant, rest = check_harmonics(degree, coefficients, means, camera_position)
+    return _Evaluation.apply(degree, *(t.contiguous() for t in (constant, rest, means, camera_position)))
+
+
+class Coefficients(NamedTuple):
+    """The degree as an integer, and coefficients in two parts."""
+
+    degree: int
+    constant: Tensor
+    rest: Tensor
+
+
+def check_harmonics(degree: int, coefficients: Any, means: Any, camera_position: Any) -> Coefficients:
+    """Return the coefficients of spherical_harmonics(), or raise what it does for arguments that do not fit."""
     arguments: dict[str, Any] = {"means": (means, ("N", 3))}
     if isinstance(coefficients, tuple | list) and len(coefficients) == 2:
         arguments |= {
@@ -56,7 +70,7 @@ def spherical_harmonics(
     constant, rest = (coefficients[:, :1], coefficients[:, 1:]) if whole else coefficients
     if constant.shape[1] + rest.shape[1] < (degree + 1) ** 2:
         raise ValueError(f"degree {degree} needs {(degree + 1) ** 2} coefficients, not {1 + rest.shape[1]}")
-    return _Evaluation.apply(degree, *(t.contiguous() for t in (constant, rest, means, camera_position)))
+    return Coefficients(degree, constant, rest)
 
 
 @dataclass(frozen=True)

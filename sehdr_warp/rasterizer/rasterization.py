@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -77,7 +78,7 @@ class Rendering:
         return self.radii > 0
 
 
-@torch_operation
+@partial(torch_operation, compiles=True)
 def rasterize(
     means: Tensor,
     log_scales: Tensor,
@@ -146,7 +147,9 @@ def rasterize(
     tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
     graphs = find_graphs(tensors, options) if background is None else None
     if graphs is None:
-        _check_arguments(*tensors, background)
+        check_shapes(*tensors, background)
+        check_opacities(opacities)
+        check_cameras(world_to_camera, intrinsics)
         options = options.checked(means.device)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
         if world_to_camera.ndim == 2:
@@ -160,7 +163,7 @@ def rasterize(
         return replace(rendering, image=rendering.image + rendering.transmittance[..., None] * behind)
 
 
-def _check_arguments(
+def check_shapes(
     means: Any,
     log_scales: Any,
     quaternions: Any,
@@ -170,6 +173,7 @@ def _check_arguments(
     intrinsics: Any,
     background: Any,
 ) -> None:
+    """Raise what rasterize() does for tensors whose shapes, dtypes or devices do not fit."""
     cameras: tuple[str, ...] = ("B",) if isinstance(world_to_camera, Tensor) and world_to_camera.ndim == 3 else ()
     opacity_axes, feature_axes = (
         cameras if isinstance(tensor, Tensor) and tensor.ndim == ndim else ()
@@ -193,8 +197,6 @@ def _check_arguments(
         raise ValueError(f"features has shape {list(features.shape)}, expected [N, C] with C >= 1")
     if cameras and not len(world_to_camera):
         raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
-    check_opacities(opacities)
-    check_cameras(world_to_camera, intrinsics)
 
 
 class _View(NamedTuple):

@@ -1,6 +1,7 @@
 """Splats seen in any directions from one point: environment maps, as latitude and longitude or the faces of a cube."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -20,7 +21,7 @@ from .warp_launch.threads import even_ranges
 _PIXELS = TILE_SIZE * TILE_SIZE
 
 
-@torch_operation
+@partial(torch_operation, compiles=True)
 def rasterize_directions(
     means: Tensor,
     log_scales: Tensor,

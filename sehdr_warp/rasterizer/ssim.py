@@ -1,5 +1,7 @@
 """Structural similarity of two images as a differentiable torch operation (kernels/ssim.py, kernels/ssim_cuda.py)."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -15,7 +17,7 @@ CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 re
 STEPS_PER_THREAD = 1024  # Smallest share of such steps that is worth handing to another thread: about 0.1 ms of work
 
 
-@torch_operation
+@partial(torch_operation, compiles=True)
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Mean structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, data range 1.
 
@@ -36,7 +38,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return _Similarity.apply(a, b, True)
 
 
-@torch_operation
+@partial(torch_operation, compiles=True)
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     """Return the [H, W, C] values whose mean is ssim(a, b); same arguments, same errors, differentiable as well."""
     return _Similarity.apply(a, b, False)

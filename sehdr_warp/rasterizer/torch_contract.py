@@ -26,13 +26,23 @@ def _autocast_of_a_device() -> bool:
     return torch.is_autocast_enabled("cuda") or torch.is_autocast_enabled("cpu")
 
 
+is_compiling = torch.compiler.is_compiling
 _some_autocast = getattr(torch._C, "_is_any_autocast_enabled", _autocast_of_a_device)
 
 
-def torch_operation(function: Callable[P, T]) -> Callable[P, T]:
+_compiled: dict[str, Callable[..., Any]] = {}
+
+
+def register_compiled(**operations: Callable[..., Any]) -> None:
+    """Name what takes the place of an operation within torch.compile and torch.export."""
+    _compiled.update(operations)
+
+
+def torch_operation(function: Callable[P, T], *, compiles: bool = False) -> Callable[P, T]:
     """Make a public operation of a function that launches kernels on tensors.
 
-    - torch.compile calls it as it is: the graph breaks there, nothing inside is traced.
+    - torch.compile calls what register_compiled() named if it `compiles`. Else it calls the operation as it is: the
+      graph breaks there, nothing inside is traced.
     - Under torch.autocast, half-precision tensors become float32, as torch.amp.custom_fwd(cast_inputs=...) does.
     - torch.func transforms and forward-mode differentiation are refused by a sentence.
 
@@ -43,6 +53,8 @@ def torch_operation(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        if compiles and is_compiling():
+            return _compiled[name](*args, **kwargs)
         if _transforms_are_active():
             raise NotImplementedError(f"{name}() does not support torch.func; use torch.autograd")
         if forward_ad._current_level >= 0 and any(map(_has_tangent, (*args, *kwargs.values()))):
@@ -52,6 +64,8 @@ def torch_operation(function: Callable[P, T]) -> Callable[P, T]:
         return function(*args, **kwargs)
 
     operation: Any = call
+    if compiles:
+        return operation
     if set_code_exec_strategy is None or _FrameExecStrategy is None or _FrameAction is None:
         disabled: Any = torch.compiler.disable(operation)
         return disabled

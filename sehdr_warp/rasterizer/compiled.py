@@ -1,0 +1,259 @@
+"""Public operations within torch.compile and torch.export: opaque nodes of one graph, with the shapes of their results.
+
+Nothing here runs outside of a compiler. The backward pass of a node renders once more, because a node's results are
+tensors alone.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
+from .harmonics import check_harmonics, spherical_harmonics
+from .rasterization import Rendering, check_shapes, rasterize
+from .sphere import rasterize_directions
+from .ssim import ssim, ssim_map
+from .torch_contract import HALF, register_compiled
+
+Run = Callable[..., list[Tensor]]
+_KEYS = torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
+"""How torch dispatches outside of an operator: within one it records no gradients."""
+
+
+def define_node(name: str, options: str, run: Run, fake: Run) -> Callable[..., list[Tensor]]:
+    """Register an operator of torch, with its gradient, and return it.
+
+    Args:
+        name: without "sehdr_warp::".
+        options: the schema's arguments after the tensors.
+        run: takes a list of tensors, and options; returns tensors, differentiable.
+        fake: returns tensors of the results' shapes.
+    """
+
+    def forward(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
+        with torch.no_grad():
+            return [result.contiguous() for result in run(tensors, *values)]
+
+    def gradients_of(tensors: Sequence[Tensor], upstream: Sequence[Tensor | None], *values: Any) -> list[Tensor]:
+        with torch._C._ForceDispatchKeyGuard(*_KEYS), torch.enable_grad():
+            leaves = [tensor.detach().requires_grad_() for tensor in tensors]
+            results = run(leaves, *values)
+            known = [place for place, gradient in enumerate(upstream) if gradient is not None]
+            known = [place for place in known if results[place].requires_grad]
+            gradients: Sequence[Tensor | None] = [None] * len(leaves)
+            if known:
+                outputs, by_outputs = [results[place] for place in known], [upstream[place] for place in known]
+                gradients = torch.autograd.grad(outputs, leaves, by_outputs, allow_unused=True)
+        # Each with memory of its own, as a compiler may assume.
+        pairs = zip(leaves, gradients, strict=True)
+        return [torch.zeros_like(leaf) if gradient is None else gradient.clone() for leaf, gradient in pairs]
+
+    schema = f"(Tensor[] tensors{options}) -> Tensor[]"
+    node = torch.library.custom_op(f"sehdr_warp::{name}", forward, mutates_args=(), schema=schema)
+    schema = f"(Tensor[] tensors, Tensor?[] upstream{options}) -> Tensor[]"
+    adjoint = torch.library.custom_op(f"sehdr_warp::{name}_backward", gradients_of, mutates_args=(), schema=schema)
+    node.register_fake(fake)
+    adjoint.register_fake(lambda tensors, upstream, *values: [torch.empty_like(tensor) for tensor in tensors])
+
+    def keep(ctx: Any, inputs: tuple, output: Any) -> None:
+        tensors, *ctx.values = inputs
+        ctx.save_for_backward(*tensors)
+
+    def differentiate(ctx: Any, upstream: Sequence[Tensor | None]) -> tuple:
+        gradients = adjoint(list(ctx.saved_tensors), list(upstream), *ctx.values)
+        return gradients, *(None for _ in ctx.values)
+
+    node.register_autograd(differentiate, setup_context=keep)
+    return node
+
+
+def _as_float(*tensors: Tensor) -> list[Tensor]:
+    """Return the tensors as autocast leaves them; see torch_operation()."""
+    halves = [tensor.dtype in HALF and torch.is_autocast_enabled(tensor.device.type) for tensor in tensors]
+    return [tensor.float() if half else tensor for tensor, half in zip(tensors, halves, strict=True)]
+
+
+def _run_rasterize(tensors: Sequence[Tensor], width: int, height: int, *options: Any) -> list[Tensor]:
+    near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic = options
+    arguments: Any = (*tensors[:7], width, height)
+    rendering = rasterize(
+        *arguments,
+        near_plane=near_plane,
+        eps2d=eps2d,
+        alpha_threshold=alpha_threshold,
+        antialiased=antialiased,
+        background=tensors[7] if len(tensors) > 7 else None,
+        depth=depth,
+        max_intersections=max_intersections,
+        deterministic=deterministic,
+    )
+    results = [rendering.image, rendering.transmittance, rendering.means2d, rendering.depths, rendering.extents]
+    optional = rendering.depth, rendering.overflow, rendering.needed_intersections
+    return results + [result for result in optional if result is not None]
+
+
+def _fake_rasterize(tensors: Sequence[Tensor], width: int, height: int, *options: Any) -> list[Tensor]:
+    arguments: Any = (*tensors[:7], tensors[7] if len(tensors) > 7 else None)
+    check_shapes(*arguments)
+    *_, depth, max_intersections, _ = options
+    means, features, pose = tensors[0], tensors[4], tensors[5]
+    cameras, count = pose.shape[:-2], means.shape[0]
+    results = [
+        means.new_empty(*cameras, height, width, features.shape[-1]),
+        means.new_empty(*cameras, height, width),
+        means.new_empty(*cameras, count, 2),
+        means.new_empty(*cameras, count),
+        means.new_empty(*cameras, count, 2),
+    ]
+    results += [means.new_empty(*cameras, height, width)] if depth else []
+    if max_intersections is not None:
+        results += [means.new_empty((), dtype=torch.bool), means.new_empty((), dtype=torch.int64)]
+    return results
+
+
+_rasterize_node = define_node(
+    "rasterize",
+    ", SymInt width, SymInt height, float near_plane, float eps2d, float alpha_threshold, bool antialiased, "
+    "bool depth, SymInt? max_intersections, bool deterministic",
+    _run_rasterize,
+    _fake_rasterize,
+)
+
+
+def compiled_rasterize(
+    means: Tensor,
+    log_scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float = NEAR_PLANE,
+    eps2d: float = EPS2D,
+    alpha_threshold: float = ALPHA_THRESHOLD,
+    antialiased: bool = False,
+    background: Tensor | None = None,
+    depth: bool = False,
+    max_intersections: int | None = None,
+    deterministic: bool = False,
+) -> Rendering:
+    """Do what rasterize() does, as a node. The number of intersections is 0 without max_intersections."""
+    tensors = [means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics]
+    tensors = _as_float(*tensors, *(() if background is None else (background,)))
+    options = near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
+    results = list(_rasterize_node(tensors, width, height, *options))
+    image, transmittance, means2d, depths, extents = results[:5]
+    overflow = needed = None
+    if max_intersections is not None:
+        overflow, needed = results[-2:]
+    return Rendering(
+        image=image,
+        transmittance=transmittance,
+        means2d=means2d,
+        depths=depths,
+        extents=extents,
+        intersection_count=0 if max_intersections is None else max_intersections,
+        overflow=overflow,
+        needed_intersections=needed,
+        depth=results[5] if depth else None,
+    )
+
+
+def _run_directions(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
+    focal_length, pixel_angle, antialiased, near_plane, alpha_threshold = options
+    arguments: Any = tensors
+    return list(
+        rasterize_directions(
+            *arguments,
+            focal_length=focal_length,
+            pixel_angle=pixel_angle,
+            antialiased=antialiased,
+            near_plane=near_plane,
+            alpha_threshold=alpha_threshold,
+        )
+    )
+
+
+_directions_node = define_node(
+    "rasterize_directions",
+    ", float focal_length, float pixel_angle, bool antialiased, float near_plane, float alpha_threshold",
+    _run_directions,
+    lambda tensors, *options: [
+        tensors[4].new_empty(*tensors[6].shape[:2], tensors[4].shape[1]),
+        tensors[4].new_empty(tensors[6].shape[:2]),
+    ],
+)
+
+
+def compiled_directions(
+    means: Tensor,
+    log_scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    position: Tensor,
+    directions: Tensor,
+    *,
+    focal_length: float,
+    pixel_angle: float = 0.0,
+    antialiased: bool = False,
+    near_plane: float = NEAR_PLANE,
+    alpha_threshold: float = ALPHA_THRESHOLD,
+) -> tuple[Tensor, Tensor]:
+    """Do what rasterize_directions() does, as a node."""
+    tensors = _as_float(means, log_scales, quaternions, opacities, features, position, directions)
+    results = _directions_node(tensors, focal_length, pixel_angle, antialiased, near_plane, alpha_threshold)
+    return results[0], results[1]
+
+
+def _fake_harmonics(tensors: Sequence[Tensor], degree: int) -> list[Tensor]:
+    constant, rest, means, position = tensors
+    check_harmonics(degree, (constant, rest), means, position)
+    return [torch.empty_like(means)]
+
+
+_harmonics_node = define_node(
+    "spherical_harmonics",
+    ", SymInt degree",
+    lambda tensors, degree: [spherical_harmonics(degree, (tensors[0], tensors[1]), tensors[2], tensors[3])],
+    _fake_harmonics,
+)
+
+
+def compiled_harmonics(
+    degree: int, coefficients: Tensor | tuple[Tensor, Tensor], means: Tensor, camera_position: Tensor
+) -> Tensor:
+    """Do what spherical_harmonics() does, as a node."""
+    whole = isinstance(coefficients, Tensor)
+    constant, rest = (coefficients[:, :1], coefficients[:, 1:]) if whole else coefficients
+    return _harmonics_node(_as_float(constant, rest, means, camera_position), degree)[0]
+
+
+_ssim_node = define_node("ssim", "", lambda tensors: [ssim(*tensors)], lambda tensors: [tensors[0].new_empty(())])
+_ssim_map_node = define_node(
+    "ssim_map", "", lambda tensors: [ssim_map(*tensors)], lambda tensors: [torch.empty_like(tensors[0])]
+)
+
+
+def compiled_ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Do what ssim() does, as a node."""
+    return _ssim_node(_as_float(a, b))[0]
+
+
+def compiled_ssim_map(a: Tensor, b: Tensor) -> Tensor:
+    """Do what ssim_map() does, as a node."""
+    return _ssim_map_node(_as_float(a, b))[0]
+
+
+register_compiled(
+    rasterize=compiled_rasterize,
+    rasterize_directions=compiled_directions,
+    spherical_harmonics=compiled_harmonics,
+    ssim=compiled_ssim,
+    ssim_map=compiled_ssim_map,
+)

@@ -1,0 +1,96 @@
+"""Operations within torch.compile: nodes of one graph, with the same bits, in silence."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from sehdr_warp.rasterizer import compiled, rasterize
+
+from .scenes import random_scene
+from .test_torch_contract import SIZE, directions, splats
+
+STEP = """
+import time, warnings
+import torch
+from sehdr_warp.rasterizer import rasterize, rasterize_directions, spherical_harmonics, ssim, ssim_map
+from tests.rasterizer.test_torch_contract import SIZE, directions, splats
+
+leaves = splats(dtype=torch.float32, channels=3)
+coefficients, rays = torch.rand(6, 4, 3), directions().float()
+
+def step(*leaves):
+    total = 0.0
+    for _ in range(3):
+        colors = spherical_harmonics(1, coefficients, leaves[0], torch.zeros(3)) + leaves[4]
+        rendering = rasterize(*leaves[:4], colors, *leaves[5:], *SIZE, depth=True, background=torch.ones(3))
+        image = rendering.image * 2.0
+        total = total + ssim(image, torch.full_like(image, 0.5)) + rendering.alpha.mean() + rendering.depth.mean()
+        total = total + (rendering.means2d[:, 0] * rendering.visible).mean() + ssim_map(image, image.detach()).mean()
+    around, _ = rasterize_directions(*leaves[:5], torch.zeros(3), rays, focal_length=22.0)
+    return total + around.sum()
+
+def gradients(function):
+    for leaf in leaves:
+        leaf.grad = None
+    loss = function(*leaves)
+    loss.backward()
+    return [loss.detach(), *(leaf.grad for leaf in leaves)]
+
+truth = gradients(step)
+began = time.perf_counter()
+whole = gradients(torch.compile(step, backend="aot_eager", fullgraph=True))
+seconds = time.perf_counter() - began
+assert all(map(torch.equal, truth, whole)), "other bits"
+print(seconds)
+"""
+
+
+def test_a_loop_is_one_graph_with_the_same_bits_in_silence():
+    done = subprocess.run([sys.executable, "-c", STEP], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr.strip(), done.stderr
+    assert float(done.stdout) < 60
+
+
+OPTIONS = 0.01, 0.3, 1e-3, False
+
+
+@pytest.mark.parametrize("options", [(False, None, False), (True, 400, True)])
+def test_torch_checks_the_node(options, device):
+    tensors = [leaf.detach().requires_grad_() for leaf in splats(device, torch.float32)]
+    arguments = [*tensors, torch.ones(2, device=device)], *SIZE, *OPTIONS, *options
+    checks = "test_schema", "test_faketensor"
+    torch.library.opcheck(torch.ops.sehdr_warp.rasterize.default, arguments, test_utils=checks)
+    rays = directions(device).float()
+    position = torch.zeros(3, device=device)
+    around = [*tensors[:5], position, rays], 22.0, 0.0, False, 0.01, 1e-3
+    torch.library.opcheck(torch.ops.sehdr_warp.rasterize_directions.default, around, test_utils=checks)
+
+
+def test_several_cameras_and_room_have_the_shapes_that_the_compiler_expects(device):
+    scene = random_scene(count=20, channels=3).to(torch.float32, device)
+    cameras = [torch.stack([tensor.detach()] * 2) for tensor in scene.tensors[5:]]
+    arguments = *scene.tensors[:5], *cameras, *SIZE
+    truth = rasterize(*arguments, max_intersections=500, depth=True)
+    rendering = compiled.compiled_rasterize(*arguments, max_intersections=500, depth=True)
+    for name in ("image", "transmittance", "means2d", "depths", "extents", "overflow", "needed_intersections", "depth"):
+        mine, true = getattr(rendering, name), getattr(truth, name)
+        assert mine.shape == true.shape and torch.equal(mine, true)
+
+
+def test_a_misfit_is_named_while_compiling():
+    leaves = splats(dtype=torch.float32)
+    draw = torch.compile(lambda means: rasterize(means, *leaves[1:], *SIZE).image, backend="eager", fullgraph=True)
+    with pytest.raises(Exception, match=r"means has shape \[6, 2\], expected \[N, 3\]"):
+        draw(leaves[0][:, :2])
+
+
+def test_half_precision_is_cast_under_autocast():
+    leaves = splats(dtype=torch.float32)
+    half = leaves[4].detach().bfloat16()
+    draw = torch.compile(lambda colors: rasterize(*leaves[:4], colors, *leaves[5:], *SIZE).image, backend="eager")
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        image = draw(half)
+    assert torch.equal(image, rasterize(*leaves[:4], half.float(), *leaves[5:], *SIZE).image)
