@@ -20,15 +20,15 @@ def exposures_kernel(dtype):
         place = first + wp.tid()
         value = values[place]
         # Not clamped, which would make a number of what is none.
-        held = wp.where(value > bound, bound, wp.where(value < -bound, -bound, value))
-        exposures[place] = wp.exp(held)
+        clamped = wp.where(value > bound, bound, wp.where(value < -bound, -bound, value))
+        exposures[place] = wp.exp(clamped)
 
     return activate_exposures
 
 
 @cache
 def exposures_adjoint_kernel(dtype):
-    """value_gradients [N C], flat, of exposure_gradients [N, C] of any strides; 0 from the bounds on."""
+    """Write value_gradients [N C], flat, from exposure_gradients [N, C] of any strides; 0 from the bounds on."""
     real = dtype
 
     @wp.kernel(module="unique", module_options=FORWARD)

@@ -8,12 +8,12 @@ vectorisation.
 
 Forward, per pixel, with T the transmittance so far:
 
-    alpha = min(opacity exp(p), ALPHA_MAX),  counted if alpha > threshold and T (1 - alpha) > TRANSMITTANCE_MIN
+    alpha = min(opacity exp(p), ALPHA_MAX),  counts if alpha > threshold and T (1 - alpha) > TRANSMITTANCE_MIN
     image += alpha T feature;  T *= 1 - alpha
 
 A finished pixel stays finished. Its T is stored negated meanwhile, which saves a separate flag.
 
-The adjoint walks the list back to front, from the last counted Gaussian of each pixel, with two numbers of state
+The adjoint walks the list back to front, from the last Gaussian that counts in each pixel, with two numbers of state
 whatever the channel count: T, and R = the part of the loss's derivative that arrives from behind,
 
     R_last = T_last dL/dT;   T = T / (1 - alpha);   q = <feature, dL/dimage>
@@ -63,7 +63,7 @@ def row_functions(dtype, halvings: int):
 
     @wp.func
     def step(x: row) -> row:
-        """1 where x > 0, else 0; compiles to a compare."""
+        """Return 1 where x > 0, else 0; compiles to a compare."""
         return wp.min(wp.max(x * real(1.0e30), row(real(0.0))), row(real(1.0)))
 
     if dtype is wp.float64:
@@ -89,7 +89,7 @@ def row_functions(dtype, halvings: int):
 
     @wp.func
     def halves(x: real, ellipse: vec4) -> wp.vec2i:
-        """First and one past the last; x: of the Gaussian's centre from the tile's first pixel."""
+        """Return the first half that is reached and one past the last; x: from the tile's first pixel to the centre."""
         determinant = ellipse[0] * ellipse[2] - ellipse[1] * ellipse[1]
         reached = wp.vec2i(0, wp.static(HALVES))
         # For needles rounding leaves nothing of the determinant.
@@ -111,10 +111,10 @@ def _options(dtype) -> dict:
 
 @cache
 def forward_kernel(dtype, channels: int, halvings: int):
-    """blend_forward over tiles, from `first` on: see the module's description.
+    """Return blend_forward(), launched over tiles from `first` on; see the module's description.
 
     halvings: see row_functions
-    ranges: [tiles] first and one past the last entry; intersections: [M] Gaussians
+    ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians
     shapes: [N] (x, y, opacity, half-height); ellipses: [N] (conic a, b, c, level); features: [N, C]
     columns: tiles across; width, height: of the image; iota: one row, 0 to 7
     transmittance, accumulated, last: scratch of [tiles, 32] rows, [tiles, C, 32] rows and [tiles, 32] rows, 16 a half
@@ -165,16 +165,16 @@ def forward_kernel(dtype, channels: int, halvings: int):
                     p = in_x + dx * (-ellipse[1] * dy) + spread(real(-0.5) * ellipse[2] * dy * dy)
                     a = wp.min(exponential(wp.min(p, spread(real(0.0)))) * shape[2], spread(real(ALPHA_MAX)))
                     t = transmittance[tile, at]
-                    counted = wp.cw_mul(step(a - spread(alpha_threshold)), step(t))
-                    weight = wp.cw_mul(wp.cw_mul(a, t), counted)
+                    counts = wp.cw_mul(step(a - spread(alpha_threshold)), step(t))
+                    weight = wp.cw_mul(wp.cw_mul(a, t), counts)
                     goes_on = step(t - weight - spread(real(TRANSMITTANCE_MIN)))
                     weight = wp.cw_mul(weight, goes_on)
-                    # The pixel that this Gaussian finishes keeps its T, negated; finished ones have counted = 0.
-                    finished = counted - wp.cw_mul(counted, goes_on)
+                    # The pixel that this Gaussian finishes keeps its T, negated; finished ones have counts = 0.
+                    finished = counts - wp.cw_mul(counts, goes_on)
                     transmittance[tile, at] = t - weight - wp.cw_mul(t, finished) * real(2.0)
-                    drawn = wp.cw_mul(counted, goes_on)
+                    contributes = wp.cw_mul(counts, goes_on)
                     previous = last[tile, at]
-                    last[tile, at] = previous + wp.cw_mul(drawn, spread(real(k - bounds[0] + 1)) - previous)
+                    last[tile, at] = previous + wp.cw_mul(contributes, spread(real(k - bounds[0] + 1)) - previous)
                     for channel in range(wp.static(channels)):
                         accumulated[tile, channel, at] = accumulated[tile, channel, at] + weight * features[i, channel]
             k += 1
@@ -247,13 +247,13 @@ def backward_kernel(dtype, channels: int, halvings: int):
                         incoming[tile, channel, at][i] = image_gradient[pixel, channel]
             behind[tile, at] = wp.cw_mul(t, from_left_over)
 
-        drawn = int(wp.max(furthest))
-        for k in range(bounds[0] + drawn, bounds[1]):
+        blend_count = int(wp.max(furthest))
+        for k in range(bounds[0] + blend_count, bounds[1]):
             for column in range(wp.static(channels + 6)):
                 intersection_gradients[unsorted[k], column] = real(0.0)
 
-        for step_back in range(drawn):
-            k = bounds[0] + drawn - 1 - step_back
+        for step_back in range(blend_count):
+            k = bounds[0] + blend_count - 1 - step_back
             i = intersections[k]
             shape = shapes[i]
             ellipse = ellipses[i]
@@ -275,22 +275,22 @@ def backward_kernel(dtype, channels: int, halvings: int):
                     p = in_x + dx * (-ellipse[1] * dy) + spread(real(-0.5) * ellipse[2] * dy * dy)
                     unclamped = exponential(wp.min(p, spread(real(0.0)))) * shape[2]
                     a = wp.min(unclamped, spread(real(ALPHA_MAX)))
-                    counted = wp.cw_mul(step(a - spread(alpha_threshold)), step(last[tile, at] - place))
+                    counts = wp.cw_mul(step(a - spread(alpha_threshold)), step(last[tile, at] - place))
                     inverse = wp.cw_div(ones, ones - a)
                     t = transmittance[tile, at]
                     # As an addition: t * inverse would round each of many faint factors the same way.
-                    t = t + wp.cw_mul(wp.cw_mul(t, wp.cw_mul(a, inverse)), counted)
+                    t = t + wp.cw_mul(wp.cw_mul(t, wp.cw_mul(a, inverse)), counts)
                     transmittance[tile, at] = t
                     q = incoming[tile, 0, at] * features[i, 0]
                     for channel in range(1, wp.static(channels)):
                         q += incoming[tile, channel, at] * features[i, channel]
                     r = behind[tile, at]
-                    weight = wp.cw_mul(wp.cw_mul(a, t), counted)
-                    from_a = wp.cw_mul(wp.cw_mul(t, q) - wp.cw_mul(r, inverse), counted)
+                    weight = wp.cw_mul(wp.cw_mul(a, t), counts)
+                    from_a = wp.cw_mul(wp.cw_mul(t, q) - wp.cw_mul(r, inverse), counts)
                     behind[tile, at] = r + wp.cw_mul(weight, q)
                     weights[tile, j] = weight
-                    # alpha = opacity exp(p): the derivative by p is alpha's own, and none where alpha is held at its
-                    # limit
+                    # alpha = opacity exp(p): the derivative by p is alpha's own, and 0 where alpha is clamped to
+                    # its limit
                     slopes[tile, j] = wp.cw_mul(wp.cw_mul(a, from_a), step(spread(real(ALPHA_MAX)) - unclamped))
 
                 s0 = spread(real(0.0))

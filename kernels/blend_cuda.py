@@ -1,20 +1,20 @@
 """N-channel front-to-back blend for CUDA: one warp of 32 lanes owns a corner of a tile, 8 x 4 pixels.
 
-The maths is blend_cpu's; what differs is who does what. The adjoint is in blend_cuda_adjoint.py.
+The mathematics is that of blend_cpu; the division of work differs. The adjoint is in blend_cuda_adjoint.py.
 
-Most intersections of a 16 x 16 tile miss an 8 x 4 corner of it. `find_lists` of tiles.py tests every entry's ellipse
-exactly against the corners of its tile, and leaves a bit for each. A warp walks its tile's list 32 intersections at a
-time, ROUNDS of them together, and packs those that touch its corner into a queue in shared memory, a ring; they are
-blended in batches of 32. In a batch a lane fetches one Gaussian's shape, ellipse and features, and then each lane draws
-all of them on its pixel.
+Most intersections of a 16 x 16 tile miss an 8 x 4 corner of it. `find_lists` of tiles.py tests the ellipse of every
+intersection exactly against the corners of its tile, and sets a bit for each. A warp walks its tile's list 32
+intersections at a time, ROUNDS of them together, and packs those that touch its corner into a ring buffer in shared
+memory. It blends them in batches of 32: each lane loads the shape, ellipse and features of one Gaussian, and then each
+lane blends all 32 on its own pixel.
 
-Lists differ in length by a hundred times, and the longest decide how long a picture takes: a warp that waits for what
-it has just asked for does nothing else. So the next rounds, and the next batch, are on their way while a batch is
-blended, and the alphas of TOGETHER Gaussians, which depend on nothing, are worked out before the first is drawn,
-without a branch. What they leave of a pixel's light only falls: whether it is still enough is asked behind all of them.
+Lists differ in length by a factor of a hundred, and the longest ones decide the time of a picture, because a warp that
+waits for memory does nothing else. Therefore the next rounds and the next batch are loaded while a batch is blended,
+and the alphas of TOGETHER Gaussians, which do not depend on each other, are computed without a branch before the first
+of them is blended. Transmittance only falls, so one test after all of them finds whether it is still above its limit.
 
-All lanes read a batch before it is overwritten; a vote or a scatter with its barrier always stands between.
-These kernels also run on the CPU where wp.config.enable_cpu_blocks is set: slow, but the same logic, for tests.
+All lanes read a batch before it is overwritten, because a vote or a scatter with its barrier always lies between.
+These kernels also run on the CPU if wp.config.enable_cpu_blocks is set: slow, but the same logic, for tests.
 """
 
 from functools import cache
@@ -26,13 +26,13 @@ from .geometry import geometry, vector
 
 BLOCK_DIM = 32
 BLOCKS_PER_TILE = (TILE_SIZE // CORNER[0]) * (TILE_SIZE // CORNER[1])
-TOGETHER = 8  # Gaussians whose alphas are worked out before the first of them is drawn; divides 32
-ROUNDS = 4  # Of 32 intersections, that are looked at together
-QUEUE = 64 * ROUNDS  # Room for those of ROUNDS and for 31 that were left: a power of 2
+TOGETHER = 8  # Gaussians whose alphas are computed before the first of them is blended; divides 32
+ROUNDS = 4  # Rounds of 32 intersections that are tested together
+QUEUE = 64 * ROUNDS  # Slots of the ring buffer: at least 32 ROUNDS + 31, and a power of 2
 
 
 def padded_channels(channels: int) -> int:
-    """Feature rows are read four at a time."""
+    """Return the columns of a feature row, a multiple of four, because rows are read four numbers at a time."""
     return (channels + 3) // 4 * 4
 
 
@@ -57,7 +57,7 @@ def pad_rows_kernel(dtype, channels: int):
 
 
 def module_options(dtype) -> dict:
-    """Approximate division and exponential in float32; float64 is the reference and never has them."""
+    """Return options with approximate division and exponential in float32; float64, the reference, has exact ones."""
     return {"fast_math": dtype is wp.float32, "max_unroll": 64, "enable_backward": False}
 
 
@@ -116,12 +116,12 @@ def block_functions(dtype, cuda: bool) -> tuple:
 
 @cache
 def forward_kernel(dtype, channels: int, cuda: bool = False):
-    """blend_forward over tiles x BLOCKS_PER_TILE x 32 threads. cuda: not to run on the CPU's fibers.
+    """Return blend_forward(), launched over tiles x BLOCKS_PER_TILE x 32 threads. cuda: not for the CPU's fibers.
 
-    ranges: [tiles] first and one past the last entry; intersections: [M] Gaussians; corners: [M] find_lists()'s;
+    ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians; corners: [M] find_lists()'s;
     shapes: [N] (x, y, opacity, -); ellipses: [N] (conic a, b, c, level);
     features: [N padded_channels / 4] rows of four, flat
-    image: [H W] vectors of C; transmittance: [H W]; last: [H W] 1 + list place of the last Gaussian drawn
+    image: [H W] vectors of C; transmittance: [H W]; last: [H W] 1 + list place of the last Gaussian that contributes
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
@@ -157,7 +157,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
 
         t = real(1.0)
         bar = wp.where(inside, alpha_threshold, real(wp.inf))
-        drawn = real(0.0)
+        last_place = real(0.0)
         sums = vec_padded()
 
         bounds = ranges[tile]
@@ -231,7 +231,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                     weight = alphas[k] * following
                     following = following - weight
                     on = following > real(TRANSMITTANCE_MIN)
-                    drawn = wp.where(on and alphas[k] > real(0.0), places[k], drawn)
+                    last_place = wp.where(on and alphas[k] > real(0.0), places[k], last_place)
                     t = wp.where(on, following, t)
                     alphas[k] = wp.where(on, weight, real(0.0))
                 bar = wp.where(following > real(TRANSMITTANCE_MIN), bar, real(wp.inf))
@@ -263,6 +263,6 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                 colors[channel] = sums[channel]
             image[pixel] = colors
             transmittance[pixel] = t
-            last[pixel] = int(drawn)
+            last[pixel] = int(last_place)
 
     return blend_forward

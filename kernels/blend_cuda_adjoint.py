@@ -1,9 +1,9 @@
 """The adjoint of blend_cuda: one warp of 32 lanes owns 8 x 4 pixels of a tile.
 
-The list is walked as blend_cuda walks it, but from the last Gaussian drawn, and each 32 survivors in two phases. First
-a lane is a pixel: it walks the survivors back to front and writes (weight, slope) for each. Then a lane is a Gaussian:
-it sums its 32 pixels with no exchange between lanes. The gradients leave through shared memory as whole rows, so that
-the atomics of a warp fall on neighbouring addresses.
+A warp walks the list as in blend_cuda, but from the last Gaussian that contributes, and treats each batch of 32 that
+touch its corner in two phases. In the first a lane is a pixel: it walks the batch back to front and writes (weight,
+slope) for each Gaussian. In the second a lane is a Gaussian: it sums its 32 pixels, without an exchange between lanes.
+Gradients go through shared memory as whole rows, so that the atomics of a warp fall on neighbouring addresses.
 """
 
 from functools import cache
@@ -44,21 +44,21 @@ def add_row(numbers: wp.array(dtype=wp.float32), i: int, a: float, b: float, c: 
 
 
 def adds_rows(dtype, ordered: bool, cuda: bool) -> bool:
-    """Whether gradients are added to by rows of four, and have as many columns as a multiple of that."""
+    """Return whether gradients are added by rows of four numbers; they then have a multiple of four columns."""
     return cuda and dtype is wp.float32 and not ordered
 
 
 @cache
 def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
-    """blend_backward over tiles x BLOCKS_PER_TILE x 32 threads.
+    """Return blend_backward(), launched over tiles x BLOCKS_PER_TILE x 32 threads.
 
     As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; transmittance_gradient: [H W], or [0] for 0;
     rows: ROWS and gradient_count: C + 6, as arguments so that their loops stay loops;
     gradients: [N (C + 6)], flat rows (features, conic a b c, x, y, opacity), added to
 
     ordered: the same sums in the same order every time, by one launch over tiles x 32 threads for each `corner` of the
-    BLOCKS_PER_TILE, within which a row of gradients has one writer. rows_of: [M] the row of each entry, gradients:
-    [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: atomics add to the Gaussians' rows.
+    BLOCKS_PER_TILE, within which a row of gradients has one writer. rows_of: [M] the row of each intersection;
+    gradients: [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: atomics add to the Gaussians' rows.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
@@ -109,12 +109,12 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         corner_y = real(top) + real(0.5)
 
         begin = ranges[tile][0]
-        own_drawn = int(0)
+        own_last = int(0)
         if inside:
-            own_drawn = last[pixel]
-        most_drawn = wp.tile_max(wp.tile(own_drawn))
+            own_last = last[pixel]
+        most_drawn = wp.tile_max(wp.tile(own_last))
         count = most_drawn[0]
-        drawn = real(own_drawn)
+        last_place = real(own_last)
         t = transmittance[pixel]
         pixel_gradient = image_gradient[pixel]
         behind = real(0.0)
@@ -178,7 +178,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
             queued = queued - coming
 
             if ready > 0:
-                # A lane is a pixel: back to front, one that is not drawn with an alpha of 0.
+                # A lane is a pixel: back to front, one that does not contribute with an alpha of 0.
                 for group in range((ready + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
                     alphas = vec_many()
                     gains = vec_many()
@@ -191,9 +191,9 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                         dy = s[1] - y
                         unclamped = s[2] * wp.exp(wp.min(dx * (q[0] * dx + q[1] * dy) + q[2] * dy * dy, real(0.0)))
                         a = wp.min(real(ALPHA_MAX), unclamped)
-                        draw = s[3] < drawn and a > alpha_threshold
-                        alphas[k] = wp.where(draw, a, real(0.0))
-                        gains[k] = wp.where(draw and unclamped < real(ALPHA_MAX), a, real(0.0))
+                        contributes = s[3] < last_place and a > alpha_threshold
+                        alphas[k] = wp.where(contributes, a, real(0.0))
+                        gains[k] = wp.where(contributes and unclamped < real(ALPHA_MAX), a, real(0.0))
                         along = real(0.0)
                         for e in range(wp.static(quads)):
                             quad = wp.tile_extract(batch_features, j * wp.static(quads) + e)

@@ -83,10 +83,10 @@ def clipped_logarithms_kernel(dtype, code):
         clipped = int(codes[wp.int32(index[0]), i]) == white_code
         if mask:
             clipped = clipped and mask[i // 3] > real(0.0)
-        found = real(NOT_CLIPPED)
+        logarithm = real(NOT_CLIPPED)
         if clipped:
-            found = wp.log(wp.max(image[i], white) / white)
-        logarithms[i] = found
+            logarithm = wp.log(wp.max(image[i], white) / white)
+        logarithms[i] = logarithm
 
     return clipped_logarithms
 
@@ -191,14 +191,14 @@ def clipped_light_patch_kernel(dtype, code):
                 i = (y * width + x) * 3 + channel
                 v = wp.tile_extract(sums, row, at + wp.static(CHANNELS * REACH))[2]
                 if v >= real(0.0):
-                    found = vec3()
+                    figures = vec3()
                     for k in range(wp.static(2 * REACH + 1)):
-                        found += wp.tile_extract(sums, row, at + wp.static(CHANNELS) * k)
+                        figures += wp.tile_extract(sums, row, at + wp.static(CHANNELS) * k)
                     down = wp.min(y + wp.static(REACH + 1), height) - wp.max(y - wp.static(REACH), 0)
                     across = wp.min(x + wp.static(REACH + 1), width) - wp.max(x - wp.static(REACH), 0)
                     expected, precision = estimate_of(estimates, rows, columns, y, x, channel, height, width)
                     term, by_v = terms_of(
-                        v, found[0], found[1], down * across, smoothness, lift, expected, precision, hold
+                        v, figures[0], figures[1], down * across, smoothness, lift, expected, precision, hold
                     )
                     energy += term
                     if slopes:

@@ -33,12 +33,12 @@ def code_residual_kernel(dtype, code, mu_law: bool):
         first: int,
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
         table: wp.array(dtype=vec3), scale: real, gain: real,
-        seen: wp.array(dtype=real), slopes: wp.array(dtype=real), truth: wp.array(dtype=real),
+        rendered: wp.array(dtype=real), slopes: wp.array(dtype=real), truth: wp.array(dtype=real),
     ):
         """Compare an image with photo index[0] of a stack of codes.
 
         table: radiance of each code, and the ends of the interval of radiances that map to it. truth: radiances of the
-        photo. seen: the truth plus the distance of the image from the interval. slopes: derivatives of seen by the
+        photo. rendered: truth plus the image's distance from the interval. slopes: derivatives of rendered by the
         image.
         """
         i = first + wp.tid()
@@ -58,7 +58,7 @@ def code_residual_kernel(dtype, code, mu_law: bool):
             elif value >= row[1]:
                 value = row[0]
                 slope = real(0.0)
-        seen[i] = value
+        rendered[i] = value
         slopes[i] = slope
         truth[i] = row[0]
 

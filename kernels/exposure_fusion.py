@@ -17,7 +17,7 @@ POINTS_PER_THREAD = 64  # Of one hidden unit's gradients, summed before the atom
 
 @cache
 def fusion_kernels(dtype) -> SimpleNamespace:
-    """perceptrons, mix, mix_adjoint, unit_adjoint and point_adjoint for one scalar type.
+    """Return perceptrons, mix, mix_adjoint, unit_adjoint and point_adjoint for one scalar type.
 
     encoded, exposedness, outputs and what is made of them: [3, Q]; inner [3, 2, H], inner_bias, outer [3, H],
     outer_bias [3]: the perceptrons' weights; log_sigma: [3]; results: [M, 3].
@@ -46,7 +46,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         most_log: real, most: real,
         inner: reals3d, inner_bias: reals2d, outer: reals2d, outer_bias: reals, exposedness: reals2d, outputs: reals2d,
     ):
-        """exposedness: exp(-d^2 / 2) of the deviations from mid grey; outputs: of the perceptron of both."""
+        """Write exposedness, exp(-d^2 / 2) of deviations from mid grey, and the outputs of the perceptron of both."""
         channel, point = wp.tid()
         x = encoded[channel, point]
         deviation = wp.clamp(deviation_of(x, log_sigma[channel], most_log), -most, most)
@@ -83,7 +83,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         brackets: int, scale: real,
         results: reals2d, result_gradients: reals2d, by_exposedness: reals2d, by_output: reals2d,
     ):
-        """by_exposedness: through the logits alone."""
+        """Write the gradients; by_exposedness is that through the logits alone."""
         place, channel = wp.tid()
         count = results.shape[0]
         largest = largest_logit(outputs, exposedness, channel, place, count, brackets)
@@ -141,7 +141,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         most_log: real, most: real,
         inner: reals3d, inner_bias: reals2d, outer: reals2d, by_log_sigma: reals2d,
     ):
-        """by_log_sigma: [3, Q], to be summed over Q."""
+        """Write by_log_sigma [3, Q], to be summed over Q."""
         channel, point = wp.tid()
         x = encoded[channel, point]
         near = exposedness[channel, point]

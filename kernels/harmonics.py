@@ -248,7 +248,7 @@ def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
     turn, weight_vector = turn_function(dtype, degree)
-    used = (degree + 1) * (degree + 1) - 1
+    columns = (degree + 1) * (degree + 1) - 1
 
     @wp.kernel(module="unique", module_options=FORWARD)
     def harmonics_adjoint(
@@ -265,12 +265,12 @@ def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
         z = direction[2]
         if wp.static(coefficients):
             constant_gradients[i, 0] = harmonic(0, x, y, z) * gradient
-            for k in range(wp.static(used)):
+            for k in range(wp.static(columns)):
                 rest_gradients[i, k] = harmonic(k + 1, x, y, z) * gradient
-            for unused in range(wp.static(used), rest_gradients.shape[1]):
-                rest_gradients[i, unused] = vec3()
+            for column in range(wp.static(columns), rest_gradients.shape[1]):
+                rest_gradients[i, column] = vec3()
         weights = weight_vector()
-        for k in range(wp.static(used)):
+        for k in range(wp.static(columns)):
             weights[k] = wp.dot(rest[i, k], gradient)
         mean_gradients[i] = without_nan(turn(weights, direction), gradient)
 

@@ -56,7 +56,7 @@ def interpolate(
     low: float, inverse_step: float,
     positions: wp.array2d(dtype=wp.float32), values: wp.array2d(dtype=wp.float32),
 ):
-    """table: [nodes + 2, C], the node at `low` in row 1; positions, values: [N, C]."""
+    """Interpolate a table [nodes + 2, C], whose row 1 is the node at `low`; positions, values: [N, C]."""
     i, column = wp.tid()
     position = wp.max((positions[i, column] - low) * inverse_step, 0.0)
     cell = cell_of(position, table.shape[0] - 4)
@@ -74,7 +74,7 @@ def interpolate_adjoint(
     positions: wp.array2d(dtype=wp.float32), value_gradients: wp.array2d(dtype=wp.float32),
     position_gradients: wp.array2d(dtype=wp.float32), table_gradients: wp.array3d(dtype=wp.float32),
 ):
-    """table_gradients: [copies, nodes + 2, C], added to; the other gradients: [N, C]."""
+    """Add to table_gradients [copies, nodes + 2, C], and write the other gradients [N, C]."""
     i, column = wp.tid()
     offset = (positions[i, column] - low) * inverse_step
     position = wp.max(offset, 0.0)

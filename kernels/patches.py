@@ -22,7 +22,7 @@ def patches_of(height: int, width: int, channels: int) -> int:
 
 @cache
 def patch_functions(radius: int) -> SimpleNamespace:
-    """reach: numbers of a row that a patch reaches. patch_of, column_of and value_of say what a thread takes."""
+    """Return patch_of(), column_of() and value_of(), which map threads to pixels, and reach, the numbers of a row."""
 
     @wp.func
     def patch_of(index: int, width: int, channels: int):

@@ -129,7 +129,7 @@ def sweep(
     total *= WHITE
 
     best = costs8()
-    counted = int(0)
+    neighbor_count = int(0)
     here = depth * wp.vec3((float(column) + 0.5 - own[2]) / own[0], (float(row) + 0.5 - own[3]) / own[1], 1.0)
     reach = float(RADIUS)
     for slot in range(neighbors.shape[1]):
@@ -155,13 +155,13 @@ def sweep(
                         pixel = center + float(x - RADIUS) * across + float(y - RADIUS) * down
                         nearness = 1.0 / pixel[2]
                         u, v = pixel[0] * nearness, pixel[1] * nearness
-                        seen = color_between(photos, offset, size[0], size[1], u, v)
+                        color_there = color_between(photos, offset, size[0], size[1], u, v)
                         color = color_at(photos, place + wp.int64((y - RADIUS) * width + x - RADIUS))
-                        apart = wp.min(difference(color, seen), WHITE * LARGEST)
+                        apart = wp.min(difference(color, color_there), WHITE * LARGEST)
                         unlike += weights[y * wp.static(SIDE) + x] * apart
-                best = in_order(best, counted, unlike / total)
-                counted += 1
-    costs[n, i - n * count] = better_half(best, counted)
+                best = in_order(best, neighbor_count, unlike / total)
+                neighbor_count += 1
+    costs[n, i - n * count] = better_half(best, neighbor_count)
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
@@ -171,7 +171,7 @@ def trust_depths(
     worst: float, factor: float, slack: float, few: int, widest: float,
     depths: wp.array(dtype=wp.float32),
 ):
-    """depths[n]: where costs[n, d] of the depths planes[d], three at least, farthest first, are least, or 0.
+    """Write to depths[n] the depth of least cost among planes[d], at least three, farthest first; 0 if untrusted.
 
     Costs below factor times the least, plus slack, are as good. They are trusted where the least is below worst and
     they span fewer than `few` planes: the depth is then that of a parabola through the least and those beside it; or

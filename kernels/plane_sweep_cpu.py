@@ -49,7 +49,7 @@ def channels_of(codes: _codes, channel: int) -> _row:
 
 @wp.func
 def codes_at(photos: wp.array(dtype=wp.int32), offset: wp.int64, places: _row) -> _codes:
-    """places: of pixels, which floats hold exactly up to 16 million."""
+    """Return colors at places of pixels, which floats represent exactly up to 16 million."""
     result = _codes()
     for lane in range(wp.static(LANES)):
         result[lane] = photos[offset + wp.int64(int(places[lane]))]
@@ -109,9 +109,9 @@ def sweep_rows(
         total += weights[k]
     total *= WHITE
 
-    found = _costs()
+    result = _costs()
     for slot in range(neighbors.shape[1]):
-        found[slot] = _row(2.0 * LARGEST)
+        result[slot] = _row(2.0 * LARGEST)
         other = neighbors[view, slot]
         if other >= 0:
             to_other, lens = between[view, slot], intrinsics[other]
@@ -138,16 +138,16 @@ def sweep_rows(
                 finite += (x_there + y_there) * 0.0
                 k += 1
             margin += finite  # Minima pass over what is not a number; this sum becomes none.
-            shown = int(-1)
+            last_neighbor = int(-1)
             for lane in range(wp.static(LANES)):
                 if margin[lane] >= 0.0:
-                    shown = lane
-            if shown >= 0:
+                    last_neighbor = lane
+            if last_neighbor >= 0:
                 # Depths that the neighbor does not show are looked up where it shows another.
                 safe = depth
                 for lane in range(wp.static(LANES)):
                     if not margin[lane] >= 0.0:
-                        safe[lane] = depth[shown]
+                        safe[lane] = depth[last_neighbor]
                 sums = _row()
                 for k in range(wp.static(PATCH)):
                     y = k / wp.static(SIDE)
@@ -175,14 +175,14 @@ def sweep_rows(
                     sums += wp.min(apart, _row(WHITE * LARGEST)) * weights[k]
                 for lane in range(wp.static(LANES)):
                     if margin[lane] >= 0.0:
-                        found[slot, lane] = sums[lane] / total
+                        result[slot, lane] = sums[lane] / total
 
     for d in range(start, end):
         best = costs8()
-        counted = int(0)
+        neighbor_count = int(0)
         for slot in range(neighbors.shape[1]):
-            cost = found[slot, d - start]
+            cost = result[slot, d - start]
             if cost < 2.0 * LARGEST:
-                best = in_order(best, counted, cost)
-                counted += 1
-        costs[n, d] = better_half(best, counted)
+                best = in_order(best, neighbor_count, cost)
+                neighbor_count += 1
+        costs[n, d] = better_half(best, neighbor_count)

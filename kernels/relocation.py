@@ -68,17 +68,17 @@ def number_places(
 @wp.kernel(module="unique", module_options=FORWARD)
 def count_copies(
     first: int,
-    chosen: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), begin: wp.array(dtype=wp.int64),
+    sampled_rows: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), begin: wp.array(dtype=wp.int64),
     end: wp.array(dtype=wp.int64), copies: wp.array(dtype=wp.int32), changed: wp.array(dtype=wp.bool),
 ):
-    """Count how often each row is chosen for the places from begin[0] to end[0], and mark those rows in changed.
+    """Count how often each row was sampled for the places from begin[0] to end[0], and mark those rows in changed.
 
-    Nothing is counted if total[0], the sum of the weights of the draw, is 0. Launched over `chosen` in one range,
+    Nothing is counted if total[0], the sum of the weights of the draw, is 0. Launched over sampled_rows in one range,
     because several may choose the same row.
     """
     i = first + wp.tid()
     if total[0] > wp.float64(0.0) and wp.int64(i) < end[0] - begin[0]:
-        source = int(chosen[i])
+        source = int(sampled_rows[i])
         wp.atomic_add(copies, source, 1)
         changed[source] = True
 
@@ -97,25 +97,25 @@ def copy_row(sources: _rows, source: int, values: _rows, row: int):
 def copy_rows(
     first: int,
     places: wp.array(dtype=wp.int32), begin: wp.array(dtype=wp.int64), end: wp.array(dtype=wp.int64),
-    chosen: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64),
+    sampled_rows: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64),
     given_a: _rows, given_b: _rows, given_c: _rows, given_d: _rows, given_e: _rows, given_f: _rows,
     values_a: _rows, values_b: _rows, values_c: _rows, values_d: _rows, values_e: _rows, values_f: _rows,
     changed: wp.array(dtype=wp.bool),
 ):
-    """Fill rows whose place is begin[0] + k, below end[0], with source row k or, if `chosen` is not empty, chosen[k].
+    """Fill rows whose place is begin[0] + k, below end[0], with source row k or, unless it is empty, sampled_rows[k].
 
-    With `chosen` nothing is filled if total[0] is 0. Filled rows are marked in changed, if it is not empty. Sources may
-    be the values themselves if no row is both read and written. One thread for each row.
+    With sampled_rows nothing is filled if total[0] is 0. Filled rows are marked in changed, unless it is empty. Sources
+    may be the values themselves if no row is both read and written. One thread for each row.
     """
     row = first + wp.tid()
     place = wp.int64(places[row])
     if place < begin[0] or place >= end[0]:
         return
     source = int(place - begin[0])
-    if chosen.shape[0] > 0:
+    if sampled_rows.shape[0] > 0:
         if not (total[0] > wp.float64(0.0)):
             return
-        source = int(chosen[source])
+        source = int(sampled_rows[source])
     copy_row(given_a, source, values_a, row)
     copy_row(given_b, source, values_b, row)
     copy_row(given_c, source, values_c, row)

@@ -14,7 +14,7 @@ def error_weights_kernel(code):
     @wp.kernel(module="unique", module_options=FORWARD)
     def error_weights(
         first: int,
-        shown: wp.array(dtype=wp.vec3), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64), white: float,
+        rendered: wp.array(dtype=wp.vec3), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64), white: float,
         mask: wp.array(dtype=wp.float32), least: float, weights: wp.array(dtype=wp.float64),
     ):
         """Write the squared mean difference over channels between encoded values and the codes of photo index[0].
@@ -24,7 +24,7 @@ def error_weights_kernel(code):
         """
         i = first + wp.tid()
         photo = wp.int32(index[0])
-        color = shown[i]
+        color = rendered[i]
         error = float(0.0)
         for channel in range(3):
             error += wp.abs(wp.clamp(color[channel], 0.0, 1.0) - float(codes[photo, 3 * i + channel]) / white) / 3.0
@@ -40,12 +40,12 @@ def sampled_pixels(
     first: int,
     places: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), width: int, view: int,
     across: float, down: float, columns: int, rows: int, border: int,
-    pixels: wp.array2d(dtype=wp.int32), meant: wp.array(dtype=wp.bool),
+    pixels: wp.array2d(dtype=wp.int32), is_sample: wp.array(dtype=wp.bool),
 ):
     """Convert places in a photo `width` pixels wide to pixels (view, column, row) of the same photo at another size.
 
     The other size is columns x rows, across and down times as large. Pixels are clamped to `border` from its edge.
-    meant: whether a pixel was that far from the edge before and the total of the weights is above 0.
+    is_sample: whether a pixel was that far from the edge before and the total of the weights is above 0.
     """
     k = first + wp.tid()
     place = wp.int32(places[k])
@@ -55,4 +55,4 @@ def sampled_pixels(
     pixels[k, 0] = view
     pixels[k, 1] = wp.clamp(column, border, columns - border - 1)
     pixels[k, 2] = wp.clamp(row, border, rows - border - 1)
-    meant[k] = total[0] > wp.float64(0.0) and pixels[k, 1] == column and pixels[k, 2] == row
+    is_sample[k] = total[0] > wp.float64(0.0) and pixels[k, 1] == column and pixels[k, 2] == row

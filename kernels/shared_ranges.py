@@ -31,7 +31,7 @@ class Work(ctypes.Structure):
 
 
 class Arguments(ctypes.Structure):
-    """share_ranges()'s, as Warp packs them."""
+    """The arguments of share_ranges(), as Warp packs them."""
 
     _fields_ = ("work", ctypes.c_uint64), ("fork", ctypes.c_uint64), ("threads", ctypes.c_int32)
 

@@ -116,7 +116,7 @@ def projection_kernel(dtype, antialiased: bool):
 
 @cache
 def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
-    """list_tiles, blend and blend_adjoint for one scalar type and number of channels."""
+    """Return list_tiles, blend and blend_adjoint for one scalar type and number of channels."""
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
     features_type = vector(channels, dtype)
@@ -182,11 +182,11 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         image: wp.array(dtype=features_type), transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32),
     ):
         """Blend each pixel's list front to back. ends: one past the last intersection that a pixel shows."""
-        found = pixel_of(first + wp.tid(), columns)
-        if found[1] < width and found[2] < height:
-            pixel = found[2] * width + found[1]
+        place = pixel_of(first + wp.tid(), columns)
+        if place[1] < width and place[2] < height:
+            pixel = place[2] * width + place[1]
             d = directions[pixel]
-            bounds = ranges[found[0]]
+            bounds = ranges[place[0]]
             left_over = real(1.0)
             total = features_type()
             end = bounds[0]
@@ -222,14 +222,14 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         by_image: wp.array(dtype=features_type), by_transmittance: wp.array(dtype=real), rows: wp.array2d(dtype=real),
     ):
         """Add gradients to rows[places[intersection]]: cap direction, across, along (3 each), opacity, features."""
-        found = pixel_of(first + wp.tid(), columns)
-        if found[1] < width and found[2] < height:
-            pixel = found[2] * width + found[1]
+        place = pixel_of(first + wp.tid(), columns)
+        if place[1] < width and place[2] < height:
+            pixel = place[2] * width + place[1]
             d = directions[pixel]
             incoming = by_image[pixel]
             left_over = transmittance[pixel]
             behind = left_over * by_transmittance[pixel]
-            begin = ranges[found[0]][0]
+            begin = ranges[place[0]][0]
             k = ends[pixel]
             while k > begin:
                 k -= 1

@@ -145,12 +145,12 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
             md += moments[1, y, i + k * channels] * weight
             ss += moments[2, y, i + k * channels] * weight
             dd += moments[3, y, i + k * channels] * weight
-        found, by_sd, by_ss, by_dd = similarity_of(ms, md, ss, dd)
+        similarity_value, by_sd, by_ss, by_dd = similarity_of(ms, md, ss, dd)
         if wp.static(distance):
             apart = wp.abs(a[y, i] - b[y, i])
-            similarity[y, i] = apart * distance_weight + (run(real(1.0)) - found) * dissimilarity_weight
+            similarity[y, i] = apart * distance_weight + (run(real(1.0)) - similarity_value) * dissimilarity_weight
         else:
-            similarity[y, i] = found
+            similarity[y, i] = similarity_value
         derivatives[0, y, i] = by_sd
         derivatives[1, y, i] = by_ss
         derivatives[2, y, i] = by_dd

@@ -1,12 +1,12 @@
-"""Which Gaussian touches which tile, front to back.
+"""List the Gaussians that touch each tile, front to back.
 
-`pack_splats` counts the tiles that each Gaussian's ellipse really touches (not its bounding box), and a prefix sum
-over the counts gives every Gaussian its range of intersections. Two ways lead to lists in depth order, by stable sorts:
-Gaussians are put in it, `emit_intersections` fills their ranges, and a sort of the intersections by tile leaves each
-tile's list in the order in which they were emitted (the GPU has least to do); or `emit_keys` fills the ranges of the
-Gaussians as they come, and the intersections are sorted once by tile and depth (the host has). `find_lists` finds where
-each tile's list begins and ends, and which corners of its tile each entry touches. Adjoints sum what they write for
-each entry by Gaussian in one order, whatever runs when: `gather_intersections`.
+`pack_splats` counts the tiles that each Gaussian's ellipse touches (the ellipse, not its bounding box), and a prefix
+sum over the counts gives every Gaussian its range of intersections. There are two ways to lists in depth order, both by
+stable sorts. With many Gaussians, these are sorted by depth, `emit_intersections` fills their ranges in that order, and
+a sort by tile keeps it: the least work for a GPU. With few, `emit_keys` fills the ranges in the Gaussians' own order,
+and one sort by tile and depth follows: the fewest launches. `find_lists` finds where each tile's list begins and ends,
+and which corners of its tile each intersection touches. Adjoints write a row for each intersection, and
+`gather_intersections` sums the rows of a Gaussian in a fixed order, whatever the order of execution.
 """
 
 from functools import cache
@@ -19,20 +19,20 @@ from .geometry import geometry
 
 DEPTH_BITS = 30
 DEPTH_OFFSET = (127 - 40) << 23
-"""Of the bits of a float32 depth those count that differ between 2^-40 and 2^88: a pass of the sort less. Nearer and
-farther ones are alike."""
+"""Sort keys keep only the 30 bits of a float32 depth that tell depths from 2^-40 to 2^88 apart, which saves a pass of
+the radix sort. Depths outside of that range compare equal."""
 
 
 @cache
 def tile_kernels(dtype) -> SimpleNamespace:
-    """pack_splats, key_by_depth, emit_intersections, emit_keys and gather_intersections for one scalar type."""
+    """Return pack_splats, key_by_depth, emit_intersections, emit_keys and gather_intersections for a scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     reals, reals2d = wp.array(dtype=real), wp.array2d(dtype=real)
     ints, int64s = wp.array(dtype=wp.int32), wp.array(dtype=wp.int64)
     vec2s, vec4s, bools = wp.array(dtype=vec2), wp.array(dtype=vec4), wp.array(dtype=wp.bool)
     size = float(TILE_SIZE)
-    # Without fused multiply-adds: who counts and who emits must decide alike; a compiler fuses each its own way.
+    # Without fused multiply-adds, which a compiler places differently in each kernel: counting and emitting must agree.
     options = FORWARD | {"fuse_fp": False}
 
     @wp.func
@@ -115,9 +115,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
         ):
             """Write the intersections of each Gaussian, which end at ends[place].
 
-            If fewer tiles are touched than were counted, or no Gaussian is left, the rest up to `max_intersections`
-            gets tile columns * rows, which is none. overflow: [1], whether more were counted than there is memory for;
-            or None.
+            If fewer tiles are touched than were counted, or no Gaussian is left, further intersections up to
+            `max_intersections` get tile columns * rows, which does not exist. overflow: [1], whether more were counted
+            than there is memory for; or None.
 
             keys: tiles, of Gaussians in their order; or if by_depth, of Gaussians by index, tiles above DEPTH_BITS of
             the depth, whose bits order as positive numbers do. Without by_depth `depths` is None, with it `order`.
@@ -189,7 +189,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
 @wp.kernel(module="unique", module_options=FORWARD)
 def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: wp.array2d(dtype=wp.int32)):
-    """counts[c, t], of zeros: how many intersections of chunk c, `size` of them, are tile t's. Covers [0, chunks)."""
+    """Add to counts[c, t] how many intersections of chunk c, which has `size`, are in tile t; launched over chunks."""
     chunk = first + wp.tid()
     for entry in range(chunk * size, wp.min((chunk + 1) * size, tiles.shape[0])):
         counts[chunk, tiles[entry]] = counts[chunk, tiles[entry]] + 1
@@ -198,7 +198,7 @@ def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: 
 @wp.kernel(module="unique", module_options=FORWARD)
 def place_intersections(
     first: int,
-    tiles: wp.array(dtype=wp.int32), given: wp.array(dtype=wp.int32), size: int, starts: wp.array2d(dtype=wp.int32),
+    tiles: wp.array(dtype=wp.int32), emitted: wp.array(dtype=wp.int32), size: int, starts: wp.array2d(dtype=wp.int32),
     gaussians: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32),
 ):
     """Write Gaussians, and their places before, to starts[chunk, tile], counted up; launched over the chunks.
@@ -210,7 +210,7 @@ def place_intersections(
         tile = tiles[entry]
         slot = starts[chunk, tile]
         starts[chunk, tile] = slot + 1
-        gaussians[slot] = given[entry]
+        gaussians[slot] = emitted[entry]
         if places.shape[0] > 0:
             places[slot] = entry
 

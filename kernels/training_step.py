@@ -52,7 +52,7 @@ def judge_step(
 
 @wp.func
 def bias_correction(decay_log: float, step: float) -> float:
-    """1 - exp(step decay_log), without the cancellation that the first steps would suffer in float32."""
+    """Return 1 - exp(step decay_log), without the cancellation of the first steps in float32."""
     x = step * decay_log
     correction = 1.0 - wp.exp(x)
     if x > -0.02:
@@ -80,8 +80,8 @@ _floats = wp.array(dtype=wp.float32)
 
 
 @wp.func
-def counted(parameters: _floats, live: wp.array(dtype=wp.int32), width: int) -> int:
-    """How many of the numbers count: where `live`, [1] or [0], says how many rows do, those of so many of a width."""
+def live_numbers(parameters: _floats, live: wp.array(dtype=wp.int32), width: int) -> int:
+    """Return how many numbers to update: those of the first live[0] rows of `width`, or all without live."""
     count = parameters.shape[0]
     if live.shape[0] > 0 and width > 0:
         count = wp.min(count, live[0] * width)
@@ -102,26 +102,26 @@ def update_by_adam(
 
     Launched over the longest parameter. step: [1], already counted up; rate: [1]; all of length 0 for an absent
     parameter. *_decay_log: logarithms of the decays; *_gain: 1 - decay, not as float32 would round it. means, squares:
-    the moments. live, width_*: as counted() takes them.
+    the moments. live, width_*: as of live_numbers().
     """
     i = first + wp.tid()
     if skipped[0] == 0.0:
-        if i < counted(parameters_a, live, width_a):
+        if i < live_numbers(parameters_a, live, width_a):
             step_by_adam(
                 i, gradients_a[i], step_a[0], rate_a[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_a, means_a, squares_a,
             )  # fmt: skip
-        if i < counted(parameters_b, live, width_b):
+        if i < live_numbers(parameters_b, live, width_b):
             step_by_adam(
                 i, gradients_b[i], step_b[0], rate_b[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_b, means_b, squares_b,
             )  # fmt: skip
-        if i < counted(parameters_c, live, width_c):
+        if i < live_numbers(parameters_c, live, width_c):
             step_by_adam(
                 i, gradients_c[i], step_c[0], rate_c[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_c, means_c, squares_c,
             )  # fmt: skip
-        if i < counted(parameters_d, live, width_d):
+        if i < live_numbers(parameters_d, live, width_d):
             step_by_adam(
                 i, gradients_d[i], step_d[0], rate_d[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_d, means_d, squares_d,
@@ -133,9 +133,9 @@ def find_nonfinite(
     first: int,
     a: _floats, b: _floats, c: _floats, d: _floats, e: _floats, f: _floats,
     g: _floats, h: _floats, i: _floats, j: _floats, k: _floats, m: _floats,
-    found: _floats,
+    result: _floats,
 ):
-    """found[0]: infinity where one of the numbers is not finite, else as it was. Covers the longest."""
+    """Set result[0] to infinity if one of the numbers is not finite. Launched over the longest."""
     place = first + wp.tid()
     finite = bool(True)
     if place < a.shape[0]:
@@ -163,7 +163,7 @@ def find_nonfinite(
     if place < m.shape[0]:
         finite = finite and wp.isfinite(m[place])
     if not finite:
-        found[0] = wp.inf
+        result[0] = wp.inf
 
 
 @wp.func
@@ -195,7 +195,7 @@ def harmonics_adam_kernel(count: int):
     ):
         thread = first + wp.tid()
         turn = int(step[0]) % turns
-        final = counted(parameters, live, wp.static(3 * count)) - 1
+        final = live_numbers(parameters, live, wp.static(3 * count)) - 1
         if skipped[0] == 0.0 and place_in_turn(thread, turn, turns) <= final:
             owners = whole_numbers()
             rows = whole_numbers()
@@ -216,12 +216,12 @@ def harmonics_adam_kernel(count: int):
             degrees = basis.shape[1]
             for view in range(basis.shape[0]):
                 for k in range(wp.static(NUMBERS)):
-                    seen = basis[view, wp.min(rows[k], degrees - 1), owners[k]]
+                    basis_value = basis[view, wp.min(rows[k], degrees - 1), owners[k]]
                     by_value = value_gradients[view, owners[k], channels[k]]
-                    gradients[k] += wp.where(rows[k] < degrees, seen, 0.0) * by_value
-            made = wp.ceil(step[0] / float(turns))
-            length = rate[0] / bias_correction(first_decay_log, made)
-            enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, made))
+                    gradients[k] += wp.where(rows[k] < degrees, basis_value, 0.0) * by_value
+            turn_count = wp.ceil(step[0] / float(turns))
+            length = rate[0] / bias_correction(first_decay_log, turn_count)
+            enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, turn_count))
             for k in range(wp.static(NUMBERS)):
                 mean = means[k] + first_gain * (gradients[k] - means[k])
                 square = squares[k] + second_gain * (gradients[k] * gradients[k] - squares[k])
@@ -239,7 +239,7 @@ def add_gradient_statistics(
     first: int,
     gradients: wp.array(dtype=wp.vec2), radii: wp.array(dtype=wp.float32), usable: wp.array(dtype=wp.float32),
     half_width: float, half_height: float,
-    gradient_sum: wp.array(dtype=wp.float32), seen: wp.array(dtype=wp.float32),
+    gradient_sum: wp.array(dtype=wp.float32), visits: wp.array(dtype=wp.float32),
 ):
     """Add, for each Gaussian with a radius, the length of its gradient by the projected centre, and 1.
 
@@ -255,7 +255,7 @@ def add_gradient_statistics(
         if larger > 0.0:
             length = larger * wp.sqrt((x / larger) * (x / larger) + (y / larger) * (y / larger))
         gradient_sum[i] = gradient_sum[i] + length
-        seen[i] = seen[i] + 1.0
+        visits[i] = visits[i] + 1.0
 
 
 @wp.kernel(module="unique", module_options=FORWARD)
