@@ -1,6 +1,6 @@
 """The command `sehdr-warp`: find the command, parse its options, call it, and print errors as one line.
 
-Each command is a dataclass of options and a function that takes them, in the `commands` module of its room. To add one,
+Each command is a dataclass of options and a function that takes them, in the `commands` module of its package. To add one,
 add a line to COMMANDS. A module is imported when its command runs, so nothing here imports torch.
 """
 
@@ -212,7 +212,7 @@ First try:  {PROGRAM} train embedded --out runs/first
 
 
 def _summary(command: Command) -> str:
-    """Return the first sentence of a command's help, read from its source because importing all rooms takes seconds."""
+    """Return the first sentence of a command's help, read from its source because imports take seconds."""
     import ast
     from pathlib import Path
 
