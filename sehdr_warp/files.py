@@ -77,8 +77,8 @@ def _written_beside(path: Path, overwrite: bool, ours: bool, folder: bool) -> It
             yield temporary
             if folder and not ours:
                 seal(temporary)
-            for written in (temporary, *temporary.rglob("*")):
-                _sync(written)
+            for file in (temporary, *temporary.rglob("*")):
+                _sync(file)
             check_absent(path, overwrite, folder=folder, ours=ours)
             if not (folder or ours):
                 list_file(temporary, path)
@@ -162,14 +162,9 @@ def read_text(path: Path, limit: int = MAX_FILE_BYTES, errors: str = "strict") -
 
 
 def read_lines(path: Path, errors: str = "strict") -> Iterator[str]:
-    """Yield the lines of a file of UTF-8 text.
+    """Yield the lines of a file of UTF-8 text; raise InputError as read_text does, and for a line that is too long.
 
-    Args:
-        path: the file.
-        errors: "strict", or "surrogateescape" to keep bytes that are not UTF-8, as Python keeps them in names of files.
-
-    Raises:
-        InputError: as read_text raises it, and for a line that is too long.
+    errors: "strict", or "surrogateescape" to keep bytes that are not UTF-8, as Python keeps them in names of files.
     """
     try:
         if plain_size(path) == 0:

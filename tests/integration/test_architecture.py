@@ -13,7 +13,19 @@ PACKAGE = ROOT / "sehdr_warp"
 
 # What each package may import of the others: training -> runs -> model -> response -> rasterizer -> kernels, and below
 # them all what any package may use.
-ANY = {"errors", "quiet", "arguments", "files", "own_files", "console", "sandbox", "parallel", "limits", "caches"}
+ANY = {
+    "errors",
+    "quiet",
+    "arguments",
+    "files",
+    "own_files",
+    "console",
+    "sandbox",
+    "parallel",
+    "limits",
+    "caches",
+    "progress",
+}
 ALLOWED = {
     "kernels": set(),
     "errors": set(),
@@ -40,10 +52,11 @@ ALLOWED = {
         "splats",
         "model.exposure",
         "model.baking",
+        "model.lights",
         "model.sensor_colors",
         "model.visibility",
     },
-    "viewer": ANY | {"runs", "scene", "output"},
+    "viewer": ANY | {"runs", "scene", "output", "model.lights"},
     "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.names", "output.charts"},
     "runs": ANY | {"scene", "response", "prior", "model", "splats", "output.notebook"},
     "training": ANY
