@@ -56,7 +56,7 @@ ALLOWED = {
         "model.sensor_colors",
         "model.visibility",
     },
-    "viewer": ANY | {"runs", "scene", "output", "model.lights"},
+    "viewer": ANY | {"runs", "scene", "output", "splats", "model.lights"},
     "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.names", "output.charts"},
     "runs": ANY | {"scene", "response", "prior", "model", "splats", "output.notebook"},
     "training": ANY
