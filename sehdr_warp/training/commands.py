@@ -81,7 +81,7 @@ class MachineOptions:
     gpus: int = 1
     """GPUs of this machine to train on; with --blocks, blocks to train at once."""
     slurm: str | None = None
-    """Train blocks as SLURM jobs with these parameters, such as partition=gpu,time=240 (minutes)."""
+    """Submit blocks to SLURM: partition=gpu,time=MINUTES."""
 
 
 @dataclass(frozen=True)
