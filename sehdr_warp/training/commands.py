@@ -49,9 +49,9 @@ class TrainingOptions:
     seed: int | None = None
     """Seed of every random number."""
     blocks: str | None = None
-    """Divide the photos by space into N blocks, trained one by one and merged; auto chooses N."""
+    """Train in N blocks of space, merged; auto chooses N."""
     plan_only: bool = False
-    """Print what the scene does not need, and why; train nothing."""
+    """Print what the scene does not need; train nothing."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class OutputOptions:
     tensorboard: bool = False
     """Write TensorBoard event files into the run."""
     view: bool = False
-    """Serve the page of `view` meanwhile, from port 8080 or the next free one."""
+    """Serve the page of `view` meanwhile, from port 8080."""
     json: bool = False
     """Print the result as JSON on standard output."""
 
@@ -79,7 +79,7 @@ class MachineOptions:
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
     gpus: int = 1
-    """GPUs of this machine to train on; with --blocks, blocks to train at once."""
+    """GPUs, for one training or for blocks."""
     slurm: str | None = None
     """Submit blocks to SLURM: partition=gpu,time=MINUTES."""
 
