@@ -45,6 +45,15 @@ def test_docstrings_name_every_argument_and_field_in_googles_form(name):
     assert not names or {*re.findall(r"^ {4}(\w+): ", told[1], re.MULTILINE)} == {*names}
 
 
+def test_type_checkers_see_every_public_name():
+    from sehdr_warp import rasterizer
+    from sehdr_warp.compat import gsplat
+
+    text = (ROOT / "tests" / "public_types.py").read_text()
+    names = {*sehdr_warp.__all__, *rasterizer.__all__, *gsplat.__all__}
+    assert not {name for name in names if not re.search(rf"\b{name}\b", text)}
+
+
 def test_unknown_names_are_attribute_errors():
     with pytest.raises(AttributeError, match="no attribute 'trian'"):
         sehdr_warp.trian  # noqa: B018
