@@ -22,6 +22,7 @@ _HOMES = {
     "output.brackets": ("write_brackets",),
     "output.export": ("export",),
     "output.environment_map": ("write_environment_map",),
+    "output.proxy_mesh": ("write_proxy_mesh",),
     "output.render_views": ("render_views",),
     "output.report": ("write_report",),
     "response": ("Response", "response_by_name", "response_names"),

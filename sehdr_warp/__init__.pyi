@@ -7,6 +7,7 @@ from .evaluation.folder import evaluate_folder
 from .output.brackets import write_brackets
 from .output.environment_map import write_environment_map
 from .output.export import export
+from .output.proxy_mesh import write_proxy_mesh
 from .output.render_views import render_views
 from .output.report import write_report
 from .rasterizer import Rendering, differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim
@@ -62,6 +63,7 @@ __all__ = [
     "train",
     "write_brackets",
     "write_environment_map",
+    "write_proxy_mesh",
     "write_report",
 ]
 

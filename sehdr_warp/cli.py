@@ -43,6 +43,7 @@ COMMANDS = {
         "lights": Command("output.commands", "Lights", "run_lights"),
         "meter": Command("output.commands", "Meter", "run_meter"),
         "export": Command("output.splat_commands", "Export", "run_export"),
+        "mesh": Command("output.splat_commands", "Mesh", "run_mesh"),
         "convert": Command("output.splat_commands", "Convert", "run_convert"),
     },
     "choose and calibrate": {
@@ -63,6 +64,8 @@ _COMMANDS = {name: command for group in COMMANDS.values() for name, command in g
 _RENAMED = {
     "panorama": f"the command is {PROGRAM} envmap",
     "resume": f"{PROGRAM} train --resume --out RUN continues a training",
+    "continue": f"{PROGRAM} train --resume --out RUN continues a training",
+    "demo": f"{PROGRAM} train embedded --preset demo --out RUN trains one; make demo, in a checkout, reports on it",
     "score": f"the command is {PROGRAM} eval FOLDER --truth SET",
     "bench": "it left the installed program; in a checkout, run python -m benchmarks",
 }

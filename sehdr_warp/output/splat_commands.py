@@ -7,7 +7,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from ..errors import UsageError
-from ..runs.open import open_scene
+from ..runs.open import open_run, open_scene
 from .options import WorldOptions, changed_flags
 
 
@@ -73,6 +73,34 @@ class Convert:
     """Replace a file that exists."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh:
+    """Write a mesh of a scene's surfaces: to catch shadows, to collide, to hide what is behind."""
+
+    run: Positional[Path]
+    """Folder of a run."""
+    out: Path
+    """The file: .usda or .usdc (OpenUSD) or .obj."""
+    world: WorldOptions = field(default_factory=WorldOptions)
+    crop: str | None = None
+    """Mesh only this region, in upright coordinates: sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1."""
+    resolution: int = 160
+    """Voxels along the longest side; memory grows with its cube."""
+    overwrite: bool = False
+    """Replace a file that exists."""
+    device: str | None = None
+    """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+def run_mesh(args: Mesh) -> None:
+    """Run `sehdr-warp mesh`."""
+    from .proxy_mesh import check_mesh, write_proxy_mesh
+
+    check_mesh(args.out, args.resolution, args.crop, args.overwrite)  # Before the scene is opened.
+    options = {"resolution": args.resolution, "crop": args.crop, "overwrite": args.overwrite}
+    print(write_proxy_mesh(open_run(args.run, args.device), args.out, **options, **vars(args.world)))
 
 
 def run_export(args: Export) -> None:

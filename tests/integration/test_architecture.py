@@ -33,6 +33,7 @@ ALLOWED = {
     "sandbox": {"errors"},
     "parallel": {"limits"},
     "limits": set(),
+    "progress": set(),
     "caches": set(),
     "files": {"errors", "own_files"},
     "own_files": set(),

@@ -1,0 +1,163 @@
+"""Surfaces from the depth of many views: a truncated signed distance field (Curless and Levoy, 1996) and its zero."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Camera
+
+from ..progress import tracked
+from .images import as_array
+from .splat_edits import Box, Sphere
+from .world_transform import WorldTransform
+
+log = logging.getLogger(__name__)
+MOST_VIEWS, _VIEW_SIZE = 40, 400  # Training views that are fused, and their longest side in pixels
+_TRUNCATION = 3.0  # Voxels around the surface within which the distance field is not clamped
+_EDGE = 0.08  # Relative depth step to a neighboring pixel from which depth is a mean over an edge, and is not used
+_LEAST_ALPHA = 0.5
+_PERCENTILES, _FAR = (2, 98), 2.5  # Of the points within this many times the median depth: the box without a crop
+_CHUNK = 1 << 20  # Voxels at once
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """A camera in the file's coordinates, with its depth [H, W] (0 where it is not known) and radiance [H, W, 3]."""
+
+    camera: Camera
+    depth: torch.Tensor
+    radiance: torch.Tensor
+
+
+def depth_view(run: Any, camera: Camera, transform: WorldTransform) -> DepthView:
+    """Render a view; depth at edges and where little covers the pixel is 0."""
+    small = camera.within(_VIEW_SIZE)
+    rendered = run.render(small)
+    depth = np.where(as_array(rendered.alpha) > _LEAST_ALPHA, as_array(rendered.depth), 0) * transform.scale
+    flat = np.ones(depth.shape, bool)
+    for axis in (0, 1):
+        step = np.abs(np.diff(depth, axis=axis)) > _EDGE * np.minimum(*_neighbors(depth, axis))
+        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
+        before[axis], after[axis] = (0, 1), (1, 0)
+        flat &= ~(np.pad(step, before) | np.pad(step, after))
+    depth = torch.from_numpy(np.where(flat, depth, 0).astype(np.float32))
+    return DepthView(transform.camera(small), depth, torch.from_numpy(np.array(as_array(rendered.hdr))))
+
+
+def _neighbors(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return values without the last and without the first along an axis."""
+    count = values.shape[axis]
+    return np.take(values, range(count - 1), axis), np.take(values, range(1, count), axis)
+
+
+def surface_points(view: DepthView) -> np.ndarray:
+    """Return the points [N, 3] of a view's depth."""
+    depth, camera = view.depth.numpy(), view.camera
+    row, column = np.nonzero(depth)
+    rays = [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))]
+    return (np.stack(rays, axis=1) * depth[row, column, None]) @ camera.world_to_camera[:3, :3] + camera.position
+
+
+def mesh_bounds(views: Sequence[DepthView], region: Box | Sphere | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the box to mesh: that of the region, or of what most views show, but not far behind."""
+    if isinstance(region, Box):
+        return region.low, region.high
+    if isinstance(region, Sphere):
+        return region.center - region.radius, region.center + region.radius
+    depths = np.concatenate([view.depth[view.depth > 0].numpy() for view in views])
+    if not depths.size:
+        raise SehdrError("no view shows a surface to mesh; was the training long enough?")
+    near = float(np.median(depths)) * _FAR
+    points = np.concatenate(
+        [surface_points(replace(view, depth=torch.where(view.depth < near, view.depth, 0)))[::7] for view in views]
+    )
+    low, high = (np.percentile(points, q, axis=0) for q in _PERCENTILES)
+    margin = 0.03 * (high - low).max()
+    return low - margin, high + margin
+
+
+def voxel_centers(low: np.ndarray, voxel: float, shape: Sequence[int]) -> np.ndarray:
+    """Return the centers of all voxels, [X, Y, Z, 3]."""
+    axes = [low[axis] + voxel * np.arange(count) for axis, count in enumerate(shape)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def fuse_depth(
+    views: Sequence[DepthView], low: np.ndarray, voxel: float, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fuse the views' depth.
+
+    Returns:
+        Signed distance to the surface in truncation lengths, in [-1, 1] and positive outside; number of views that
+        measured a voxel; mean radiance near the surface. [X, Y, Z] and [X, Y, Z, 3].
+    """
+    count = int(np.prod(shape))
+    distance, weight = torch.zeros(count), torch.zeros(count)
+    light, near = torch.zeros(count, 3), torch.zeros(count)
+    reach = _TRUNCATION * voxel
+    for _, view in tracked("fusing depth of views", views, log):
+        camera = view.camera
+        turn = torch.tensor(camera.world_to_camera, dtype=torch.float32)
+        for start, points in _chunks(low, voxel, shape):
+            part = slice(start, start + len(points))
+            x, y, z = (points @ turn[:3, :3].T + turn[:3, 3]).unbind(1)
+            ahead = z > 1e-6
+            safe = torch.where(ahead, z, torch.ones_like(z))
+            column = (camera.fx * x / safe + camera.cx).floor().long()
+            row = (camera.fy * y / safe + camera.cy).floor().long()
+            ahead &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            index = torch.where(ahead, row * camera.width + column, torch.zeros_like(row))
+            depth = view.depth.reshape(-1)[index]
+            signed = (depth - z) / reach
+            measured = ahead & (depth > 0) & (signed > -1)
+            distance[part] += torch.where(measured, signed.clamp(-1, 1), 0)
+            weight[part] += measured
+            close = measured & (signed < 1)
+            light[part] += view.radiance.reshape(-1, 3)[index] * close[:, None]
+            near[part] += close
+    mean = distance / weight.clamp_min(1)
+    colors = light / near.clamp_min(1)[:, None]
+    return mean.reshape(shape).numpy(), weight.reshape(shape).numpy(), colors.reshape(*shape, 3).numpy()
+
+
+def _chunks(low: np.ndarray, voxel: float, shape: tuple[int, ...]) -> Iterator[tuple[int, torch.Tensor]]:
+    """Yield the first index and the centers [N, 3] of slabs of voxels."""
+    slab = shape[1] * shape[2]
+    step = max(1, _CHUNK // slab)
+    for first in range(0, shape[0], step):
+        part = (min(step, shape[0] - first), *shape[1:])
+        origin = low + np.array([first * voxel, 0, 0])
+        yield first * slab, torch.from_numpy(voxel_centers(origin, voxel, part).reshape(-1, 3)).float()
+
+
+def zero_surface(distance: np.ndarray, measured: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [V, 3], from the first voxel, and faces [F, 3] of the zero of a distance field."""
+    try:
+        found = marching_cubes_function()(
+            distance, 0.0, spacing=(voxel,) * 3, mask=measured, gradient_direction="descent"
+        )
+    except (ValueError, RuntimeError):  # Nothing of the field is measured, or it has no zero.
+        raise SehdrError("there is no surface to mesh; take another --crop, or train longer") from None
+    vertices, faces = found[:2]
+    finite = np.isfinite(vertices).all(axis=1)
+    return vertices, faces[finite[faces].all(axis=1)]
+
+
+def marching_cubes_function() -> Any:
+    """Return scikit-image's marching cubes; raise SehdrError if it is not installed."""
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError:
+        raise SehdrError("meshes need scikit-image; pip install 'sehdr-warp[mesh]'") from None
+    return marching_cubes
+
+
+def nearest_values(volume: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return the values of a volume [X, Y, Z, 3] at the voxels nearest to places [V, 3]."""
+    index = np.clip(np.rint(places).astype(int), 0, np.array(volume.shape[:3]) - 1)
+    return volume[tuple(index.T)]

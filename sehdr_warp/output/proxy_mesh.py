@@ -1,0 +1,314 @@
+"""A proxy mesh of a scene: for shadows, collisions and depth tests where a program cannot use Gaussians.
+
+Depth of the training views is fused (see depth_fusion) and scikit-image extracts the surface. Colors are the scene's
+mean radiance there.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.scene import Camera
+
+from ..files import atomic_path, check_absent
+from ..progress import tracked
+from ..splats.usd import pxr
+from .camera_paths import evenly
+from .depth_fusion import (
+    MOST_VIEWS,
+    depth_view,
+    fuse_depth,
+    marching_cubes_function,
+    mesh_bounds,
+    nearest_values,
+    surface_points,
+    voxel_centers,
+    zero_surface,
+)
+from .splat_edits import Box, Sphere, read_region
+from .tonemap import encode_srgb
+from .world_transform import WorldTransform, describe, world_transform
+
+log = logging.getLogger(__name__)
+SUFFIXES = (".obj", ".usda", ".usdc")
+RESOLUTIONS = 16, 512
+_FEWEST_VIEWS = 2  # Views that must have measured a voxel
+_LEAST_PART = 0.01  # Share of all triangles that a connected part needs to stay
+_CHECKED = 3  # Held-out views that the mesh's depth is compared in
+_CLOSE = 0.03  # Relative difference of depth that counts as agreement
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A floor: the lowest large level part of a mesh, in upright coordinates.
+
+    Attributes:
+        height: Of the plane where x and z are 0.
+        normal: [3] unit vector, upwards.
+        share: Share of the mesh's area.
+    """
+
+    height: float
+    normal: np.ndarray
+    share: float
+
+    @property
+    def tilt(self) -> float:
+        """Angle to level, degrees."""
+        return float(np.degrees(np.arccos(np.clip(self.normal[1], -1, 1))))
+
+    def corners(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Return the corners [4, 3] of the plane above a box, counterclockwise as seen from above."""
+        x, z = np.array([low[0], low[0], high[0], high[0]]), np.array([low[2], high[2], high[2], low[2]])
+        return np.stack([x, self.height - (self.normal[0] * x + self.normal[2] * z) / self.normal[1], z], axis=1)
+
+
+@dataclass(frozen=True)
+class ProxyMesh:
+    """A triangle mesh in the coordinates of a file.
+
+    Attributes:
+        vertices: [V, 3] float32.
+        faces: [F, 3] int32, counterclockwise as seen from outside.
+        radiance: [V, 3] float32, scene-linear Rec.709.
+        voxel: Side of a voxel.
+        ground: The floor, if one was found.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    radiance: np.ndarray
+    voxel: float
+    ground: Ground | None = None
+
+
+def write_proxy_mesh(
+    run: Any,
+    path: Path | str,
+    *,
+    resolution: int = 160,
+    crop: str | None = None,
+    axes: str = "upright",
+    up: str | Sequence[float] | None = None,
+    scale: float | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a mesh of a scene's surfaces, and log how far its depth agrees with that of the scene.
+
+    An OpenUSD file holds `/World/Proxy` with radiance as displayColor and, if a floor was found, a level plane
+    `/World/Ground`. An OBJ file holds both as objects, with display colors.
+
+    Args:
+        run: A trained run, with training cameras.
+        path: The file: .obj, .usda or .usdc.
+        resolution: Voxels along the longest side of the meshed box, 16 to 512. Memory grows with its cube.
+        crop: Region to mesh, as "box:x0,y0,z0,x1,y1,z1" or "sphere:x,y,z,radius" in the file's coordinates; by
+            default what most photos show, without what is far behind.
+        axes: As in world_transform.
+        up: As in world_transform.
+        scale: As in world_transform.
+        overwrite: Replace a file that exists.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: For an unknown suffix, or if the file exists.
+        SehdrError: If scikit-image or OpenUSD is missing, for values that cannot be, or if there is no surface.
+    """
+    path, region = Path(path), check_mesh(path, resolution, crop, overwrite)
+    transform = world_transform(run, axes, up=up, scale=scale)
+    mesh = proxy_mesh(run, transform, resolution=resolution, region=region)
+    with atomic_path(path, overwrite) as temporary:
+        write = _write_obj if path.suffix.lower() == ".obj" else _write_usd
+        write(temporary, mesh, transform, run)
+    log.info("%s: %d triangles, voxels of %.3g", path.name, len(mesh.faces), mesh.voxel)
+    if mesh.ground is not None:
+        text = "ground: at y = %.3g, %.1f degrees off level, %.0f %% of the surface"
+        log.info(text, mesh.ground.height, mesh.ground.tilt, 100 * mesh.ground.share)
+    _log_agreement(mesh, run, transform)
+    return path
+
+
+def check_mesh(path: Path | str, resolution: int, crop: str | None, overwrite: bool) -> Box | Sphere | None:
+    """Return the region to mesh; raise the errors of write_proxy_mesh() that need no scene."""
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        kind = path.suffix or "a file without a suffix"
+        raise InputError(path, f"a mesh is not written as {kind}", f"use one of {', '.join(SUFFIXES)}")
+    if not RESOLUTIONS[0] <= resolution <= RESOLUTIONS[1]:
+        raise SehdrError(f"resolution {resolution} is not between {RESOLUTIONS[0]} and {RESOLUTIONS[1]} voxels")
+    region = None if crop is None else read_region(crop)
+    marching_cubes_function()
+    if path.suffix.lower() != ".obj":
+        pxr("Usd")
+    check_absent(path, overwrite)
+    return region
+
+
+def proxy_mesh(
+    run: Any, transform: WorldTransform, *, resolution: int = 160, region: Box | Sphere | None = None
+) -> ProxyMesh:
+    """Return the mesh of a run in the coordinates that a transform leads to; arguments as in write_proxy_mesh."""
+    cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
+    if not cameras:
+        raise SehdrError(f"{run.path}: has no training cameras whose depth could be fused")
+    views = [
+        depth_view(run, camera, transform) for _, camera in tracked("depth of views", evenly(cameras, MOST_VIEWS), log)
+    ]
+    low, high = mesh_bounds(views, region)
+    voxel = float((high - low).max()) / resolution
+    shape = tuple(int(side) for side in np.maximum(np.ceil((high - low) / voxel), 2) + 1)
+    distance, weight, radiance = fuse_depth(views, low, voxel, shape)
+    if isinstance(region, Sphere):
+        outside = ~region.contains(voxel_centers(low, voxel, shape).reshape(-1, 3)).reshape(shape)
+        weight[outside] = 0
+    vertices, faces = zero_surface(distance, weight >= min(_FEWEST_VIEWS, len(views)), voxel)
+    colors = nearest_values(radiance, vertices / voxel)
+    vertices, faces, colors = _large_parts(vertices + low, faces, colors)
+    places = np.array([view.camera.position for view in views])
+    ground = find_ground(vertices, faces, places, voxel)
+    return ProxyMesh(vertices.astype(np.float32), faces.astype(np.int32), colors.astype(np.float32), voxel, ground)
+
+
+def _large_parts(
+    vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a mesh without connected parts that have less than _LEAST_PART of the triangles."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
+    part = connected_components(graph, directed=False)[1][faces[:, 0]]
+    faces = faces[np.bincount(part)[part] >= _LEAST_PART * len(faces)]
+    if not len(faces):
+        raise SehdrError("there is no surface to mesh: only scattered pieces; take another --crop, or train longer")
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3), colors[used]
+
+
+def _areas(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unit normals [F, 3] and areas [F] of triangles."""
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    normals = np.cross(second - first, third - first)
+    lengths = np.linalg.norm(normals, axis=1)
+    return normals / np.maximum(lengths, 1e-20)[:, None], lengths / 2
+
+
+def find_ground(vertices: np.ndarray, faces: np.ndarray, cameras: np.ndarray, voxel: float) -> Ground | None:
+    """Return the floor of an upright mesh: the lowest of its large level parts, below the cameras.
+
+    Args:
+        vertices: [V, 3].
+        faces: [F, 3].
+        cameras: [C, 3] places of the cameras.
+        voxel: Resolution of the mesh.
+    """
+    normals, areas = _areas(vertices, faces)
+    middles = vertices[faces].mean(axis=1)
+    level = (normals[:, 1] > np.cos(np.radians(20))) & (middles[:, 1] < np.percentile(cameras[:, 1], 10))
+    if areas[level].sum() < 0.02 * areas.sum():
+        return None
+    low = middles[level, 1].min()
+    bins = ((middles[level, 1] - low) / voxel).astype(int)
+    profile = np.convolve(np.bincount(bins, areas[level]), np.ones(5), "same")
+    peak = int(np.flatnonzero(profile >= profile.max() / 3)[0])
+    while peak + 1 < len(profile) and profile[peak + 1] > profile[peak]:
+        peak += 1
+    chosen = np.flatnonzero(level)[np.abs(bins - peak) <= 2]
+    if areas[chosen].sum() < 0.02 * areas.sum():
+        return None
+    root, points = np.sqrt(areas[chosen]), middles[chosen]
+    matrix = np.stack([points[:, 0], points[:, 2], np.ones(len(points))], axis=1)
+    slope_x, slope_z, height = np.linalg.lstsq(matrix * root[:, None], points[:, 1] * root, rcond=None)[0]
+    normal = np.array([-slope_x, 1.0, -slope_z])
+    normal /= np.linalg.norm(normal)
+    return Ground(float(height), normal, float(areas[chosen].sum() / areas.sum()))
+
+
+def mesh_depth(mesh: ProxyMesh, camera: Camera) -> np.ndarray:
+    """Return the depth [H, W] of a mesh in a camera of its coordinates, 0 where nothing is; from points on triangles.
+
+    Triangles are about as large as voxels, so a few points on each cover every pixel of a small picture.
+    """
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    depth = np.full(camera.height * camera.width, np.inf)
+    steps = 5
+    for i in range(steps):
+        for j in range(steps - i):
+            a, b = (i + 1 / 3) / steps, (j + 1 / 3) / steps
+            points = corners[:, 0] * (1 - a - b) + corners[:, 1] * a + corners[:, 2] * b
+            x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                column, row = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
+            seen = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            np.minimum.at(depth, (row[seen] * camera.width + column[seen]).astype(int), z[seen])
+    return np.where(np.isfinite(depth), depth, 0).reshape(camera.height, camera.width)
+
+
+def _log_agreement(mesh: ProxyMesh, run: Any, transform: WorldTransform) -> None:
+    """Compare the depth of mesh and scene in a few held-out views, and log it."""
+    held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
+    cameras = evenly(held_out or [entry.camera for entry in run.cameras], _CHECKED)
+    low, high = mesh.vertices.min(0) - mesh.voxel, mesh.vertices.max(0) + mesh.voxel
+    differences, total, covered = [], 0, 0
+    for camera in cameras:
+        view = depth_view(run, camera.within(120), transform)
+        points, depth = surface_points(view), view.depth.numpy()
+        rows, columns = np.nonzero(depth)
+        inside = ((points >= low) & (points <= high)).all(axis=1)
+        rows, columns = rows[inside], columns[inside]
+        found = mesh_depth(mesh, view.camera)[rows, columns]
+        total, covered = total + len(found), covered + int((found > 0).sum())
+        differences.append(np.abs(found - depth[rows, columns])[found > 0] / depth[rows, columns][found > 0])
+    values = np.concatenate(differences) if differences else np.zeros(0)
+    if values.size:
+        text = "depth beside the scene, %d views: %.1f %% off in the median, %.0f %% within 3 %%, %.0f %% not covered"
+        close = float((values < _CLOSE).mean())
+        log.info(text, len(cameras), 100 * float(np.median(values)), 100 * close, 100 * (1 - covered / total))
+
+
+def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: Any) -> None:
+    """Write an OBJ file with vertex colors, in sRGB with the exposure of the photos."""
+    colors = encode_srgb(np.clip(mesh.radiance * run.base_time, 0, 1))
+    with path.open("w", encoding="utf-8") as file:
+        file.write(f"# sehdr-warp proxy mesh, +Y up\n# sehdr:world_matrix {describe(transform)}\no Proxy\n")
+        np.savetxt(file, np.hstack([mesh.vertices, colors]), "v %.6g %.6g %.6g %.4f %.4f %.4f")
+        np.savetxt(file, mesh.faces + 1, "f %d %d %d")
+        if mesh.ground is not None:
+            file.write("o Ground\n")
+            np.savetxt(file, mesh.ground.corners(mesh.vertices.min(0), mesh.vertices.max(0)), "v %.6g %.6g %.6g")
+            file.write("f {} {} {} {}\n".format(*(len(mesh.vertices) + 1 + np.arange(4))))
+
+
+def _write_usd(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: Any) -> None:
+    """Write an OpenUSD layer; radiance is the displayColor of the mesh."""
+    Usd, UsdGeom, Sdf, Vt, Gf = (pxr(name) for name in ("Usd", "UsdGeom", "Sdf", "Vt", "Gf"))
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    world = UsdGeom.Xform.Define(stage, "/World")
+    stage.SetDefaultPrim(world.GetPrim())
+    matrix = Gf.Matrix4d(transform.matrix.T.tolist())  # USD's matrices act on row vectors.
+    world.GetPrim().CreateAttribute("sehdr:worldMatrix", Sdf.ValueTypeNames.Matrix4d, True).Set(matrix)
+    meshes = [("Proxy", mesh.vertices, mesh.faces)]
+    if mesh.ground is not None:
+        corners = mesh.ground.corners(mesh.vertices.min(0), mesh.vertices.max(0))
+        meshes.append(("Ground", corners, np.arange(4)[None]))
+    for name, vertices, faces in meshes:
+        prim = UsdGeom.Mesh.Define(stage, f"/World/{name}")
+        points = np.ascontiguousarray(vertices, np.float32)
+        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+        prim.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), faces.shape[1]))
+        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.reshape(-1), np.int32)))
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(0), points.max(0)])))
+        if name == "Proxy":
+            prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(mesh.radiance))
+    stage.GetRootLayer().Save()

@@ -1,0 +1,179 @@
+"""A proxy mesh against surfaces that are known: a ball on a floor, seen from all around."""
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.proxy_mesh import find_ground, mesh_depth, proxy_mesh, write_proxy_mesh
+from sehdr_warp.output.world_transform import WorldTransform
+from sehdr_warp.scene import Camera, look_at
+
+from .helpers import AnalyticRun, Entry, Rendered
+
+pytest.importorskip("skimage")
+RADIUS, FLOOR = 0.6, -0.6  # The ball lies on the floor, its center at the origin; +Y is up
+RED, GREY = (2.0, 0.1, 0.1), (0.2, 0.2, 0.2)
+
+
+def around(angle, height=1.2, distance=2.6, size=128):
+    position = (distance * np.sin(angle), height, distance * np.cos(angle))
+    pose = look_at(position, (0, -0.2, 0), up=(0, 1, 0))
+    return Camera(size, size, 150.0, 150.0, size / 2, size / 2, pose)
+
+
+class BallOnFloor(AnalyticRun):
+    """A red ball on a grey floor, as a run renders it."""
+
+    def __init__(self):
+        super().__init__(names=())
+        angles = np.arange(12) * 2 * np.pi / 12
+        self.cameras = [Entry(f"v_{i}", "train", around(angle)) for i, angle in enumerate(angles)]
+        self.cameras += [Entry("t_0", "test", around(0.2, 1.0))]
+
+    def render(self, view):
+        """Intersect the rays of a camera with ball and floor."""
+        y, x = np.mgrid[: view.height, : view.width] + 0.5
+        local = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], axis=2)
+        rays, origin = local @ view.world_to_camera[:3, :3], view.position
+        a, b = (rays**2).sum(2), (rays * origin).sum(2)
+        root = b**2 - a * (origin @ origin - RADIUS**2)
+        ball = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+        with np.errstate(divide="ignore"):
+            floor = np.where(rays[..., 1] < 0, (FLOOR - origin[1]) / rays[..., 1], np.inf)
+        depth = np.minimum(ball, floor)
+        hdr = np.where((ball < floor)[..., None], RED, GREY).astype(np.float32)
+        known = np.isfinite(depth)
+        return Rendered(hdr, known.astype(np.float32), np.where(known, depth, 0).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return proxy_mesh(BallOnFloor(), WorldTransform.identity(), resolution=72)
+
+
+def test_vertices_lie_on_the_surfaces(mesh):
+    ball = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS)
+    floor = np.abs(mesh.vertices[:, 1] - FLOOR)
+    error = np.minimum(ball, floor)
+    assert np.percentile(error, 90) < 0.5 * mesh.voxel and (ball < mesh.voxel).sum() > 500
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    level = np.abs(corners[:, :, 1] - FLOOR).max(1) < 0.3 * mesh.voxel
+    assert (normals[level, 1] > 0).mean() > 0.99, "faces look outwards"
+    on_top = np.linalg.norm(mesh.vertices - (0, RADIUS, 0), axis=1) < 0.3
+    np.testing.assert_allclose(np.median(mesh.radiance[on_top], axis=0), RED, rtol=1e-3)
+
+
+def test_the_floor_is_found_and_a_tilt_of_it(mesh):
+    assert mesh.ground is not None
+    assert mesh.ground.height == pytest.approx(FLOOR, abs=0.3 * mesh.voxel) and mesh.ground.tilt < 0.5
+    turn = np.radians(4)
+    tilted = mesh.vertices @ np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    places = np.array([[0, 1.2, 2.6], [0, 1.2, -2.6]])
+    ground = find_ground(tilted, mesh.faces, places, 2 * mesh.voxel)
+    assert ground is not None and ground.tilt == pytest.approx(4, abs=1)
+    assert find_ground(mesh.vertices, mesh.faces, places - (0, 5, 0), mesh.voxel) is None, "none above the cameras"
+
+
+def test_depth_agrees_with_the_scene(mesh):
+    run = BallOnFloor()
+    camera = run.cameras[-1].camera.within(96)
+    truth, found = run.render(camera).depth, mesh_depth(mesh, camera)
+    both = (truth > 0) & (found > 0)
+    assert (found > 0)[24:72, 24:72].mean() > 0.98
+    assert np.median(np.abs(found - truth)[both] / truth[both]) < 0.01
+
+
+def test_openusd_holds_mesh_and_ground(tmp_path, logged):
+    Usd, UsdGeom = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    path = write_proxy_mesh(BallOnFloor(), tmp_path / "proxy.usdc", resolution=48, scale=2.0, up="y")
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and stage.GetDefaultPrim().GetName() == "World"
+    proxy, ground = (UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")) for name in ("Proxy", "Ground"))
+    points = np.array(proxy.GetPointsAttr().Get())
+    assert UsdGeom.Mesh.ValidateTopology(
+        proxy.GetFaceVertexIndicesAttr().Get(), proxy.GetFaceVertexCountsAttr().Get(), len(points)
+    )[0]
+    assert len(proxy.GetDisplayColorPrimvar().Get()) == len(points)
+    floor = np.array(ground.GetPointsAttr().Get())
+    # The upright origin is where the cameras look, and meters are twice the scene's units.
+    matrix = np.array(stage.GetDefaultPrim().GetAttribute("sehdr:worldMatrix").Get()).T
+    np.testing.assert_allclose(floor[:, 1], (matrix @ [0, FLOOR, 0, 1])[1], atol=0.05)
+    assert any("triangles" in line for line in logged) and any("off in the median" in line for line in logged)
+
+
+def test_mitsuba_composites_and_shadows_by_the_mesh(tmp_path):
+    """A CG ball behind the photographed one is hidden as far as it should be, and its shadow falls on the floor."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    run, camera = BallOnFloor(), around(0.0).within(48)
+    path = write_proxy_mesh(run, tmp_path / "proxy.obj", resolution=64, axes="scene")
+    eye, ahead, center, radius = camera.position, camera.camera_to_world[:3, 2], np.array([0.5, 0.1, -0.8]), 0.4
+    sensor = {
+        "type": "perspective", "fov": float(np.degrees(2 * np.arctan(24 / camera.fx))), "fov_axis": "x",
+        "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), (eye + ahead).tolist(), [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}},
+        "sampler": {"type": "independent", "sample_count": 4},
+    }  # fmt: skip
+    travel = np.array([0.5, -1, 1]) / 1.5
+    sun = {"type": "directional", "direction": travel.tolist(), "irradiance": 1.0}
+    material = {"type": "twosided", "inside": {"type": "diffuse"}}
+    proxy = {"type": "obj", "filename": str(path), "face_normals": True, "bsdf": material}
+    ball = {"type": "sphere", "center": center.tolist(), "radius": radius}
+    plain = {"type": "scene", "sensor": sensor, "sun": sun, "proxy": proxy}
+    with_ball = plain | {"ball": ball}
+
+    def positions(scene):
+        aov = {"integrator": {"type": "aov", "aovs": "p:position"}}
+        return np.array(mi.render(mi.load_dict(scene | aov), spp=1))[..., -3:]
+
+    # The CG ball is seen where Mitsuba's rays end on it before they end on the mesh.
+    visible = np.abs(np.linalg.norm(positions(with_ball) - center, axis=2) - radius) < 1e-3
+    depth = np.where(run.render(camera).depth > 0, run.render(camera).depth, np.inf)
+    y, x = np.mgrid[:48, :48] + 0.5
+    local = np.stack([(x - 24) / camera.fx, (y - 24) / camera.fy, np.ones_like(x)], axis=2)
+    rays, offset = local @ camera.world_to_camera[:3, :3], eye - center
+    a, b = (rays**2).sum(2), (rays * offset).sum(2)
+    root = b**2 - a * (offset @ offset - radius**2)
+    hit = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+    expected = hit < depth
+    assert (np.isfinite(hit) & ~expected).sum() > 20 and expected.sum() > 20, "it is partly hidden"
+    assert (visible == expected).mean() > 0.98
+    # Its shadow, away from that of the photographed ball.
+    direct = {"integrator": {"type": "direct"}}
+    lit, shaded = (np.array(mi.render(mi.load_dict(each | direct), spp=16)).mean(2) for each in (plain, with_ball))
+    ground = positions(plain)
+    floor = np.abs(ground[..., 1] - FLOOR) < 0.05
+    distance = np.linalg.norm(np.cross(ground - center, travel), axis=2)
+    away = floor & (distance > 0.5) & ~visible & (np.linalg.norm(np.cross(ground, travel), axis=2) > 0.8)
+    under = floor & (distance < 0.3) & ~visible
+    assert under.sum() > 3 and np.median(shaded[under]) < 0.1 * np.median(lit[away])
+    assert np.median(shaded[away]) == pytest.approx(np.median(lit[away]), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "name, options, message",
+    [
+        ("proxy.fbx", {}, r"not written as .fbx; use one of .obj, .usda, .usdc"),
+        ("proxy.obj", {"resolution": 4}, "resolution 4 is not between 16 and 512"),
+        ("proxy.obj", {"crop": "cube:1"}, "is not box:"),
+        ("proxy.obj", {"crop": "sphere:50,50,50,1", "axes": "scene", "resolution": 24}, "no surface to mesh"),
+    ],
+)
+def test_bad_requests_are_one_line(name, options, message, tmp_path):
+    with pytest.raises(SehdrError, match=message):
+        write_proxy_mesh(BallOnFloor(), tmp_path / name, **options)
+    assert not (tmp_path / name).exists()
+
+
+def test_a_scene_without_cameras_is_refused():
+    run = BallOnFloor()
+    run.cameras = []
+    with pytest.raises(SehdrError, match="no training cameras"):
+        proxy_mesh(run, WorldTransform.identity())
+
+
+def test_files_are_not_replaced(tmp_path):
+    (tmp_path / "proxy.obj").write_text("mine")
+    with pytest.raises(InputError):
+        write_proxy_mesh(BallOnFloor(), tmp_path / "proxy.obj")
