@@ -194,7 +194,7 @@ def test_make_calls_documented_commands(tmp_path):
         for goal in ("demo", "test")
     }
     commands = [line for line in recipe["demo"] if line.startswith(f"{tmp_path}/venv/bin/sehdr-warp ")]
-    assert [line.split()[1] for line in commands] == ["train", "eval", "render", "report"]
+    assert [line.split()[1] for line in commands] == ["synth", "train", "eval", "render", "report"]
     for line in commands:
         parse(line)
     assert recipe["test"][-1].startswith(f"{tmp_path}/venv/bin/python -m pytest")
