@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from . import __version__
-from .errors import SehdrError, UsageError, as_user_error, did_you_mean
+from .errors import SehdrError, UsageError, as_user_error, did_you_mean, visible
 
 PROGRAM = "sehdr-warp"
 MIN_COLUMNS = 40
@@ -228,6 +228,6 @@ def _summary(command: Command) -> str:
 def _print_error(line: str) -> None:
     """Print a line on standard error, or nothing if nobody reads it."""
     try:
-        print(line, file=sys.stderr, flush=True)
+        print(visible(line), file=sys.stderr, flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())

@@ -13,6 +13,7 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
+from .errors import visible
 from .progress import LINE_INTERVAL, Stage, format_seconds, shown_by
 
 BAR_INTERVAL = 0.25
@@ -43,7 +44,7 @@ class _LogLines(logging.Handler):
     """Writes to the current sys.stderr, which a live bar replaces to put lines above itself."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        print(self.format(record), file=sys.stderr, flush=True)
+        print(visible(self.format(record)), file=sys.stderr, flush=True)
 
 
 def show_logs(level: str = "info") -> None:

@@ -54,6 +54,15 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f", did you mean {suggestion}?" if suggestion else ""
 
 
+# Control characters but line ends and tabs, and those that change the direction of text.
+_HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+
+
+def visible(text: str) -> str:
+    """Return text of which a terminal obeys nothing: names of files and what files say may hold its commands."""
+    return _HIDDEN.sub(lambda match: ascii(match[0])[1:-1], text)
+
+
 _OUT_OF_MEMORY = re.compile(
     r"allocate memory|[Ff]ailed to allocate|bad_alloc|out of memory|map segment|start new thread"
 )

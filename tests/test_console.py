@@ -115,3 +115,11 @@ def test_a_stage_on_a_terminal_is_one_line(monkeypatch):
     kept = stream.getvalue().count("\n")
     assert "a note" in lines and lines[-1].startswith("matching") and "5/10" in lines[-1]
     assert kept == 3, "one line for each stage, and the note above them"
+
+
+def test_a_terminal_obeys_nothing_of_what_files_say(monkeypatch):
+    stream = Terminal()
+    monkeypatch.setattr("sys.stderr", stream)
+    console.show_logs()
+    logging.getLogger("sehdr_warp.scene").warning("photo %s", "a\x1b[2J\r\u202egpj\x9b Größe 写真")
+    assert stream.getvalue() == "photo a\\x1b[2J\\x0d\\u202egpj\\x9b Größe 写真\n".replace("\\x0d", "\\r")

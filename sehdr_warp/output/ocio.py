@@ -1,6 +1,7 @@
 """Previews as a production's OpenColorIO config shows them (the extra `ocio`)."""
 
 import os
+import zipfile
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -72,6 +73,19 @@ def _line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
+def _check_archive(path: Path) -> None:
+    """Raise InputError for an archive that is damaged, or unpacks to more than a LUT may have."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise InputError(
+            path, f"is no archive of a config ({error!s:.80})", "archive it again with ocioarchive"
+        ) from None
+    if size > _LARGEST:
+        raise InputError(path, f"unpacks to {size} bytes, more than {_LARGEST}", "use the config without an archive")
+
+
 def _open_config(OCIO: Any, config: str) -> tuple[Any, Any]:
     """Return a config, and what reads its LUTs; None for a built-in config and an archive, which hold theirs."""
     if config.startswith("ocio://"):
@@ -79,6 +93,7 @@ def _open_config(OCIO: Any, config: str) -> tuple[Any, Any]:
     path = Path(config)
     if path.suffix.lower() == ".ocioz":
         read_bytes(path, _LARGEST)
+        _check_archive(path)
         return OCIO.Config.CreateFromFile(config), None
     text = read_text(path, _LARGEST)
 
@@ -95,16 +110,16 @@ def _open_config(OCIO: Any, config: str) -> tuple[Any, Any]:
             if not os.path.lexists(name):
                 return ""
             try:
-                known.setdefault(name, list(read_bytes(Path(name), _LARGEST)))
+                known.setdefault(name, bytearray(read_bytes(Path(name), _LARGEST)))
             except InputError as error:
                 # Of a name without content OpenColorIO would open the file itself.
-                self.refusal, known[name] = error, [0]
+                self.refusal, known[name] = error, bytearray(1)
             return name
 
-        def getLutData(self, name: str) -> list[int]:
+        def getLutData(self, name: str) -> bytearray:
             return known[name]
 
-    known: dict[str, list[int]] = {}
+    known: dict[str, bytearray] = {}
     files = Files()
     OCIO.ClearAllCaches()  # It would take another file's content for that of the same name.
     read = OCIO.Config.CreateFromConfigIOProxy(files)

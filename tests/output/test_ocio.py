@@ -1,6 +1,7 @@
 """Previews through OpenColorIO, and its names of color spaces."""
 
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -114,3 +115,15 @@ def test_luts_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
     with pytest.raises(InputError) as error:
         ocio_view(config_of(tmp_path, transform), "V")
     assert "\n" not in str(error.value) and len(str(error.value)) < 900
+
+
+@pytest.mark.parametrize("kind", ["no archive", "large"])
+def test_archives_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
+    file = tmp_path / "own.ocioz"
+    file.write_bytes(b"PK" + bytes(100))
+    if kind == "large":
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.cube", "w") as lut:
+            for _ in range(5):
+                lut.write(bytes(60_000_000))
+    with pytest.raises(InputError, match="is no archive of a config|unpacks to 300000000 bytes"):
+        ocio_view(str(file), "V")
