@@ -84,17 +84,19 @@ def combined_estimates(
         stated_deviation: standard deviation of its natural logarithm.
 
     Returns:
-        [h, w, 6] float16 at the size of `coarse_size`: for each channel the expected natural logarithm of light over
-        white, and then 1 / its deviation; 0 where nothing is clipped or known. Two estimates of a value are averaged
-        by their precisions.
+        [h, w, 6] float16 at the size of `coarse_size`: for each channel the natural logarithm of the expected light
+        over white, and then 1 / the deviation of the logarithm; 0 where nothing is clipped or known. Two estimates of
+        a value are averaged by their precisions.
     """
     size = coarse_size(*exposure.shape[:2])
     total = exposure.new_zeros(*size, 3)
     precision = torch.zeros_like(total)
     if prior is not None:
         estimate = prior.estimate(exposure, clipped)
-        precision += (estimate.deviation * math.log(2)) ** -2
-        total += precision * estimate.mean * math.log(2)
+        deviation = estimate.deviation * math.log(2)
+        precision += deviation**-2
+        # The mean of light, not of its logarithm: lamps then have their energy in the mean.
+        total += precision * (estimate.mean * math.log(2) + deviation.square() / 2)
     if stated is not None and stated_deviation > 0:
         has_value = (clipped & (stated >= 1)).to(exposure)
         share, light = (

@@ -4,6 +4,7 @@ Every candidate is a table of log exposure over the 8-bit codes, and the photos 
 speaks for a candidate is computed for all of them at once.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -98,12 +99,17 @@ class ResponseScore:
 
 @dataclass(frozen=True)
 class ResponseSelection:
-    """The chosen response, by which score, and every candidate's scores, best first."""
+    """The chosen response, by which score, and every candidate's scores, best first.
+
+    uncertainty: stops; by how much curves that explain the photos as well differ from the chosen one: the root mean
+    square over codes 10 to 245 and over the posterior, after one scale for each curve. NaN by "paper".
+    """
 
     response: Response
     method: str
     edge_count: int
     scores: tuple[ResponseScore, ...]
+    uncertainty: float
 
 
 def select_response(
@@ -167,14 +173,17 @@ def select_response(
     scores = [ResponseScore(*row) for row in zip(candidates, *(column.tolist() for column in columns), strict=True)]
     order = np.argsort(-paper if method == "paper" else posteriors, kind="stable")
     best = candidates[order[0]]
+    costs = posteriors
     if beside:
         named = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
         costs = np.concatenate([named, evidence[count:] + np.log((len(logs) - count) / NO_FORMULA)])
-        chances = np.exp(costs.min() - costs)
-        chances /= chances.sum()
-        if chances[order[0]] < DECISIVE:
-            best = TabulatedResponse("posterior mean", np.r_[0.0, np.exp(chances @ logs)[1:]], CODES)
-    return ResponseSelection(best, method, len(edges), tuple(scores[index] for index in order))
+    chances = np.exp(costs.min() - costs)
+    chances /= chances.sum()
+    if beside and chances[order[0]] < DECISIVE:
+        best = TabulatedResponse("posterior mean", np.r_[0.0, np.exp(chances @ logs)[1:]], CODES)
+    off = (logs - np.log(np.maximum(np.asarray(best.decode(CODES)), 1e-30)))[:, 10:246] / np.log(2)
+    uncertainty = float(np.sqrt(chances @ off.var(1))) if method == "posterior" else math.nan
+    return ResponseSelection(best, method, len(edges), tuple(scores[index] for index in order), uncertainty)
 
 
 def edge_facts(count: int) -> float:

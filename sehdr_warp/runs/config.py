@@ -114,9 +114,9 @@ class LossConfig(_Table):
     """compare the base color with HDR truth in the linear loss, for views that have it"""
     anchor_weight: Weight = 0.0
     """learned response: weight of (f(1) - 1/2)^2, which fixes the scale of exposure (HDR-NeRF: 0.5)"""
-    opacity_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
+    opacity_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.003
     """weight of the mean opacity, which lets unneeded Gaussians fade for mcmc to relocate (3DGS-MCMC: 0.01); it is 0
-    from the last relocation on, because it would leave surfaces transparent"""
+    from the last relocation on; more leaves surfaces transparent"""
 
     @property
     def uses_hdr(self) -> bool:

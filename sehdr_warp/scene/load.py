@@ -35,6 +35,7 @@ __all__ = [
 ]
 _log = logging.getLogger("sehdr_warp.scene")
 _MOST_SAMPLED = 24  # Photos that a response is chosen from: they have more edges than are looked at
+_UNSURE = 0.4  # Uncertainty of a chosen response, in stops, from which a line says that it is a guess
 
 
 def load_scene(
@@ -216,4 +217,12 @@ def select_response_for(
     from ..response.selection import select_response
 
     known = [response for name in candidates for response in responses_named(name)] or None
-    return select_response(codes, known, method=method, from_camera=are_camera_jpegs(files)).response
+    selection = select_response(codes, known, method=method, from_camera=are_camera_jpegs(files))
+    if selection.uncertainty > _UNSURE:
+        _log.warning(
+            "the response %s is a guess: curves that explain the photos as well differ from it by %.1f stops between "
+            "dark and bright; name it with --response, or measure it with `sehdr-warp calibrate`",
+            selection.response.name,
+            selection.uncertainty,
+        )
+    return selection.response

@@ -110,6 +110,9 @@ class Plan:
         if self.facts.drift >= DRIFT and not evened:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             lines.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
+        if code := self.facts.plateau:
+            problem = f"no photo is brighter than code {code} of 255, which many pixels have: they clip there"
+            lines.append(f"plan: {problem}, and that is taken for their light; export them with white at 255")
         return lines + [f"plan: {line}, as given" for line in _format_fields(self.kept)]
 
 

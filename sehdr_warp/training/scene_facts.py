@@ -1,6 +1,7 @@
 """Figures of a scene's photos and cameras for the plan, measured in about a second."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,9 @@ PROBES = 2000  # Number of places at which overlap and visibility are measured
 FEWEST_POINTS = 100  # With fewer sparse points, places along the cameras' rays are the probes
 MOST_PIXELS = 250_000  # Largest number of pixels that are read from a photo
 MOST_VIEWS = 64  # Largest number of photos whose codes are read; cameras are read of all
+LOWEST_PLATEAU, PLATEAU_CODES, PLATEAU_SHARE, PLATEAU_EXCESS = 200, 3, 1e-3, 3.0
+"""Photos clip below white if the brightest code is at least the first; if so many codes, the brightest that occur, hold
+the third share of the pixels, and the fourth times what as many codes below them hold. JPEG spreads a plateau."""
 MOST_GAZE, MOST_AHEAD = 0.3, 0.75
 """Cameras look all around if both figures are below these. Eight captures of objects, rooms and grounds have 0.5 to 1
 of the first, maps from within a place 0.1; objects have nearly 1 of the second."""
@@ -41,6 +45,7 @@ class SceneFacts:
         ahead: Fraction of the cameras that look towards the middle of all.
         light_known: Whether the photos hold light itself: RAW, linear, float.
         unclipped: Whether they are float pictures without clipping.
+        plateau: Code of 255, below 255, at which the photos clip, as after an edit; 0 if they do not.
     """
 
     photos: int
@@ -58,6 +63,7 @@ class SceneFacts:
     ahead: float = 1.0
     light_known: bool = False
     unclipped: bool = False
+    plateau: int = 0
 
     @property
     def around(self) -> bool:
@@ -76,7 +82,8 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     visible, on_rays = (
         np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, ray_points)
     )
-    figures = np.array([_codes(view) for view in views[:: -(-len(views) // MOST_VIEWS)]])
+    read_views = views[:: -(-len(views) // MOST_VIEWS)]
+    figures = np.array([_codes(view) for view in read_views])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     gaze, ahead = _gaze(np.stack([view.camera.world_to_camera for view in views]))
     return SceneFacts(
@@ -95,6 +102,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         ahead=ahead,
         light_known=scene.light_known,
         unclipped=scene.light_known and all(view.source and kind_of(view.source) == "float" for view in views),
+        plateau=0 if scene.light_known else _plateau(read_views),
     )
 
 
@@ -108,6 +116,19 @@ def _codes(view: View) -> tuple[float, float, float, float, float]:
     clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
     median = 2.2 * math.log2(max(float(np.median(image)), 0.5 / 255))
     return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean(), median
+
+
+def _plateau(views: Sequence[View]) -> int:
+    """Return the code of 255, below 255, that is the largest of many pixels of the photos; 0 if there is none."""
+    counts = np.zeros(256)
+    for view in views:
+        step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
+        brightest = encoded_values(view.codes[::step, ::step]).max(2)
+        counts += np.bincount(np.rint(255 * brightest).astype(np.int64).ravel(), minlength=256)
+    largest = int(np.flatnonzero(counts)[-1])
+    at, below = (counts[max(0, top - PLATEAU_CODES) : top].sum() for top in (largest + 1, largest + 1 - PLATEAU_CODES))
+    is_plateau = at >= PLATEAU_SHARE * counts.sum() and at >= PLATEAU_EXCESS * below
+    return largest if is_plateau and LOWEST_PLATEAU <= largest < 255 else 0
 
 
 def _gaze(poses: np.ndarray) -> tuple[float, float]:

@@ -9,6 +9,7 @@ from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response import selection as response_selection
 from sehdr_warp.response.selection import FINE, GRID, edge_facts, family_logs, select_response
 from sehdr_warp.response.table import TabulatedResponse
+from sehdr_warp.scene.load import select_response_for
 
 CODES = np.arange(256) / 255
 
@@ -178,6 +179,25 @@ def test_posterior_never_takes_photos_for_linear():
     selection = select_response([photograph("linear", mosaic(seed)) for seed in range(4)])
     assert min(selection.scores, key=lambda score: score.edges).response.name == "linear"
     assert selection.response.name != "linear"
+
+
+def test_uncertainty_is_small_with_edges_and_large_without():
+    clean = select_response([photograph("srgb", mosaic(seed)) for seed in range(4)])
+    grey = select_response(np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3)))
+    assert clean.uncertainty < 0.2 < 0.4 < grey.uncertainty < 3
+    alone = select_response(photograph("srgb", mosaic()), candidates=named("srgb"))
+    assert alone.uncertainty == pytest.approx(0, abs=1e-6)
+    assert np.isnan(select_response(photograph("srgb", mosaic()), method="paper").uncertainty)
+
+
+def test_a_guess_is_told(caplog):
+    ramp = np.rint(255 * np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))).astype(np.uint8)
+    select_response_for([ramp], [None], "posterior", ())
+    assert "is a guess: curves that explain the photos as well differ from it by" in caplog.text
+    caplog.clear()
+    codes = [np.rint(255 * photograph("srgb", mosaic(seed))).astype(np.uint8) for seed in range(4)]
+    select_response_for(codes, [None] * 4, "posterior", ())
+    assert "guess" not in caplog.text
 
 
 def family_curve(draw: int) -> Response:

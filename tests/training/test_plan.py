@@ -115,6 +115,17 @@ def test_a_plan_says_whether_relocation_has_room(facts, points, choice):
     assert choice in chosen and f"{max(points, 1568)} to start with" in reason
 
 
+def test_photos_that_clip_below_white_get_a_line(scene):
+    def edited(view):
+        return np.minimum(2 * view.image, 1) * 243 / 255
+
+    assert measure_scene(with_images(scene, edited)).plateau == 243
+    plan = make_plan(with_images(scene, edited), config_of())
+    assert any("brighter than code 243 of 255" in line for line in plan.lines())
+    for other in (lambda view: np.minimum(2 * view.image, 1), lambda view: 0.9 * np.sqrt(view.image)):
+        assert measure_scene(with_images(scene, other)).plateau == 0
+
+
 def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     shares = iter(np.linspace(0.1, 0.9, len(scene.views)))
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
