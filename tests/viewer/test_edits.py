@@ -16,6 +16,7 @@ from sehdr_warp.viewer.server import Server, Viewer
 
 from ..output.test_splat_edits import run_of, splats
 from .browser import browser, page_of
+from .test_page import until
 from .test_server import ask, frame
 
 
@@ -137,3 +138,32 @@ def test_a_page_to_share_is_saved(server):
     view = server.viewer.runs[0].cameras[0].camera.to_dict()
     status, kind, page = ask(server, "/save", {"kind": "page", "cameras": [view]})
     assert (status, kind) == (200, "text/html") and b"</html>" in page
+
+
+def test_undo_goes_back_one_edit_at_a_time(server):
+    """And lengths are in units until the scale is set, then in meters."""
+    with browser() as chromium, page_of(chromium, server.url) as page:
+        page.wait_for_selector("#stage[data-frame=full]")
+
+        def pick(*points):
+            page.evaluate("points => { state.points = points; measured(); }", list(points))
+
+        def edit(button, count, words):
+            page.click(button)
+            until(page, f"facts.gaussians === {count} && $('edited').textContent.includes('{words}')")
+
+        pick((1, 0, 0), (1.2, 0, 0))
+        assert page.inner_text("#distance") == "0.200 units"
+        edit("#cut", 1, "--cut sphere:")
+        pick((0, 0, 0), (0.5, 0, 0))
+        edit("#crop", 1, "--crop sphere:")
+        edit("#undo", 1, "part.ply --cut")
+        assert "--crop" not in page.inner_text("#edited")
+        edit("#undo", 2, "all of it is shown")
+        assert page.locator("#undo").is_disabled()
+        pick((0, 0, 0), (0.5, 0, 0))
+        page.fill("#meters", "2")
+        page.click("#setScale")
+        until(page, "$('edited').textContent.includes('kept: 4')")
+        pick((0, 0, 0), (0.5, 0, 0))
+        assert page.inner_text("#distance") == "2.00 m"

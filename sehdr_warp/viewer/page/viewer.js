@@ -375,7 +375,7 @@ function fly(now) {
 
 // Points that are picked measure lengths, set scale and up, and crop
 const upright = point => { const m = facts.upright; return m ? [0, 1, 2].map(i => dot(m[i].slice(0, 3), point) + m[i][3]) : point; };
-state.points = [], state.region = {};
+state.points = [], state.regions = [{}];  // The last one is shown; Undo goes back by one
 function pick(place) {
   const point = pointAt(place);
   if (!point) return note("nothing is there to pick");
@@ -386,7 +386,9 @@ function pick(place) {
 }
 function measured() {
   const [a, b] = state.points.map(upright), length = b && Math.hypot(...add(b, a, -1));
-  $("distance").textContent = length ? figure(length) : a ? a.map(figure).join(", ") : "";
+  const scale = facts && facts.upright ? Math.hypot(...facts.upright[0].slice(0, 3)) : 1;
+  // A unit of a scene is no length that anybody knows, until its scale was set.
+  $("distance").textContent = length ? figure(length) + (Math.abs(scale - 1) > 1e-6 ? " m" : " units") : a ? a.map(figure).join(", ") : "";
   $("setScale").disabled = state.points.length !== 2;
   $("setUp").disabled = state.points.length !== 3;
   $("crop").disabled = $("cut").disabled = state.points.length !== 2;
@@ -412,6 +414,7 @@ async function change(path, body, done) {
     measured();
     note(done());
     moved();
+    return true;
   } catch (error) { note(error.message); }
 }
 $("measure").addEventListener("click", () => {
@@ -430,13 +433,19 @@ $("setUp").addEventListener("click", () => {
   const up = normal.map(x => x * (dot(normal, add(camera.position, a, -1)) < 0 ? -1 : 1));
   change("orientation", {up}, () => { camera.up = up; return "kept: files are upright by this floor"; });
 });
-for (const name of ["crop", "cut"]) $(name).addEventListener("click", () => {
+for (const name of ["crop", "cut"]) $(name).addEventListener("click", async () => {
   const [a, b] = state.points.map(upright), region = "sphere:" + [...a, Math.hypot(...add(b, a, -1))].map(x => x.toPrecision(5)).join(",");
-  state.region = {...state.region, [name]: region};
-  change("edit", state.region, () => `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.name} --out part.ply`
-    + Object.entries(state.region).map(([flag, text]) => ` --${flag} ${text}`).join(""));
+  state.regions.push({...state.regions.at(-1), [name]: region});
+  if (!await edit()) state.regions.pop();  // As where nothing would be left
 });
-$("undo").addEventListener("click", () => { state.region = {}; change("edit", {}, () => "all of it is shown"); });
+$("undo").addEventListener("click", () => {
+  if (state.regions.length > 1) state.regions.pop();
+  edit();
+});
+function edit() {
+  const region = state.regions.at(-1), flags = Object.entries(region).map(([flag, text]) => ` --${flag} ${text}`).join("");
+  return change("edit", region, () => flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.name} --out part.ply${flags}` : "all of it is shown");
+}
 measured();
 
 // Lights: a list to fly to, with a gain for each
