@@ -21,6 +21,8 @@ from .primaries import REC709, encoding_of_interop_id, matrix_to_rec709
 _MOST_PIXELS_PER_BYTE = 4096
 _REMEDY = "export the image again"
 _MAX_HEADER_BYTES = 1 << 16
+_COLOR_NAMES = "RGB", "rgb", "XYZ", "YYY", "VVV"
+_PICTURE_LAYERS = "rgba", "rgb", "combined", "beauty", "image", "c", "color"  # Of Blender, Arnold, V-Ray, Nuke, ...
 _XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 _RADIANCE = (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.333, 0.333)
 """Radiance's default primaries. Files that state them were mostly written by tools that mean Rec.709."""
@@ -92,7 +94,8 @@ def _exr_colors(
         primaries = encoding.chromaticities
     if {"Y", "RY", "BY"} <= set(channels):
         return _from_luminance(channels, primaries, path), primaries
-    names = next((names for names in ("RGB", "rgb", "XYZ", "YYY", "VVV") if set(names) <= set(channels)), None)
+    channels = _picture_layer(channels, path)
+    names = next((names for names in _COLOR_NAMES if set(names) <= set(channels)), None)
     if names is None:
         problem = f"has the channels {sorted(channels)[:8]}, not R, G, B"
         raise InputError(path, problem, "export it with color channels")
@@ -100,6 +103,26 @@ def _exr_colors(
     if names == "XYZ":
         return pixels, _XYZ
     return encoding.decode(pixels), primaries
+
+
+def _picture_layer(channels: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.ndarray]:
+    """Return the channels of the layer that is the picture (`ViewLayer.Combined.R` of Blender), named as if alone.
+
+    Raises:
+        InputError: if several layers have colors and their names do not say which is the picture.
+    """
+    if any(set(names) <= set(channels) for names in _COLOR_NAMES):
+        return channels
+    layers: dict[str, dict[str, np.ndarray]] = {}
+    for name, values in channels.items():
+        layer, _, channel = name.rpartition(".")
+        layers.setdefault(layer, {})[channel] = values
+    with_color = [layer for layer, parts in layers.items() if set("RGB") <= set(parts)]
+    pictures = [layer for layer in with_color if layer.rpartition(".")[2].lower() in _PICTURE_LAYERS]
+    if len(pictures or with_color) > 1:
+        problem = f"has the layers {sorted(with_color)[:5]}, and none of them is named as the picture"
+        raise InputError(path, problem, "export the picture's R, G, B alone, or name its layer `rgba`")
+    return layers[(pictures or with_color)[0]] if with_color else channels
 
 
 def _from_luminance(channels: Mapping[str, np.ndarray], primaries: tuple[float, ...], path: Path) -> np.ndarray:

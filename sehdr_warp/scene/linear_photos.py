@@ -44,9 +44,20 @@ def float_codes(radiance: np.ndarray, time: float) -> np.ndarray:
 
 
 def float_time(photos: Sequence[Path]) -> float:
-    """Return the exposure time at which the log-average of a set of float images is middle grey."""
-    sample = photos[:: -(-len(photos) // _MOST_JUDGED)]
-    return _MIDDLE_GREY / float(np.exp(np.mean([np.log(_log_average(read_hdr(photo))) for photo in sample])))
+    """Return the exposure time at which the log-average of a set of float images is middle grey.
+
+    Raises:
+        InputError: if none of those that are sampled can be read; others are left out.
+    """
+    averages, problems = [], []
+    for photo in photos[:: -(-len(photos) // _MOST_JUDGED)]:
+        try:
+            averages.append(np.log(_log_average(read_hdr(photo))))
+        except InputError as error:
+            problems.append(error)
+    if not averages:
+        raise problems[0]
+    return _MIDDLE_GREY / float(np.exp(np.mean(averages)))
 
 
 def tone_mapped(path: Path) -> np.ndarray:

@@ -33,6 +33,7 @@ from .video import is_video
 from .video_frames import read_video
 
 _MARK = "transforms_train.json"  # A file of every embedded scene
+_UNSTITCHED = (".insv", ".360", ".lrv")  # Of Insta360 and GoPro, before their own programs join both lenses
 _HOLDOUT = 8  # Every eighth view is held out, as LLFF, Mip-NeRF 360 and 3DGS do
 _FEWEST_FOR_TEST = 5  # In smaller sets no view is held out
 
@@ -119,7 +120,10 @@ def _folder(path: Path | str) -> Path:
     except FileNotFoundError:
         raise InputError(folder, "not found", "give a folder of photos, or 'embedded'") from None
     except NotADirectoryError:
-        raise InputError(folder, "is not a folder", "give the folder that holds the photos") from None
+        problem, remedy = "is not a folder", "give the folder that holds the photos"
+        if folder.suffix.lower() in _UNSTITCHED:
+            problem, remedy = "holds the pictures of two lenses", "export it as one equirectangular MP4"
+        raise InputError(folder, problem, remedy) from None
     except OSError as error:
         raise InputError(folder, f"cannot be read ({error.strerror or error})", "check its rights") from None
     if empty:

@@ -150,7 +150,7 @@ class _Preprocessor:
             return self.view(record, name)
         except InputError as error:
             own = str(record.image), str(record.mask)
-            if error.path not in own or record.derived or record.hdr == record.image:
+            if error.path not in own or record.derived:
                 raise
             return error
 

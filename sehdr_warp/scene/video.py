@@ -20,10 +20,13 @@ from .images import MAX_PIXELS, check_size
 
 _log = logging.getLogger("sehdr_warp.scene")
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mxf")
+VIDEO_SUFFIXES = (
+    ".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf",
+)  # fmt: skip
 _REMEDY = "copy the clip again, or convert it with FFmpeg"
 # FFmpeg's demuxers of VIDEO_SUFFIXES, by content. Others, such as playlists, would open the files that they name.
-_OPTIONS = {"format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mxf", "protocol_whitelist": "file"}
+_DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mxf"
+_OPTIONS = {"format_whitelist": _DEMUXERS, "protocol_whitelist": "file"}
 # Codes of ITU-T H.273: transfer characteristics, color primaries and matrix coefficients.
 _HLG, _PQ, _LOG100, _LOG316 = 18, 16, 9, 10
 _UNSPECIFIED = 2
@@ -220,7 +223,7 @@ def codes(frame: Any, color: VideoColor) -> np.ndarray:
     values = stored.astype(np.float32)
     top = float((2**color.bits - 1) << (16 - color.bits))  # The largest code, as it stands in 16 bits
     if color.matrix is None:
-        rgb = values / np.float32(values.max(initial=0) if color.bits == 16 else 65535)
+        rgb = values / np.float32(65535)
     else:
         kr, kb = color.matrix
         unit = 256.0

@@ -165,3 +165,36 @@ def test_exposure_times_of_openexr(tmp_path):
     assert same.views[0].exposure_time == plain.views[0].exposure_time
     assert exr_exposure_time(tmp_path / "b" / "images" / "r_0.exr") == pytest.approx(0.02)
     assert exr_exposure_time(tmp_path / "c" / "images" / "r_0.exr") is None
+
+
+@pytest.mark.parametrize("layers, picture", [
+    (["ViewLayer.Combined", "ViewLayer.Normal"], "ViewLayer.Combined"), (["beauty"], "beauty"),
+    (["diffuse", "rgba", "specular"], "rgba"), (["left.main"], "left.main"),
+])  # fmt: skip
+def test_the_picture_of_a_file_of_layers(tmp_path, layers, picture):
+    channels = {}
+    for layer in layers:
+        values = RGB if layer == picture else RGB * 3
+        channels |= {f"{layer}.{name}": np.full((6, 8), value, np.float32) for name, value in zip("RGB", values)}
+    np.testing.assert_array_equal(read_hdr(write_exr(tmp_path / "a.exr", channels))[2, 3], RGB)
+
+
+def test_layers_without_a_picture_are_named(tmp_path):
+    channels = {f"{layer}.{name}": np.ones((4, 4), np.float32) for layer in ("diffuse", "specular") for name in "RGB"}
+    with pytest.raises(InputError, match=r"has the layers \['diffuse', 'specular'\], and none .*; export the picture"):
+        read_hdr(write_exr(tmp_path / "a.exr", channels))
+
+
+def test_a_float_image_that_is_not_finite_is_left_out(tmp_path):
+    float_set(tmp_path, 0.1 + pattern(40, 30) / 255, [0.01] * 6, stated=False)
+    bad = planes((0.1, np.nan, 0.1), (30, 40))
+    write_exr(tmp_path / "images" / "r_0.exr", bad)
+    scene = load_scene(tmp_path, holdout=0)
+    assert len(scene.views) == 5
+    assert any(
+        "1 of 6 photos cannot be used and were left out (r_0.exr: 1200 pixels not finite" in n for n in scene.notes
+    )
+    for i in range(6):
+        write_exr(tmp_path / "images" / f"r_{i}.exr", bad)
+    with pytest.raises(InputError, match="1200 pixels not finite"):
+        load_scene(tmp_path)

@@ -13,7 +13,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, load_scene, look_at
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.names import list_images
-from sehdr_warp.scene.video import codes, decode, open_clip
+from sehdr_warp.scene.video import codes, decode, is_video, open_clip
 from sehdr_warp.scene.video_frames import choose_frames, frames_folder
 
 from .clips import pan, write_clip
@@ -192,3 +192,64 @@ def test_an_hlg_clip_of_a_room_becomes_a_scene(tmp_path):
     steps = np.diff(places, axis=0)
     along = np.linalg.svd(places - places.mean(0))[2][0]
     assert np.abs(steps @ along).sum() > 20 * np.abs(steps - np.outer(steps @ along, along)).sum(0).max()
+
+
+@pytest.mark.parametrize("pixels", ["gbrp10le", "gbrp16le", "yuv444p16le"])
+def test_clips_without_loss_keep_their_light(tmp_path, pixels):
+    """RGB and luma with chroma: the light of an HLG clip of 10 bits is right to its last code."""
+    av = pytest.importorskip("av")
+    response, rgb = response_by_name("colour:ITU-R BT.2100 HLG"), 0.8 * still()[0]
+    if pixels.startswith("gbrp"):
+        with av.open(str(tmp_path / "a.mkv"), "w") as container:
+            stream = container.add_stream("ffv1", rate=30)
+            stream.height, stream.width, stream.pix_fmt = *rgb.shape[:2], pixels
+            stored = np.rint(rgb * 65535).astype(np.uint16)
+            frame = av.VideoFrame.from_ndarray(stored, format="rgb48le").reformat(format=pixels)
+            for packet in [*stream.encode(frame), *stream.encode()]:
+                container.mux(packet)
+    else:
+        write_clip(tmp_path / "a.mkv", [rgb], tags=(18, 9, 9), codec="ffv1", pixels=pixels)
+    clip = open_clip(tmp_path / "a.mkv")
+    decoded = codes(next(decode(clip))[1], clip.color) / 65535
+    assert np.abs(decoded - rgb).max() < (1.1 / 1023 if "10" in pixels else 2 / 65535)
+    light = response.decode(decoded) - response.decode(rgb)
+    assert np.abs(light).max() < 0.01
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_chroma_lies_where_the_stream_states_it(tmp_path, place):
+    """Left (0), in the center (1), or top left (2) of its luma samples: a ramp of chroma comes out straight."""
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("libx265", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p10le"
+        stream.options = {"x265-params": f"log-level=none:lossless=1:chromaloc={place}"}
+        frame = av.VideoFrame(64, 64, "yuv420p10le")
+        for index, plane in enumerate(frame.planes):
+            rows, columns = np.mgrid[: plane.height, : plane.line_size // 2]
+            values = np.full(rows.shape, 502) if index == 0 else 400 + 6 * (columns if index == 1 else rows)
+            plane.update(values.astype(np.uint16).tobytes())
+        for packet in [*stream.encode(frame), *stream.encode()]:
+            container.mux(packet)
+    clip = open_clip(tmp_path / "a.mkv")
+    rgb = codes(next(decode(clip))[1], clip.color) / 65535
+    kr, kb = clip.color.matrix
+    luma = kr * rgb[..., 0] + (1 - kr - kb) * rgb[..., 1] + kb * rgb[..., 2]
+    blue = (rgb[..., 2] - luma) / (2 * (1 - kb)) * 896 + 512
+    red = (rgb[..., 0] - luma) / (2 * (1 - kr)) * 896 + 512
+    at = np.arange(20, 44)
+    np.testing.assert_allclose(blue[30, at], 400 + 3 * (at - (0.5 if place == 1 else 0)), atol=0.6)
+    np.testing.assert_allclose(red[at, 30], 400 + 3 * (at - (0 if place == 2 else 0.5)), atol=0.6)
+
+
+@pytest.mark.parametrize("name, codec", [("a.MPG", "mpeg2video"), ("a.3gp", "libx264")])
+def test_clips_of_older_cameras(tmp_path, name, codec):
+    write_clip(tmp_path / name.lower(), pan(8), codec=codec, pixels="yuv420p")
+    (tmp_path / name.lower()).rename(tmp_path / name)
+    assert is_video(tmp_path / name) and sum(1 for _ in decode(open_clip(tmp_path / name))) == 8
+
+
+def test_clips_of_two_lenses_are_named(tmp_path):
+    (tmp_path / "a.insv").write_bytes(b"x")
+    with pytest.raises(InputError, match="holds the pictures of two lenses; export it as one equirectangular MP4"):
+        load_scene(tmp_path / "a.insv")
