@@ -166,6 +166,19 @@ def test_existing_run_is_refused_and_resume_continues(run, capsys):
     assert "views differ" in capsys.readouterr().err
 
 
+def test_a_run_in_place_of_photos_is_told_how_to_go_on(run, tmp_path, capsys):
+    for words in (("--resume",), ("--out", tmp_path / "other", "--iterations", "60")):
+        assert call("train", run, *words) == 2
+        steps = " --iterations 60" if "60" in words else ""
+        assert (
+            f"is a run, not photos; sehdr-warp train --resume --out {run}{steps} continues it"
+            in capsys.readouterr().err
+        )
+    for word, hint in (("demo", "train embedded"), ("continue", "train --resume"), ("resume", "train --resume")):
+        assert call(word, run) == 2
+        assert hint in capsys.readouterr().err
+
+
 def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
     assert call("train", "--resume", "--out", run, "--device", "cpu") == 0
     told = capsys.readouterr()

@@ -14,7 +14,7 @@ from sehdr_warp.scene import Camera
 
 from ..files import check_absent
 from .camera_paths import common_focus
-from .colorspace import from_rec709
+from .colorspace import color_space, from_rec709
 from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr
 from .images import as_array
 from .light_pictures import exposure_of_white
@@ -101,6 +101,7 @@ def write_environment_map(
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")
     if size < 16 or size % 2 or size > _LARGEST:
         raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
+    color_space(colorspace)
     transform = world_transform(run, axes, up=up)
     exposure = exposure_of_white(run, reference_white)
     if beyond is not None and not 0 <= beyond < np.inf:

@@ -137,6 +137,7 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     gpus, place = args.machine.gpus, launched_as()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
+    _refuse_run(args)
     if _in_blocks(args):
         if place is not None:
             raise UsageError("--blocks starts its own processes; leave torchrun out")
@@ -313,6 +314,19 @@ def run_config(args: ShowConfig) -> None:
     folder = RunFolder(args.which)
     config = folder.read_config() if folder.config.is_file() else configs.load_config(args.which)
     print(json.dumps(config.model_dump()) if args.json else configs.config_as_toml(config, args.diff))
+
+
+def _refuse_run(args: Train) -> None:
+    """Raise UsageError if SCENE is a run, which --resume continues by the name after --out."""
+    from ..runs.run_folder import RunFolder
+
+    if args.data is None or not all(
+        file.is_file() for file in (RunFolder(args.data).config, RunFolder(args.data).info)
+    ):
+        return
+    steps = "" if args.training.iterations is None else f" --iterations {args.training.iterations}"
+    command = f"sehdr-warp train --resume --out {shlex.quote(args.data)}{steps}"
+    raise UsageError(f"{args.data}: is a run, not photos; {command} continues it")
 
 
 def _data(args: Train, known: Mapping | None) -> dict:
