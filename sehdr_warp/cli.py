@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from . import __version__
-from .errors import SehdrError, UsageError, as_user_error, did_you_mean, visible
+from .errors import SehdrError, UsageError, as_user_error, did_you_mean, flags_in_messages, visible
 
 PROGRAM = "sehdr-warp"
 MIN_COLUMNS = 40
@@ -78,6 +78,7 @@ _reserve = [bytearray(4 << 20)]
 """Memory that is released to print an error when a command has run out of memory."""
 
 
+@flags_in_messages()
 def main(arguments: list[str] | None = None) -> None:
     """Run a command line and exit.
 

@@ -3,11 +3,32 @@
 import difflib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 MAX_MESSAGE_PART = 400
 """Characters of a path and of a problem that a message shows; both may come from a damaged file."""
+
+_ARGUMENTS = {
+    "--resume": "resume=True",
+    "--overwrite": "overwrite=True",
+    "--max-size": "max_size",
+    "--holdout": "holdout",
+}
+"""What flags in messages are called in Python."""
+_shows_flags = False
+
+
+@contextmanager
+def flags_in_messages() -> Iterator[None]:
+    """Let messages of errors name flags within the block, which the command line runs in; else they name arguments."""
+    global _shows_flags
+    before, _shows_flags = _shows_flags, True
+    try:
+        yield
+    finally:
+        _shows_flags = before
 
 
 class SehdrError(Exception):
@@ -15,6 +36,17 @@ class SehdrError(Exception):
 
     The command line prints the message and exits with status 1; every other exception is a defect of the program.
     """
+
+    def __str__(self) -> str:
+        """Return the message, for a user of the command line or of Python."""
+        message = super().__str__()
+        if _shows_flags or isinstance(self, UsageError):
+            return message
+        parts = message.split("`")  # Between them are commands to type.
+        for place in range(0, len(parts), 2):
+            for flag, argument in _ARGUMENTS.items():
+                parts[place] = re.sub(rf"{flag}(?![\w-])", argument, parts[place])
+        return "`".join(parts)
 
 
 class UsageError(SehdrError):

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from sehdr_warp import process
-from sehdr_warp.errors import SehdrError, UsageError, as_user_error
+from sehdr_warp.errors import InputError, SehdrError, UsageError, as_user_error, flags_in_messages
 from sehdr_warp.process import _Stream, collect_late
 from sehdr_warp.training.machine import interruptible
 
@@ -188,3 +188,12 @@ def test_large_blocks_go_back_to_the_system():
         for word in ("yes", "no")
     }
     assert kept["yes"] <= 5 and (kept["no"] > 100 or platform.libc_ver()[0] != "glibc"), kept
+
+
+def test_errors_name_arguments_in_python_and_flags_on_the_command_line():
+    error = InputError("runs/a", "exists", "use --resume, or type `sehdr-warp train --overwrite`")
+    python = "runs/a: exists; use resume=True, or type `sehdr-warp train --overwrite`"
+    with flags_in_messages():
+        assert str(error) == "runs/a: exists; use --resume, or type `sehdr-warp train --overwrite`"
+    assert str(error) == python
+    assert str(UsageError("no flag --resume")) == "no flag --resume"

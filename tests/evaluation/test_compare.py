@@ -108,5 +108,5 @@ def test_folders_that_cannot_be_scored(tmp_path):
             sw.evaluate_folder(place, truth)
     small = write_pictures(tmp_path / "small", {2: 1.0})
     write_exr(small / "r_2.exr", dict.fromkeys("RGB", np.ones((4, 5))), overwrite=True)
-    with pytest.raises(SehdrError, match="its picture is 5 x 4.*: --max-size reduces the truth"):
+    with pytest.raises(SehdrError, match="its picture is 5 x 4.*: max_size reduces the truth"):
         sw.evaluate_folder(small, scene(VIEWS))

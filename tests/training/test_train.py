@@ -127,7 +127,7 @@ def test_existing_files_are_safe(scene, tmp_path):
 def test_overwrite_starts_anew(scene, tmp_path):
     short = quick(**{"schedule.iterations": 5})
     train(scene, tmp_path / "run", short, device="cpu")
-    with pytest.raises(InputError, match="--resume or --overwrite"):
+    with pytest.raises(InputError, match="resume=True or overwrite=True"):
         train(scene, tmp_path / "run", short, device="cpu")
     run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 3}), device="cpu", overwrite=True)
     assert run.iterations == 3 and [line["iteration"] for line in run.metrics()][-1] == 3
