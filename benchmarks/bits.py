@@ -54,8 +54,8 @@ def main(
     # Kernels are compiled once, not by each worker.
     row((scenes[0], exposures[0], *PHOTOS[0]), iterations=30, max_size=max_size, device=device)
     with ProcessPoolExecutor(jobs, get_context("spawn")) as workers:
-        asked = [(scene, exposure, *photos) for exposure, scene, photos in product(exposures, scenes, PHOTOS)]
-        for result_row in workers.map(measure_row, asked):
+        combinations = [(scene, exposure, *photos) for exposure, scene, photos in product(exposures, scenes, PHOTOS)]
+        for result_row in workers.map(measure_row, combinations):
             result["rows"].append(result_row)
             write_json(json, result, overwrite=True)  # What has ended outlives an interruption.
     finish(result, json, overwrite=True)

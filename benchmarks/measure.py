@@ -56,7 +56,7 @@ def measure(page: Mapping, out: Path) -> dict:
     surroundings = os.environ | {"out": str(out.absolute()), "PATH": path}
     if subprocess.run(["sh", "-ec", command], cwd=ROOT, env=surroundings).returncode:
         raise SehdrError(f"{out}: a command of this page failed")
-    results = [read_json(found) for found in sorted(out.glob("*.json"))]
+    results = [read_json(file) for file in sorted(out.glob("*.json"))]
     if not results or len({result["machine"].get("build") for result in results}) > 1:
         raise InputError(out, f"holds {len(results)} results, or of several builds", "measure all of a page at once")
     joined = {name: [item for result in results for item in result[name]] for name in ("rows", "checks", "notes")}

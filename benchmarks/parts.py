@@ -133,8 +133,8 @@ def parts_of_step(variant: Variant, work: Work, device: torch.device) -> list[di
 def work_of(arguments: Sequence[Any], harmonics: int) -> Work:
     """arguments: rasterize()'s, seven tensors, width and height; harmonics: numbers of a Gaussian's."""
     *splats, width, height = arguments
-    pairs, drawn = count_blended_pairs(splats, width, height)
-    return Work(len(splats[0]), harmonics, splats[4].shape[1], pairs, drawn, width * height)
+    pairs, warp_pairs = count_blended_pairs(splats, width, height)
+    return Work(len(splats[0]), harmonics, splats[4].shape[1], pairs, warp_pairs, width * height)
 
 
 def bytes_per_microsecond(device: torch.device) -> float:

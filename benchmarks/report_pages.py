@@ -139,9 +139,9 @@ def _quality_tables(result: dict) -> Iterable[str]:
         row["to_bound"] = None if bound is row else row["gt_max"] - bound["gt_max"]
     yield "## In short: the middle exposure, one seed, the curve known"
     yield markdown_table(in_short(rows), SHORT)
-    known = [row for row in rows if row["response"] in (KNOWN, LEARNED)]
-    yield from _irradiance_tables(known)
-    yield from _energy_tables(known)
+    known_rows = [row for row in rows if row["response"] in (KNOWN, LEARNED)]
+    yield from _irradiance_tables(known_rows)
+    yield from _energy_tables(known_rows)
     for curve, response in groups([row for row in rows if row["response"] != LEARNED], "curve", "response"):
         members = [row for row in rows if row["curve"] == curve and row["response"] in (response, LEARNED)]
         table = []
@@ -231,8 +231,11 @@ def _energy_tables(rows: Sequence[Mapping]) -> Iterable[str]:
         energies = [energy for row in mine for energy in row.get("light_energies") or ()]
         if energies:
             near = (sum(0.5 <= energy <= 2 for energy in energies)) / len(energies)
-            lost = {"lost": sum(row["lights_lost"] for row in mine), "lights": sum(row["lights_count"] for row in mine)}
-            table.append({"method": method, "exposure": exposure, "n": len(energies), "near": near} | lost)
+            counts = {
+                "lost": sum(row["lights_lost"] for row in mine),
+                "lights": sum(row["lights_count"] for row in mine),
+            }
+            table.append({"method": method, "exposure": exposure, "n": len(energies), "near": near} | counts)
             table[-1] |= _light_energy(mine)
     if table:
         yield "## Energy of the lights that photos clip, over the truth's"

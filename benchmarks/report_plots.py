@@ -97,12 +97,12 @@ def _draw(path: Path, panels: Sequence[Sequence[tuple[dict, dict]]], form: str =
 
     width = max((len(row) for row in panels), default=1)
     figure = Figure(figsize=(max(4.2 * width, 6.4), 3.2 * len(panels) + 0.5), layout="constrained")
-    named = {}
+    handles = {}
     for place, (lines, labels) in enumerate(panel for row in panels for panel in row):
         axes = figure.add_subplot(len(panels), width, place + 1)
         for (name, points), color in zip(lines.items(), cycle(COLORS)):
             if points:
-                (named[name],) = axes.plot(*zip(*points, strict=True), form, color=color, markersize=3, label=name)
+                (handles[name],) = axes.plot(*zip(*points, strict=True), form, color=color, markersize=3, label=name)
         axes.set(**labels)
         for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
             if axis.get_scale() == "log":
@@ -111,8 +111,8 @@ def _draw(path: Path, panels: Sequence[Sequence[tuple[dict, dict]]], form: str =
                     axis.set_ticks(ticks := decade_ticks(*limits), [f"{tick:g}" for tick in ticks])
         axes.grid(color=RULE, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-    if named:
-        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    if handles:
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=90, format="png")
     Image.open(buffer).convert("RGB").quantize(32).save(path, format="PNG", optimize=True)

@@ -44,8 +44,8 @@ def parse(options: type[Options], words: list[str], program: str) -> Options:
         words = ["--help"]
     elif long_groups and {"-h", "--help"} & set(words):
         empty = dataclasses.field(default_factory=dict)
-        hidden = [(name, tyro.conf.Suppress[hint], empty) for name, hint in long_groups.items()]
-        short = dataclasses.make_dataclass(options.__name__, hidden, bases=(options,), frozen=True)
+        group_hints = [(name, tyro.conf.Suppress[hint], empty) for name, hint in long_groups.items()]
+        short = dataclasses.make_dataclass(options.__name__, group_hints, bases=(options,), frozen=True)
         short.__doc__ = options.__doc__
         try:
             tyro.cli(short, prog=program, args=["--help"], config=MARKERS)
@@ -70,19 +70,19 @@ def _check_flags(options: type, words: list[str], program: str) -> None:
             raise UsageError(f"{program} {words[0]}: no such command{hint}")
         _check_flags(commands[words[0]], words[1:], f"{program} {words[0]}")
         return
-    known, bare = {"--help", *flags(options)}, {"--" + name for name in positional(options)}
+    names, bare = {"--help", *flags(options)}, {"--" + name for name in positional(options)}
     removed = getattr(options, "removed_flags", {})
     for word in words:
         flag = word.partition("=")[0].replace("_", "-")
-        if not re.match(r"--[a-z]", flag) or flag in known:
+        if not re.match(r"--[a-z]", flag) or flag in names:
             continue
         if flag in bare:
             raise UsageError(f"{program} takes {flag[2:].upper()} without {flag}; see {program} --help")
         if flag in removed:
             raise UsageError(f"{flag} is gone: {removed[flag]}")
         # A mistyped part of a dotted flag (--los.clipping) is similar to the flag; a missing part (--clipping) is not.
-        by_field = {name.rpartition(".")[2].removeprefix("--"): name for name in known if "." in name}
-        hint = did_you_mean(flag, known) or (f", did you mean {by_field[flag[2:]]}?" if flag[2:] in by_field else "")
+        by_field = {name.rpartition(".")[2].removeprefix("--"): name for name in names if "." in name}
+        hint = did_you_mean(flag, names) or (f", did you mean {by_field[flag[2:]]}?" if flag[2:] in by_field else "")
         raise UsageError(f"{program} has no {flag}{hint or f'; see {program} --help'}")
 
 

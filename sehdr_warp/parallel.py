@@ -74,15 +74,15 @@ def run_interruptibly(function: Callable[[], Result], waiting: Callable[[], None
     """
     if threading.current_thread() is not threading.main_thread():
         return function()
-    done: Future[Result] = Future()
+    future: Future[Result] = Future()
     # Not the thread itself: Python 3.11 takes one for ended if a signal interrupts its join().
     ended = threading.Event()
 
     def run() -> None:
         try:
-            done.set_result(function())
+            future.set_result(function())
         except BaseException as error:  # noqa: BLE001 - It is raised where the result is waited for.
-            done.set_exception(error)
+            future.set_exception(error)
         finally:
             ended.set()
 
@@ -97,7 +97,7 @@ def run_interruptibly(function: Callable[[], Result], waiting: Callable[[], None
         code = error.code if isinstance(error, SystemExit) else 130 if isinstance(error, KeyboardInterrupt) else 1
         atexit.register(_leave, ended, code if isinstance(code, int) else 1)
         raise
-    return done.result()
+    return future.result()
 
 
 def _leave(ended: threading.Event, code: int) -> None:

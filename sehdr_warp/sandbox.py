@@ -80,8 +80,8 @@ def main(module: str, name: str, path: str, memory: str) -> int:
         with suppress(ImportError, OSError, ValueError):
             import resource
 
-            used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-            most = used + int(memory)
+            in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            most = in_use + int(memory)
             resource.setrlimit(resource.RLIMIT_AS, (most, most))
         packed = io.BytesIO()
         np.savez(packed, **read(Path(path)))

@@ -26,11 +26,11 @@ VARIANCE_ERROR = 8 * UNIT / 9e-4
 def _response_readings(curve: Response, device, exposures, **options) -> list[Reading]:
     """Photo, its derivative where asked for, and the exposure that the photo decodes to, of one curve."""
     values = torch.linspace(curve.black + 2 * CODE, curve.peak - 2 * CODE, 97, dtype=torch.float64)
-    given = {"elementwise": True, "floor": 1e-6, "label": f"{curve.name} {{}}"}
+    settings = {"elementwise": True, "floor": 1e-6, "label": f"{curve.name} {{}}"}
     # A filmic curve's derivative is the difference of terms that are up to 50 times as large (x near its white).
     options["extra"] = 64 * UNIT if curve.name in ("filmic", "aces") else 0.0
-    encoded = compare(lambda x: {"f": curve.encode(x)}, {"x": exposures}, device, **given, **options)
-    return encoded + compare(lambda v: {"decode": curve.decode(v)}, {"v": values}, device, **given)
+    encoded = compare(lambda x: {"f": curve.encode(x)}, {"x": exposures}, device, **settings, **options)
+    return encoded + compare(lambda v: {"decode": curve.decode(v)}, {"v": values}, device, **settings)
 
 
 def _exposures(device):

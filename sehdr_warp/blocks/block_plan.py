@@ -249,8 +249,8 @@ def blocks_for(photos: int, pixels: float, config: Config) -> int:
         config: Options of the training.
     """
     by_photos = OVERLAP * photos * STEPS_PER_PHOTO / REFERENCE_ITERATIONS
-    wanted = config.mcmc.cap_density * math.sqrt(pixels)
-    by_gaussians = OVERLAP * wanted / config.densification.cap_max
+    gaussians = config.mcmc.cap_density * math.sqrt(pixels)
+    by_gaussians = OVERLAP * gaussians / config.densification.cap_max
     if "densification.cap_max" in config.plan.keep or config.densification.strategy != "mcmc":
         by_gaussians = 0.0
     return max(1, math.ceil(max(by_photos, by_gaussians) - OVERLAP + 1))
@@ -303,8 +303,8 @@ def _blocks(scene: Scene, division: Division, points: np.ndarray) -> tuple[Block
     names: list[list[str]] = [[views[index].name for index in own] for own in division.photos]
     owner = division.block_of(points)
     for view in scene.test_views:
-        shown = np.bincount(owner, weights_of(view.camera, points), len(division.cells))
-        names[int(shown.argmax())].append(view.name)
+        weights = np.bincount(owner, weights_of(view.camera, points), len(division.cells))
+        names[int(weights.argmax())].append(view.name)
     digits = max(2, len(str(len(names))))
     return tuple(
         Block(

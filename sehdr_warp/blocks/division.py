@@ -107,9 +107,9 @@ def divide(name: str, cameras: Sequence[Camera], points: np.ndarray, count: int)
         raise InputError(name, problem, remedy)
     points = np.asarray(points, np.float64)
     points = points[:: -(-len(points) // MOST_PLACES) or 1]
-    shown = np.stack([weights_of(camera, points) for camera in cameras])  # [V, P], each row sums to 1 or 0
-    blind = np.flatnonzero(shown.sum(1) == 0)
-    middles = shown @ points
+    weights = np.stack([weights_of(camera, points) for camera in cameras])  # [V, P], each row sums to 1 or 0
+    blind = np.flatnonzero(weights.sum(1) == 0)
+    middles = weights @ points
     middles[blind] = np.array([camera.position for camera in cameras]).reshape(-1, 3)[blind]
     axes = _principal_axes(middles)
     cells = _split(middles @ axes.T, Cell(np.full(3, -np.inf), np.full(3, np.inf)), count)
@@ -117,17 +117,17 @@ def divide(name: str, cameras: Sequence[Camera], points: np.ndarray, count: int)
     low, high = np.quantile(places, [0.02, 0.98], axis=0)
     margins = np.stack([MARGIN * _extent(cell, low, high) for cell in cells])
     enlarged = [Cell(cell.low - margin, cell.high + margin) for cell, margin in zip(cells, margins, strict=True)]
-    parts = np.stack([shown @ cell.contains(places) for cell in enlarged], axis=1)  # [V, B]
+    parts = np.stack([weights @ cell.contains(places) for cell in enlarged], axis=1)  # [V, B]
     own = np.stack([cell.contains(middles @ axes.T) for cell in cells], axis=1)
-    chosen = (parts >= LEAST_PART) | own
-    photos = tuple(np.flatnonzero(column) for column in chosen.T)
+    members = (parts >= LEAST_PART) | own
+    photos = tuple(np.flatnonzero(column) for column in members.T)
     _check(name, photos, len(cameras), count)
     return Division(axes, tuple(cells), margins, photos)
 
 
-def largest_count(name: str, cameras: Sequence[Camera], points: np.ndarray, wanted: int) -> Division | None:
+def largest_count(name: str, cameras: Sequence[Camera], points: np.ndarray, most: int) -> Division | None:
     """Return the division into `wanted` blocks, or into the largest smaller number that is possible; None for none."""
-    for count in range(wanted, 1, -1):
+    for count in range(most, 1, -1):
         try:
             return divide(name, cameras, points, count)
         except InputError:

@@ -115,7 +115,7 @@ def _in_colors(
     color_matrix: np.ndarray | None,
 ) -> GaussianArrays:
     """Return gaussians_of() in the field's own coordinates, like camera_positions."""
-    arrays, to_radiance = _stored(field)
+    arrays, to_radiance = _arrays_of(field)
     if color_matrix is not None:
         to_radiance = _in_rec709(to_radiance or (lambda x: x / field.base_time), color_matrix, field.base_time)
     time = exposure_time or field.base_time
@@ -144,7 +144,7 @@ def _in_rec709(native: Colors, matrix: np.ndarray, base_time: float) -> Colors:
     return lambda colors: rec709_of(torch.from_numpy(np.asarray(native(colors))), matrix, base_time).numpy()
 
 
-def _stored(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
+def _arrays_of(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
     """Return the Gaussians in the field's own colors, and their conversion to radiance (None if they are exposures)."""
     tensors: dict[str, Any] = {name: value.cpu().numpy() for name, value in field.gaussians.tensors().items()}
     harmonics = np.concatenate([tensors.pop("harmonics_dc"), tensors.pop("harmonics_rest")], axis=1)
@@ -232,7 +232,7 @@ def refine(
         optimizer.zero_grad()
         (rendered.clamp(0, 1) - targets[index]).square().mean().backward()
         optimizer.step()
-    return to_scene(_stored(field)[0], field.normalization)
+    return to_scene(_arrays_of(field)[0], field.normalization)
 
 
 @torch.no_grad()

@@ -144,9 +144,9 @@ def gather_evidence(
         sums = field.weighted_sums(field.camera_tensors(view.camera), images)
         total += sums
         peak = torch.maximum(peak, sums[:, 0])
-    seen = total[:, 0].clamp_min(0)
-    means = total[:, 1:] / seen.clamp_min(1e-12)[:, None]
-    return Evidence(seen, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1), peak)
+    weight_sum = total[:, 0].clamp_min(0)
+    means = total[:, 1:] / weight_sum.clamp_min(1e-12)[:, None]
+    return Evidence(weight_sum, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1), peak)
 
 
 def _deviation(estimates: Tensor, photo: Tensor) -> Tensor:

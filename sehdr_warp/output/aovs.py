@@ -70,14 +70,14 @@ def _alpha(view: ViewData) -> Channels:
 
 
 def _confidence(view: ViewData) -> Channels:
-    return {"confidence": _measured(view.run, view.run.render_confidence(view.camera))}
+    return {"confidence": _require_values(view.run, view.run.render_confidence(view.camera))}
 
 
 def _clipped(view: ViewData) -> Channels:
-    return {"clipped": _measured(view.run, view.run.render_clipped(view.camera))}
+    return {"clipped": _require_values(view.run, view.run.render_clipped(view.camera))}
 
 
-def _measured(run, values) -> np.ndarray:
+def _require_values(run, values) -> np.ndarray:
     if values is None:
         raise SehdrError(f"{run.path}: its confidence was not measured; `sehdr-warp report` does, from the photos")
     return as_array(values)

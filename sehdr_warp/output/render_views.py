@@ -178,9 +178,9 @@ def _camera_files(views: Sequence[tuple[str, Camera]], transform: WorldTransform
         transform: To the coordinates of files.
         moving: Whether the cameras may be frames of one that moves; photos are not, whatever their names.
     """
-    placed = [(name, transform.camera(camera)) for name, camera in views]
-    path = camera_path(placed) if moving else None
-    files = {"cameras.usda": usd_cameras(placed, transform, path=path)}
+    cameras = [(name, transform.camera(camera)) for name, camera in views]
+    path = camera_path(cameras) if moving else None
+    files = {"cameras.usda": usd_cameras(cameras, transform, path=path)}
     if path is not None:
         files["cameras.chan"] = chan_cameras(path)
         # In the set's own coordinates, which nerfstudio's dataparser_transforms.json starts from.
@@ -245,13 +245,13 @@ def select_cameras(
         SehdrError: If there are none, or `cameras` is neither a known name nor a file.
     """
     check_cameras(cameras)
-    text, known = str(cameras), ", ".join(SPLITS + PATHS)
+    text, choices = str(cameras), ", ".join(SPLITS + PATHS)
     if camera is not None and text in SPLITS + PATHS:
         raise SehdrError(f"--camera {camera}: chooses from a file of cameras, and --cameras {text} is none")
     if text in SPLITS:
-        named = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
-        if not named:
-            others = known.replace(f"{text}, ", "")
+        views = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
+        if not views:
+            others = choices.replace(f"{text}, ", "")
             raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
     elif text in PATHS:
         photos = [entry.camera for entry in run.cameras if entry.split == "train"]
@@ -262,39 +262,39 @@ def select_cameras(
         digits = max(3, len(str(count - 1)))
         return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
     else:
-        named = _from_file(run, Path(cameras), transform)
+        views = _from_file(run, Path(cameras), transform)
         if camera is not None:
-            names = [name for name, _ in named]
-            named = [
+            names = [name for name, _ in views]
+            views = [
                 (name, each)
-                for name, each in named
+                for name, each in views
                 if name == camera or re.fullmatch(re.escape(camera) + r"_[\d.]+", name)
             ]
-            if not named:
+            if not views:
                 raise SehdrError(f"{cameras}: has no camera {camera!r}{did_you_mean(camera, names)}")
-    return list(zip(safe_names([name for name, _ in named]), [camera for _, camera in named], strict=True))
+    return list(zip(safe_names([name for name, _ in views]), [camera for _, camera in views], strict=True))
 
 
 def _from_file(run: Any, path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
     """Return the cameras of a file in the scene's own coordinates."""
-    named = load_cameras(path)
+    views = load_cameras(path)
     if path.suffix.lower() not in EXCHANGE_SUFFIXES:
-        return named
+        return views
     matrix = read_exchange_cameras(path).world_matrix
     try:
         to_file = None if matrix is None else WorldTransform.from_matrix(matrix)
     except ValueError as error:
         raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
     back = (to_file or transform or world_transform(run)).inverse()
-    return [(name, back.camera(camera)) for name, camera in named]
+    return [(name, back.camera(camera)) for name, camera in views]
 
 
 def provenance(run) -> dict[str, str]:
     """Return where a picture came from, as text by key."""
     unit = read_light_unit(run)
-    known = {"scene": run.scene_name, "iterations": run.iterations, "units": str(unit or "relative radiance")}
-    known["response"] = getattr(run.response, "name", None)
-    return {key: str(value) for key, value in known.items() if value not in (None, "")}
+    values = {"scene": run.scene_name, "iterations": run.iterations, "units": str(unit or "relative radiance")}
+    values["response"] = getattr(run.response, "name", None)
+    return {key: str(value) for key, value in values.items() if value not in (None, "")}
 
 
 def _focus_distance(run, cameras: Sequence[Camera]) -> float:

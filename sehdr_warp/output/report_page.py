@@ -178,10 +178,10 @@ def _opening(comparison: Comparison, time: float, gain: float) -> Markup:
 
 def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:
     sources = {"Photo alone": comparison.from_photo, "Scene": comparison.hdr, "Truth": comparison.truth}
-    known = {name: light for name, light in sources.items() if light is not None}
-    lights = {name: smaller(light * time, _DIAL) for name, light in known.items()}
+    present = {name: light for name, light in sources.items() if light is not None}
+    lights = {name: smaller(light * time, _DIAL) for name, light in present.items()}
     cells = [markup("<span>&nbsp;</span>"), *(markup("<span>{}</span>", stops_text(stop)) for stop in STOPS)]
-    for name, light in known.items():
+    for name, light in present.items():
         small = smaller(light, _STRIP)
         cells.append(markup('<span class="name">{}</span>', name))
         for stop in STOPS:

@@ -39,8 +39,8 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
                 if isinstance(letter, str):
                     sizes.setdefault(letter, size)
         if tuple(value.shape) != tuple(sizes.get(n, -1) if isinstance(n, str) else n for n in shape):
-            known = ", ".join(f"{n} = {sizes[n]}" for n in shape if isinstance(n, str) and n in sizes)
-            expected += f" with {known}" if known else ""
+            sizes_text = ", ".join(f"{n} = {sizes[n]}" for n in shape if isinstance(n, str) and n in sizes)
+            expected += f" with {sizes_text}" if sizes_text else ""
             raise ValueError(f"{name} has shape {list(value.shape)}, expected {expected}")
         if value.layout != torch.strided:
             raise ValueError(f"{name} is a tensor of layout {value.layout}, expected a dense one; use to_dense()")

@@ -40,11 +40,11 @@ def define_node(name: str, options: str, run: Run, fake: Run) -> Callable[..., l
         with torch._C._ForceDispatchKeyGuard(*_KEYS), torch.enable_grad():
             leaves = [tensor.detach().requires_grad_() for tensor in tensors]
             results = run(leaves, *values)
-            known = [place for place, gradient in enumerate(upstream) if gradient is not None]
-            known = [place for place in known if results[place].requires_grad]
+            places = [place for place, gradient in enumerate(upstream) if gradient is not None]
+            places = [place for place in places if results[place].requires_grad]
             gradients: Sequence[Tensor | None] = [None] * len(leaves)
-            if known:
-                outputs, by_outputs = [results[place] for place in known], [upstream[place] for place in known]
+            if places:
+                outputs, by_outputs = [results[place] for place in places], [upstream[place] for place in places]
                 gradients = torch.autograd.grad(outputs, leaves, by_outputs, allow_unused=True)
         # Each with memory of its own, as a compiler may assume.
         pairs = zip(leaves, gradients, strict=True)

@@ -39,7 +39,7 @@ def sample_residual_pixels(
     steps = weights.cumsum(0)
     places = torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(steps) - 1)
     pixels = torch.empty(len(places), 3, dtype=torch.int32, device=rendered.device)
-    meant = torch.empty(len(places), dtype=torch.bool, device=rendered.device)
+    is_sample = torch.empty(len(places), dtype=torch.bool, device=rendered.device)
     resized = size[0] / width, size[1] / height, *size, BORDER
-    launch(kernels.sampled_pixels, len(places), places, steps[-1], width, view, *resized, pixels, meant)
-    return pixels, meant
+    launch(kernels.sampled_pixels, len(places), places, steps[-1], width, view, *resized, pixels, is_sample)
+    return pixels, is_sample

@@ -78,13 +78,15 @@ def calibrate_codes(
     if darker[np.diff(stops[order]) > 0.1].any():
         raise InputError(name, "a photo of longer exposure is darker than one of shorter", "correct the exposure times")
     selection = slice(None) if channel is None else [CHANNELS.index(channel)]
-    taken = codes[..., selection].reshape(len(photos), -1)
-    curve, residuals, weights, light = _solve(taken, stops, name)
+    photo_codes = codes[..., selection].reshape(len(photos), -1)
+    curve, residuals, weights, light = _solve(photo_codes, stops, name)
     plain = float(np.sqrt(np.square(residuals[weights > 0]).mean()))
     if plain > _MISALIGNED:
         raise InputError(name, f"its photos contradict each other by {plain:.2f} stops: something moved", _REMEDY)
     pairs = rng.permutation(np.argwhere(weights > 0))[:_SHOWN].T
-    samples = np.stack([2.0 ** (light[pairs[1]] + stops[pairs[0]] - curve[255]), taken[tuple(pairs)] / 255], axis=1)
+    samples = np.stack(
+        [2.0 ** (light[pairs[1]] + stops[pairs[0]] - curve[255]), photo_codes[tuple(pairs)] / 255], axis=1
+    )
     exposures = 2.0 ** (curve - curve[255])
     exposures[0] = 0.0
     return Calibration(

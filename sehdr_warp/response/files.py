@@ -160,16 +160,16 @@ def _emor(path: Path, text: str, selector: str | None) -> Response:
 
 def _json_curve(path: Path) -> Response:
     remedy = 'give {"exposures": [...], "values": [...]}'
-    stored = read_json(path)
+    fields = read_json(path)
     try:
-        if "kind" in stored:
-            return Response.from_dict(stored)
-        exposures, values = (np.array(stored[key], np.float64) for key in ("exposures", "values"))
+        if "kind" in fields:
+            return Response.from_dict(fields)
+        exposures, values = (np.array(fields[key], np.float64) for key in ("exposures", "values"))
     except SehdrError as error:
         raise InputError(path, str(error), remedy) from error
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, f"has no two lists of numbers ({error!r})", remedy) from error
-    return TabulatedResponse(str(stored.get("name", path.stem)), exposures, values, source=str(path))
+    return TabulatedResponse(str(fields.get("name", path.stem)), exposures, values, source=str(path))
 
 
 def _text_curve(path: Path, text: str) -> Response:

@@ -36,14 +36,14 @@ def light_estimates(
     if not any(some and bool(mask.any()) for some, mask in zip(has_estimate, masks, strict=True)):
         return None
     prior = load_prior(device) if config.light_prior else None
-    found = []
+    result = []
     for view, mask in zip(views, masks, strict=True):
         if not bool(mask.any()):
-            found.append(torch.zeros(*coarse_size(*mask.shape[:2]), 6, dtype=torch.float16))
+            result.append(torch.zeros(*coarse_size(*mask.shape[:2]), 6, dtype=torch.float16))
             continue
         exposure = response.decode(torch.from_numpy(view.image).to(device)).float() / response.white
         evidence = view.light_above_white
         evidence = None if evidence is None else torch.from_numpy(evidence).to(device).float()
         estimates = combined_estimates(exposure, mask.to(device), prior, evidence, view.light_above_white_deviation)
-        found.append(estimates.cpu())
-    return found
+        result.append(estimates.cpu())
+    return result

@@ -105,12 +105,12 @@ class RunWriter(RunFolder):
     @contextmanager
     def _locked(self) -> Iterator[None]:
         """Hold the lock meanwhile, and release it if it was not held before."""
-        held = self._lock.is_locked
+        had_lock = self._lock.is_locked
         self.lock()
         try:
             yield
         finally:
-            if not held:
+            if not had_lock:
                 self.unlock()
 
     def begin(
@@ -165,7 +165,7 @@ class RunWriter(RunFolder):
             write_json(new.scene, scene)
             write_json(new.info, info)
             write_json(new.config, config.model_dump())
-            new.write_checkpoint(*state, kept=1)
+            new.write_checkpoint(*state, keep=1)
         self._settle()
         self._hashes = new._hashes
 
@@ -223,10 +223,10 @@ class RunWriter(RunFolder):
         with atomic_path(self.metrics, ours=True) as beside:
             beside.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
 
-    def write_checkpoint(self, tensors: dict[str, Tensor], values: dict, *, kept: int) -> Path:
+    def write_checkpoint(self, tensors: dict[str, Tensor], values: dict, *, keep: int) -> Path:
         """Write the checkpoint of a state unless it is there and sound; return its folder.
 
-        Deletes all but the newest `kept`, and those of later iterations, which were damaged if a training goes on from
+        Deletes all but the newest `keep`, and those of later iterations, which were damaged if a training goes on from
         this one. values: plain values, with the "iteration".
         """
         from safetensors.torch import save
@@ -245,7 +245,7 @@ class RunWriter(RunFolder):
                 (beside / VALUES).write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
         folders = self._checkpoint_folders()
         end = folders.index(final) + 1
-        for other in folders[: max(0, end - kept)] + folders[end:]:
+        for other in folders[: max(0, end - keep)] + folders[end:]:
             remove_checkpoint(other)
         return final
 

@@ -58,13 +58,13 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
 
 def _of_json(path: Path) -> list[tuple[str, Camera]]:
     if read_text(path).lstrip().startswith("["):
-        return _listed(path, _list(path), lambda entry, _: (str(entry["img_name"]), _inria(entry, path)))
+        return _cameras(path, _list(path), lambda entry, _: (str(entry["img_name"]), _inria(entry, path)))
     values = read_json(path)
     if isinstance(values.get("cameras"), list):
-        return _listed(path, values["cameras"], lambda e, i: (str(e.get("name", f"{i:04d}")), Camera.from_dict(e)))
+        return _cameras(path, values["cameras"], lambda e, i: (str(e.get("name", f"{i:04d}")), Camera.from_dict(e)))
     if isinstance(values.get("camera_path"), list):
         back = _dataparser(path)
-        return _listed(path, values["camera_path"], lambda e, i: (f"{i:04d}", _nerfstudio(e, i, values, path, back)))
+        return _cameras(path, values["camera_path"], lambda e, i: (f"{i:04d}", _nerfstudio(e, i, values, path, back)))
     if "frames" in values:
         return [
             (Path(name).stem, frame_lens(values, frame, None, path).camera(frame_pose(frame, path, name)))
@@ -73,7 +73,7 @@ def _of_json(path: Path) -> list[tuple[str, Camera]]:
     raise InputError(path, "has none of cameras, camera_path and frames", "export cameras as the manual describes")
 
 
-def _listed(path: Path, entries: list, read) -> list[tuple[str, Camera]]:
+def _cameras(path: Path, entries: list, read) -> list[tuple[str, Camera]]:
     """Call read(entry, index) for each entry, with errors that name the camera."""
     cameras = []
     for i, entry in enumerate(entries):

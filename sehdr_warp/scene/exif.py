@@ -53,8 +53,8 @@ def exif_exposure(path: Path) -> ExifExposure:
         with open_image(path) as image:
             first = exif_of(image)
             tables = first.get_ifd(_EXIF_IFD), first
-            numbers = {tag: _stated(tables, tag) for tag in (_EXPOSURE_TIME, _SHUTTER_APEX, _F_NUMBER, _APERTURE_APEX)}
-            speeds = [_stated(tables, tag) for tag in _ISO_TAGS]
+            numbers = {tag: _of_tag(tables, tag) for tag in (_EXPOSURE_TIME, _SHUTTER_APEX, _F_NUMBER, _APERTURE_APEX)}
+            speeds = [_of_tag(tables, tag) for tag in _ISO_TAGS]
     except PILLOW_ERRORS:
         return ExifExposure()
     time = _within(numbers[_EXPOSURE_TIME], SHORTEST, LONGEST)
@@ -93,7 +93,7 @@ def are_camera_jpegs(sources: Sequence[Path | None]) -> bool:
     return 2 * sum(bool(exposure.time or exposure.f_number) for exposure in exposures) > len(sources)
 
 
-def _stated(tables: Iterable[Any], tag: int) -> float | None:
+def _of_tag(tables: Iterable[Any], tag: int) -> float | None:
     """Return the first usable number of a tag in EXIF's own table or, as some tools write it, the first one."""
     for table in tables:
         value = table.get(tag)

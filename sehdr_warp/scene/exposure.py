@@ -144,10 +144,10 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
     for place in places:
         if not (place / EXPOSURES).is_file():
             continue
-        listed = _read_times(place / EXPOSURES)
+        table = _read_times(place / EXPOSURES)
         names = _names_of(images, [*bases, place])
         strange, ambiguous = [], []
-        for name, seconds in listed.items():
+        for name, seconds in table.items():
             matches = names.get(_plain(name), [])
             if len(matches) == 1:
                 times[matches[0]] = seconds
@@ -159,7 +159,7 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
                 strange.append(name)
         if strange:
             listing = ", ".join(strange[:_MOST_NAMED]) + (" ..." if len(strange) > _MOST_NAMED else "")
-            notes.append(f"{EXPOSURES}: {len(strange)} of its {len(listed)} names belong to no photo: {listing}")
+            notes.append(f"{EXPOSURES}: {len(strange)} of its {len(table)} names belong to no photo: {listing}")
         if ambiguous:
             listing = ", ".join(ambiguous[:_MOST_NAMED])
             notes.append(f"{EXPOSURES}: {len(ambiguous)} names fit several photos, and need their folders: {listing}")

@@ -167,26 +167,26 @@ def initial_gains(views: Sequence[View], response: Response) -> ExposureCompensa
 
 
 def rough_gains(
-    views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response
+    views: Sequence[View], points: np.ndarray, visible: np.ndarray, response: Response
 ) -> ExposureCompensation:
     """Estimate what fit_gains() fits, in a small part of its time.
 
     Alternates means over photos and over points, with one quadratic vignetting for each lens. Outliers keep their
     weight.
     """
-    light, radius = point_light(views, points, seen, response)
-    known, of = np.isfinite(light), lens_groups(views)
-    light, square = np.where(known, light, 0.0), radius[..., None] ** 2
+    light, radius = point_light(views, points, visible, response)
+    valid, of = np.isfinite(light), lens_groups(views)
+    light, square = np.where(valid, light, 0.0), radius[..., None] ** 2
     gains, slopes = np.zeros((len(views), 1, 3)), np.zeros(of.max() + 2)  # The last is for photos of no group
     mine = [(of == lens)[:, None, None] * square for lens in range(of.max() + 1)]
-    beside = [(own - _mean(own * known, known, 0)) * known for own in mine]
+    beside = [(own - _mean(own * valid, valid, 0)) * valid for own in mine]
     for _ in range(ROUNDS):
         for lens, own in enumerate(beside):
             rest = light - gains + slopes[of][:, None, None] * square
-            rest -= _mean(rest * known, known, 0)
+            rest -= _mean(rest * valid, valid, 0)
             slopes[lens] -= float((rest * own).sum() / max((own**2).sum(), 1e-9))
         rest = light + slopes[of][:, None, None] * square
-        gains = _mean((rest - _mean((rest - gains) * known, known, 0)) * known, known, 1)
+        gains = _mean((rest - _mean((rest - gains) * valid, valid, 0)) * valid, valid, 1)
     names = [view.name for view in views]
     vignetting = {name: (max(float(slopes[lens]), 0.0), 0.0) for name, lens in zip(names, of, strict=True)}
     return _from_logarithms(names, gains[:, 0], vignetting)
@@ -199,7 +199,7 @@ def _mean(values: np.ndarray, valid: np.ndarray, axis: int) -> np.ndarray:
 def disagreement(
     views: Sequence[View],
     points: np.ndarray,
-    seen: np.ndarray,
+    visible: np.ndarray,
     response: Response,
     gains: ExposureCompensation | None = None,
     *,
@@ -210,12 +210,12 @@ def disagreement(
     Args:
         views: the photos.
         points: [P, 3] places in the world.
-        seen: [V, P] bool, which photos show a point.
+        visible: [V, P] bool, which photos show a point.
         response: the camera's.
         gains: divided out first.
         colors: compare white balance alone, which differs less if points do not match exactly.
     """
-    light, radius = point_light(views, points, seen, response)
+    light, radius = point_light(views, points, visible, response)
     light -= _logarithms(gains, views, radius) if gains is not None else 0.0
     if colors:
         light -= light.mean(2, keepdims=True)
@@ -224,14 +224,14 @@ def disagreement(
 
 
 def remaining_vignetting(
-    views: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response, gains: ExposureCompensation
+    views: Sequence[View], points: np.ndarray, visible: np.ndarray, response: Response, gains: ExposureCompensation
 ) -> float:
     """Return the fraction of the median cross-photo disagreement that remains after the vignetting correction.
 
     Differences are weighted by how much the vignetting predicts, because few points lie near the centre of one photo
     and near the corner of another. Arguments are those of disagreement().
     """
-    light, radius = point_light(views, points, seen, response)
+    light, radius = point_light(views, points, visible, response)
     predicted = np.where(np.isfinite(light), -_powers(gains, views, radius)[..., None], np.nan)
     light -= _logarithms(gains.parts(vignetting=False), views, radius)
     several = np.isfinite(light).sum(0) > 1
@@ -276,7 +276,7 @@ def lens_groups(views: Sequence[View]) -> np.ndarray:
 
 
 def fit_gains(
-    views: Sequence[View], others: Sequence[View], points: np.ndarray, seen: np.ndarray, response: Response
+    views: Sequence[View], others: Sequence[View], points: np.ndarray, visible: np.ndarray, response: Response
 ) -> ExposureCompensation:
     """Fit the gains of photos and the vignetting of lenses by which photos agree on the light of surface points.
 
@@ -286,14 +286,14 @@ def fit_gains(
         views: photos that take part.
         others: photos that do not, and get the median of their differences.
         points: [P, 3] places of surfaces in the world.
-        seen: [V + others, P] bool, which photos show a point; occlusion is not known otherwise.
+        visible: [V + others, P] bool, which photos show a point; occlusion is not known otherwise.
         response: the camera's.
     """
     from scipy import sparse
     from scipy.sparse.linalg import lsmr
 
     names = [view.name for view in (*views, *others)]
-    light, radius = point_light((*views, *others), points, seen, response)
+    light, radius = point_light((*views, *others), points, visible, response)
     trained, count, most, of = light[: len(views)], len(points), len(views), lens_groups((*views, *others))
     view, point, channel = np.nonzero(np.isfinite(trained))
     values, lens = trained[view, point, channel], of[view]
@@ -322,8 +322,8 @@ def fit_gains(
     mean = np.mean(gains, 0)
     for index in range(most, len(names)):
         differences = light[index] - surfaces + powers[index][:, None]
-        measured = np.isfinite(differences).sum(0).min() > 0
-        gains.append(np.nanmedian(differences, 0) if measured else mean)
+        has_values = np.isfinite(differences).sum(0).min() > 0
+        gains.append(np.nanmedian(differences, 0) if has_values else mean)
     return _from_logarithms(names, np.array(gains) - mean, vignetting)
 
 
@@ -351,10 +351,10 @@ def _radius(view: View, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     return np.hypot(column + 0.5 - width / 2, row + 0.5 - height / 2) / np.hypot(width / 2, height / 2)
 
 
-def point_light(views: Sequence[View], points, seen, response) -> tuple[np.ndarray, np.ndarray]:
-    """Return _light() of all photos: [V, P, 3], NaN if unknown or not seen, and radii [V, P]."""
+def point_light(views: Sequence[View], points, visible, response) -> tuple[np.ndarray, np.ndarray]:
+    """Return _light() of all photos: [V, P, 3], NaN if unknown or not visible, and radii [V, P]."""
     light, radius = zip(*(_light(view, points, response) for view in views), strict=True)
-    return np.where(seen[: len(views), :, None], np.stack(light), np.nan), np.stack(radius)
+    return np.where(visible[: len(views), :, None], np.stack(light), np.nan), np.stack(radius)
 
 
 def _light(view: View, points: np.ndarray, response: Response) -> tuple[np.ndarray, np.ndarray]:

@@ -159,7 +159,7 @@ def _of_jpeg(path: Path) -> GainMap | None:
                 make = _of_apple(xmp, exif)
             else:
                 continue
-            return _made(make, _pixels(image, photo))
+            return _gain_map_of(make, _pixels(image, photo))
     return None
 
 
@@ -175,12 +175,12 @@ def _of_items(path: Path) -> GainMap | None:
     for number, item in items.items.items():
         if item.kind == "tmap" and len(to := inputs.get(number, ())) >= 2 and to[0] == items.primary:
             make = _of_iso(item_bytes(path, item)[1:])
-            return _made(make, _item_pixels(path, items, to[1], photo))
+            return _gain_map_of(make, _item_pixels(path, items, to[1], photo))
     for number, item in items.items.items():
         kinds = [data[4:].split(b"\0")[0].decode("latin-1") for name, data in item.properties if name == "auxC"]
         if _APPLE_AUX in kinds:
             xmp = "".join(_text(item_bytes(path, items.items[n])) for n in _described_by(items, number))
-            return _made(_of_apple(xmp, exif), _item_pixels(path, items, number, photo))
+            return _gain_map_of(_of_apple(xmp, exif), _item_pixels(path, items, number, photo))
     return None
 
 
@@ -239,21 +239,21 @@ class _Parameters:
     apple_headroom: float | None = None
 
 
-def _made(stated: _Parameters, encoded: np.ndarray) -> GainMap | None:
+def _gain_map_of(parameters: _Parameters, encoded: np.ndarray) -> GainMap | None:
     """Return the gain map of parameters and pixels; None if the photo itself is the HDR rendition.
 
     Raises ValueError for parameters that cannot be.
     """
-    if stated.base_is_hdr:
+    if parameters.base_is_hdr:
         return None
-    if stated.apple_headroom is not None:
+    if parameters.apple_headroom is not None:
         # light = base (1 + (headroom - 1) g), g decoded by Rec.709; as a gain map of stops.
         linear = np.where(encoded <= 0.08145, encoded / 4.5, ((encoded + 0.099) / 1.099) ** (1 / 0.45))
-        stops = math.log2(stated.apple_headroom)
-        encoded = (np.log2(1 + (stated.apple_headroom - 1) * linear) / stops).astype(np.float32)
-        stated = _Parameters(maximum=(stops,), base_offset=(0.0,), alternate_offset=(0.0,), headroom=stops)
+        stops = math.log2(parameters.apple_headroom)
+        encoded = (np.log2(1 + (parameters.apple_headroom - 1) * linear) / stops).astype(np.float32)
+        parameters = _Parameters(maximum=(stops,), base_offset=(0.0,), alternate_offset=(0.0,), headroom=stops)
     names = ("minimum", "maximum", "gamma", "base_offset", "alternate_offset")
-    numbers = {name: np.resize(np.array(getattr(stated, name), np.float64), 3) for name in names}
+    numbers = {name: np.resize(np.array(getattr(parameters, name), np.float64), 3) for name in names}
     if not all(np.isfinite(values).all() for values in numbers.values()):
         raise ValueError("its parameters are not finite")
     if not ((numbers["gamma"] > 0.01) & (numbers["gamma"] < 100)).all():
@@ -273,8 +273,8 @@ def _of_xmp(xmp: str) -> _Parameters:
         return _xmp_values(xmp, f"hdrgm:{name}")
 
     def numbers(name: str, default: float) -> tuple[float, ...]:
-        stated = tuple(float(value) for value in values(name))
-        return stated if len(stated) in (1, 3) else (default,)
+        floats = tuple(float(value) for value in values(name))
+        return floats if len(floats) in (1, 3) else (default,)
 
     return _Parameters(
         minimum=numbers("GainMapMin", 0.0),
@@ -334,8 +334,8 @@ def _of_apple(xmp: str, exif: Any) -> _Parameters:
 
     Raises ValueError if neither states it.
     """
-    if stated := _xmp_values(xmp, "HDRGainMap:HDRGainMapHeadroom"):
-        headroom = float(stated[0])
+    if headroom_text := _xmp_values(xmp, "HDRGainMap:HDRGainMapHeadroom"):
+        headroom = float(headroom_text[0])
     else:
         note = _apple_note(exif.get_ifd(0x8769).get(0x927C, b""))
         if 33 not in note or 48 not in note:

@@ -159,14 +159,14 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
         if not file.parts:
             raise InputError(path, "pixel data is damaged or ends early", DAMAGED)
         header = dict(file.header())
-        stored = {
+        arrays = {
             name: (channel.pixels, channel.xSampling, channel.ySampling) for name, channel in file.channels().items()
         }
     (low, high) = header["dataWindow"]
     left, top = (int(a) - b for a, b in zip(low, origin, strict=True))
     size = tuple(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
     channels = {}
-    for name, (pixels, *sampling) in stored.items():
+    for name, (pixels, *sampling) in arrays.items():
         if pixels is not None and pixels.ndim == 2:
             if sampling != [1, 1]:
                 pixels = _interpolated(pixels, size[::-1], sampling[::-1])

@@ -161,14 +161,14 @@ def _items(data: bytes, start: int, end: int) -> HeifItems:
     places = _places(data, *boxes["iloc"]) if "iloc" in boxes else {}
     inner = boxes.get("idat")
     properties = _properties(data, *boxes["iprp"]) if "iprp" in boxes else {}
-    items, taken = {}, 0
+    items, total = {}, 0
     for number, (kind, flags_place) in kinds.items():
         method, extents = places.get(number, (0, ()))
         inside = None
         if method == 1 and inner is not None:
-            taken += sum(length for _, length in extents)
-            if taken > len(data):  # Parts may overlap, and be many.
-                raise ValueError(f"{taken} bytes of items in {len(data)} bytes")
+            total += sum(length for _, length in extents)
+            if total > len(data):  # Parts may overlap, and be many.
+                raise ValueError(f"{total} bytes of items in {len(data)} bytes")
             inside = b"".join(data[inner[0] + at : inner[0] + at + length] for at, length in extents)
         items[number] = Item(kind, extents, inside, properties.get(number, ()), flags_place)
     references = tuple(_references(data, *boxes["iref"])) if "iref" in boxes else ()
@@ -202,7 +202,7 @@ def _places(data: bytes, start: int, end: int) -> dict[int, tuple[int, tuple[tup
         return int.from_bytes(data[at - size : at])
 
     offset_size, length_size, base_size, index_size = sizes
-    found, total = {}, 0
+    places, total = {}, 0
     for _ in range(take(4 if version == 2 else 2)):
         number = take(4 if version == 2 else 2)
         method = take(2) & 15 if version else 0
@@ -218,8 +218,8 @@ def _places(data: bytes, start: int, end: int) -> dict[int, tuple[int, tuple[tup
                 take(index_size)
             offset = base + take(offset_size)
             extents.append((offset, take(length_size)))
-        found[number] = method, tuple(extents)
-    return found
+        places[number] = method, tuple(extents)
+    return places
 
 
 def _properties(data: bytes, start: int, end: int) -> dict[int, tuple[tuple[str, bytes], ...]]:

@@ -87,8 +87,8 @@ def load_scene(
 
     if max_size is not None and max_size < 1:
         raise InputError(path, f"longest side of {max_size} pixels asked for", "give at least 1 pixel")
-    named = isinstance(response, str | Path) and str(response) not in ("auto", "learned", "linear")
-    curve = response_by_name(response) if named else response  # pyright: ignore[reportArgumentType]
+    by_name = isinstance(response, str | Path) and str(response) not in ("auto", "learned", "linear")
+    curve = response_by_name(response) if by_name else response  # pyright: ignore[reportArgumentType]
     for candidate in candidates:
         responses_named(candidate)
     check = partial(_check_response, response=response, path=path)
@@ -113,12 +113,12 @@ def load_scene(
         curve = response_by_name("srgb")
     names = unique_names(dataset.records)
     if views is not None:
-        chosen = [index for index, name in enumerate(names) if name in views]
+        indices = [index for index, name in enumerate(names) if name in views]
         if missing := sorted(set(views) - set(names)):
             problem = f"{len(missing)} of the views that were named are missing, {missing[0]} first"
             raise InputError(path, problem, "put the photos back as they were")
-        names = [names[index] for index in chosen]
-        dataset = replace(dataset, records=tuple(dataset.records[index] for index in chosen))
+        names = [names[index] for index in indices]
+        dataset = replace(dataset, records=tuple(dataset.records[index] for index in indices))
     scene = preprocess(dataset, curve, max_size, photos, names)  # pyright: ignore[reportArgumentType]
     named_views = zip(names, dataset.records, strict=True)
     if guessed := {name for name, record in named_views if not record.time_known}:
@@ -195,11 +195,11 @@ def choose_response(
 
 def sample_photos(photos: Sequence, method: str) -> Sequence:
     """Return those of the training photos that a response is chosen from."""
-    chosen = photos[:: -(-len(photos) // _MOST_SAMPLED)]
+    sample = photos[:: -(-len(photos) // _MOST_SAMPLED)]
     if method == "paper":
-        chosen = (photos[int(np.random.default_rng(0).integers(len(photos)))],)
-    _log.info("choosing the response from %d photos", len(chosen))
-    return chosen
+        sample = (photos[int(np.random.default_rng(0).integers(len(photos)))],)
+    _log.info("choosing the response from %d photos", len(sample))
+    return sample
 
 
 def select_response_for(
@@ -216,8 +216,8 @@ def select_response_for(
     from ..response import responses_named
     from ..response.selection import select_response
 
-    known = [response for name in candidates for response in responses_named(name)] or None
-    selection = select_response(codes, known, method=method, from_camera=are_camera_jpegs(files))
+    curves = [response for name in candidates for response in responses_named(name)] or None
+    selection = select_response(codes, curves, method=method, from_camera=are_camera_jpegs(files))
     if selection.uncertainty > _UNSURE:
         _log.warning(
             "the response %s is a guess: curves that explain the photos as well differ from it by %.1f stops between "

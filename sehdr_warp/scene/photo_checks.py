@@ -53,7 +53,7 @@ def usable_photos(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], st
             kind = "linear" if linear else kind
             if odd:
                 state = "do not state their light as the others do" if linear else "state light and the others do not"
-                notes.append(f"{_listed(odd)} {state} and were left out")
+                notes.append(f"{_names_text(odd)} {state} and were left out")
     return usable, kind, notes
 
 
@@ -107,7 +107,7 @@ def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRe
         return kind, list(records), []
     kind_names = " and ".join(name for each, name in _KINDS.items() if each != kind and kinds[each])
     reason = f"were left out, because most are {_KINDS[kind]}: photos of one set are of one kind"
-    notes = [f"{_listed([record.image.name for record in others])} ({kind_names}) {reason}"]
+    notes = [f"{_names_text([record.image.name for record in others])} ({kind_names}) {reason}"]
     return kind, [record for record in records if kind_of(record.image) == kind], notes
 
 
@@ -123,6 +123,6 @@ def _checked(record: ImageRecord) -> ImageRecord:
     return record
 
 
-def _listed(names: Sequence[str]) -> str:
+def _names_text(names: Sequence[str]) -> str:
     listing = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
     return f"{len(names)} photos: {listing}" if len(names) > 1 else listing

@@ -57,7 +57,7 @@ class PhotoFile:
             self._file.truncate(most)
         except OSError as error:
             raise self._refused(error) from None
-        self.most, self.used = most, 0
+        self.most, self.end = most, 0
         # A shared mapping, although nothing writes through it: a private one would count as memory of this process.
         self._map = _Map(self._file.fileno(), most, access=mmap.ACCESS_WRITE)
         self._map.owner = self  # The file stays open for as long as any array lies in it.
@@ -73,7 +73,7 @@ class PhotoFile:
         """
         if self.place(array) is not None:
             return array
-        offset, data = self.used, np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+        offset, data = self.end, np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
         if offset + len(data) > self.most:
             raise ValueError(f"{len(data)} bytes more than the {self.most} of the file")
         written_bytes = 0
@@ -85,7 +85,7 @@ class PhotoFile:
                 )
         except OSError as error:
             raise self._refused(error) from None
-        self.used = -(-(offset + len(data)) // _ALIGNED) * _ALIGNED
+        self.end = -(-(offset + len(data)) // _ALIGNED) * _ALIGNED
         return self._array(offset, array.dtype, array.shape)
 
     def share(self, value: Any) -> tuple:

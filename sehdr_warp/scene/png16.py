@@ -21,7 +21,7 @@ def png16(codes: np.ndarray, exif: bytes | None = None, level: int = -1) -> byte
     chunks = {b"IHDR": struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)}
     chunks |= {} if exif is None else {b"eXIf": exif}
     chunks |= {b"IDAT": zlib.compress(filtered.tobytes(), level), b"IEND": b""}
-    written = b"\x89PNG\r\n\x1a\n"
+    png = b"\x89PNG\r\n\x1a\n"
     for kind, data in chunks.items():
-        written += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return written
+        png += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return png

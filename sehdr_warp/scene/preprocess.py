@@ -78,8 +78,8 @@ def preprocess(
     masks = mask_note(list(preprocessor.mask_shares.values()))
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
-    known = dataset.times_known
-    return Scene(dataset.name, dataset.format, tuple(views), points, colors, known, notes, response=response)
+    times_known = dataset.times_known
+    return Scene(dataset.name, dataset.format, tuple(views), points, colors, times_known, notes, response=response)
 
 
 def require_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> Iterator[np.ndarray]:
@@ -242,8 +242,8 @@ class _Preprocessor:
         # A mean over clipped samples is a lower bound, so a pixel counts as clipped if half of its area is.
         averaged = codes_of(np.where(clipped >= 0.5, np.float32(1.0), encoded), 16)
         if above is not None:
-            known = (averaged == 65535) & (clipped < _LEAST_CLIPPED)
-            above = np.where(known, np.maximum(light / white, 1), 0).astype(np.float16) if known.any() else None
+            overflow = (averaged == 65535) & (clipped < _LEAST_CLIPPED)
+            above = np.where(overflow, np.maximum(light / white, 1), 0).astype(np.float16) if overflow.any() else None
         return averaged, above
 
 

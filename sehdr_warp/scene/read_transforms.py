@@ -131,13 +131,13 @@ def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
 def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str]:
     """Return splits by file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
     split_names = ("train", "test", "val")
-    named = {name: frame["split"] for name, frame in frames if frame.get("split") in split_names}
+    by_name = {name: frame["split"] for name, frame in frames if frame.get("split") in split_names}
     for split in ("train", "val", "test"):
         filenames = values.get(f"{split}_filenames")
         if isinstance(filenames, list):
-            named.update({name: split for name in filenames if isinstance(name, str)})
-    splits = {"train": "train", "test" if "test" in named.values() else "val": "test"}
-    return {name: splits[split] for name, split in named.items() if split in splits}
+            by_name.update({name: split for name in filenames if isinstance(name, str)})
+    splits = {"train": "train", "test" if "test" in by_name.values() else "val": "test"}
+    return {name: splits[split] for name, split in by_name.items() if split in splits}
 
 
 def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:

@@ -67,11 +67,11 @@ class Reconstruction:
 
     def notes(self, photos: Sequence[Path]) -> tuple[str, ...]:
         """Return a line for each reason not to trust the places of the cameras, with the photos concerned."""
-        placed = {int(Path(image.name).stem) for image in self.model.images}
-        lost, notes = [photo.name for i, photo in enumerate(photos) if i not in placed], []
-        if lost:
-            first = ", ".join(lost[:5]) + (", ..." if len(lost) > 5 else "")
-            notes.append(f"{len(lost)} of {len(photos)} photos could not be placed and were left out: {first}")
+        registered = {int(Path(image.name).stem) for image in self.model.images}
+        unregistered, notes = [photo.name for i, photo in enumerate(photos) if i not in registered], []
+        if unregistered:
+            first = ", ".join(unregistered[:5]) + (", ..." if len(unregistered) > 5 else "")
+            notes.append(f"{len(unregistered)} of {len(photos)} photos could not be placed and were left out: {first}")
         if self.weak:
             first = ", ".join(photos[i].name for i in self.weak[:5]) + (", ..." if len(self.weak) > 5 else "")
             notes.append(
@@ -369,10 +369,10 @@ def _map(database: Path, work: Path, count: int, source: Path):
         output.mkdir()
         with quiet_colmap(), stage("placing photos", count, _log) as progress:
             progress.later = 0.0
-            placed = itertools.count(3)
+            counter = itertools.count(3)
             place: Any = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
             models = run_interruptibly(
-                partial(place, next_image_callback=lambda: progress.update(next(placed)))  # noqa: B023
+                partial(place, next_image_callback=lambda: progress.update(next(counter)))  # noqa: B023
             )
         candidates = [*([] if best is None else [best]), *models.values()]
         best = max(candidates, key=lambda model: model.num_reg_images(), default=None)

@@ -185,10 +185,10 @@ def _map_rigs(database: Path, work: Path, count: int, source: Path):
         output = work / f"model{int(patient)}"
         output.mkdir()
         with quiet_colmap(), stage("placing views of panoramas", count * len(face_rotations()), _log) as progress:
-            placed = itertools.count(3)
+            counter = itertools.count(3)
             place: Any = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
             models = run_interruptibly(
-                partial(place, next_image_callback=lambda: progress.update(next(placed)))  # noqa: B023
+                partial(place, next_image_callback=lambda: progress.update(next(counter)))  # noqa: B023
             )
         candidates = [*([] if best is None else [best]), *models.values()]
         best = max(candidates, key=lambda model: model.num_reg_frames(), default=None)

@@ -52,7 +52,7 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         place = os.path.commonpath([file.parent for file in photos])
         count_text = f"{len(photos)} photos" if len(photos) > 1 else "1 photo"
         where = Path(place).relative_to(folder).as_posix() if Path(place) != folder else "the folder"
-        notes.append(f"{count_text} of {where} {'are' if len(photos) > 1 else 'is'} in no view: {_listed(photos)}")
+        notes.append(f"{count_text} of {where} {'are' if len(photos) > 1 else 'is'} in no view: {_names_text(photos)}")
     if others:
         notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
     return notes
@@ -70,7 +70,7 @@ def _by_suffix(files: Sequence[Path]) -> str:
     kinds: dict[str, list[Path]] = {}
     for file in files:
         kinds.setdefault(file.suffix.lower().removeprefix(".").upper(), []).append(file)
-    parts = [f"{len(each)} {kind} ({_listed(each, 1)})" for kind, each in sorted(kinds.items())]
+    parts = [f"{len(each)} {kind} ({_names_text(each, 1)})" for kind, each in sorted(kinds.items())]
     needs = any(file.suffix.lower() in HEIF_SUFFIXES for file in files) and not heif_installed()
     return ", ".join(parts) + ("; HEIC photos need pillow-heif: pip install 'sehdr-warp[phone]'" if needs else "")
 
@@ -92,5 +92,5 @@ def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
                     yield file
 
 
-def _listed(files: Sequence[Path], most: int = _MOST_NAMED) -> str:
+def _names_text(files: Sequence[Path], most: int = _MOST_NAMED) -> str:
     return ", ".join(file.name for file in files[:most]) + (" ..." if len(files) > most else "")

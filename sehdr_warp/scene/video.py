@@ -217,10 +217,10 @@ def codes(frame: Any, color: VideoColor) -> np.ndarray:
 
     planar = "rgb48le" if color.matrix is None else "yuv444p16le"
     same = ColorRange.JPEG if color.full_range else ColorRange.MPEG
-    stored = frame.reformat(
+    converted = frame.reformat(
         format=planar, src_color_range=same, dst_color_range=same, interpolation=Interpolation.BICUBIC
     ).to_ndarray()
-    values = stored.astype(np.float32)
+    values = converted.astype(np.float32)
     top = float((2**color.bits - 1) << (16 - color.bits))  # The largest code, as it stands in 16 bits
     if color.matrix is None:
         rgb = values / np.float32(65535)
@@ -288,8 +288,8 @@ def _color(container: Any, stream: Any, frame: Any) -> VideoColor:
         return replace(color, curve=log[0], response=f"colour:{log[0]}", primaries=log[1])
     if transfer in _STATED_CURVES:
         # Where a clip states HLG or PQ alone, its primaries are those of BT.2100.
-        known = color.primaries or (None if primaries == 1 else "ITU-R BT.2020")
-        return replace(color, curve=_CURVE_NAMES[transfer], response=_STATED_CURVES[transfer], primaries=known)
+        space = color.primaries or (None if primaries == 1 else "ITU-R BT.2020")
+        return replace(color, curve=_CURVE_NAMES[transfer], response=_STATED_CURVES[transfer], primaries=space)
     if transfer == 8:
         return replace(color, curve="linear", response="linear")
     return replace(color, curve=_CURVE_NAMES.get(transfer, "no stated curve"))

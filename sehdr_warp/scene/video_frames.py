@@ -65,7 +65,7 @@ def choose_frames(clip: Clip) -> FrameChoice:
     reference: np.ndarray | None = None
     before = 0.0  # Movement up to the reference
     total = 0
-    for number, frame in _shown(decode(clip)):
+    for number, frame in _without_hidden(decode(clip)):
         total = number + 1
         if number % stride:
             continue
@@ -92,7 +92,7 @@ def choose_frames(clip: Clip) -> FrameChoice:
     return FrameChoice(tuple(numbers[k] for k in sorted(best.values())), total, movement)
 
 
-def _shown(frames: Iterable[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
+def _without_hidden(frames: Iterable[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
     """Yield numbered frames as a stage; a clip does not state reliably how many it has."""
     with stage("looking at frames", 0, _log) as progress:
         for number, frame in frames:
@@ -108,14 +108,14 @@ def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
         cache: where it lies; None is the user's cache ($SEHDR_CACHE), or a temporary folder that lasts as long as the
             process if that cannot be written.
     """
-    named = f"video-{file_digest(clip.path)[:16]}-{_VERSION}"
+    name = f"video-{file_digest(clip.path)[:16]}-{_VERSION}"
     cache_folder = cache or os.environ.get("SEHDR_CACHE")
     folder = user_cache("sehdr-warp") if cache_folder is None else Path(cache_folder)
     if folder is None or not usable(folder):
         if cache is not None:
             raise InputError(cache, "the frames cannot be kept there", "name a folder that can be written")
         folder = _temporary()
-    place = folder / named
+    place = folder / name
     if place.is_dir() and is_sealed(place):
         _log.info("using the cached frames %s", place)
         return place
@@ -145,13 +145,13 @@ def _temporary() -> Path:
 def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
     numbers = frozenset(choice.numbers)
     with stage("keeping frames", len(numbers), _log) as progress:
-        for done, (number, frame) in enumerate(decode(clip, numbers), start=1):
+        for count, (number, frame) in enumerate(decode(clip, numbers), start=1):
             pixels, file = codes(frame, clip.color), folder / f"frame_{number:06d}.png"
             if pixels.dtype == np.uint8:
                 Image.fromarray(pixels).save(file, compress_level=1)
             else:
                 file.write_bytes(png16(pixels, level=1))
-            progress.update(done)
+            progress.update(count)
     facts = {"total": choice.total, "movement": choice.movement}
     (folder / "frames.json").write_text(json.dumps(facts))
 
@@ -168,8 +168,10 @@ def read_video(path: Path, cache: Path | str | None = None) -> DataparserOutputs
     dataset = find_photos(folder)
     count = len(list_images(folder, (".png",)))
     color = clip.color
-    known = f"its response is {color.response}" if color.response else "its response is chosen as for photos"
-    note = f"video: the sharpest {count} of {facts['total']} frames are used; its curve is {color.curve}: {known}"
+    response_note = f"its response is {color.response}" if color.response else "its response is chosen as for photos"
+    note = (
+        f"video: the sharpest {count} of {facts['total']} frames are used; its curve is {color.curve}: {response_note}"
+    )
     return replace(
         dataset,
         format="video",

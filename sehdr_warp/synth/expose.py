@@ -177,8 +177,8 @@ def write_hdr_nerf_scene(
     places = {"train": count(), "test": count()}
     for index, view in enumerate(views):
         (folder / view.split).mkdir(parents=True, exist_ok=True)
-        for k, taken in enumerate(photos):
-            code = (np.clip(taken[index], 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+        for k, photo in enumerate(photos):
+            code = (np.clip(photo[index], 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
             Image.fromarray(code).save(folder / view.split / f"{view.name}_{k}.png")
         write_radiance(truth_path(folder, view.split, next(places[view.split])), view.radiance)
     write_tables(folder, views, exposure_times, points)

@@ -187,16 +187,18 @@ def _may_drift(views: Sequence[View], shared: SharedPoints, response: Response) 
 
 
 def _explanatory_parts(
-    gains: ExposureCompensation, views: Sequence[View], shared: SharedPoints, response: Response, stated: bool
+    gains: ExposureCompensation, views: Sequence[View], shared: SharedPoints, response: Response, on_request: bool
 ) -> Parts:
     """Return the parts of gains that explain how photos differ at shared points."""
     before = shared.disagreement(views, response, None)
     after = shared.disagreement(views, response, gains.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
-    exposure = white_balance = not stated and gains.stops >= MIN_STOPS and explains
-    if not exposure and (gains.white_balance >= MIN_WHITE_BALANCE or (stated and _exceeds_stated(gains, views))):
+    exposure = white_balance = not on_request and gains.stops >= MIN_STOPS and explains
+    if not exposure and (gains.white_balance >= MIN_WHITE_BALANCE or (on_request and _exceeds_stated(gains, views))):
         drift, colors = _cross_validate(views, shared, response)
-        exposure = stated and gains.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS and drift <= MAX_REMAINING_CROSS
+        exposure = (
+            on_request and gains.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS and drift <= MAX_REMAINING_CROSS
+        )
         white_balance = (exposure or gains.white_balance >= MIN_WHITE_BALANCE) and colors <= MAX_REMAINING_WHITE_BALANCE
     vignetting = gains.corner_loss >= MIN_CORNER_LOSS
     if vignetting:
@@ -233,7 +235,7 @@ def _cross_validate(views: Sequence[View], shared: SharedPoints, response: Respo
     return float(drift), float(colors)
 
 
-def _decision(gains: ExposureCompensation, parts: Parts, stated: bool) -> Decision:
+def _decision(gains: ExposureCompensation, parts: Parts, on_request: bool) -> Decision:
     """Return the line of the plan for gains that are corrected."""
     figures = []
     if parts.exposure:
@@ -243,5 +245,5 @@ def _decision(gains: ExposureCompensation, parts: Parts, stated: bool) -> Decisi
     if parts.vignetting:
         figures.append(f"{gains.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
-    choice = f"taken out of the photos{over if stated else ''}"
+    choice = f"taken out of the photos{over if on_request else ''}"
     return Decision("exposure-compensation", {}, choice, f"matched points differ by {', '.join(figures)}", told=True)

@@ -31,7 +31,7 @@ class GraphCapacity:
             self._copied = torch.cuda.Event()
 
     @property
-    def known(self) -> bool:
+    def has_counts(self) -> bool:
         """True after a observe step whose intersections were counted exactly."""
         return self._intersections > 0
 

@@ -100,8 +100,8 @@ def make_field(
     points, colors = start_points(scene, config, matcher, rng)
     most = config.densification.cap_max
     if len(points) > most:
-        chosen = np.sort(rng.choice(len(points), most, replace=False))
-        points, colors = points[chosen], colors[chosen]
+        subset = np.sort(rng.choice(len(points), most, replace=False))
+        points, colors = points[subset], colors[subset]
     dc = color_model(config.model.radiance).start(colors, response)
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
     gaussians = Gaussians.from_points(points, dc, config.model.sh_degree)
@@ -275,11 +275,11 @@ def focus_distance(views: tuple[View, ...]) -> float:
 def points_on_rays(views, count: int, distance: float, rng: np.random.Generator) -> np.ndarray:
     """Return [N, 3] points in front of the cameras, uniform over views, pixels and inverse depth within DEPTH_RANGE."""
     near, far = (factor * distance for factor in DEPTH_RANGE)
-    chosen = rng.integers(len(views), size=count)
+    view_indices = rng.integers(len(views), size=count)
     across, depth = rng.random((count, 2)), 1 / rng.uniform(1 / far, 1 / near, count)
     points = np.empty((count, 3))
     for index, view in enumerate(views):
-        mine, camera = chosen == index, view.camera
+        mine, camera = view_indices == index, view.camera
         x = (across[mine, 0] * camera.width - camera.cx) / camera.fx
         y = (across[mine, 1] * camera.height - camera.cy) / camera.fy
         local = np.stack([x, y, np.ones_like(x)], 1) * depth[mine, None]

@@ -184,7 +184,7 @@ def optimizer_tensors(optimizer: Adam, batch: int = 1) -> dict[str, Tensor]:
     Step counts are in photos, so that a training can continue with another number of ranks; `batch` is the photos of a
     step.
     """
-    states = {prefix: optimizer.state.get(parameter, {}) for prefix, parameter in _named(optimizer)}
+    states = {prefix: optimizer.state.get(parameter, {}) for prefix, parameter in _parameters_by_name(optimizer)}
     return {
         f"{prefix}{key}": value * batch if key == "step" and batch > 1 else value
         for prefix, state in states.items()
@@ -194,7 +194,7 @@ def optimizer_tensors(optimizer: Adam, batch: int = 1) -> dict[str, Tensor]:
 
 def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: int = 1) -> None:
     """Continue from optimizer_tensors()."""
-    for prefix, parameter in _named(optimizer):
+    for prefix, parameter in _parameters_by_name(optimizer):
         if state := under(tensors, prefix):
             optimizer.state[parameter] = {
                 key: value.to(parameter.device, copy=True).reshape(() if key == "step" else parameter.shape)
@@ -203,7 +203,7 @@ def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: i
             optimizer.state[parameter]["step"] /= batch
 
 
-def _named(optimizer: Adam) -> Iterator[tuple[str, Tensor]]:
+def _parameters_by_name(optimizer: Adam) -> Iterator[tuple[str, Tensor]]:
     """Yield a name prefix and a parameter for each parameter of an optimizer."""
     for group in optimizer.param_groups:
         for index, parameter in enumerate(group["params"]):

@@ -88,7 +88,7 @@ class RunOutput:
             log.warning(message, trainer.iteration, loss)
             return
         keep = trainer.config.schedule.keep_checkpoints
-        self.folder.write_checkpoint(tensors, values | {"seconds": trainer.seconds}, kept=keep)
+        self.folder.write_checkpoint(tensors, values | {"seconds": trainer.seconds}, keep=keep)
 
     def finish(self, trainer: TrainingState, *, complete: bool) -> None:
         """Write the last checkpoint and the summary.

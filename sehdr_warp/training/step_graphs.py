@@ -38,17 +38,17 @@ class StepGraphs:
         """The CUDA graph that the next step of the same kind replays; None if there is none."""
         return None if self._first is None else self._first._graph
 
-    def can_capture(self, views: Any, kind: Hashable, *, counted: bool) -> TypeGuard[ViewStack | PhotoStream]:
+    def can_capture(self, views: Any, kind: Hashable, *, has_counts: bool) -> TypeGuard[ViewStack | PhotoStream]:
         """Return whether a step can be captured: photos of one size, after a step of its kind was launched.
 
         Args:
             views: The training views, which a captured step selects by an index on the device.
             kind: Everything that changes which kernels a step launches.
-            counted: Whether the number of intersections of a step is known.
+            has_counts: Whether the number of intersections of a step is known.
         """
         if self._first is None or not isinstance(views, ViewStack | PhotoStream):
             return False
-        ready = kind in self._launched and counted
+        ready = kind in self._launched and has_counts
         self._launched.add(kind)
         return ready
 

@@ -184,7 +184,7 @@ class Trainer(TrainingState):
         small = gaussians.reserved < EXACT_BELOW, gaussians.reserved <= ONE_SORT
         kind = (self.degree, watched, self.opacity_weight > 0, *small)
         fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
-        if fixed_time and self.graphs.can_capture(views, kind, counted=self.capacity.known):
+        if fixed_time and self.graphs.can_capture(views, kind, has_counts=self.capacity.has_counts):
             self._index.fill_(index)
             if isinstance(views, PhotoStream):
                 views.bring(index)

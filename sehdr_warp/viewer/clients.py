@@ -21,9 +21,9 @@ class Client:
         """Set the connection and those beside it."""
         self._connections, self._connection = connections, connection
 
-    def gone(self) -> bool:
+    def is_closed(self) -> bool:
         """Return whether the client no longer waits for the answer."""
-        return self._connection.gone()
+        return self._connection.is_closed()
 
     def reserve(self, size: int) -> None:
         """Wait for room for an answer of so many bytes; see Connections.reserve."""

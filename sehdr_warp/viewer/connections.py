@@ -50,7 +50,7 @@ class Connection:
         """Wrap the socket of a client."""
         self.socket = client
         self.answering = self.sending = self.receiving = self.closed = False
-        self.since, self.held = time.monotonic(), 0
+        self.since, self.reserved_bytes = time.monotonic(), 0
 
     def close(self) -> None:
         """Shut the connection, which ends the thread that serves it."""
@@ -58,7 +58,7 @@ class Connection:
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
 
-    def gone(self) -> bool:
+    def is_closed(self) -> bool:
         """Return whether the client has closed the connection."""
         if self.closed:
             return True
@@ -148,7 +148,7 @@ class Connections:
             yield
         finally:
             with self._changed:
-                connection.answering, connection.held, connection.since = False, 0, time.monotonic()
+                connection.answering, connection.reserved_bytes, connection.since = False, 0, time.monotonic()
                 self._changed.notify_all()
 
     def reserve(self, connection: Connection, size: int) -> None:
@@ -158,7 +158,9 @@ class Connections:
         """
         end = time.monotonic() + _ROOM_WAIT
         with self._changed:
-            while (by_others := self._taken_by_others(connection)) and by_others + connection.held + size > MOST_BYTES:
+            while (
+                by_others := self._taken_by_others(connection)
+            ) and by_others + connection.reserved_bytes + size > MOST_BYTES:
                 now = time.monotonic()
                 if now > end:
                     raise BusyError
@@ -167,7 +169,7 @@ class Connections:
                     stalled.close()
                     stalled.since = now  # Its thread takes a moment to end.
                 self._changed.wait(SHORT_STALL / 2)
-            connection.held += size
+            connection.reserved_bytes += size
 
     def _taken_by_others(self, connection: Connection) -> int:
-        return sum(each.held for each in self._open.values() if each is not connection)
+        return sum(each.reserved_bytes for each in self._open.values() if each is not connection)

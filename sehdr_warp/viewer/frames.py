@@ -118,7 +118,7 @@ class ViewerScene:
         The planes are [H, W, 4] exposure at the base time and confidence (1 in a draft, or if unknown), [H, W] depth,
         and with `clipped` [H, W] the share of clipped values.
         """
-        return next(made for made in self.frame_parts(camera, draft=draft, clipped=clipped) if made is not None)
+        return next(part for part in self.frame_parts(camera, draft=draft, clipped=clipped) if part is not None)
 
     def frame_parts(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> Iterator[memoryview | None]:
         """Make a frame in parts, between which other pictures can be made: yield None, and the frame at the end."""
@@ -188,5 +188,5 @@ def frame_bytes(camera: Camera, clipped: bool) -> int:
 def camera_file(cameras: Sequence[Camera]) -> str:
     """Return cameras as JSON that `render --cameras` reads."""
     digits = max(3, len(str(len(cameras) - 1)))
-    named = [{"name": f"view_{i:0{digits}d}"} | camera.to_dict() for i, camera in enumerate(cameras)]
-    return json.dumps({"cameras": named}, indent=1)
+    views = [{"name": f"view_{i:0{digits}d}"} | camera.to_dict() for i, camera in enumerate(cameras)]
+    return json.dumps({"cameras": views}, indent=1)

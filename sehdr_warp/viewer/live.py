@@ -48,12 +48,16 @@ class LiveTraining(ViewerScene):
     def __getattr__(self, name: str):
         """Return what the viewer reads of a run from the training."""
         field = self.run.field
-        known = {"response": field.response, "base_time": field.base_time, "gaussian_count": field.gaussians.count}
-        known |= {"scene_name": self.run.scene.name, "iterations": self.run.iteration, "cameras": self.run.scene.views}
-        known |= {"color_matrix": self.run.scene.color_matrix}
-        if name not in known:
+        attributes = {"response": field.response, "base_time": field.base_time, "gaussian_count": field.gaussians.count}
+        attributes |= {
+            "scene_name": self.run.scene.name,
+            "iterations": self.run.iteration,
+            "cameras": self.run.scene.views,
+        }
+        attributes |= {"color_matrix": self.run.scene.color_matrix}
+        if name not in attributes:
             raise AttributeError(name)
-        return known[name]
+        return attributes[name]
 
     def render(self, camera: Camera):
         """Render between two steps."""

@@ -35,21 +35,21 @@ class Renderer:
         Raises:
             RuntimeError: If the thread was ended, also while this waited.
         """
-        done: Future[Any] = Future()
+        future: Future[Any] = Future()
         with self._changed:
             if self._closed:
                 raise RuntimeError("the renderer has ended")
             turn = time.monotonic() + pixels / _PIXELS_PER_SECOND
-            heapq.heappush(self._waiting, (turn, next(self._numbers), done, make))
+            heapq.heappush(self._waiting, (turn, next(self._numbers), future, make))
             self._changed.notify()
-        return done.result()
+        return future.result()
 
     def close(self) -> None:
         """End the thread after the picture that it makes, and wait for it; those that wait are not made."""
         with self._changed:
             self._closed = True
-            for _, _, done, _ in self._waiting:
-                done.set_exception(RuntimeError("the renderer has ended"))
+            for _, _, future, _ in self._waiting:
+                future.set_exception(RuntimeError("the renderer has ended"))
             self._waiting.clear()
             self._changed.notify()
         self._thread.join()
@@ -60,9 +60,9 @@ class Renderer:
                 self._changed.wait_for(lambda: self._waiting or self._closed)
                 if self._closed:
                     return
-                _, _, done, make = heapq.heappop(self._waiting)
+                _, _, future, make = heapq.heappop(self._waiting)
             try:
-                done.set_result(make())
+                future.set_result(make())
             except BaseException as error:  # noqa: BLE001 - It is raised where the result is waited for.
-                done.set_exception(error)
-            del done, make
+                future.set_exception(error)
+            del future, make

@@ -153,7 +153,7 @@ class Viewer:
         """
 
         def call() -> Any:
-            if self._closed.is_set() or client.gone():
+            if self._closed.is_set() or client.is_closed():
                 raise ClientGone
             return make()
 
@@ -348,10 +348,11 @@ class _Handler(BaseHTTPRequestHandler):
             return
         with connections.answering(connection):
             self._send(
-                connection, *self._found(partial(find, self.path.partition("?")[0], Client(connections, connection)))
+                connection,
+                *self._result_of(partial(find, self.path.partition("?")[0], Client(connections, connection))),
             )
 
-    def _found(self, find: Callable[[], tuple[str, bytes | memoryview]]) -> tuple[int, str, bytes | memoryview]:
+    def _result_of(self, find: Callable[[], tuple[str, bytes | memoryview]]) -> tuple[int, str, bytes | memoryview]:
         """Return status, content type and content of an answer."""
         try:
             if not self.server.allowed(self.headers.get("Host", ""), self.headers.get("Origin")):

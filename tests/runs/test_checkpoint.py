@@ -30,7 +30,7 @@ def state(iteration):
 
 def test_round_trip(folder):
     tensors, values = state(7)
-    path = folder.write_checkpoint(tensors, values, kept=1)
+    path = folder.write_checkpoint(tensors, values, keep=1)
     read = read_checkpoint(path)
     assert {name: value.dtype for name, value in read.tensors.items()} == {
         name: value.dtype for name, value in tensors.items()
@@ -42,14 +42,14 @@ def test_round_trip(folder):
 
 def test_only_the_newest_are_kept(folder):
     for iteration in (9, 10, 100):
-        folder.write_checkpoint(*state(iteration), kept=2)
+        folder.write_checkpoint(*state(iteration), keep=2)
     assert sorted(p.name for p in folder.checkpoints.iterdir()) == ["iteration_00000010", "iteration_00000100"]
     assert folder.newest_checkpoint().values["iteration"] == 100
 
 
 def test_a_damaged_newest_falls_back(folder):
     for iteration in (1, 2):
-        folder.write_checkpoint(*state(iteration), kept=2)
+        folder.write_checkpoint(*state(iteration), keep=2)
     file = folder.checkpoints / "iteration_00000002" / "state.safetensors"
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
@@ -58,7 +58,7 @@ def test_a_damaged_newest_falls_back(folder):
     with pytest.raises(InputError, match="SHA-256"):
         read_checkpoint(file.parent)
     # Written again, the damaged one is replaced.
-    folder.write_checkpoint(*state(2), kept=2)
+    folder.write_checkpoint(*state(2), keep=2)
     assert folder.newest_checkpoint().values["iteration"] == 2
 
 
@@ -74,14 +74,14 @@ def test_what_a_killed_writer_left_is_no_checkpoint(folder):
         (place / "half").write_bytes(b"half")
     with pytest.raises(InputError, match="iteration_00000001"):
         folder.newest_checkpoint()
-    folder.write_checkpoint(*state(6), kept=1)
+    folder.write_checkpoint(*state(6), keep=1)
     assert not left.exists() and all((place / "half").exists() for place in theirs)
 
 
 def test_what_decides_the_picture_is_hashed_with_the_checkpoint(folder):
     for file in (folder.config, folder.scene, folder.info):
         file.write_text('{"a": 1, "data": {"path": "here"}}')
-    folder.write_checkpoint(*state(1), kept=1)
+    folder.write_checkpoint(*state(1), keep=1)
     folder.info.write_text('{"data": {"path": "moved"}, "a": 1}')
     assert RunFolder(folder.path).newest_checkpoint().values["iteration"] == 1
     for file in (folder.config, folder.scene, folder.info):
@@ -95,7 +95,7 @@ def test_what_decides_the_picture_is_hashed_with_the_checkpoint(folder):
 def test_a_wrong_tensor_file_with_a_right_hash_is_refused(folder):
     import hashlib
 
-    path = folder.write_checkpoint(*state(1), kept=1)
+    path = folder.write_checkpoint(*state(1), keep=1)
     values = json.loads((path / "checkpoint.json").read_text())
     (path / "state.safetensors").write_bytes(b"not safetensors")
     values["sha256"] = hashlib.sha256(b"not safetensors").hexdigest()

@@ -193,7 +193,7 @@ def test_a_lock_that_was_removed_stops_the_writer(run):
     for write in (
         lambda: writer.append_metrics({"iteration": 4}),
         lambda: writer.write_summary({}),
-        lambda: writer.write_checkpoint({"a": torch.zeros(1)}, {"iteration": 1}, kept=1),
+        lambda: writer.write_checkpoint({"a": torch.zeros(1)}, {"iteration": 1}, keep=1),
         lambda: writer.rewind_metrics(0),
     ):
         with pytest.raises(SehdrError, match=r"\.lock: was removed"):

@@ -54,7 +54,7 @@ def test_arrays_are_kept_shared_and_gone(tmp_path):
     photos = PhotoFile(1 << 20, tmp_path)
     given = np.arange(30_000, dtype=np.uint16).reshape(100, 100, 3)
     kept = photos.keep(given)
-    assert photos.keep(kept) is kept and photos.used < 2 * given.nbytes
+    assert photos.keep(kept) is kept and photos.end < 2 * given.nbytes
     assert list(tmp_path.iterdir()) == [], "no name"
     if sys.platform == "linux":
         value = open_shared(
@@ -62,7 +62,7 @@ def test_arrays_are_kept_shared_and_gone(tmp_path):
         )
         np.testing.assert_array_equal(value["photo"], given)
         assert value["mask"].sum() == 6400 and value["name"] == "a" and value["small"].shape == (1, 100, 3)
-        assert photos.used < given.nbytes + 6400 * 4 + 4096, "what lies there is not copied"
+        assert photos.end < given.nbytes + 6400 * 4 + 4096, "what lies there is not copied"
     handle = photos._file.fileno()
     del photos
     gc.collect()

@@ -20,9 +20,9 @@ def replay(capacity, pairs):
 
 def test_room_follows_the_most_pairs_seen(device):
     capacity = GraphCapacity(device)
-    assert not capacity.known
+    assert not capacity.has_counts
     capacity.observe(MANY)
-    assert capacity.known
+    assert capacity.has_counts
     most = MANY * 6 // 5
     assert replay(capacity, [MANY, most, MANY]) == HEADROOM * MANY
     assert capacity.poll() == (0, False)

@@ -41,7 +41,7 @@ def test_clients_that_never_read_make_room_for_others(serve, monkeypatch):
     def watch():
         nonlocal largest
         while not watched.wait(0.005):
-            largest = max(largest, sum(each.held for each in list(server.connections._open.values())))
+            largest = max(largest, sum(each.reserved_bytes for each in list(server.connections._open.values())))
 
     watcher = threading.Thread(target=watch)
     watcher.start()

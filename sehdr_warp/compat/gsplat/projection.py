@@ -158,8 +158,10 @@ def _linearised(
         rays = torch.stack([x, y], 1) / z[:, None]
         size = K.new_tensor([width, height])
         margin = FRUSTUM_MARGIN * size / 2
-        held = torch.minimum(torch.maximum(rays, -(principal + margin) / focal), (size - principal + margin) / focal)
-        by_place = [1 / z, zero, -held[:, 0] / z], [zero, 1 / z, -held[:, 1] / z]
+        clamped_rays = torch.minimum(
+            torch.maximum(rays, -(principal + margin) / focal), (size - principal + margin) / focal
+        )
+        by_place = [1 / z, zero, -clamped_rays[:, 0] / z], [zero, 1 / z, -clamped_rays[:, 1] / z]
     jacobian = torch.stack([torch.stack(row, 1) for row in by_place], 1) * focal[:, None]
     return rays * focal + principal, jacobian
 
