@@ -208,7 +208,8 @@ def parse_pairs(flag: str, text: str | None) -> dict[str, str] | None:
     """
     if text is None:
         return None
-    pairs = dict(item.partition("=")[::2] for item in text.split(","))
+    parts = [item.partition("=") for item in text.split(",")]
+    pairs = {name: value for name, _, value in parts}
     if not all(name and value for name, value in pairs.items()):
         raise InputError(
             f"{flag} {text}", "not NAME=VALUE separated by commas", f"write for example {flag}=partition=gpu"

@@ -139,11 +139,11 @@ class _StageLines:
 
     def _open(self, stage: Stage) -> None:
         from rich.console import Console
-        from rich.progress import BarColumn, TextColumn
+        from rich.progress import BarColumn, ProgressColumn, TextColumn
         from rich.progress import Progress as Bar
 
         parts = "{task.description}", "{task.completed}/{task.total}", "{task.fields[left]}", "{task.fields[training]}"
-        columns = [TextColumn(part, markup=False) for part in parts]
+        columns: list[ProgressColumn] = [TextColumn(part, markup=False) for part in parts]
         columns.insert(1, BarColumn(20))
         self._bar, self._stage = Bar(*columns, console=Console(file=sys.stderr)), stage
         self._bar.add_task(stage.activity, total=stage.total or None, left="", training="")

@@ -37,7 +37,7 @@ class Cell:
 
     def contains(self, places: np.ndarray) -> np.ndarray:
         """Return whether the cell contains places [..., 3]: a bool [...]; its lower faces belong to it."""
-        return ((places >= self.low) & (places < self.high)).all(-1)
+        return np.all((places >= self.low) & (places < self.high), axis=-1)
 
     def halves(self, axis: int, at: float) -> tuple["Cell", "Cell"]:
         """Return the two parts of the cell below and above a plane."""

@@ -192,7 +192,7 @@ class RadianceField(nn.Module):
         encoded, exposure, light = images.get("encoded"), images.get("fused"), None
         if self.tone_map == "pixel":
             # Usually the ratio is 1.
-            light = exposure if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
+            light = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(light) if encode else None
         return TrainRender(encoded, exposure, images.get("base", exposure), rendering, light, gradients, penalty)
 

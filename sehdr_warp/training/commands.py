@@ -176,14 +176,13 @@ def _train(args: Train, ranks=None) -> None:
     from ..runs.run_writer import RunWriter
     from .hdr_truth import check_dataset_truth
 
-    output, resumed = args.output, None
-    out, how = output.out, {"resume": output.resume, "overwrite": output.overwrite}
+    output, resumed, out = args.output, None, args.output.out
     if args.training.plan_only:
         out = None
     elif out is None:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     # What can be refused is refused before the photos are read, which may take minutes.
-    elif (folder := RunWriter(out)).check(**how):
+    elif (folder := RunWriter(out)).check(resume=output.resume, overwrite=output.overwrite):
         resumed = folder
     elif output.resume:
         log.info("%s holds no run yet: a training begins there", out)
@@ -208,7 +207,15 @@ def _train(args: Train, ranks=None) -> None:
         from .train import create_trainer
 
         trainer = create_trainer(
-            scene, out, config, device=device, tensorboard=output.tensorboard, data=data, ranks=ranks, **how
+            scene,
+            out,
+            config,
+            device=device,
+            resume=output.resume,
+            overwrite=output.overwrite,
+            tensorboard=output.tensorboard,
+            data=data,
+            ranks=ranks,
         )
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
@@ -220,7 +227,7 @@ def _train(args: Train, ranks=None) -> None:
 
 def _photo_storage(config) -> str:
     """Return where load_scene() stores the photos of a training."""
-    return {"device": "memory"}.get(config.schedule.photo_cache, config.schedule.photo_cache)
+    return "memory" if config.schedule.photo_cache == "device" else config.schedule.photo_cache
 
 
 def _print_result(args: Train, run, advice: Callable[[Path, dict], list[str]] | None = None) -> None:

@@ -123,8 +123,8 @@ class Viewer:
             run = self._run(request)
             if path == "/gain":
                 light, stops = int(request["light"]), float(request["stops"])
-                self._on_renderer(client, partial(run.set_gain, light, stops))
-            return "application/json", json.dumps(self._on_renderer(client, run.describe_lights)).encode()
+                self.on_renderer(client, partial(run.set_gain, light, stops))
+            return "application/json", json.dumps(self.on_renderer(client, run.describe_lights)).encode()
         if path in ("/path", "/save"):
             cameras = [camera_of(camera) for camera in request["cameras"][:MOST_VIEWS]]
             if not cameras:
