@@ -144,7 +144,9 @@ def compiled_rasterize(
 ) -> Rendering:
     """Do what rasterize() does, as a node. The number of intersections is 0 without max_intersections."""
     tensors = [means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics]
-    tensors = _as_float(*tensors, *(() if background is None else (background,)))
+    if background is not None:
+        tensors.append(background)
+    tensors = _as_float(*tensors)
     options = near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     results = list(_rasterize_node(tensors, width, height, *options))
     image, transmittance, means2d, depths, extents = results[:5]

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from operator import attrgetter
+from typing import NamedTuple
 
 import torch
 
@@ -45,8 +46,19 @@ LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
 DRIFT = 3.0  # Stops of brightness between photos that suggest an exposure that changed without being stated
 
-Choice = tuple[dict[str, object], str, str]
-"""Result of a rule: fields of the config with their values, the choice in words, and the figures it rests on."""
+
+class Choice(NamedTuple):
+    """Result of a rule.
+
+    Attributes:
+        fields: Fields of the config, with their values.
+        words: The choice in words.
+        reason: The figures it rests on.
+    """
+
+    fields: dict[str, object]
+    words: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -76,13 +88,13 @@ class Plan:
         config: Config to train with.
         facts: Figures of the scene.
         decisions: Decisions in the order of RULES.
-        kept: Fields that a decision would have changed, but the user had set.
+        user_fields: Fields that a decision would have changed, but the user had set.
     """
 
     config: Config
     facts: SceneFacts
     decisions: tuple[Decision, ...]
-    kept: dict[str, object]
+    user_fields: dict[str, object]
 
     def with_decision(self, decision: Decision) -> "Plan":
         """Return the plan with one more decision."""
@@ -91,7 +103,7 @@ class Plan:
     def to_dict(self) -> dict:
         """Return plain values for plan.json and --json."""
         decisions = [asdict(decision) for decision in self.decisions]
-        return {"decisions": decisions, "kept": self.kept, "facts": asdict(self.facts)}
+        return {"decisions": decisions, "kept": self.user_fields, "facts": asdict(self.facts)}
 
     def table(self) -> str:
         """Return all decisions as lines: name, choice, reason and values."""
@@ -101,19 +113,19 @@ class Plan:
             lines.append(f"{row.name:{name}}  {row.choice:{choice}}  {row.reason}")
             if row.fields:
                 lines.append(f"{'':{name}}  {'':{choice}}  -> {', '.join(_format_fields(row.fields))}")
-        return "\n".join([*lines, *(f"kept as given: {line}" for line in _format_fields(self.kept))])
+        return "\n".join([*lines, *(f"kept as given: {line}" for line in _format_fields(self.user_fields))])
 
     def lines(self) -> list[str]:
         """Return a line for each decision that changes something, and for each field that the user set."""
         lines = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.told]
-        evened = any(row.name == "exposure-compensation" and row.told for row in self.decisions)
-        if self.facts.drift >= DRIFT and not evened:
+        compensated = any(row.name == "exposure-compensation" and row.told for row in self.decisions)
+        if self.facts.drift >= DRIFT and not compensated:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             lines.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
         if code := self.facts.plateau:
             problem = f"no photo is brighter than code {code} of 255, which many pixels have: they clip there"
             lines.append(f"plan: {problem}, and that is taken for their light; export them with white at 255")
-        return lines + [f"plan: {line}, as given" for line in _format_fields(self.kept)]
+        return lines + [f"plan: {line}, as given" for line in _format_fields(self.user_fields)]
 
 
 def _format_fields(fields: dict) -> list[str]:
@@ -138,12 +150,14 @@ def make_plan(scene: Scene, config: Config, device: str | torch.device | None = 
     check_fields(scene, config)
     planned, decisions, overridden = config, [], {}
     for name, rule in RULES.items():
-        fields, choice, reason = rule(facts, planned, device)
-        overridden |= {path: attrgetter(path)(planned) for path in fields if path in config.plan.keep}
+        choice = rule(facts, planned, device)
+        overridden |= {path: attrgetter(path)(planned) for path in choice.fields if path in config.plan.keep}
         changes = {
-            path: new for path, new in fields.items() if path not in overridden and new != attrgetter(path)(planned)
+            path: new
+            for path, new in choice.fields.items()
+            if path not in overridden and new != attrgetter(path)(planned)
         }
-        decisions.append(Decision(name, changes, choice, reason))
+        decisions.append(Decision(name, changes, choice.words, choice.reason))
         planned = override_config(planned, changes, f"{scene.name}: plan of {name}")
     planned = override_config(planned, {"plan.enabled": False}, scene.name)
     return Plan(planned, facts, tuple(decisions), overridden)
@@ -228,11 +242,11 @@ def check_fields(scene: Scene, config: Config) -> None:
 def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     name = config.response.name
     if facts.light_known:
-        return {}, "no search", "the photos hold light itself"
+        return Choice({}, "no search", "the photos hold light itself")
     if name != "auto":
-        return {}, "no search", "learned with the scene" if name == "learned" else f"{name} was named"
+        return Choice({}, "no search", "learned with the scene" if name == "learned" else f"{name} was named")
     writer = "a camera made the files" if facts.from_camera else "nothing says what made the files"
-    return {}, "search", f"no curve was named, and {writer}: it is chosen from {facts.photos} photos"
+    return Choice({}, "search", f"no curve was named, and {writer}: it is chosen from {facts.photos} photos")
 
 
 def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -240,10 +254,10 @@ def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
         unneeded: dict[str, object] = (
             {} if facts.clipped else dict.fromkeys(("loss.clipped_smoothness", "loss.clipped_estimate"), 0.0)
         )
-        return unneeded, "as photos show it", f"{facts.clipped:.1%} of the pixels are a bound alone"
+        return Choice(unneeded, "as photos show it", f"{facts.clipped:.1%} of the pixels are a bound alone")
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
     reason = f"{facts.truths} float pictures hold all light: behind a photo's curve the brightest would hardly count"
-    return fields, "in the mu-law", reason
+    return Choice(fields, "in the mu-law", reason)
 
 
 def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -253,20 +267,20 @@ def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice
         f"(render --evs=-{darker},0,{brighter}); all are scalings of one render, made at export"
     )
     if not config.fusion.enabled:
-        return {}, "plain scaling", reason
+        return Choice({}, "plain scaling", reason)
     unfused: dict[str, object] = {"fusion.enabled": False}
     unfused |= {} if config.loss.hdr_truth and facts.truths else {"loss.linear_weight": 0.0}
     reason = f"{len(config.fusion.exposures)} brackets of one base hold no light of their own; {reason}"
-    return unfused, "plain scaling", reason
+    return Choice(unfused, "plain scaling", reason)
 
 
 def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     truths = f"{facts.truths} of {facts.photos} photos have HDR truth"
     if config.loss.linear_weight == 0:
-        return {}, "none", f"loss.linear_weight = 0; {truths}"
+        return Choice({}, "none", f"loss.linear_weight = 0; {truths}")
     if config.loss.hdr_truth and facts.truths:
-        return {}, "against truth", truths
-    return {"loss.linear_weight": 0.0}, "none", f"{truths}: against its own brackets a base learns nothing"
+        return Choice({}, "against truth", truths)
+    return Choice({"loss.linear_weight": 0.0}, "none", f"{truths}: against its own brackets a base learns nothing")
 
 
 def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -285,11 +299,11 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
         if facts.around:
             fields["mcmc.prune_near_angle"] = WIDEST
             reason += "; the cameras look all around from within, where wide Gaussians would veil them"
-        return fields, choice, f"{reason}; {start} to start with"
+        return Choice(fields, choice, f"{reason}; {start} to start with")
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.cap_max, max(most, 2 * facts.points))
     reason += f"; {facts.points} points to start from"
-    return {"densification.cap_max": most}, f"{most} Gaussians", reason
+    return Choice({"densification.cap_max": most}, f"{most} Gaussians", reason)
 
 
 def _is_short_of_time(facts: SceneFacts, config: Config, device: torch.device) -> bool:
@@ -316,27 +330,27 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choi
             reason = f"about {took} on a CPU with {thread_count()} threads; --iterations for more"
             if seconds > 2 * CPU_SECONDS:  # Of the fewest steps, then.
                 reason += ", --max-size for smaller photos and less time"
-    return {"schedule.iterations": number}, f"{number}", reason
+    return Choice({"schedule.iterations": number}, f"{number}", reason)
 
 
 def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     # Adam moves a parameter by its rate at most: of fewer steps each is to go farther.
     steps = config.schedule.iterations
     if facts.photos > HASTY_PHOTOS:
-        return {}, "as they are", f"more than {HASTY_PHOTOS} photos"
+        return Choice({}, "as they are", f"more than {HASTY_PHOTOS} photos")
     haste = round(min(MOST_HASTE, max(1.0, (RATES_FOR / steps) ** HASTE)), 2)
     usual = OptimizerConfig()
     as_usual = [name for name in HASTY if getattr(config.optimizer, name) == getattr(usual, name)]
     if haste == 1 or not as_usual:
-        return {}, "as they are", f"{steps} steps"
+        return Choice({}, "as they are", f"{steps} steps")
     fields: dict[str, object] = {f"optimizer.{name}": float(f"{getattr(usual, name) * haste:.3g}") for name in as_usual}
-    return fields, f"{haste:g} times", f"{steps} steps, and the rates are made for {RATES_FOR}"
+    return Choice(fields, f"{haste:g} times", f"{steps} steps, and the rates are made for {RATES_FOR}")
 
 
 def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     unsure = facts.clipped + facts.black
     reason = f"{unsure:.1%} of the pixels state a bound alone, and a place is seen by {facts.seen:.1f} photos"
-    return {}, "worth a look" if unsure >= 0.001 or facts.seen < 4 else "high throughout", reason
+    return Choice({}, "worth a look" if unsure >= 0.001 or facts.seen < 4 else "high throughout", reason)
 
 
 RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {

@@ -98,13 +98,13 @@ def test_decisions_follow_their_figures(facts, name, change, field, few, many):
     small = {"photos": 6, "seen": 3.0, "pixels": 6144}
     # Relocation has a budget of its own.
     config = config_of(**({"densification__strategy": "adc"} if name == "densification" else {}))
-    assert RULES[name](replace(facts, **small), config, GPU)[0].get(field) == few
-    assert RULES[name](replace(facts, **small | change), config, GPU)[0].get(field) == many
+    assert RULES[name](replace(facts, **small), config, GPU).fields.get(field) == few
+    assert RULES[name](replace(facts, **small | change), config, GPU).fields.get(field) == many
 
 
 @pytest.mark.parametrize("clipped", [0.0, 1e-4])
 def test_clipped_light_is_left_out_where_none_is(facts, clipped):
-    weights = RULES["light"](replace(facts, clipped=clipped), config_of(), GPU)[0]
+    weights = RULES["light"](replace(facts, clipped=clipped), config_of(), GPU).fields
     assert weights == ({} if clipped else {"loss.clipped_smoothness": 0.0, "loss.clipped_estimate": 0.0})
 
 
@@ -149,7 +149,7 @@ def test_rates_of_a_short_training_are_raised_once_and_those_given_stay(scene, f
     enough = make_plan(scene, config_of(schedule__iterations=30_000, plan__keep=["schedule.iterations"]))
     assert enough.config.optimizer == usual
     few, many = (
-        RULES["rates"](replace(facts, photos=n), config_of(schedule__iterations=1000), CPU)[0] for n in (40, 41)
+        RULES["rates"](replace(facts, photos=n), config_of(schedule__iterations=1000), CPU).fields for n in (40, 41)
     )
     assert few and not many
 
@@ -186,7 +186,7 @@ def test_brackets_of_one_base_become_a_scaling(scene):
 def test_what_the_user_gave_stays(scene):
     plan = make_plan(scene, config_of(schedule__iterations=9000, plan__keep=["schedule.iterations"]))
     assert plan.config.schedule.iterations == 9000
-    assert plan.kept == {"schedule.iterations": 9000}
+    assert plan.user_fields == {"schedule.iterations": 9000}
     assert "schedule.iterations" not in fields(plan)
     assert "kept as given: schedule.iterations = 9000" in plan.table()
 
