@@ -24,6 +24,8 @@ def prepared(tmp_path_factory) -> Path:
     again = call(*TRAIN, "--overwrite", "-q", folder=folder)
     anew = call(*[word if word != "run" else "new" for word in TRAIN], "-q", folder=folder)
     shutil.rmtree(folder / "new")
+    for suffix in (".glb", ".spz", ".sog", ".compressed.ply"):
+        assert call("export", "run", "--out", f"files/a{suffix}", folder=folder).code == 0
     seen = call(*VIEW, folder=folder, prepare=browse(folder, ever=False))
     changes |= {"train": again.changes, "train anew": anew.changes, "view": seen.changes}
     shutil.rmtree(folder / "tmp")
@@ -61,6 +63,8 @@ def pytest_terminal_summary(terminalreporter):
     if rows:
         terminalreporter.write_sep("=", f"the trial, seed {SEED}")
         terminalreporter.write_line(markdown_table(*trial_table(rows.values())))
+        used = sum(os.times()[:4])  # On a busy machine the seconds of the table say little.
+        terminalreporter.write_line(f"{used:.0f} s of processor time, those of pytest and all that it started")
         if path := os.environ.get("SEHDR_TRIAL_JSON"):
             known = {row["family"]: row for row in kept(Path(path)).get("rows", [])}
             keep(Path(path), rows=[*(known | rows).values()], seed=SEED, **told("pytest -m trial"))

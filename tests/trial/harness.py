@@ -148,6 +148,10 @@ def _watch(event: str, arguments) -> None:
         os.write(2, f"STARTED {event} {arguments[:2]}\n".encode())
     if event == "socket.connect" and isinstance(arguments[1], tuple) and arguments[1][0] not in LOCAL:
         os.write(2, f"STARTED a connection to {arguments[1]}\n".encode())
+    if event == "socket.bind" and "view" not in "".join(sys.argv[1:2]) and isinstance(arguments[1], tuple):
+        os.write(2, f"STARTED to listen at {arguments[1]}\n".encode())
+    if event == "socket.getaddrinfo" and arguments[0] not in (*LOCAL, None, ""):
+        os.write(2, f"STARTED to look for {arguments[0]}\n".encode())
 
 
 def _count(kill_at: int | None) -> list[int]:

@@ -1,6 +1,7 @@
 """SIGKILL at any moment: what was whole stays whole, what was begun can be finished, to the same bits."""
 
 import json
+import os
 import random
 import shutil
 from pathlib import Path
@@ -8,13 +9,17 @@ from pathlib import Path
 import pytest
 import torch
 
+from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.own_files import LIST, first_foreign
 from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.scene import Camera, look_at
+from tests.scene.clips import write_clip
+from tests.scene.panorama_room import light, walls
 
 from .harness import COMMANDS, SEED, TRAIN, VIEW, browse, call, files_in
 
 pytestmark = pytest.mark.trial
-KILLS, KILLS_EACH = 50, 20
+KILLS, KILLS_EACH, KILLS_OF_VIDEO = 50, 20, 12
 ANEW = [word if word != "run" else "new" for word in TRAIN] + ["-q"]
 
 
@@ -99,3 +104,51 @@ def test_commands_killed_at_a_change_of_the_disk(space, name, number):
     assert {path: path.read_bytes() for path in kept} == kept, "finished jobs were run again"
     assert left_over(space) == []
     assert sorted(path.name for path in run.rglob("*")) == sorted(path.name for path in (space / "run").rglob("*"))
+
+
+VIDEO = ["train", "clip.mov", "--preset", "demo", "--iterations", "12", "--max-size", "32", "--seed", "3"]
+VIDEO += ["--out", "new", "--device", "cpu", "-q"]
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory) -> Path:
+    """A clip of a room, the run that is trained on it, the cache of frames and cameras, and how much changes."""
+    pytest.importorskip("av")
+    pytest.importorskip("pycolmap")
+    folder, painted, frames = tmp_path_factory.mktemp("trial") / "space", walls(), []
+    folder.mkdir()
+    for i in range(30):
+        camera = Camera(256, 192, 200, 200, 128, 96, look_at((-0.6 + 0.04 * i, -0.5, 0.1), (0.1, 1, 0)))
+        frames.append(encode_srgb(0.5 * light(camera, painted)))
+    write_clip(folder / "clip.mov", frames, codec="libx264", pixels="yuv420p")
+    ended = call(*VIDEO, folder=folder, prepare=lambda: os.environ.update(SEHDR_CACHE="cache"))
+    assert ended.code == 0, ended.err
+    (folder / "new").rename(folder / "run")
+    (folder / "changes.json").write_text(json.dumps(ended.changes))
+    return folder
+
+
+@pytest.mark.parametrize("number", range(KILLS_OF_VIDEO))
+def test_training_on_a_video_killed_at_a_change_of_the_disk(filmed, tmp_path, number):
+    """Frames are the same files again, and so is the run."""
+    space = shutil.copytree(filmed, tmp_path / "space")
+    changes, cache = json.loads((space / "changes.json").read_text()), files_in(space / "cache")
+    if number % 3:  # Of these the cameras are known already.
+        for folder in (space / "cache").glob("video-*"):
+            shutil.rmtree(folder)
+    else:
+        shutil.rmtree(space / "cache")
+    prepare = lambda: os.environ.update(SEHDR_CACHE="cache")  # noqa: E731
+    ended = call(*VIDEO, folder=space, prepare=prepare, kill_at=1 + number * changes // KILLS_OF_VIDEO)
+    assert ended.code in (0, -9)
+    if (
+        not (space / "new" / "run.json").exists()
+        or call(*["train", "--resume", "--out", "new", "--device", "cpu", "-q"], folder=space, prepare=prepare).code
+    ):
+        assert not list((space / "new").glob("[!.]*"))
+        assert call(*VIDEO, folder=space, prepare=prepare).code == 0
+    made = files_in(space / "cache")
+    assert {name: made.get(name) for name in cache} == cache
+    for (tensors, *told), (expected, *stated) in [(result(space / "new"), result(space / "run"))]:
+        assert told == stated and all(torch.equal(tensors[name], expected[name]) for name in expected)
+    assert left_over(space / "new") == []
