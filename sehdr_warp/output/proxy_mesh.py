@@ -40,6 +40,7 @@ RESOLUTIONS = 16, 512
 _FEWEST_VIEWS = 2  # Views that must have measured a voxel
 _LEAST_PART = 0.01  # Share of all triangles that a connected part needs to stay
 _CHECKED = 3  # Held-out views that the mesh's depth is compared in
+_LEVEL = 1.0  # Degrees to which a floor counts as level
 _CLOSE = 0.03  # Relative difference of depth that counts as agreement
 
 
@@ -129,8 +130,7 @@ def write_proxy_mesh(
         write(temporary, mesh, transform, run)
     log.info("%s: %d triangles, voxels of %.3g", path.name, len(mesh.faces), mesh.voxel)
     if mesh.ground is not None:
-        text = "ground: at y = %.3g, %.1f degrees off level, %.0f %% of the surface"
-        log.info(text, mesh.ground.height, mesh.ground.tilt, 100 * mesh.ground.share)
+        log.info("%s", _ground_line(mesh.ground, transform))
     _log_agreement(mesh, run, transform)
     return path
 
@@ -272,6 +272,15 @@ def _log_agreement(mesh: ProxyMesh, run: Any, transform: WorldTransform) -> None
         text = "depth beside the scene, %d views: %.1f %% off in the median, %.0f %% within 3 %%, %.0f %% not covered"
         close = float((values < _CLOSE).mean())
         log.info(text, len(cameras), 100 * float(np.median(values)), 100 * close, 100 * (1 - covered / total))
+
+
+def _ground_line(ground: Ground, transform: WorldTransform) -> str:
+    """Return a line about a floor, with the option that makes it level for all files."""
+    line = f"ground: at y = {ground.height:.3g}, {ground.tilt:.1f} degrees off level, {ground.share:.0%} of the surface"
+    if ground.tilt < _LEVEL:
+        return line
+    up = ",".join(f"{value:.4f}" for value in transform.rotation.T @ ground.normal)
+    return f"{line}; --up={up} levels it, here and for render, export and envmap"
 
 
 def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: Any) -> None:

@@ -102,6 +102,19 @@ def test_openusd_holds_mesh_and_ground(tmp_path, logged):
     assert any("triangles" in line for line in logged) and any("off in the median" in line for line in logged)
 
 
+def test_a_floor_that_is_not_level_comes_with_the_option_that_levels_it(tmp_path, logged):
+    turn = np.radians(6)
+    up = f"{np.sin(turn):.6f},{np.cos(turn):.6f},0"
+    write_proxy_mesh(BallOnFloor(), tmp_path / "tilted.obj", resolution=48, up=up)
+    [line] = [line for line in logged if line.startswith("ground")]
+    found = np.array([float(value) for value in line.split("--up=")[1].split(" ")[0].split(",")])
+    np.testing.assert_allclose(found, [0, 1, 0], atol=0.02)
+    logged.clear()
+    write_proxy_mesh(BallOnFloor(), tmp_path / "level.obj", resolution=48, up=",".join(map(str, found)))
+    [line] = [line for line in logged if line.startswith("ground")]
+    assert "--up" not in line
+
+
 def test_mitsuba_composites_and_shadows_by_the_mesh(tmp_path):
     """A CG ball behind the photographed one is hidden as far as it should be, and its shadow falls on the floor."""
     mi = pytest.importorskip("mitsuba")
