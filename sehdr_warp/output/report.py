@@ -1,5 +1,6 @@
 """Reports of a training: a page to look through, and pictures for papers."""
 
+import logging
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -13,12 +14,15 @@ from sehdr_warp.scene import Scene, View
 from sehdr_warp.scene.exposure import shutter
 
 from ..files import atomic_path, check_absent
+from ..progress import tracked
 from .camera_paths import evenly
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare, darker_stops
 from .report_page import STOPS, report_page
 from .report_page import stops_text as _stops
 from .tonemap import expose, fit_tone_map
+
+log = logging.getLogger(__name__)
 
 
 def write_report(
@@ -62,7 +66,7 @@ def write_report(
     if not candidates:
         raise SehdrError("the scene has no views to report on; check its splits")
     views = evenly(candidates, max(view_count, 1))
-    comparisons = [compare(run, view, scene.views) for view in views]
+    comparisons = [compare(run, view, scene.views) for _, view in tracked("comparing views", views, log)]
     brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
     time = views[0].exposure_time
     compared = comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out)
