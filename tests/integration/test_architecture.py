@@ -1,6 +1,7 @@
 """docs/architecture.md, held: which package may import which, and how large a file may be."""
 
 import ast
+import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -117,6 +118,20 @@ def test_imports_go_down_the_line(path, package):
             assert fits, f"{package} may not import {name}"
         if top in ONLY_IN and package in ALLOWED:
             assert package in ONLY_IN[top], f"{package} may not import {name}"
+
+
+def test_the_page_names_files_and_functions_that_exist():
+    section = (ROOT / "docs" / "architecture.md").read_text().partition("## Follow a command")[2].partition("## ")[0]
+    named = {}
+    for file, _, functions in re.findall(r"`([\w/]+\.py)`( \(((?:`\w[\w.]*`(?:, |: )?)+))?", section):
+        named.setdefault(file, set()).update(re.findall(r"`([\w.]+)`", functions))
+    assert len(named) > 15
+    for file, functions in named.items():
+        path = ROOT / file if file.startswith("kernels/") else PACKAGE / file
+        assert path.is_file(), f"docs/architecture.md names {file}, which does not exist"
+        names = {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)}
+        wrong = {function.rpartition(".")[2] for function in functions if not function.endswith(".py")} - names
+        assert not wrong, f"docs/architecture.md names functions that {file} lacks: {wrong}"
 
 
 def test_warp_internals_are_used_in_warp_launch_alone():
