@@ -6,7 +6,7 @@ The defaults are the `default` preset. Iteration numbers other than `schedule.it
 
 from collections.abc import Iterator
 from operator import attrgetter
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -33,6 +33,13 @@ class _Table(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Raise SehdrError for a field, because a config is checked as a whole when it is made."""
+        if name in type(self).model_fields:
+            remedy = "make another config, as in load_config(preset, {'loss.ssim_weight': 0.3})"
+            raise SehdrError(f"{type(self).__name__}.{name} = {value!r:.60}: a config cannot be changed; {remedy}")
+        super().__setattr__(name, value)
 
 
 class ModelConfig(_Table):

@@ -1,12 +1,14 @@
 """Configs: presets, files, overrides, and clear refusals."""
 
+import copy
 import json
+import pickle
 from pathlib import Path
 
 import pytest
 
 import sehdr_warp
-from sehdr_warp.errors import InputError
+from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import (
     GONE,
@@ -202,3 +204,10 @@ def test_iteration_numbers_scale():
     config = load_config("default", {"schedule.iterations": 3000})
     assert config.scaled(15_000) == 1500 and config.scaled(1) == 1
     assert config.scaled(700) == 70
+
+
+def test_a_field_cannot_be_set_and_the_error_says_what_to_do():
+    config = load_config("default")
+    with pytest.raises(SehdrError, match=r"LossConfig.ssim_weight = 3: a config cannot be changed; .*load_config\("):
+        config.loss.ssim_weight = 3
+    assert pickle.loads(pickle.dumps(config)) == config == copy.deepcopy(config)
