@@ -18,7 +18,7 @@ from .geometry import geometry, matrix
 
 
 @cache
-def projection_kernel(dtype, antialiased: bool):
+def projection_kernel(dtype, antialiased: bool, exact: bool = False):
     """Return the projection kernel for one scalar type.
 
     The kernel's `forward_extents` is the forward pass's extents in the adjoint, and None in the forward pass.
@@ -27,6 +27,7 @@ def projection_kernel(dtype, antialiased: bool):
         dtype: wp.float32 or wp.float64.
         antialiased: lower the opacity by sqrt(det / det_blurred), so that the blur by eps2d keeps a Gaussian's energy
             (Yu et al. 2024, Mip-Splatting). The factor is constant in the adjoint of the covariance.
+        exact: the factor is not constant there, as in gsplat.
     """
     g = geometry(dtype)
     real, vec2, vec3, vec4, mat44 = g.real, g.vec2, g.vec3, g.vec4, g.mat44
@@ -36,9 +37,21 @@ def projection_kernel(dtype, antialiased: bool):
     def compensation(determinant: real, blurred: real) -> real:
         return wp.sqrt(wp.max(determinant / blurred, real(0.0)))
 
-    @wp.func_grad(compensation)
-    def _no_gradient(determinant: real, blurred: real, adj_ret: real):
-        pass
+    if exact:
+
+        @wp.func_grad(compensation)
+        def _gradient(determinant: real, blurred: real, adj_ret: real):
+            ratio = wp.max(determinant / blurred, real(0.0))
+            # A small addition keeps the slope of the root finite.
+            slope = adj_ret * real(0.5) / ((wp.sqrt(ratio) + real(1.0e-6)) * blurred)
+            wp.adjoint[determinant] += slope
+            wp.adjoint[blurred] += -slope * ratio
+
+    else:
+
+        @wp.func_grad(compensation)
+        def _no_gradient(determinant: real, blurred: real, adj_ret: real):
+            pass
 
     @wp.kernel(module="unique", module_options={"enable_backward": True, "cpu_compiler_flags": cpu_flags()})
     def project(

@@ -46,6 +46,7 @@ def project(
     eps2d: float,
     alpha_threshold: float,
     antialiased: bool,
+    exact: bool = False,
 ) -> ProjectedGaussians:
     """Project Gaussians to the image plane of one camera; all but the extents are differentiable.
 
@@ -62,6 +63,7 @@ def project(
         eps2d: variance in square pixels added to each 2D Gaussian.
         alpha_threshold: alpha at which extents end.
         antialiased: whether opacities are lowered so that the added variance keeps a Gaussian's energy.
+        exact: whether that factor is differentiated with respect to the covariance, and not constant.
     """
     count = means.shape[0]
     outputs = ProjectedGaussians(
@@ -71,7 +73,7 @@ def project(
         means.new_empty(count),
         means.new_empty(count, 2),
     )
-    kernel = projection_kernel(warp_scalar(means.dtype), antialiased)
+    kernel = projection_kernel(warp_scalar(means.dtype), antialiased, exact and antialiased)
     parameters = width, height, near_plane, eps2d, alpha_threshold
     inputs = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
     return ProjectedGaussians(*launch_projection(kernel, inputs, parameters, outputs))
@@ -85,6 +87,8 @@ def project_to_camera(
     world_to_camera: Tensor,
     intrinsics: Tensor,
     options: RenderOptions,
+    *,
+    exact: bool = False,
 ) -> ProjectedGaussians:
     """Project Gaussians, whose means, log_scales and quaternions are contiguous, to one camera; see project()."""
     return project(
@@ -100,6 +104,7 @@ def project_to_camera(
         eps2d=options.eps2d,
         alpha_threshold=options.alpha_threshold,
         antialiased=options.antialiased,
+        exact=exact,
     )
 
 

@@ -69,7 +69,7 @@ def project_gaussians(
         options = RenderOptions(width, height, near, eps2d, ALPHA_THRESHOLD, antialiased)
         log_scales = scales.abs().clamp_min(SMALLEST_SIZE).log()
         shapes = means.contiguous(), log_scales, quats.contiguous()
-        projected = project_to_camera(*shapes, opacities, viewmat, lens, options)
+        projected = project_to_camera(*shapes, opacities, viewmat, lens, options, exact=True)
     else:
         if covars is None:
             assert quats is not None and scales is not None
@@ -115,7 +115,7 @@ def _project_covariances(
     inside = inside & (determinant > 0) & determinant.isfinite()
     determinant = torch.where(inside, determinant, 1.0)
     if antialiased:
-        opacities = opacities * (sharp / determinant).clamp_min(0.0).sqrt().detach()
+        opacities = opacities * (sharp / determinant).clamp_min(1e-12).sqrt()
     with torch.no_grad():
         level = 2 * torch.log((opacities / ALPHA_THRESHOLD).clamp_min(1.0))
         extents = (level[:, None] * torch.stack([xx, yy], 1)).clamp_min(0.0).sqrt()

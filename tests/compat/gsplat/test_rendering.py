@@ -314,3 +314,22 @@ def test_splatfactos_call(device):
     absolute, plain = info["means2d"].absgrad, info["means2d"].grad
     assert absolute.shape == plain.shape == (1, COUNT, 2)
     assert bool((absolute >= plain.abs() * 0.999 - 1e-9).all()) and bool((absolute > 0).any())
+
+
+def test_antialiasing_is_differentiated_whole(device):
+    """As torch's operations do it, by which covariances are projected."""
+    leaves, place = scene(device)
+    leaves = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    place = [place[0].double(), place[1].double(), *place[2:]]
+    gradients_of = []
+    for by_covariances in (False, True):
+        means, quats, scales, opacities, colors = leaves
+        covars, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        shapes = (None, None) if by_covariances else (quats, scales)
+        given = {"covars": covars} if by_covariances else {}
+        image, _, _ = rasterization(
+            means, *shapes, opacities, colors, *place, rasterize_mode="antialiased", packed=False, **given
+        )
+        gradients_of.append(torch.autograd.grad(image.square().sum(), leaves))
+    for ours, true in zip(*gradients_of, strict=True):
+        assert float((ours - true).norm() / true.norm()) < 1e-4
