@@ -131,8 +131,7 @@ def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
 
     If exposures are compared, the light of clipped pixels, which the photo does not determine, is smoothed and lifted.
     """
-    image = photo.light if target.scale.mu else photo.encoded
-    assert image is not None
+    image = compared_image(photo, target)
     codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
     clipped = clipped_weights(config, target) if target.scale.mu and config.clipping else ClippedWeights()
     if target.mask is None and weight:
@@ -143,6 +142,13 @@ def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
     if clipped:
         loss = loss + clipped_light_energy(image, codes, scale.white, clipped, index, target.mask, target.estimates)
     return loss
+
+
+def compared_image(photo: TrainRender, target: Target) -> Tensor:
+    """Return the rendered image that is compared with the photo: exposures if the target has them, else codes."""
+    image = photo.light if target.scale.mu else photo.encoded
+    assert image is not None
+    return image
 
 
 def clipped_weights(config: LossConfig, target: Target) -> ClippedWeights:
