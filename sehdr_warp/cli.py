@@ -47,8 +47,8 @@ COMMANDS = {
         "convert": Command("output.splat_commands", "Convert", "run_convert"),
     },
     "choose and calibrate": {
-        "presets": Command("training.commands", "Presets", "run_presets"),
-        "config": Command("training.commands", "ShowConfig", "run_config"),
+        "presets": Command("runs.commands", "Presets", "run_presets"),
+        "config": Command("runs.commands", "ShowConfig", "run_config"),
         "calibrate": Command("scene.commands", "Calibrate", "run_calibrate"),
         "responses": Command("scene.commands", "Responses", "run_responses"),
         "scenes": Command("scene.commands", "Scenes", "run_scenes"),

@@ -174,17 +174,14 @@ class RunFolder:
 
     def check_same_scene(self, scene: Scene) -> None:
         """Raise InputError if the run was trained on other views, cameras or photos than a scene's."""
-        saved = self.read_scene()
-        current = json.loads(json.dumps(describe_scene(scene)))
-        photos, current_photos = _split_photos(saved), _split_photos(current)
-        for name in ("layout", "views"):
-            if saved.get(name) != current[name]:
-                problem = f"its {name} differ from those of {scene.name}"
-                raise InputError(self.scene, problem, "resume with the same data, --max-size and --holdout")
-        if changed := changed_photos(photos, current_photos):
-            named = f"{changed[0]} and {len(changed) - 1} more" if len(changed) > 1 else changed[0]
-            remedy = "put them back as they were, or train anew with --overwrite"
-            raise InputError(self.scene, f"photos or masks were changed since the training began: {named}", remedy)
+        difference = scene_difference(self.read_scene(), describe_scene(scene))
+        if difference is None:
+            return
+        if difference.photos:
+            problem = f"photos or masks were changed since the training began: {difference}"
+            raise InputError(self.scene, problem, "put them back as they were, or train anew with --overwrite")
+        problem = f"its {difference} differ from those of {scene.name}"
+        raise InputError(self.scene, problem, "resume with the same data, --max-size and --holdout")
 
     def read_decisions(self) -> list[dict]:
         """Return the decisions of the run's plan, see DecisionValues; none without a plan."""
@@ -305,6 +302,35 @@ def describe_scene(scene: Scene) -> dict:
     ]
     known = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
     return {"format": FORMAT, "name": scene.name, "layout": scene.format, **known, "views": views}
+
+
+@dataclass(frozen=True)
+class SceneDifference:
+    """What differs between two scenes: "layout", "views", or the names of photos.
+
+    Attributes:
+        text: In words.
+        photos: Whether the pictures themselves differ.
+    """
+
+    text: str
+    photos: bool
+
+    def __str__(self) -> str:
+        """Return the text."""
+        return self.text
+
+
+def scene_difference(saved: dict, current: dict) -> SceneDifference | None:
+    """Return what differs between two descriptions of describe_scene(); None if they are of the same scene."""
+    saved, current = (json.loads(json.dumps(description)) for description in (saved, current))
+    photos, current_photos = _split_photos(saved), _split_photos(current)
+    for name in ("layout", "views"):
+        if saved.get(name) != current[name]:
+            return SceneDifference(name, False)
+    if changed := changed_photos(photos, current_photos):
+        return SceneDifference(f"{changed[0]} and {len(changed) - 1} more" if len(changed) > 1 else changed[0], True)
+    return None
 
 
 def _split_photos(description: dict) -> dict[str, str]:

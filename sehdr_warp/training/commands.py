@@ -1,4 +1,4 @@
-"""The command lines of `sehdr-warp train`, `presets` and `config`.
+"""The command line of `sehdr-warp train`.
 
 torch is imported when they run.
 """
@@ -105,26 +105,6 @@ class Train:
     fields: Annotated[configs.flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
 
 
-@dataclass(frozen=True)
-class Presets:
-    """List the presets: what each is for, and what it costs."""
-
-    json: bool = False
-    """Print them as JSON."""
-
-
-@dataclass(frozen=True)
-class ShowConfig:
-    """Print the whole config of a preset or a run, with the meaning of every field, as a TOML file."""
-
-    which: Positional[str] = "default"
-    """A preset, a TOML file, or the folder of a run."""
-    diff: bool = False
-    """Only what differs from the default preset: a file that --preset takes."""
-    json: bool = False
-    """Print it as JSON."""
-
-
 def run_train(args: Train, argv: Sequence[str]) -> None:
     """Train, or print the plan, and print what was written and what to do next.
 
@@ -132,7 +112,7 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         args: the options.
         argv: the words of the command line, with which --gpus starts the other ranks.
     """
-    from .ranks import device_of_rank, join_ranks, launched_as
+    from .rank_place import device_of_rank, launched_as
 
     gpus, place = args.machine.gpus, launched_as()
     if gpus < 1:
@@ -149,16 +129,18 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         launch(gpus, _run_as_rank, list(argv))
     elif place is None or args.training.plan_only:
         _train(args)
-    elif gpus not in (1, place[1]):
-        raise UsageError(f"--gpus {gpus}, but {place[1]} ranks were started; leave it out")
+    elif gpus not in (1, place.local_count):
+        raise UsageError(f"--gpus {gpus}, but {place.local_count} ranks were started; leave it out")
     else:
-        with join_ranks(*place, device_of_rank(place[0], args.machine.device)) as ranks:
+        from .ranks import join_ranks
+
+        with join_ranks(place, device_of_rank(place.local_rank, args.machine.device)) as ranks:
             if ranks.leads:
                 _train(args, ranks)
             else:
                 from .following import follow_leader
 
-                follow_leader(ranks)
+                follow_leader(ranks, _path_of(args))
 
 
 def _run_as_rank(words: list[str]) -> None:
@@ -194,12 +176,19 @@ def _train(args: Train, ranks=None) -> None:
     if out is not None:
         check_dataset_truth(data, config)
     with nullcontext() if out is None or device.type != "cpu" else _precompiling(config):
+        if ranks is not None and ranks.place.several_nodes:
+            from .following import PhotoRequest
+
+            ranks.request_photos(PhotoRequest(data, {"response": options.name, **selection}))
         scene = load_photos(data, response=options.name, **selection)
         if out is None:
+            from ..blocks import estimate
             from .plan import make_plan
 
             plan = make_plan(scene, config, device)
-            print(json.dumps(plan.to_dict()) if output.json else plan.table())
+            cost = estimate.estimate(plan, device, args.machine.gpus)
+            values = plan.to_dict() | {"cost": estimate.to_dict(*cost)}
+            print(json.dumps(values) if output.json else plan.table() + estimate.table(*cost))
             return
         from ..console import follow
         from ..viewer.live import viewed
@@ -264,7 +253,7 @@ def _train_blocks(args: Train) -> None:
     from ..blocks.block_plan import BlockPlan
     from ..blocks.train import is_in_blocks, train_in_blocks
     from ..runs.device import pick_device
-    from .ranks import device_of_rank
+    from .rank_place import device_of_rank
 
     output, machine = args.output, args.machine
     if output.out is None:
@@ -306,23 +295,6 @@ def _precompiling(config):
     return precompiled(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
 
 
-def run_presets(args: Presets) -> None:
-    """Print every preset with its purpose and cost."""
-    names, purpose = configs.preset_names(), configs.preset_purpose
-    rows = {name: {"purpose": purpose(name), "cost": _cost(configs.load_config(name))} for name in names}
-    lines = (f"{name:<14}{row['purpose']}\n{'':<14}{row['cost']}" for name, row in rows.items())
-    print(json.dumps(rows) if args.json else "\n".join(lines))
-
-
-def run_config(args: ShowConfig) -> None:
-    """Print a config."""
-    from ..runs.run_folder import RunFolder
-
-    folder = RunFolder(args.which)
-    config = folder.read_config() if folder.config.is_file() else configs.load_config(args.which)
-    print(json.dumps(config.model_dump()) if args.json else configs.config_as_toml(config, args.diff))
-
-
 def _refuse_run(args: Train) -> None:
     """Raise UsageError if SCENE is a run, which --resume continues by the name after --out."""
     from ..runs.run_folder import RunFolder
@@ -336,15 +308,20 @@ def _refuse_run(args: Train) -> None:
     raise UsageError(f"{args.data}: is a run, not photos; {command} continues it")
 
 
-def _data(args: Train, known: Mapping | None) -> dict:
-    """Return the arguments of load_scene() of the command line, or else those of the run that is resumed."""
+def _path_of(args: Train) -> str | None:
+    """Return where the command line says that the photos are, as an absolute path or a name; None if it does not."""
     from ..scene import is_embedded
 
-    path = args.data
-    if path is not None and not is_embedded(path):
-        path = str(Path(path).absolute())
-        require_text(path)
-    options = {"path": path} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
+    if args.data is None or is_embedded(args.data):
+        return args.data
+    path = str(Path(args.data).absolute())
+    require_text(path)
+    return path
+
+
+def _data(args: Train, known: Mapping | None) -> dict:
+    """Return the arguments of load_scene() of the command line, or else those of the run that is resumed."""
+    options: dict = {"path": _path_of(args)} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
     if known is not None:
         options = {name: known.get(name) if value is None else value for name, value in options.items()}
         options |= {"views": known["views"]} if known.get("views") else {}
@@ -368,19 +345,6 @@ def _config(args: Train, saved):
     config = configs.load_config(options.preset or "default", named, flags)
     user_fields = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
     return configs.override_config(config, {"plan.keep": sorted(user_fields)})
-
-
-def _cost(config) -> str:
-    """Describe the amount of work of a training."""
-    planned = "as many steps as the photos deserve, up to" if config.plan.enabled else "steps:"
-    parts = {
-        f"{planned} {config.schedule.iterations}": True,
-        f"up to {config.densification.cap_max:,} Gaussians": True,
-        f"{len(config.fusion.exposures)} brackets in every step": config.fusion.enabled,
-        "a learned response": config.response.name == "learned",
-        "needs HDR truth": config.loss.uses_hdr,
-    }
-    return "; ".join(part for part, holds in parts.items() if holds)
 
 
 def _ending(path: Path, summary: dict) -> str:

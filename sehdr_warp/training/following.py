@@ -1,18 +1,22 @@
 """Train on several ranks: rank 0 sends its training to the others, which follow it step by step."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from ..errors import InputError, SehdrError
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
-from ..runs.run import field_from_checkpoint
-from ..scene import Scene
+from ..runs.open import load_photos
+from ..runs.run import exposure_compensation, field_from_checkpoint
+from ..runs.run_folder import describe_scene, scene_difference
+from ..scene import Scene, View
+from ..scene.exposure_compensation import ExposureCompensation
 from .initialization import sizes_of
 from .machine import interruptible, torch_settings
 from .plan import gain_of_ranks
@@ -21,35 +25,54 @@ from .trainer import Trainer
 
 
 @dataclass(frozen=True)
-class SharedTraining:
-    """Values that the other ranks need for the same training.
+class PhotoRequest:
+    """Arguments with which the photos of other nodes are read.
 
     Attributes:
-        scene: The scene with its training views.
-        config: Options of the training, after the plan.
-        info: Response, base time and normalization, as in run.json.
-        tensors: Tensors of TrainingState.state(), as arrays.
-        values: Values of TrainingState.state().
+        data: Arguments of load_scene() as a run saves them.
+        options: Its further arguments: response, method, candidates, photos.
     """
 
-    scene: Scene
+    data: dict[str, Any]
+    options: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SharedTraining:
+    """Values that the other ranks need for the same training; the tensors of its state follow.
+
+    Attributes:
+        config: Options of the training, after the plan.
+        info: Response, base time, normalization and exposure compensation, as in run.json.
+        layout: Shape and type of each tensor of TrainingState.state().
+        values: Values of TrainingState.state().
+        scene: Description of the training views, for nodes that read photos themselves; None on one node.
+    """
+
     config: Config
     info: dict[str, Any]
-    tensors: dict[str, np.ndarray]
+    layout: dict[str, tuple[torch.Size, torch.dtype]]
     values: dict[str, Any]
+    scene: dict | None
 
 
-def send_training(ranks: Ranks, scene: Scene, trainer: Trainer) -> None:
-    """Send a training from rank 0 to the others, in the form of a checkpoint."""
+def send_training(ranks: Ranks, trainer: Trainer, gains: ExposureCompensation | None) -> None:
+    """Send a training from rank 0 to the others, in the form of a checkpoint; gains: already taken from its photos."""
+    if ranks.place.several_nodes and not ranks.photos_are_requested:
+        raise SehdrError("ranks on several nodes read their own photos: train by the command line")
     tensors, values = trainer.state()
-    arrays = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
     field = trainer.field
     info = {"response": field.response.to_dict(), "base_time": field.base_time}
     info["normalization"] = field.normalization.to_dict()
-    scene = Scene(scene.name, scene.format, scene.train_views, scene.points, scene.point_colors)
-    photos = [array for view in scene.views for array in (view.codes, view.mask, view.hdr) if array is not None]
-    size = sum(array.nbytes + 64 for array in (*photos, *arrays.values(), scene.points, scene.point_colors))
-    ranks.broadcast_object(SharedTraining(scene, trainer.config, info, arrays, values), size)
+    if gains is not None:
+        info["exposure_compensation"] = gains.to_dict()
+    layout = {name: (tensor.shape, tensor.dtype) for name, tensor in tensors.items()}
+    scene = _training_part(trainer.scene)
+    description = describe_scene(scene) if ranks.place.several_nodes else None
+    ranks.broadcast_object(SharedTraining(trainer.config, info, layout, values, description))
+    ranks.broadcast_arrays(list(tensors.values()))
+    ranks.share_photos(scene, _bytes_of(scene))
 
 
 def several_ranks_notes(trainer: Trainer) -> Iterator[str]:
@@ -62,16 +85,32 @@ def several_ranks_notes(trainer: Trainer) -> Iterator[str]:
     yield from trainer.ranks.notes()
 
 
-def follow_leader(ranks: Ranks) -> Trainer:
-    """Run the steps of rank 0's training on another rank until it ends; return the trainer."""
-    shared: SharedTraining | None = ranks.receive_object()
-    if shared is None:
-        raise SystemExit(1)
-    config, scene = shared.config, shared.scene
-    tensors = {name: torch.from_numpy(array) for name, array in shared.tensors.items()}
+def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
+    """Run the steps of rank 0's training on another rank until it ends; return the trainer.
+
+    Args:
+        ranks: The ranks.
+        path: Where the photos are on this node; None for where they are on that of rank 0.
+    """
+    reads = ranks.place.node > 0 and ranks.place.leads_node
+    scene = None
+    if reads:
+        request: PhotoRequest = ranks.requested_photos()
+        scene = load_photos(request.data | ({} if path is None else {"path": path}), **request.options)
+    shared: SharedTraining = ranks.broadcast_object()
+    config = shared.config
+    tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in shared.layout.items()}
+    ranks.broadcast_arrays(list(tensors.values()))
     checkpoint = Checkpoint(Path("rank 0"), tensors, shared.values)
-    field = field_from_checkpoint(checkpoint, config, shared.info).to(ranks.device)
-    trainer = Trainer(scene, config, field, ranks=ranks)
+    field = field_from_checkpoint(checkpoint, config, shared.info)
+    if scene is not None:
+        gains = exposure_compensation(shared.info)
+        scene = _training_part(scene if gains is None else gains.normalize_photos(scene, field.response))
+        _check_same_photos(ranks, shared, scene)
+        ranks.share_photos(scene, _bytes_of(scene))
+    else:
+        scene = ranks.receive_photos()
+    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks)
     trainer.load_state(checkpoint.tensors, checkpoint.values)
     del shared, checkpoint, tensors
 
@@ -90,3 +129,29 @@ def follow_leader(ranks: Ranks) -> Trainer:
         trainer.gather()
         ranks.shutdown()  # After rank 0 has saved.
     return trainer
+
+
+def _training_part(scene: Scene) -> Scene:
+    """Return what other ranks need of a scene: its training views and points."""
+    return Scene(scene.name, scene.format, scene.train_views, scene.points, scene.point_colors)
+
+
+def _bytes_of(scene: Scene) -> int:
+    """Return about how many bytes the arrays of a scene take."""
+    photos = [array for view in scene.views for array in _arrays(view) if array is not None]
+    return sum(array.nbytes + 64 for array in (*photos, scene.points, scene.point_colors))
+
+
+def _arrays(view: View) -> tuple[np.ndarray | None, ...]:
+    """Return the arrays of a view."""
+    return view.codes, view.mask, view.hdr, view.light_above_white
+
+
+def _check_same_photos(ranks: Ranks, shared: SharedTraining, scene: Scene) -> None:
+    """Raise InputError if this node has read other photos than rank 0."""
+    assert shared.scene is not None
+    name = shared.scene["name"]
+    difference = scene_difference(shared.scene, describe_scene(replace(scene, name=name)))
+    if difference is not None:
+        problem = f"{ranks.place} reads other photos than rank 0: {difference} differ"
+        raise InputError(scene.name, problem, "copy the same set to all nodes, or use a shared file system")

@@ -13,6 +13,7 @@ import torch.distributed as dist
 import torch.multiprocessing as processes
 
 from ..errors import SehdrError
+from .rank_place import FILE_STORE
 
 GRACE = 5.0  # Seconds that other ranks have to end after one has ended, and again after SIGTERM
 
@@ -60,7 +61,7 @@ def launch(count: int, run: Callable[[list[str]], None], words: list[str]) -> No
 
 def _rank(rank: int, count: int, run: Callable[[list[str]], None], words: list[str], store_path: str) -> None:
     """Run one rank with the environment variables that torchrun sets."""
-    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), "SEHDR_RANKS": store_path}
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(count), FILE_STORE: store_path}
     run(words)
 
 

@@ -17,6 +17,7 @@ from ..runs.config_files import override_config
 from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS
+from .cost import CPU_GAUSSIAN, CPU_PIXEL, START_SECONDS, exchange_seconds, step_seconds
 from .hdr_truth import largest_hdr_truth
 from .initialization import base_time, start_count
 from .scene_facts import SceneFacts, measure_scene
@@ -34,13 +35,6 @@ RATES_FOR = 30_000  # Length of the trainings that 3DGS's learning rates are for
 HASTE, MOST_HASTE = 0.22, 2.5  # Learning rates of shorter trainings grow with this power, up to this factor
 HASTY_PHOTOS = 40  # Largest number of photos for that: scenes with 10 to 21 photos gain, with 52 and 84 lose
 HASTY = "means", "means_final", "log_scales", "opacity_logits", "harmonics_rest"
-CPU_PIXEL, CPU_GAUSSIAN = 1.0e-6, 1.5e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
-STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 4.7e-4, 1e-11, 3.2e-9
-"""Duration of a captured step on one H200: fixed part, per pixel, per Gaussian."""
-NUMBERS, RANK_NUMBERS = 11, 3  # Floats per Gaussian in the all-reduce: 11, plus 3 color gradients per rank
-EXCHANGE_SECONDS, NUMBER_SECONDS = 1.5e-4, 2.3e-11
-"""Additional duration on two H200: to start the all-reduce, and per float of the gradients."""
-START_SECONDS = 10.0  # Approximate duration to start more processes
 REACH = 2.0**16  # Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
@@ -191,9 +185,8 @@ def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: 
     if device.type == "cpu":
         shared = f"{count} processes share this machine's {thread_count() * count} threads"
         return f"plan: ranks: {shared}: no faster than one"
-    step = STEP_SECONDS + PIXEL_SECONDS * pixels + GAUSSIAN_SECONDS * gaussians
-    exchange = EXCHANGE_SECONDS + 2 * (1 - 1 / count) * NUMBER_SECONDS * (NUMBERS + RANK_NUMBERS * count) * gaussians
-    alone, together = photos * step, photos / count * (step + exchange)
+    step = step_seconds(pixels, gaussians)
+    alone, together = photos * step, photos / count * (step + exchange_seconds(gaussians, count))
     estimate = (
         f"an estimated {alone / together:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
     )

@@ -1,8 +1,8 @@
-"""Processes that train one scene together, each on its own GPU (or, with gloo, on the CPU of one machine).
+"""Processes that train one scene together, each on its own GPU (or, with gloo, on CPUs), on one node or several.
 
 Every rank has all Gaussians and takes its own photo; all gradients, in one buffer, are averaged, so that all ranks
-apply the same step. Rank 0 leads: it reads the photos and shares them, densifies, evaluates, writes and prints. The
-others only run steps.
+apply the same step. Rank 0 leads: it densifies, evaluates, writes and prints. One rank of each node reads the photos
+and shares them with the others of its node, which only run steps.
 """
 
 import hashlib
@@ -24,11 +24,12 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from ..errors import InputError, SehdrError, as_user_error
+from ..errors import SehdrError, as_user_error
 from ..model.adam import Adam
 from ..model.gaussians import Gaussians
-from ..parallel import run_interruptibly, thread_count
+from ..parallel import WAITING_NOTICE, run_interruptibly, thread_count
 from ..scene.photo_file import PhotoFile, can_share, open_shared
+from .rank_place import Place, open_store
 from .strategies import Strategy
 
 log = logging.getLogger(__name__)
@@ -51,26 +52,28 @@ class Ranks:
     """This process among those that train together; use join_ranks().
 
     Attributes:
-        store: Key-value store that the ranks broadcast_object.
+        store: Key-value store of the ranks.
+        place: Place of this process.
         rank: Number of this process.
         count: Number of processes.
         device: Device that this process trains on.
         leads: True for rank 0.
     """
 
-    def __init__(self, store: dist.Store, rank: int, count: int, device: torch.device):
+    def __init__(self, store: dist.Store, place: Place, device: torch.device):
         """Create a rank; init() connects it."""
-        self.store, self.rank, self.count, self.device = store, rank, count, device
-        self.leads = rank == 0
+        self.store, self.place, self.device = store, place, device
+        self.rank, self.count = place.rank, place.count
+        self.leads = place.rank == 0
         self._cuda = device.type == "cuda"
         self._deadline: float | None = None
         self._over = threading.Event()
         self._photos: PhotoFile | None = None
-        timeout = os.environ.get(TIMEOUT, "")
-        self._patience = float(timeout) if timeout.replace(".", "", 1).isdigit() else LONGEST_SILENCE
+        self._patience = patience()
 
     def init(self) -> None:
-        """Connect to the other ranks; raise SehdrError if they run other versions."""
+        """Connect to the other ranks; raise SehdrError if some do not come, or run other versions."""
+        self._await_all()
         with self._together():
             backend = "nccl" if self._cuda else "gloo"
             options: dict[str, Any] = {"device_id": self.device} if self._cuda else {}
@@ -85,7 +88,27 @@ class Ranks:
 
     def _log_wait(self) -> None:
         """Log that this rank waits for the others."""
-        log.info("rank %d of %d waits for the others", self.rank, self.count)
+        log.info("%s waits for the others", self.place)
+
+    def _await_all(self) -> None:
+        """Wait until all ranks are there; raise SehdrError that names the nodes of those that do not come."""
+        keys = [f"here/{rank}" for rank in range(self.count)]
+        self.store.set(keys[self.rank], platform.node())
+        began, told = time.monotonic(), False
+        while not self.store.check(keys):
+            waited = time.monotonic() - began
+            if waited > WAITING_NOTICE and not told:
+                self._log_wait()
+                told = True
+            if waited > self._patience:
+                absent = [rank for rank, key in enumerate(keys) if not self.store.check([key])]
+                nodes = ", ".join(str(node) for node in sorted({self.place.node_of(rank) for rank in absent}))
+                problem = f"{self.place} waited {self._patience:.0f} s ({TIMEOUT}) for rank {absent[0]}"
+                problem += f" and {len(absent) - 1} more" if len(absent) > 1 else ""
+                raise SehdrError(
+                    f"{problem}: node {nodes} of {self.place.nodes} did not come; start it, or use fewer nodes"
+                )
+            time.sleep(_POLL)
 
     def all_reduce_min(self, signal: int) -> int:
         """Return the smallest of GO, WAIT and END that any rank passes.
@@ -166,19 +189,60 @@ class Ranks:
                 "or they are of different kinds; --resume continues from the last checkpoint, --gpus 1 on one"
             )
 
-    def broadcast_object(self, value: Any, size: int) -> None:
-        """Send a value of about `size` bytes from rank 0; the ranks read its large arrays from one shared file."""
-        self._photos = PhotoFile(size + (1 << 30))
-        # The store takes bytes, although its stub says str.
-        self.store.set("shared", pickle.dumps(self._photos.share(value)))  # pyright: ignore[reportArgumentType]
+    def broadcast_object(self, value: Any = None) -> Any:
+        """Return rank 0's value on all ranks; the others wait as long as rank 0 needs before it calls this."""
+        values = [value]
+        with self._together():
+            run_interruptibly(partial(dist.broadcast_object_list, values, 0, group=self._hosts))
+        return values[0]
 
-    def receive_object(self) -> Any:
-        """Receive the value of rank 0's broadcast_object(), however late; None if rank 0 ended without one."""
-        while not self.store.check(["shared"]):
-            if self.store.check(["ended"]):
-                return None
-            time.sleep(_POLL)
-        return open_shared(pickle.loads(self.store.get("shared")))
+    def broadcast_arrays(self, tensors: list[Tensor]) -> None:
+        """Replace tensors on the CPU by those of rank 0."""
+        for tensor in tensors:
+            with self._together():
+                dist.broadcast(tensor, 0, group=self._hosts)
+
+    def request_photos(self, request: Any) -> None:
+        """Tell the ranks that read photos for other nodes which ones to read, before rank 0 reads its own."""
+        self.store.set("request", pickle.dumps(request))  # pyright: ignore[reportArgumentType]
+
+    def requested_photos(self) -> Any:
+        """Return what rank 0 passed to request_photos(); wait for it."""
+        self._await_keys(["request"])
+        return pickle.loads(self.store.get("request"))
+
+    @property
+    def photos_are_requested(self) -> bool:
+        """True if request_photos() was called."""
+        return self.store.check(["request"])
+
+    def share_photos(self, value: Any, size: int) -> None:
+        """Share a value of about `size` bytes with the other ranks of this node, which read its arrays from one file.
+
+        Rank 0 waits until those of other nodes have done the same.
+        """
+        handle = None
+        if self.place.local_count > 1:
+            self._photos = PhotoFile(size + (1 << 30))
+            handle = self._photos.share(value)
+        # The store takes bytes, although its stub says str.
+        self.store.set(f"photos/{self.place.node}", pickle.dumps(handle))  # pyright: ignore[reportArgumentType]
+        if self.leads:
+            self._await_keys([f"photos/{node}" for node in range(self.place.nodes)])
+
+    def receive_photos(self) -> Any:
+        """Return what the rank that reads the photos of this node shares; wait for it."""
+        key = f"photos/{self.place.node}"
+        self._await_keys([key])
+        return open_shared(pickle.loads(self.store.get(key)))
+
+    def _await_keys(self, keys: list[str]) -> None:
+        """Wait until the store has keys; exit if a rank has ended before."""
+        with self._together():
+            while not self.store.check(keys):
+                if self.store.check(["ended"]):
+                    raise SystemExit(1)
+                time.sleep(_POLL)
 
     def ends_first(self) -> bool:
         """Return whether this is the first rank that ends with an error; only that one reports it."""
@@ -189,7 +253,7 @@ class Ranks:
 
     def notes(self) -> Iterator[str]:
         """Yield notes about this machine's GPUs."""
-        others = range(1, self.count) if self._cuda else ()
+        others = range(1, self.place.local_count) if self._cuda else ()
         apart = [k for k in others if not torch.cuda.can_device_access_peer(0, k)]
         if apart:
             yield f"GPU {apart[0]} has no access to the memory of GPU 0: gradients go through the host, which is slower"
@@ -214,7 +278,7 @@ class Ranks:
         except RuntimeError as error:
             time.sleep(_GRACE)
             log.debug("%s", error)
-            raise RanksLost(f"rank {self.rank} of {self.count} lost another, which has ended: {ENDING}") from error
+            raise RanksLost(f"{self.place} lost another, which has ended: {ENDING}") from error
 
     def _check_versions(self) -> None:
         """Raise SehdrError if a rank runs other versions of packages."""
@@ -227,7 +291,9 @@ class Ranks:
             dist.all_gather_object(versions, own, group=self._hosts)
         other = next((k for k, text in enumerate(versions) if text != versions[0]), None)
         if other is not None:
-            raise SehdrError(f"rank {other} runs {versions[other]}, rank 0 {versions[0]}: install the same on all")
+            who = f"rank {other}"
+            who += f" on node {self.place.node_of(other)}" if self.place.several_nodes else ""
+            raise SehdrError(f"{who} runs {versions[other]}, rank 0 {versions[0]}: install the same on all")
 
     def _watch(self) -> None:
         """End this process if another rank does not answer: waits for a device or a socket cannot be interrupted.
@@ -246,8 +312,8 @@ class Ranks:
                         heard, since = message, now
             if (deadline is not None and now > deadline) or (heard and now - since > self._patience):
                 if self.ends_first():
-                    message = "another rank did not answer rank %d of %d for %.0f s (%s): %s"
-                    log.error(message, self.rank, self.count, self._patience, TIMEOUT, ENDING)
+                    message = "another rank did not answer %s for %.0f s (%s): %s"
+                    log.error(message, self.place, self._patience, TIMEOUT, ENDING)
                 os._exit(1)
 
 
@@ -259,50 +325,27 @@ def _source() -> str:
     return total.hexdigest()[:8]
 
 
-def launched_as() -> tuple[int, int] | None:
-    """Return rank and count that a launcher (torchrun, or --gpus) sets for this process; None if there is no launcher.
-
-    Raises:
-        SehdrError: For ranks on several machines.
-    """
-    try:
-        rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-        here = int(os.environ.get("LOCAL_WORLD_SIZE", count))
-    except (KeyError, ValueError):
-        return None
-    if here != count:
-        raise SehdrError(f"{count} ranks on several machines: one machine trains a scene, with --gpus or torchrun")
-    return (rank, count) if count > 1 else None
-
-
-def device_of_rank(rank: int, device: str | None) -> torch.device:
-    """Return the device of a rank: a GPU of its own, or the CPU if that is named or there is no GPU."""
-    if device not in (None, "cpu", "cuda"):
-        raise InputError(f"device {device}", "is one, and each rank takes its own", "use cpu or cuda, or leave it out")
-    if device == "cpu" or (device is None and not torch.cuda.is_available()):
-        if rank >= (most := max(2, os.cpu_count() or 1)):
-            raise SehdrError(f"{rank + 1} ranks on {os.cpu_count()} processors: start {most} at most")
-        return torch.device("cpu")
-    if (there := torch.cuda.device_count()) <= rank:
-        raise SehdrError(f"rank {rank} finds {there} GPUs: start as many ranks as there are, or give --device cpu")
-    return torch.device("cuda", rank)
+def patience() -> float:
+    """Return the seconds that another rank may be silent."""
+    timeout = os.environ.get(TIMEOUT, "")
+    return float(timeout) if timeout.replace(".", "", 1).isdigit() else LONGEST_SILENCE
 
 
 @contextmanager
-def join_ranks(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
+def join_ranks(place: Place, device: torch.device) -> Iterator[Ranks]:
     """Connect this process to the ranks within this block; an error of any rank ends all, and one reports it."""
-    if not can_share():
-        raise SehdrError("several ranks need Linux, where processes can read one nameless file")
-    os.environ.setdefault("SEHDR_THREADS", str(max(1, thread_count() // count)))
-    # All are on this machine, whatever its network.
-    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
-        os.environ.setdefault(name, "lo")
+    if place.local_count > 1 and not can_share():
+        raise SehdrError("several ranks of one machine need Linux, where processes can read one nameless file")
+    os.environ.setdefault("SEHDR_THREADS", str(max(1, thread_count() // place.local_count)))
+    if not place.several_nodes:  # All are on this machine, whatever its network.
+        for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+            os.environ.setdefault(name, "lo")
     if device.type == "cuda":
         torch.cuda.set_device(device)
-    if rank:
+    if place.rank:
         logging.getLogger("sehdr_warp").setLevel(logging.ERROR)
-    store = run_interruptibly(_store, lambda: log.info("rank %d of %d waits for the others", rank, count))
-    ranks = Ranks(store, rank, count, device)
+    waits = partial(log.info, "%s waits for the others", place)
+    ranks = Ranks(run_interruptibly(partial(open_store, place, patience()), waits), place, device)
     try:
         ranks.init()
         yield ranks
@@ -313,27 +356,9 @@ def join_ranks(rank: int, count: int, device: torch.device) -> Iterator[Ranks]:
         first, message = ranks.ends_first(), isinstance(error, Exception) and as_user_error(error)
         if message and not first:
             raise SystemExit(1) from None
-        if rank and isinstance(error, KeyboardInterrupt):
+        if place.rank and isinstance(error, KeyboardInterrupt):
             raise SystemExit(130) from None
         raise
-
-
-def _store() -> dist.Store:
-    """Return the store of the ranks: a file of --gpus, or torchrun's server."""
-    if path := os.environ.get("SEHDR_RANKS"):
-        return dist.FileStore(path, int(os.environ["WORLD_SIZE"]) + 1)
-    from torch.distributed.rendezvous import rendezvous
-
-    if missing := [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]:
-        problem = f"RANK and WORLD_SIZE are set, and {' and '.join(missing)} not"
-        raise SehdrError(f"{problem}: start with torchrun or --gpus, or unset RANK")
-    try:
-        return next(rendezvous("env://", timeout=timedelta(minutes=5)))[0]
-    except (RuntimeError, ValueError) as error:
-        place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
-        raise SehdrError(
-            f"no other ranks at {place} ({str(error).splitlines()[0]:.120}); start with torchrun"
-        ) from None
 
 
 def _end_soon(error: BaseException) -> None:

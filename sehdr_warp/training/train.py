@@ -100,7 +100,7 @@ def create_trainer(
                     scene, folder, config, device, ranks, tensorboard, data or {}, shared, overwrite=overwrite
                 )
             if ranks is not None:
-                send_training(ranks, trainer.scene, trainer)
+                send_training(ranks, trainer, exposure_compensation(folder.read_info()))
         except BaseException:
             folder.unlock()
             raise

@@ -94,7 +94,20 @@ def test_flags_and_fields_on_the_pages_exist(page):
         "--no-deps",
         "--clock-control",
         "--nproc-per-node",
-    }  # of pip, Nsight and torchrun
+        "--nnodes",
+        "--node-rank",
+        "--master-addr",
+        "--max-restarts",
+        "--rdzv-backend",
+        "--rdzv-endpoint",
+        "--rdzv-id",
+        "--nodes",
+        "--ntasks-per-node",
+        "--gpus-per-node",
+        "--cpus-per-task",
+        "--time",
+        "--requeue",
+    }  # of pip, Nsight, torchrun and sbatch
     assert set(re.findall(r"(?<![\w-])(--[a-z][a-z-]*)(?![\w.])", text)) <= known | others
     fields = {path for path, _ in config_fields()}
     parts = "|".join({field.split(".")[0] for field in fields if "." in field})

@@ -18,10 +18,11 @@ def run_team(work, folder: Path, *arguments) -> None:
 
 
 def _rank(rank: int, work, folder: Path, arguments: tuple) -> None:
+    from sehdr_warp.training.rank_place import Place
     from sehdr_warp.training.ranks import join_ranks
 
     os.environ |= {"WORLD_SIZE": str(RANKS), "SEHDR_RANKS": str(folder / "meeting"), "SEHDR_RANK_TIMEOUT": "60"}
-    with join_ranks(rank, RANKS, torch.device("cpu")) as ranks:
+    with join_ranks(Place.on_one_node(rank, RANKS), torch.device("cpu")) as ranks:
         work(ranks, folder, *arguments)
 
 
@@ -39,7 +40,7 @@ def train_together(ranks, folder: Path, strategies: list[str], iterations: int) 
                 if step.iteration >= iterations:
                     training.stop()
             trainer = training
-            ranks.store.delete_key("shared")
+            ranks.store.delete_key("photos/0")
         else:
             trainer = follow_leader(ranks)
         ranks.all_reduce_min(2)

@@ -18,7 +18,7 @@ from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
 from sehdr_warp.training.plan import gain_of_ranks
-from sehdr_warp.training.ranks import device_of_rank
+from sehdr_warp.training.rank_place import device_of_rank
 from sehdr_warp.training.strategies import make_strategy
 from sehdr_warp.training.train import train
 

@@ -1,0 +1,51 @@
+"""The cost of a planned training, whole and in blocks, for `train --plan-only`."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from ..parallel import thread_count
+from ..training.cost import Choice, Workload, choices, cpu_cost, recommend
+from ..training.initialization import start_count
+from ..training.plan import STEPS_PER_PHOTO, Plan
+from ..training.strategies import mcmc_cap
+from .block_plan import blocks_for
+
+
+def estimate(plan: Plan, device: torch.device, gpus: int = 1) -> tuple[list[Choice], str]:
+    """Return ways to train a set with their cost, and which of them is recommended.
+
+    Args:
+        plan: The plan of the training.
+        device: Device to train on; on the CPU, figures for H100 follow those of this machine.
+        gpus: GPUs that may be used.
+    """
+    facts, config = plan.facts, plan.config
+    cap = mcmc_cap(config, facts.pixels) if config.densification.strategy == "mcmc" else config.densification.cap_max
+    gaussians = max(min(facts.points, config.densification.cap_max), start_count(config, facts.pixels), cap)
+    whole = Workload(facts.photos, facts.pixels / facts.photos, gaussians, config.schedule.iterations)
+    blocks = blocks_for(facts.photos, facts.pixels, config)
+    wanted = config.mcmc.cap_density * math.sqrt(facts.pixels) if blocks > 1 else 0.0
+    divided = replace(
+        whole, gaussians=max(whole.gaussians, wanted), iterations=max(whole.iterations, STEPS_PER_PHOTO * facts.photos)
+    )
+    if device.type == "cuda":
+        memory = float(torch.cuda.get_device_properties(device).total_memory)
+        return list(choices(whole, divided, blocks, memory, gpus)), recommend(whole, blocks, memory, gpus)
+    threads = thread_count()
+    here = Choice(f"CPU, {threads} threads", cpu_cost(whole, threads))
+    others = [replace(each, name=f"{each.name} (H100)") for each in choices(whole, divided, blocks, None, gpus)]
+    recommended = recommend(whole, blocks, None) if blocks > 1 else "this machine, or one GPU if that takes too long"
+    return [here, *others], recommended
+
+
+def table(rows: list[Choice], recommended: str) -> str:
+    """Return the lines of an estimate."""
+    return "\n".join(["", "estimated cost", *(row.line() for row in rows), f"recommended: {recommended}"])
+
+
+def to_dict(rows: list[Choice], recommended: str) -> dict[str, Any]:
+    """Return plain values of an estimate for --json."""
+    return {"choices": [row.to_dict() for row in rows], "recommended": recommended}

@@ -1,0 +1,216 @@
+"""What a training costs: time, memory, network and disk as functions of photos, pixels, Gaussians, GPUs and nodes.
+
+The constants are fitted to the measurements in docs/reports (step, gpus, large) on one and two H100 and H200. Estimates
+within their range are marked as such, and all others as predictions: more than two GPUs, several nodes, or more
+Gaussians than were measured.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+
+STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 2.0e-4, 3.4e-10, 2.4e-9
+"""Duration of a captured step on one GPU: fixed part, per pixel of a photo, per Gaussian, with densification."""
+NUMBERS, RANK_NUMBERS = 11, 3  # Floats per Gaussian in the all-reduce: 11, plus 3 color gradients per rank
+EXCHANGE_SECONDS, NUMBER_SECONDS = 1.5e-4, 2.3e-11
+"""Additional duration on two GPUs of one node: to start the all-reduce, and per float of the gradients."""
+NETWORK = 12.5e9  # Bytes a second between nodes, of 100 Gb/s; not measured
+GAUSSIAN_BYTES, PIXEL_BYTES = 920, 177
+"""Memory on the GPU: of a Gaussian with gradients and optimizer state, and of a pixel of one photo in a step."""
+STATE_BYTES = 940  # Of a Gaussian in a checkpoint: parameters, moments, moving average
+CPU_PIXEL, CPU_GAUSSIAN = 1.0e-6, 1.5e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
+GROWTH = 1.5  # Final number of Gaussians relative to the mean over a training that grows for half of its steps
+START_SECONDS = 10.0  # Approximate duration to start a process
+OVERLAP = 1.3  # Photos and Gaussians of all blocks together, relative to the whole set
+MOST_GPUS, MOST_GAUSSIANS = 2, 5_000_000  # Range of the measurements
+SAVES = 1.2  # Blocks or more GPUs are recommended if they need this many times less
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Size of a training.
+
+    Attributes:
+        photos: Number of training photos.
+        pixels: Pixels of a photo.
+        gaussians: Final number of Gaussians.
+        iterations: Photos that are trained on.
+        code_bytes: Bytes of a photo's pixel.
+    """
+
+    photos: int
+    pixels: float
+    gaussians: float
+    iterations: int
+    code_bytes: int = 3
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a training.
+
+    Attributes:
+        seconds: Duration of its steps, with the start of processes.
+        gpu_bytes: Peak memory of each GPU, with the photos if `photos_on_gpu`.
+        network_bytes: Bytes that each node sends and receives.
+        disk_bytes: Of the run folder.
+        photo_bytes: Of the photos in memory, on each node.
+        predicted: Whether it is outside of what was measured.
+    """
+
+    seconds: float
+    gpu_bytes: float
+    network_bytes: float
+    disk_bytes: float
+    photo_bytes: float
+    predicted: bool
+
+
+def step_seconds(pixels: float, gaussians: float) -> float:
+    """Return the duration of a step on one GPU, seconds."""
+    return STEP_SECONDS + PIXEL_SECONDS * pixels + GAUSSIAN_SECONDS * gaussians
+
+
+def exchange_bytes(gaussians: float, gpus: int) -> float:
+    """Return the bytes that each GPU sends in the all-reduce of a step, by a ring."""
+    return 8 * (1 - 1 / gpus) * (NUMBERS + RANK_NUMBERS * gpus) * gaussians
+
+
+def exchange_seconds(gaussians: float, gpus: int, nodes: int = 1) -> float:
+    """Return the additional duration of a step on several GPUs, seconds."""
+    if gpus == 1:
+        return 0.0
+    sent = exchange_bytes(gaussians, gpus)
+    return EXCHANGE_SECONDS + max(sent / 4 * NUMBER_SECONDS, sent / NETWORK if nodes > 1 else 0.0)
+
+
+def training_cost(work: Workload, gpus: int = 1, nodes: int = 1) -> Cost:
+    """Return the cost of one training on GPUs, by data parallelism: each takes a photo in a step.
+
+    Args:
+        work: Size of the training.
+        gpus: GPUs of all nodes together.
+        nodes: Number of nodes.
+    """
+    mean = work.gaussians / GROWTH
+    steps = math.ceil(work.iterations / gpus)
+    seconds = steps * (step_seconds(work.pixels, mean) + exchange_seconds(mean, gpus, nodes))
+    photos = work.photos * work.pixels * work.code_bytes
+    return Cost(
+        seconds + (START_SECONDS if gpus > 1 else 0.0),
+        GAUSSIAN_BYTES * work.gaussians + PIXEL_BYTES * work.pixels,
+        steps * exchange_bytes(mean, gpus) if nodes > 1 else 0.0,
+        STATE_BYTES * work.gaussians,
+        photos,
+        gpus > MOST_GPUS or nodes > 1 or work.gaussians > MOST_GAUSSIANS,
+    )
+
+
+def block_cost(work: Workload, blocks: int, gpus: int = 1) -> Cost:
+    """Return the cost of the same training in blocks, `gpus` of them at once."""
+    share = OVERLAP / blocks
+    block = replace(
+        work,
+        photos=math.ceil(work.photos * share),
+        gaussians=work.gaussians * share,
+        iterations=math.ceil(work.iterations * share),
+    )
+    one = training_cost(block)
+    rounds = math.ceil(blocks / gpus)
+    merged = STATE_BYTES / 4 * work.gaussians
+    return replace(
+        one,
+        seconds=rounds * (one.seconds + START_SECONDS),
+        disk_bytes=blocks * one.disk_bytes + merged,
+        photo_bytes=one.photo_bytes * min(gpus, blocks),
+        predicted=one.predicted or gpus > MOST_GPUS,
+    )
+
+
+def cpu_cost(work: Workload, threads: int) -> Cost:
+    """Return the cost of a training on the CPU."""
+    step = (CPU_PIXEL * work.pixels + CPU_GAUSSIAN * work.gaussians / GROWTH) / threads
+    photos = work.photos * work.pixels * work.code_bytes
+    return Cost(step * work.iterations, 0.0, 0.0, STATE_BYTES * work.gaussians, photos, False)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A way to train a set, with its cost.
+
+    Attributes:
+        name: In words, such as "4 GPUs".
+        cost: Its cost.
+        fits: Whether it fits into the memory of a GPU.
+    """
+
+    name: str
+    cost: Cost
+    fits: bool = True
+
+    def line(self) -> str:
+        """Return the choice and its cost in one line."""
+        cost = self.cost
+        parts = [format_duration(cost.seconds)]
+        parts += [f"{format_bytes(cost.gpu_bytes)} on each GPU"] if cost.gpu_bytes else []
+        parts += [f"{format_bytes(cost.photo_bytes)} of photos", f"{format_bytes(cost.disk_bytes)} on the disk"]
+        parts += [f"{format_bytes(cost.network_bytes)} by network"] if cost.network_bytes else []
+        text = f"{self.name:<26}{', '.join(parts)}"
+        text += "" if self.fits else "; does not fit"
+        return text + (" (prediction)" if cost.predicted else "")
+
+    def to_dict(self) -> dict:
+        """Return plain values for --json."""
+        return {"name": self.name, "fits": self.fits, **asdict(self.cost)}
+
+
+def choices(whole: Workload, divided: Workload, blocks: int, memory: float | None, gpus: int = 1) -> Iterator[Choice]:
+    """Yield ways to train a set on GPUs: on one, on several, in blocks.
+
+    Args:
+        whole: Size of one training.
+        divided: Size of all blocks together, without their overlap.
+        blocks: Number of blocks for the set; 1 for a set that one training does for.
+        memory: Bytes of a GPU's memory; None if there is none to compare with.
+        gpus: GPUs that may be used on this machine.
+    """
+    for count in sorted({1, 2, 4, 8, gpus}):
+        cost = training_cost(whole, count)
+        yield Choice("1 GPU" if count == 1 else f"{count} GPUs", cost, memory is None or cost.gpu_bytes <= memory)
+    cost = training_cost(whole, 64, 8)
+    yield Choice("8 nodes of 8 GPUs", cost, memory is None or cost.gpu_bytes <= memory)
+    for count in sorted({1, gpus, min(blocks, 8)}) if blocks > 1 else ():
+        cost = block_cost(divided, blocks, count)
+        name = f"{blocks} blocks on {count} GPU" + "s" * (count > 1)
+        yield Choice(name, cost, memory is None or cost.gpu_bytes <= memory)
+
+
+def recommend(whole: Workload, blocks: int, memory: float | None, gpus: int = 1) -> str:
+    """Return which way suits a machine with so many GPUs, and why, in one line; arguments as of choices()."""
+    several = training_cost(whole, gpus)
+    if blocks > 1:
+        fill = "30,000 steps or of densification.cap_max Gaussians"
+        return f"--blocks {blocks}: the set fills {blocks} trainings of {fill}"
+    if memory is not None and several.gpu_bytes > memory:
+        needs = f"{several.gpu_bytes / 1e9:.3g} GB are more than the {memory / 1e9:.3g} GB of a GPU"
+        return f"--blocks {math.ceil(OVERLAP * several.gpu_bytes / memory)}: {needs}"
+    alone = training_cost(whole)
+    if gpus > 1 and alone.seconds > SAVES * several.seconds:
+        return f"--gpus {gpus}: {alone.seconds / several.seconds:.1f} times as fast as one"
+    return "one GPU: " + ("more gain little" if gpus > 1 else "the set is one training")
+
+
+def format_duration(seconds: float) -> str:
+    """Return a duration in words of one unit."""
+    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}" if seconds < 20 * size else f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def format_bytes(count: float) -> str:
+    """Return a number of bytes in words of one unit, with two digits."""
+    for unit, size in (("TB", 1e12), ("GB", 1e9)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}" if count < 10 * size else f"{count / size:.0f} {unit}"
+    return f"{count / 1e6:.0f} MB"

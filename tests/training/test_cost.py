@@ -1,0 +1,98 @@
+"""The model of cost, against measurements in docs/reports that it was fitted to and others."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sehdr_warp.training.cost import (
+    GAUSSIAN_BYTES,
+    PIXEL_BYTES,
+    Workload,
+    block_cost,
+    choices,
+    exchange_seconds,
+    format_duration,
+    recommend,
+    step_seconds,
+    training_cost,
+)
+
+RESULTS = Path(__file__).resolve().parents[2] / "docs" / "reports" / "results"
+SURVEY = Workload(20_000, 20e6, 76e6, 1_500_000)
+
+
+def rows(name, **wanted):
+    result = json.loads((RESULTS / f"{name}.json").read_text())
+    for part in result if isinstance(result, list) else [result]:
+        yield from (row for row in part["rows"] if all(row.get(key) == value for key, value in wanted.items()))
+
+
+def error(estimate, measured):
+    return abs(estimate / measured - 1)
+
+
+def test_steps_take_as_long_as_measured():
+    for row in rows("large", method="sehdr-warp"):
+        estimate = step_seconds(row["width"] * row["height"], row["gaussians"])
+        assert error(1e3 * estimate, row["step_ms"]) < 0.1
+    for row in rows("gpus", workers=1):
+        assert error(1e3 * step_seconds(row["width"] * row["height"], row["gaussians"]), row["amortized_ms"]) < 0.1
+    for row in rows("step", preset="default", implementation="sehdr-warp"):
+        assert error(1e3 * step_seconds(row["width"] * row["height"], row["gaussians"]), row["amortized_ms"]) < 0.1
+
+
+def test_two_gpus_take_as_long_as_measured():
+    """On H100; the exchange was fitted to H200."""
+    for row in rows("gpus", workers=2):
+        step = step_seconds(row["width"] * row["height"], row["gaussians"]) + exchange_seconds(row["gaussians"], 2)
+        assert error(1e3 * step / 2, row["amortized_ms"]) < 0.1
+
+
+def test_memory_is_as_measured():
+    for row in rows("large", method="sehdr-warp"):
+        pixels = row["width"] * row["height"]
+        estimate = GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels + 3 * 24 * pixels
+        assert error(estimate, row["memory"]) < 0.1
+    for row in rows("step", preset="default", implementation="sehdr-warp"):
+        pixels = row["width"] * row["height"]
+        assert error(GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels, row["peak_memory_bytes"]) < 0.25
+
+
+def test_only_what_was_measured_is_no_prediction():
+    small = Workload(200, 2e6, 1e6, 15_000)
+    assert [training_cost(small, gpus).predicted for gpus in (1, 2, 4)] == [False, False, True]
+    assert training_cost(small, 2, 2).predicted and training_cost(replace(small, gaussians=2e7)).predicted
+    lines = [choice.line() for choice in choices(SURVEY, SURVEY, 65, 80e9, 2)]
+    assert all(line.endswith("(prediction)") for line in lines if "64" in line or "8 GPUs" in line)
+
+
+def test_more_gpus_and_blocks_cost_what_they_must():
+    small = Workload(200, 2e6, 1e6, 15_000)
+    times = [training_cost(small, gpus).seconds for gpus in (1, 2, 4)]
+    assert times == sorted(times, reverse=True)
+    assert training_cost(small, 4, 4).seconds > training_cost(small, 4).seconds, "networks are slower than NVLink"
+    assert training_cost(small, 4, 4).network_bytes > 0 == training_cost(small, 4).network_bytes
+    one, two = block_cost(SURVEY, 64), block_cost(SURVEY, 64, 2)
+    assert two.seconds == pytest.approx(one.seconds / 2) and one.gpu_bytes < 0.07 * training_cost(SURVEY).gpu_bytes
+
+
+def test_recommendations():
+    small = Workload(400, 4e6, 3e6, 30_000)
+    assert recommend(small, 1, 80e9) == "one GPU: the set is one training"
+    assert recommend(small, 1, 80e9, 2).startswith("--gpus 2: 1.")
+    assert recommend(SURVEY, 65, 80e9, 2).startswith("--blocks 65: the set fills 65 trainings")
+    assert recommend(replace(small, gaussians=2e8), 1, 80e9).startswith("--blocks 4: 185 GB are more than the 80 GB")
+    fits = {choice.name: choice.fits for choice in choices(replace(small, gaussians=2e8), SURVEY, 65, 80e9)}
+    assert not fits["1 GPU"] and fits["65 blocks on 1 GPU"]
+
+
+def test_durations():
+    assert [format_duration(value) for value in (5, 119, 130, 3600 * 3, 86400 * 30)] == [
+        "5 s",
+        "119 s",
+        "2.2 min",
+        "3.0 h",
+        "30 days",
+    ]
