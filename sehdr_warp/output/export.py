@@ -17,7 +17,15 @@ from sehdr_warp.scene.exposure import shutter
 from ..files import atomic_path, check_absent
 from ..model.baking import agreement, field_of, gaussians_of, refine
 from ..runs.run import Splats
-from ..splats import GaussianArrays, check_suffix, color_model_of, path_is_lossy, read_gaussians, write_gaussians
+from ..splats import (
+    STREAMED_SOG,
+    GaussianArrays,
+    check_suffix,
+    color_model_of,
+    path_is_lossy,
+    read_gaussians,
+    write_gaussians,
+)
 from .splat_edits import SplatEdits, merged, without_strays
 from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
 
@@ -73,6 +81,10 @@ def export(
     kind = kind or ("hdr" if held == "linear" else "ldr")
     _check(path, kind, held, exposure_time, degree)
     beside = path.with_name(f"{path.stem}.cameras.json")
+    if path.name == STREAMED_SOG:
+        check_absent(path.parent, overwrite, folder=True)
+        if cameras:
+            raise InputError(path, "takes its folder for itself, without cameras", "leave --cameras out")
     for file in (path, *[beside] * cameras):
         check_absent(file, overwrite)  # Before minutes of fitting.
     if axes is None:
@@ -185,7 +197,8 @@ def _log_file_loss(
         field, beside = field_of(reference), "what was exported"
         picture = lambda camera: field.render_ldr(camera, time)  # noqa: E731
     decibels = agreement(gaussians, picture, views, time)
-    size = path.stat().st_size / 1e6
+    files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
+    size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
     log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, beside, loss_in_words(decibels), size)
 
 

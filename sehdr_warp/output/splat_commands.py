@@ -46,7 +46,7 @@ class Export:
     """Folder of a run, or a file of Gaussians."""
     out: Path
     """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD), .html (a page to send), or the
-    small ones .sog, .spz and .compressed.ply."""
+    small ones .sog, .spz and .compressed.ply. FOLDER/lod-meta.json is streamed SOG: chunks of a large scene."""
     world: WorldOptions = field(default_factory=WorldOptions)
     edits: EditOptions = EditOptions()
     merge: tuple[Path, ...] = ()

@@ -19,6 +19,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 
 from ..files import read_json, write_json
+from ..splats import STREAMED_SOG
 from .camera_paths import common_focus, typical_roll, up_direction
 
 log = logging.getLogger(__name__)
@@ -149,7 +150,7 @@ def is_y_down(path: Path | str) -> bool:
     Viewers of 3D Gaussian Splatting turn PLY, SOG and SPZ over, as COLMAP's axes make photos' scenes have -Y up; glTF
     and OpenUSD define +Y.
     """
-    return Path(path).suffix.lower() in Y_DOWN_SUFFIXES
+    return Path(path).suffix.lower() in Y_DOWN_SUFFIXES or Path(path).name.lower() == STREAMED_SOG
 
 
 def file_transform(transform: WorldTransform, path: Path | str) -> WorldTransform:

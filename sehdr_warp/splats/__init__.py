@@ -16,6 +16,8 @@ from .gltf import read_glb, write_glb
 from .ply import read_ply, write_ply
 from .sog import read_sog, write_sog
 from .spz import read_spz, write_spz
+from .streamed_sog import NAME as STREAMED_SOG
+from .streamed_sog import read_streamed_sog, write_streamed_sog
 from .usd import read_usd, write_usd
 
 log = logging.getLogger(__name__)
@@ -32,22 +34,23 @@ _OTHER = {
 
 
 def check_suffix(path: Path | str, *others: str) -> str:
-    """Return the suffix of a splat file in lower case; `others` are suffixes that the caller accepts too.
+    """Return the suffix of a splat file in lower case, or lod-meta.json; the caller accepts `others` too.
 
     Raises:
         InputError: For a suffix that is neither read nor written.
     """
     name = Path(path).name.lower()
     suffix = COMPRESSED_PLY if name.endswith(COMPRESSED_PLY) else Path(name).suffix
-    if suffix not in (*SUFFIXES, *others):
+    suffix = STREAMED_SOG if name == STREAMED_SOG else suffix
+    if suffix not in (*SUFFIXES, STREAMED_SOG, *others):
         why = f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is no splat file"
-        raise InputError(path, why, f"use one of {' '.join((*SUFFIXES, *others))}")
+        raise InputError(path, why, f"use one of {' '.join((*SUFFIXES, STREAMED_SOG, *others))}")
     return suffix
 
 
 def path_is_lossy(path: Path | str) -> bool:
     """Return whether a file of this suffix holds rounded numbers."""
-    return check_suffix(path) in LOSSY_SUFFIXES
+    return check_suffix(path) in (*LOSSY_SUFFIXES, STREAMED_SOG)
 
 
 def color_model_of(path: Path | str) -> str | None:
@@ -66,6 +69,7 @@ def read_gaussians(path: Path | str) -> GaussianArrays:
     """
     suffix = check_suffix(path)
     readers = {".ply": read_ply, COMPRESSED_PLY: read_ply, ".glb": read_glb, ".sog": read_sog, ".spz": read_spz}
+    readers[STREAMED_SOG] = read_streamed_sog
     read = readers.get(suffix, read_usd)
     return read(Path(path)).checked(path)
 
@@ -91,12 +95,13 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
             *(Path(path).name, far),
         )
     writers = {".ply": write_ply, COMPRESSED_PLY: write_compressed_ply, ".glb": write_glb}
-    writers |= {".sog": write_sog, ".spz": write_spz}
+    writers |= {".sog": write_sog, ".spz": write_spz, STREAMED_SOG: write_streamed_sog}
     write = writers.get(suffix, write_usd)
     write(Path(path), gaussians, overwrite)
 
 
 __all__ = [
+    "STREAMED_SOG",
     "SUFFIXES",
     "USD_SUFFIXES",
     "GaussianArrays",

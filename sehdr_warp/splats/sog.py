@@ -9,6 +9,8 @@ import json
 import math
 import zipfile
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,13 @@ _FAULTS = (KeyError, IndexError, TypeError, ValueError, OSError, AttributeError,
 
 def write_sog(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     """Write a .sog file; arguments as in write_gaussians."""
+    with atomic_path(path, overwrite) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, content in sog_files(gaussians):
+            archive.writestr(_entry(name), content)
+
+
+def sog_files(gaussians: GaussianArrays) -> Iterator[tuple[str, str | bytes]]:
+    """Yield name and content of each file of a SOG: meta.json first, then the pictures."""
     gaussians = gaussians.rows(morton_order(gaussians.means))
     count, degree = gaussians.count, gaussians.degree
     width = math.ceil(math.sqrt(count) / 4) * 4
@@ -89,48 +98,52 @@ def write_sog(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
             "codebook": levels.tolist(),
             "files": ["shN_centroids.webp", picture("shN_labels.webp", columns.astype(np.uint8))],
         }
-    with atomic_path(path, overwrite) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        archive.writestr(_entry("meta.json"), json.dumps(meta))
-        for name, texels in pictures.items():
-            buffer = io.BytesIO()
-            Image.fromarray(texels).save(buffer, "WEBP", lossless=True, exact=True, quality=100, method=4)
-            archive.writestr(_entry(name), buffer.getvalue())
+    yield "meta.json", json.dumps(meta)
+    for name, texels in pictures.items():
+        buffer = io.BytesIO()
+        Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=100, method=4)
+        yield name, buffer.getvalue()
 
 
 def read_sog(path: Path) -> GaussianArrays:
     """Read a .sog file of version 2."""
     read_bytes(path)  # Refuses what is no plain file or too large
+    with refusing_damage(path), zipfile.ZipFile(path) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+            raise InputError(path, "unpacks to more than 1 GiB", _DAMAGED)
+        return gaussians_of_files(archive.read, path)
+
+
+@contextmanager
+def refusing_damage(path: Path) -> Iterator[None]:
+    """Raise InputError in place of what a damaged file makes of its numbers, names and pictures."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
-                raise InputError(path, "unpacks to more than 1 GiB", _DAMAGED)
-            meta = json.loads(archive.read("meta.json"))
-            if meta.get("version") != 2:
-                problem = f"is SOG of version {meta.get('version', 1)!r:.20}"
-                raise InputError(path, problem, "version 2 is read; save it with a newer SplatTransform, or as PLY")
-            return _gaussians(archive, meta, path)
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        KeyError,
-        IndexError,
-        TypeError,
-        ValueError,
-        OSError,
-        AttributeError,
-    ) as error:
-        raise InputError(path, f"is damaged SOG ({error!r:.120})", _DAMAGED) from None
-    except (RecursionError, NotImplementedError, RuntimeError, OverflowError, Image.DecompressionBombError) as error:
+        yield
+    except (zipfile.BadZipFile, zlib.error, RecursionError, Image.DecompressionBombError, *_FAULTS) as error:
         raise InputError(path, f"is damaged SOG ({error!r:.120})", _DAMAGED) from None
 
 
-def _gaussians(archive: zipfile.ZipFile, meta: dict[str, Any], path: Path) -> GaussianArrays:
+def gaussians_of_files(read: Callable[[str], bytes], path: Path) -> GaussianArrays:
+    """Return the Gaussians of a SOG of version 2.
+
+    Args:
+        read: returns the content of a file of the SOG.
+        path: to name in errors.
+    """
+    meta = json.loads(read("meta.json"))
+    if meta.get("version") != 2:
+        problem = f"is SOG of version {meta.get('version', 1)!r:.20}"
+        raise InputError(path, problem, "version 2 is read; save it with a newer SplatTransform, or as PLY")
+    return _gaussians(read, meta, path)
+
+
+def _gaussians(read: Callable[[str], bytes], meta: dict[str, Any], path: Path) -> GaussianArrays:
     count = int(meta["count"])
     if not 0 < count <= _MOST_PIXELS:
         raise ValueError(f"count {count}")
 
     def texels(part: str, index: int = 0) -> np.ndarray:
-        values = _picture(archive, meta[part]["files"][index]).reshape(-1, 4)
+        values = _picture(read, meta[part]["files"][index]).reshape(-1, 4)
         if len(values) < count:
             raise ValueError(f"{part} has {len(values)} texels for {count} Gaussians")
         return values[:count]
@@ -154,7 +167,7 @@ def _gaussians(archive: zipfile.ZipFile, meta: dict[str, Any], path: Path) -> Ga
     harmonics[:, 0] = levels("sh0")[color[:, :3]]
     if degree:
         columns = texels("shN", 1).astype(int)
-        entries = _picture(archive, meta["shN"]["files"][0])
+        entries = _picture(read, meta["shN"]["files"][0])
         entries = entries.reshape(len(entries) * _ACROSS, _COEFFICIENTS[degree], 4)[..., :3]
         harmonics[:, 1:] = levels("shN")[entries[columns[:, 0] + 256 * columns[:, 1]]]
     return GaussianArrays(
@@ -169,8 +182,8 @@ def _gaussians(archive: zipfile.ZipFile, meta: dict[str, Any], path: Path) -> Ga
     )
 
 
-def _picture(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    with Image.open(io.BytesIO(archive.read(name)), formats=["WEBP", "PNG"]) as image:
+def _picture(read: Callable[[str], bytes], name: str) -> np.ndarray:
+    with Image.open(io.BytesIO(read(name)), formats=["WEBP", "PNG"]) as image:
         if image.width * image.height > _MOST_PIXELS:
             raise ValueError(f"{name} has {image.width} x {image.height} pixels")
         return np.asarray(image.convert("RGBA"))

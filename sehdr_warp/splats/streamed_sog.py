@@ -1,0 +1,119 @@
+"""Streamed SOG (PlayCanvas), version 1: a folder of SOG chunks with a tree of their bounds in lod-meta.json.
+
+Viewers load the chunks that a camera sees. The specification is public
+(developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog); each chunk is SOG whose files are not
+zipped. One level of detail is written, and the finest is read.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..errors import InputError
+from ..files import atomic_folder, contained, read_bytes, read_json
+from .arrays import GaussianArrays
+from .sog import gaussians_of_files, refusing_damage, sog_files
+
+NAME = "lod-meta.json"
+CHUNK = 1 << 18  # Largest number of Gaussians of a chunk
+DEVIATIONS = 3.0  # Size of a Gaussian in bounds, standard deviations
+_MOST_NODES = 1 << 20
+_DAMAGED = "export it again"
+
+
+def write_streamed_sog(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
+    """Write lod-meta.json and its chunks, which take the folder of the file for themselves.
+
+    Arguments as in write_gaussians.
+    """
+    chunks: list[np.ndarray] = []
+    half = _half_sizes(gaussians)
+    tree = _node(gaussians.means.astype(np.float64), half, np.arange(gaussians.count), chunks)
+    names = [f"0_{number}" for number in range(len(chunks))]
+    meta = {
+        "version": 1,
+        "asset": {"generator": f"sehdr-warp {__version__}"},
+        "count": gaussians.count,
+        "counts": [gaussians.count],
+        "lodLevels": 1,
+        "filenames": [f"{name}/meta.json" for name in names],
+        "tree": tree,
+    }
+    with atomic_folder(path.parent, overwrite) as folder:
+        for name, rows in zip(names, chunks, strict=True):
+            (folder / name).mkdir()
+            for file, content in sog_files(gaussians.rows(rows)):
+                (folder / name / file).write_bytes(content.encode() if isinstance(content, str) else content)
+        (folder / path.name).write_text(json.dumps(meta), encoding="utf-8")
+
+
+def read_streamed_sog(path: Path) -> GaussianArrays:
+    """Read the Gaussians of the finest level of a streamed SOG."""
+    meta = read_json(path)
+    if meta.get("version", 1) != 1:
+        raise InputError(path, f"is streamed SOG of version {meta['version']!r:.20}", "version 1 is read")
+    with refusing_damage(path):
+        parts: dict[int, list[tuple[int, int]]] = {}
+        nodes = [meta["tree"]]
+        for count, node in enumerate(_walk(nodes)):
+            if count > _MOST_NODES:
+                raise ValueError(f"more than {_MOST_NODES} nodes")
+            if "lods" in node and "0" in node["lods"]:
+                part = node["lods"]["0"]
+                parts.setdefault(int(part["file"]), []).append((int(part["offset"]), int(part["count"])))
+        found: list[GaussianArrays] = []
+        for index, ranges in sorted(parts.items()):
+            chunk = contained(path.parent, meta["filenames"][index], path)
+            folder = chunk.parent
+            gaussians = gaussians_of_files(lambda name, folder=folder: read_bytes(contained(folder, name, path)), chunk)
+            rows = np.concatenate([np.arange(start, start + count) for start, count in ranges])
+            found.append(gaussians.rows(rows))
+        if not found:
+            raise ValueError("no node has Gaussians of level 0")
+    return merged_chunks(found)
+
+
+def merged_chunks(parts: list[GaussianArrays]) -> GaussianArrays:
+    """Return the Gaussians of all chunks, with the highest degree of any of them."""
+    degree = max(part.degree for part in parts)
+    parts = [part.padded(degree) for part in parts]
+    arrays = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    first = parts[0]
+    return GaussianArrays(
+        **joined, color_model=first.color_model, base_time=first.base_time, world_matrix=first.world_matrix
+    )
+
+
+def _walk(nodes: list[dict]):
+    """Yield all nodes of a tree."""
+    while nodes:
+        node = nodes.pop()
+        nodes += node.get("children", [])
+        yield node
+
+
+def _node(means: np.ndarray, half: np.ndarray, rows: np.ndarray, chunks: list[np.ndarray]) -> dict[str, Any]:
+    """Return the node of some rows, split along its longest side until chunks are small enough."""
+    low, high = (means[rows] - half[rows]).min(axis=0), (means[rows] + half[rows]).max(axis=0)
+    node: dict[str, Any] = {"bound": {"min": low.tolist(), "max": high.tolist()}}
+    if len(rows) <= CHUNK:
+        node["lods"] = {"0": {"file": len(chunks), "offset": 0, "count": len(rows)}}
+        chunks.append(rows)
+        return node
+    axis = int(np.argmax(np.ptp(means[rows], axis=0)))
+    order = np.argpartition(means[rows, axis], len(rows) // 2)
+    halves = rows[order[: len(rows) // 2]], rows[order[len(rows) // 2 :]]
+    node["children"] = [_node(means, half, part, chunks) for part in halves]
+    return node
+
+
+def _half_sizes(gaussians: GaussianArrays) -> np.ndarray:
+    """Return half the size [N, 3] of the boxes around the Gaussians, float64."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_quat(np.roll(gaussians.unit_quaternions, -1, axis=1)).as_matrix()
+    return DEVIATIONS * np.sqrt(np.einsum("nij,nj->ni", turns**2, np.exp(2.0 * gaussians.log_scales)))

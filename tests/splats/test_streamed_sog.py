@@ -1,0 +1,84 @@
+"""Streamed SOG: chunks that are near in space, a tree whose bounds hold, and what other programs write."""
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.splats import read_gaussians, streamed_sog, write_gaussians
+
+from .test_compressed_files import assert_alike, natural
+from .test_npm_parsers import package
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(streamed_sog, "CHUNK", 150)
+
+
+def leaves(node):
+    for child in node.get("children", []):
+        yield from leaves(child)
+    if "lods" in node:
+        yield node
+
+
+def test_chunks_are_read_as_one(tmp_path, small_chunks):
+    given, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, given)
+    meta = json.loads(path.read_text())
+    assert (meta["version"], meta["lodLevels"], meta["count"], meta["counts"]) == (1, 1, 600, [600])
+    nodes = list(leaves(meta["tree"]))
+    assert len(nodes) == len(meta["filenames"]) == 4
+    for node in nodes:
+        part = node["lods"]["0"]
+        chunk = json.loads((path.parent / meta["filenames"][part["file"]]).read_text())
+        assert chunk["version"] == 2 and chunk["count"] == part["count"] == 150 and part["offset"] == 0
+    read = read_gaussians(path)
+    assert (read.degree, read.base_time) == (3, 0.25)
+    assert_alike(given, read, harmonics=0.06)
+    with pytest.raises(InputError, match="exists already"):
+        write_gaussians(path, given)
+    write_gaussians(path, given, overwrite=True)
+
+
+def test_bounds_hold_the_gaussians_of_their_chunks(tmp_path, small_chunks):
+    given, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, given)
+    meta, volume = json.loads(path.read_text()), 0.0
+    for node in leaves(meta["tree"]):
+        low, high = (np.array(node["bound"][name]) for name in ("min", "max"))
+        inside = ((given.means >= low) & (given.means <= high)).all(1)
+        assert inside.sum() >= 150
+        volume += np.prod(high - low)
+    whole = meta["tree"]["bound"]
+    assert volume < 2.5 * np.prod(np.subtract(whole["max"], whole["min"])), "chunks are compact"
+
+
+def test_levels_of_other_programs(tmp_path, small_chunks):
+    """The finest level is read, also where nodes share a chunk; a damaged index is refused."""
+    given, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, given)
+    meta = json.loads(path.read_text())
+    node = next(leaves(meta["tree"]))
+    first = {"file": node["lods"]["0"]["file"], "offset": 0, "count": 40}
+    second = first | {"offset": 40, "count": 60}
+    node["children"] = [{"bound": node["bound"], "lods": {"0": each, "1": first}} for each in (first, second)]
+    del node["lods"]
+    path.write_text(json.dumps(meta))
+    assert read_gaussians(path).count == 550
+    for change in ({"filenames": ["../../x/meta.json"] * 4}, {"tree": {}}, {"version": 7}, {"tree": {"lods": 3}}):
+        path.write_text(json.dumps(meta | change))
+        with pytest.raises(InputError):
+            read_gaussians(path)
+
+
+def test_splat_transform_reads_them(tmp_path, small_chunks):
+    tool = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
+    given, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, given)
+    chunk = path.parent / "0_0" / "meta.json"
+    subprocess.run(["node", tool, chunk, tmp_path / "b.ply"], check=True, capture_output=True)
+    assert read_gaussians(tmp_path / "b.ply").count == 150
