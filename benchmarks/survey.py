@@ -8,6 +8,7 @@ layout of nerfstudio (transforms.json).
 import argparse
 import json
 import math
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from plyfile import PlyData, PlyElement
 
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
+from sehdr_warp.parallel import prefetch_map
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, codes_of, look_at
 
@@ -106,13 +108,19 @@ def write_survey(
     points, log_exposures = make_town(gaussians, length, width, seed)
     field = make_field(points, log_exposures, 2 * area, device)
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    frames = []
-    for index, camera in enumerate(make_cameras(views, size, length, width)):
-        photo = field.render_ldr(camera).cpu().numpy()
-        name = f"images/photo_{index:05d}.png"
-        Image.fromarray(codes_of(photo, 8)).save(folder / name, compress_level=1)
-        pose = camera.camera_to_world @ OPENGL
-        frames.append({"file_path": name, "transform_matrix": pose.tolist(), "exposure_time": TIME})
+    cameras = make_cameras(views, size, length, width)
+    names = [f"images/photo_{index:05d}.png" for index in range(views)]
+    photos = (codes_of(field.render_ldr(camera).cpu().numpy(), 8) for camera in cameras)
+
+    def save(photo: tuple[str, np.ndarray]) -> None:
+        Image.fromarray(photo[1]).save(folder / photo[0], compress_level=1)
+
+    deque(prefetch_map(save, zip(names, photos), ahead=32), maxlen=0)
+    frames = [
+        {"file_path": name, "transform_matrix": (camera.camera_to_world @ OPENGL).tolist(), "exposure_time": TIME}
+        for name, camera in zip(names, cameras)
+    ]
+    camera = cameras[0]
     kept = np.random.default_rng(seed).permutation(len(points))[: 40 * views]
     colors = codes_of(field.response.encode(np.exp(log_exposures[kept])), 8) / 255
     _write_points(folder / "points.ply", points[kept], colors)

@@ -21,7 +21,7 @@ from ..runs.config_files import override_config
 from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter, write_confidence
 from ..scene.normalization import Normalization
-from ..splats.packing import morton_order
+from ..splats.packing import compact_order
 from .block_plan import BlockPlan
 from .job import folder_of
 
@@ -113,7 +113,7 @@ def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:
     points = own.scene_points(gaussians["means"].numpy())
     inside = np.flatnonzero(plan.division.block_of(points) == index)
     points = plan.normalization.points(points[inside]).astype(np.float32)
-    order = morton_order(points)
+    order = compact_order(points)
     rows = torch.from_numpy(inside[order])
     gaussians = {name: tensor[rows] for name, tensor in gaussians.items()}
     gaussians["means"] = torch.from_numpy(points[order])

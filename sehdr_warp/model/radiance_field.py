@@ -131,6 +131,11 @@ class RadianceField(nn.Module):
         self.antialiased, self.deterministic = antialiased, deterministic
         self.register_buffer("confidence", None, persistent=False)
 
+    @property
+    def render_device(self) -> torch.device:
+        """Device that pictures are rendered on."""
+        return self.gaussians.means.device
+
     def camera_tensors(self, camera: Camera) -> CameraTensors:
         """Return a camera of scene coordinates in those of the Gaussians, on their device."""
         return CameraTensors.of(self.normalization.camera(camera), self.gaussians.means.device)

@@ -16,6 +16,7 @@ from ..model.exposure import exposure_times
 from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.lights import Light, find_lights
+from ..model.paged_field import PagedField
 from ..model.radiance_field import RadianceField, RenderedView, Surroundings
 from ..model.sensor_colors import rec709_of
 from ..response import Response
@@ -30,6 +31,8 @@ from .run_folder import CameraEntry, RunFolder
 from .run_writer import write_confidence
 
 log = logging.getLogger(__name__)
+
+MEMORY_SHARE = 0.8  # Largest part of a GPU's free memory that the Gaussians of a picture take
 
 
 class _RenderedScene:
@@ -57,8 +60,8 @@ class _RenderedScene:
 
     @property
     def device(self) -> torch.device:
-        """Device of the Gaussians."""
-        return self.model.gaussians.means.device
+        """Device that pictures are rendered on."""
+        return self.model.render_device
 
     def normalize_photos(self, scene: Scene) -> Scene:
         """Return a scene with the exposure compensation that the run was trained with."""
@@ -152,7 +155,7 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
     """
     path = Path(path)
     gaussians = read_gaussians(path)
-    model = field_of(gaussians).to(device)
+    model = on_device(field_of(gaussians), torch.device(device))
     own, shared, cameras = path.with_name(f"{path.stem}.cameras.json"), path.with_name("cameras.json"), ()
     beside = next((file for file in (own, shared) if file.is_file()), None)
     if beside is not None:
@@ -279,7 +282,27 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
     model = field_from_checkpoint(checkpoint, config, info)
     model.confidence = folder.read_confidence(checkpoint)
-    return Run(folder, config, model.to(device).requires_grad_(False), info, checkpoint.values)
+    return Run(folder, config, on_device(model.requires_grad_(False), torch.device(device)), info, checkpoint.values)
+
+
+def on_device(model: RadianceField, device: torch.device, budget: int | None = None) -> RadianceField:
+    """Return a field on a device; if its Gaussians are too many for a GPU, one that copies those that are in view.
+
+    Args:
+        model: The field, on the CPU.
+        device: The device.
+        budget: Bytes of the device's memory that pictures may take; by default MEMORY_SHARE of what is free on a GPU.
+    """
+    if budget is None and device.type == "cuda":
+        budget = int(MEMORY_SHARE * torch.cuda.mem_get_info(device)[0])
+    paged = None if budget is None else PagedField(model, device, budget)
+    if paged is None or paged.row_bytes * model.gaussians.count <= paged.budget:
+        return model.to(device)
+    log.info(
+        "%d Gaussians do not fit into %.1f GB of %s: those in view are copied to it, far ones at less detail",
+        *(model.gaussians.count, paged.budget / 1e9, device),
+    )
+    return paged.requires_grad_(False)
 
 
 def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, base_time: float) -> RenderedView:

@@ -1,0 +1,240 @@
+"""A radiance field whose Gaussians do not fit into the memory of a GPU: those that a camera may see are copied to it.
+
+The rows are cut into cells. Rows of a merged run are in an order in which neighbours in space are neighbours in memory,
+so cells are compact; in another order the result is the same, but fewer cells can be left out. Cells outside of the
+field of view are left out. If the others do not fit into the budget, the farthest are taken at a lower level of detail:
+LEVEL_STEP neighbouring Gaussians become one, with their mean and covariance.
+"""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ..errors import SehdrError
+from ..scene import Camera
+from .gaussians import Gaussians
+from .radiance_field import RadianceField, RenderedView, Surroundings
+
+CELL = 1 << 16  # Gaussians of a cell
+DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its cell, standard deviations
+LEVEL_STEP = 8
+MOST_OPACITY = 0.99  # Of a Gaussian that stands for several
+RENDER_BYTES = 240  # Of a Gaussian during a render, beside its parameters: features, projections, intersections
+
+
+class PagedField(RadianceField):
+    """A RadianceField that renders on a device with a limited memory; its Gaussians stay on the CPU.
+
+    Attributes:
+        budget: Bytes that the Gaussians of one picture may take there.
+    """
+
+    def __init__(self, field: RadianceField, device: torch.device, budget: int):
+        """Wrap a field on the CPU, to be rendered on a device; `budget` as in the attributes."""
+        super().__init__(
+            field.gaussians,
+            field.response.to(device) if isinstance(field.response, torch.nn.Module) else field.response,
+            base_time=field.base_time,
+            rasterizer=field.rasterizer,
+            radiance=field.color_model.name,
+            tone_map=field.tone_map,
+            fusion=None if field.fusion is None else field.fusion.to(device),
+            antialiased=field.antialiased,
+            deterministic=field.deterministic,
+            normalization=field.normalization,
+        )
+        self.confidence = field.confidence
+        self._device, self.budget = device, budget
+        means = field.gaussians.means.detach()
+        reach = DEVIATIONS * field.gaussians.log_scales.detach().amax(1, keepdim=True).exp()
+        self._low = torch.stack([part.amin(0) for part in (means - reach).split(CELL)]).double().numpy()
+        self._high = torch.stack([part.amax(0) for part in (means + reach).split(CELL)]).double().numpy()
+        self._pages: OrderedDict[tuple[int, int], dict[str, Tensor]] = OrderedDict()
+
+    @property
+    def render_device(self) -> torch.device:
+        """Device that pictures are rendered on."""
+        return self._device
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a Gaussian on the device: twice its parameters, as they are joined for a picture, and its render."""
+        return 8 * (14 + 3 * self.gaussians.harmonics_rest.shape[1]) + RENDER_BYTES
+
+    def levels(self, camera: Camera | None, position: np.ndarray) -> list[tuple[int, int]]:
+        """Return the cells to render, and whether at full detail (0) or at a lower level (1).
+
+        Args:
+            camera: The camera, in scene coordinates; None for one that looks everywhere.
+            position: [3] scene coordinates, from which distances are measured.
+        """
+        inside = np.ones(len(self._low), bool)
+        if camera is not None and camera.is_pinhole:
+            inside = boxes_in_view(self.normalization.camera(camera), self._low, self._high)
+        cells = np.flatnonzero(inside)
+        place = self.normalization.points(position)
+        nearest = np.clip(place, self._low[cells], self._high[cells])
+        cells = cells[np.argsort(np.linalg.norm(nearest - place, axis=1), kind="stable")]
+        counts = np.minimum(CELL, self.gaussians.count - CELL * cells)
+        rows = self.budget // self.row_bytes
+        # Detail from the nearest cell on, as far as all others still fit at the lower level.
+        coarse = -(-counts // LEVEL_STEP)
+        remaining = coarse.sum() - np.cumsum(coarse)
+        full = np.cumsum(counts) + remaining <= rows
+        number = int(full.sum())
+        if not number and len(cells):
+            needed = int(coarse.sum()) * self.row_bytes
+            raise SehdrError(
+                f"out of memory: {coarse.sum()} Gaussians at the lower level of detail need {needed / 1e9:.1f} GB on "
+                f"{self.render_device}, and {self.budget / 1e9:.1f} GB may be used; use a larger GPU or --device cpu"
+            )
+        return [(int(cell), int(place >= number)) for place, cell in enumerate(cells)]
+
+    def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
+        """Render the HDR view of a camera, as RadianceField.render."""
+        return self._part(self.levels(camera, camera.position)).render(camera, degree=degree)
+
+    def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
+        """Render a simulated photo, as RadianceField.render_ldr."""
+        return self._part(self.levels(camera, camera.position)).render_ldr(camera, exposure_time, degree=degree)
+
+    def render_mean(self, camera: Camera, values: Tensor) -> Tensor:
+        """Render the mean of values [N], as RadianceField.render_mean."""
+        levels = self.levels(camera, camera.position)
+        part, rows = self._part(levels), self._rows(levels)
+        return part.render_mean(camera, values.cpu()[rows].to(self.render_device))
+
+    def render_directions(
+        self, position: np.ndarray, directions: Tensor, *, without: Sequence[Tensor] = (), **options: Any
+    ) -> Surroundings:
+        """Render along directions, as RadianceField.render_directions."""
+        if any(len(index) for index in without):
+            raise SehdrError("lights of a scene that does not fit into the GPU cannot be left out; use --device cpu")
+        levels = self.levels(None, position)
+        if options.get("shares") is not None:
+            options["shares"] = options["shares"].cpu()[self._rows(levels)].to(self.render_device)
+        return self._part(levels).render_directions(position, directions, **options)
+
+    def _part(self, levels: list[tuple[int, int]]) -> RadianceField:
+        """Return the field of some cells, on the device."""
+        pages = [self._page(key) for key in levels]
+        # Pages beyond the budget that this picture does not need are dropped, the longest unused first.
+        rows = sum(len(page["means"]) for page in self._pages.values())
+        for key in list(self._pages):
+            if rows * self.row_bytes <= self.budget or key in set(levels):
+                break
+            rows -= len(self._pages.pop(key)["means"])
+        if not pages:
+            pages = [self._empty()]
+        joined = {name: torch.cat([page[name] for page in pages]) for name in pages[0]}
+        confidence = joined.pop("confidence", None)
+        part = RadianceField(
+            Gaussians(**joined),
+            self.response,
+            base_time=self.base_time,
+            rasterizer=self.rasterizer,
+            radiance=self.color_model.name,
+            tone_map=self.tone_map,
+            fusion=self.fusion,
+            antialiased=self.antialiased,
+            deterministic=self.deterministic,
+            normalization=self.normalization,
+        ).requires_grad_(False)
+        part.confidence = confidence
+        return part
+
+    def _page(self, key: tuple[int, int]) -> dict[str, Tensor]:
+        """Return a cell at a level of detail on the device, copied there if it is not there yet."""
+        if key not in self._pages:
+            cell, level = key
+            rows = slice(cell * CELL, (cell + 1) * CELL)
+            page = {name: tensor[rows] for name, tensor in self.gaussians.tensors().items()}
+            page = coarser(page) if level else page
+            if self.confidence is not None:
+                page["confidence"] = self.confidence[rows][:: LEVEL_STEP if level else 1]
+            self._pages[key] = {name: tensor.to(self.render_device) for name, tensor in page.items()}
+        self._pages.move_to_end(key)
+        return self._pages[key]
+
+    def _slice(self, key: tuple[int, int]) -> slice:
+        """Return the rows of a cell at a level of detail."""
+        cell, level = key
+        return slice(cell * CELL, min((cell + 1) * CELL, self.gaussians.count), LEVEL_STEP if level else 1)
+
+    def _rows(self, levels: list[tuple[int, int]]) -> Tensor:
+        """Return the indices of the rows of some cells."""
+        parts = [torch.arange(part.start, part.stop, part.step) for part in map(self._slice, levels)]
+        return torch.cat(parts) if parts else torch.zeros(1, dtype=torch.int64)
+
+    def _empty(self) -> dict[str, Tensor]:
+        """Return one transparent Gaussian, for a camera that sees nothing."""
+        page = {name: tensor[:1].to(self.render_device) for name, tensor in self.gaussians.tensors().items()}
+        page["opacity_logits"] = torch.full_like(page["opacity_logits"], -20.0)
+        if self.confidence is not None:
+            page["confidence"] = self.confidence[:1].to(self.render_device)
+        return page
+
+
+def coarser(page: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return Gaussians that each stand for LEVEL_STEP consecutive ones: their mean, covariance, color and coverage.
+
+    Args:
+        page: Parameters of N Gaussians on the CPU, neighbours in space one after the other.
+
+    Returns:
+        Parameters of N / LEVEL_STEP Gaussians, rounded up.
+    """
+    count = len(page["means"])
+    groups = torch.arange(count) // LEVEL_STEP
+    number = int(groups[-1]) + 1
+    scales = page["log_scales"].double().exp()
+    areas = scales.sort(dim=1).values[:, 1:].prod(1)
+    weights = torch.sigmoid(page["opacity_logits"].double()) * areas
+    totals = torch.zeros(number, dtype=torch.float64).index_add_(0, groups, weights)
+    shares = weights / totals[groups].clamp_min(1e-300)
+
+    def mean(values: Tensor) -> Tensor:
+        flat = values.double().reshape(count, -1) * shares[:, None]
+        summed = torch.zeros(number, flat.shape[1], dtype=torch.float64).index_add_(0, groups, flat)
+        return summed.reshape(number, *values.shape[1:])
+
+    means = mean(page["means"])
+    turns = Rotation.from_quat(np.roll(page["quaternions"].double().numpy(), -1, axis=1)).as_matrix()
+    axes = torch.from_numpy(turns) * scales[:, None, :]
+    offsets = page["means"].double() - means[groups]
+    squares, vectors = torch.linalg.eigh(mean(axes @ axes.mT + offsets[:, :, None] * offsets[:, None, :]))
+    vectors[:, :, 2] *= torch.linalg.det(vectors).sign()[:, None]
+    log_scales = 0.5 * squares.clamp_min(1e-20).log()
+    coverage = totals / log_scales[:, 1:].sum(1).exp()  # Eigenvalues ascend.
+    quaternions = np.roll(Rotation.from_matrix(vectors.numpy()).as_quat(), 1, axis=1)
+    values = {
+        "means": means,
+        "log_scales": log_scales,
+        "quaternions": torch.from_numpy(quaternions),
+        "opacity_logits": torch.logit(coverage.clamp(1e-6, MOST_OPACITY)),
+        "harmonics_dc": mean(page["harmonics_dc"]),
+        "harmonics_rest": mean(page["harmonics_rest"]),
+    }
+    return {name: tensor.to(torch.float32) for name, tensor in values.items()}
+
+
+def boxes_in_view(camera: Camera, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return which boxes [B, 3] a pinhole camera may see: a bool [B]; some that it does not see may be included."""
+    middle, half = (low + high) / 2, (high - low) / 2
+    edges = np.array(
+        [
+            [camera.fx, 0, camera.cx],  # Left: fx x + cx z >= 0
+            [-camera.fx, 0, camera.width - camera.cx],
+            [0, camera.fy, camera.cy],
+            [0, -camera.fy, camera.height - camera.cy],
+            [0, 0, 1],
+        ]
+    )
+    normals = edges @ camera.world_to_camera[:3, :3]
+    inside = (middle - camera.position) @ normals.T + half @ np.abs(normals).T >= 0
+    return inside.all(axis=1)
