@@ -1,6 +1,6 @@
 """The command line of `sehdr-warp train`.
 
-torch is imported when they run.
+torch is imported when it runs.
 """
 
 import json
