@@ -12,10 +12,7 @@ import logging
 import math
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,6 +29,7 @@ from ..own_files import is_sealed
 from ..parallel import run_interruptibly, signals_kept
 from ..progress import Stage, stage, tracked
 from .colmap_model import SparseModel, read_model
+from .colmap_rows import counted_rows
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from .photo_checks import left_out
 from .photos import read_photo
@@ -280,44 +278,6 @@ def _show_features(progress: Stage, done: int) -> None:
         count, seconds = progress.total, progress.seconds / done
         progress.later = seconds * (_PAIR_COST * len(_pairs(count)) + _PLACE_COST * count)
         progress.update(done)
-
-
-@contextlib.contextmanager
-def counted_rows(database: Path, table: str, show: Callable[[int], None]) -> Iterator[None]:
-    """Call show() with the rows of a table of COLMAP's database every half second while the block writes to it.
-
-    Another process reads them: two copies of SQLite in one process, COLMAP's and Python's, break each other's locks.
-    """
-    words = (sys.executable, "-I", "-S", "-c", _COUNT_ROWS, database.resolve().as_uri(), table)
-    try:
-        counter = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    except OSError:  # As where no more processes may be started: the work goes on without.
-        yield
-        return
-
-    def read() -> None:
-        for line in counter.stdout or ():
-            show(int(line))
-
-    reader = threading.Thread(target=read, name="sehdr-warp counts", daemon=True)
-    with counter:
-        reader.start()
-        try:
-            yield
-        finally:
-            counter.kill()
-            reader.join()
-
-
-_COUNT_ROWS = """
-import contextlib, sqlite3, sys, time
-place, table = sys.argv[1:]
-while True:
-    with contextlib.suppress(sqlite3.Error):
-        with contextlib.closing(sqlite3.connect(place + "?mode=ro", uri=True, timeout=0.1)) as database:
-            print(database.execute("SELECT COUNT(*) FROM " + table).fetchone()[0], flush=True)
-    time.sleep(0.5)
-"""
 
 
 def _pairs(count: int) -> set[tuple[int, int]]:

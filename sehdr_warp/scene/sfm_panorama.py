@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..parallel import run_interruptibly
 from ..progress import stage, tracked
 from .colmap_model import ModelImage, SparseModel, read_points
+from .colmap_rows import counted_rows
 from .dataparser import PointCloud
 from .images import open_image
 from .lens import Lens
@@ -28,7 +29,6 @@ from .sfm import (
     Reconstruction,
     cache_key,
     cached_result,
-    counted_rows,
     file_digest,
     image_name,
     quiet_colmap,
