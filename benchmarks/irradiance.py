@@ -74,7 +74,7 @@ def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Came
         {"median", "percentile_90", "places": the median of each place, "directions": how many count}. Figures are None
         without maps or directions that count.
     """
-    focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras])) if cameras else 1.0
+    focal = typical_focal(cameras)
     per_map = [_errors(run, each, focal, scale) for each in maps]
     errors = np.concatenate([*per_map, np.zeros(0)])
     summary = {"median": None, "percentile_90": None, "places": [], "directions": len(errors)}
@@ -84,12 +84,28 @@ def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Came
     return summary
 
 
-def _errors(run: Any, truth: LightMap, focal: float, scale: float) -> np.ndarray:
+@torch.no_grad()
+def rendered_map(run: Any, truth: LightMap, focal: float, without: Sequence[torch.Tensor] = ()) -> np.ndarray:
+    """Return [H, W, 3] radiance of a run at the place and in the pixels of a map of the truth.
+
+    focal: pixels, of the training cameras. without: groups of Gaussians that give no light.
+    """
     height, width = truth.seen.shape
     fine = FINER * width
-    options = {"focal_length": focal, "pixel_angle": 2 * np.pi / fine}
-    light = run.render_directions(truth.position, latlong(fine), **options).hdr.mean(2).cpu().numpy()
-    light = scale * light.reshape(height, FINER, width, FINER).mean(axis=(1, 3))
+    options: dict[str, Any] = {"focal_length": focal, "pixel_angle": 2 * np.pi / fine}
+    options |= {"without": without} if without else {}
+    light = run.render_directions(truth.position, latlong(fine), **options).hdr.cpu().numpy()
+    return light.reshape(height, FINER, width, FINER, 3).mean(axis=(1, 3))
+
+
+def typical_focal(cameras: Sequence[Camera]) -> float:
+    """Return the median focal length of cameras, in pixels; 1 without cameras."""
+    return float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras])) if cameras else 1.0
+
+
+def _errors(run: Any, truth: LightMap, focal: float, scale: float) -> np.ndarray:
+    width = truth.seen.shape[1]
+    light = scale * rendered_map(run, truth, focal).mean(2)
     weight = truth.seen * solid_angles(width, "latlong")
     facing = np.maximum(sphere_directions(NORMALS) @ latlong(width).reshape(-1, 3).T, 0)
     rendered, true, coverage = (facing @ (each * weight).ravel() for each in (light, truth.radiance.mean(2), 1.0))

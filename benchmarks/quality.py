@@ -20,6 +20,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from benchmarks.irradiance import irradiance_errors, read_light_maps
+from benchmarks.stored_light import LIGHT, store_light
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.metrics import REGIONS
@@ -330,7 +331,9 @@ def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
     figures = evaluate(run, scene, lpips_weights=lpips if config["lpips"] else None)
     figures.pop("views")
     light_inputs = read_light_maps(_folder(job.place)), [view.camera for view in scene.train_views]
-    figures["irradiance"] = irradiance_errors(run, *light_inputs, figures["protocol"]["aligned"]["scale"] or 1.0)
+    scale = figures["protocol"]["aligned"]["scale"] or 1.0
+    figures["irradiance"] = irradiance_errors(run, *light_inputs, scale)
+    store_light(folder / LIGHT, run, *light_inputs, scale)
     figures |= {"response": run.response.name, "peak_memory_bytes": peak}
     figures["renders_per_second"] = _render_rate(run, scene)
     curve = run.metrics()
