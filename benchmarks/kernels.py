@@ -144,7 +144,7 @@ def _rows(scene: SplatScene, peer: bool, repetitions: int) -> list[dict]:
         variants = {key: splat_variant(call, scene, backward) for key, call in renderers.items()}
         if scene.device.type == "cuda":
             variants[RECORDED] = Variant(_recorded(scene, scene.cotangent() if backward else None))
-        timings = time_variants(variants, scene.device, repetitions=repetitions)
+        timings = time_variants(variants, scene.device, repetitions=repetitions, apart=True)
         for key, timing in timings.items():
             row = place | {"channels": scene.channels, "pass": name, "implementation": key, "entries": entries}
             variant = variants[key] if scene.device.type == "cpu" else _from_the_start(variants[key])

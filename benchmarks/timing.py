@@ -37,13 +37,18 @@ class Variant:
 
 
 def time_variants(
-    variants: dict[str, Variant], device: torch.device, *, repetitions: int = 30, budget: float = BUDGET
+    variants: dict[str, Variant],
+    device: torch.device,
+    *,
+    repetitions: int = 30,
+    budget: float = BUDGET,
+    apart: bool = False,
 ) -> dict[str, dict]:
     """Time variants in turns; see summary().
 
     On a GPU an event stands before and after each run, with the device idle before, so that the host's time counts if
-    it is the limit. A summary then has also `host_ms`, the median until a run returns to Python, and `device_ms`, the
-    time of its kernels without what passes between them.
+    it is the limit. If `apart`, a summary then has also `host_ms`, the median until a run returns to Python, and
+    `device_ms`, the time of its kernels without what passes between them.
     """
     samples: dict[str, list[float]] = {name: [] for name in variants}
     returned: dict[str, list[float]] = {name: [] for name in variants}
@@ -63,10 +68,9 @@ def time_variants(
                 samples[name].append(whole)
                 returned[name].append(host)
     summaries = {name: summary(values) for name, values in samples.items()}
-    if device.type == "cuda":
+    if apart and device.type == "cuda":
         for name, variant in variants.items():
-            apart = {"host_ms": statistics.median(returned[name]), "device_ms": kernel_milliseconds(variant)}
-            summaries[name] |= apart
+            summaries[name] |= {"host_ms": statistics.median(returned[name]), "device_ms": kernel_milliseconds(variant)}
     return summaries
 
 
