@@ -137,23 +137,44 @@ def blend_on_cpu(
     launch(
         blend_cpu.forward_kernel(*kind),
         tile_count,
-        *(lists.ranges, lists.gaussians, shapes, ellipses, *frame),
-        *(tile_transmittance, rows(channels, count), last, image.view(-1, channels), transmittance),
+        lists.ranges,
+        lists.gaussians,
+        shapes,
+        ellipses,
+        *frame,
+        tile_transmittance,
+        rows(channels, count),
+        last,
+        image.view(-1, channels),
+        transmittance,
         ranges=pieces,
     )
 
     def backward(by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
         if by_transmittance is None:
             by_transmittance = torch.zeros_like(transmittance)
-        # The kernel walks it back to the front in place.
-        walked = tile_transmittance.clone() if keeps_graph() else tile_transmittance
-        scratch = rows(count), rows(channels, count), rows(TILE_SIZE), rows(TILE_SIZE), rows(channels + 6)
+        # The kernel takes the transmittance back to the front, in place.
+        tile_state = tile_transmittance.clone() if keeps_graph() else tile_transmittance
         by_intersection = features.new_empty(lists.intersection_count, channels + 6)
         launch(
             blend_cpu.backward_kernel(*kind),
             tile_count,
-            *(lists.ranges, lists.gaussians, unsorted.places, shapes, ellipses, *frame, last),
-            *(by_image.view(-1, channels), by_transmittance, walked, *scratch, by_intersection),
+            lists.ranges,
+            lists.gaussians,
+            unsorted.places,
+            shapes,
+            ellipses,
+            *frame,
+            last,
+            by_image.view(-1, channels),
+            by_transmittance,
+            tile_state,
+            rows(count),
+            rows(channels, count),
+            rows(TILE_SIZE),
+            rows(TILE_SIZE),
+            rows(channels + 6),
+            by_intersection,
             ranges=pieces,
         )
         return gather_by_gaussian(unsorted, by_intersection)
@@ -189,9 +210,9 @@ def blend_on_cuda(
     """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also on fibers of the CPU)."""
     rows = pad_features(features)
     last = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
-    # Padded features are larger; few are kept so that they need not be padded again.
-    kept = rows if len(features) <= ONE_SORT else features
-    return BlockAdjoint(kept, image.shape[-1], lists, packed, transmittance, last, alpha_threshold, deterministic)
+    # Padded features take more memory; few Gaussians keep them, so that they need not be padded again.
+    saved = rows if len(features) <= ONE_SORT else features
+    return BlockAdjoint(saved, image.shape[-1], lists, packed, transmittance, last, alpha_threshold, deterministic)
 
 
 @dataclass(frozen=True)
@@ -244,7 +265,9 @@ class BlockAdjoint:
             self._kernel(),
             block_threads(self.lists, blend_cuda.BLOCKS_PER_TILE),
             *self._arguments(by_image, by_transmittance),
-            *(0, self.lists.gaussians, gathered),
+            0,
+            self.lists.gaussians,
+            gathered,
             whole=(by_image, by_transmittance, gathered),
             block_dim=blend_cuda.BLOCK_DIM,
         )
@@ -293,9 +316,24 @@ def blend_blocks(
     height, width, channels = image.shape
     last = torch.empty(height * width, dtype=torch.int32, device=rows.device)
     kernel = blend_cuda.forward_kernel(warp_scalar(rows.dtype), channels, rows.device.type == "cuda")
-    listed, frame = (lists.ranges, lists.gaussians, lists.corners), (lists.columns, width, height, alpha_threshold)
-    read = *listed, packed.shapes, packed.ellipses, rows.reshape(-1, 4), *frame
-    launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *read, image, transmittance, last)
+    launch_blocks(
+        kernel,
+        lists,
+        blend_cuda.BLOCKS_PER_TILE,
+        lists.ranges,
+        lists.gaussians,
+        lists.corners,
+        packed.shapes,
+        packed.ellipses,
+        rows.reshape(-1, 4),
+        lists.columns,
+        width,
+        height,
+        alpha_threshold,
+        image,
+        transmittance,
+        last,
+    )
     return last
 
 

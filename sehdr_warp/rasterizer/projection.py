@@ -127,7 +127,8 @@ def launch_projection(
         outputs: with a row for each Gaussian. The last one is 0 if a Gaussian is culled, and not differentiable.
     """
     count = inputs[0].shape[0]
-    launch(kernel, count, *inputs, *parameters, None, *outputs)
+    arguments = *inputs, *parameters, None, *outputs
+    launch(kernel, count, *arguments)
 
     def adjoint(
         inputs: Sequence[Tensor], culling: Tensor, upstream: Sequence[Tensor | None], results: Sequence[Tensor | None]
@@ -135,8 +136,8 @@ def launch_projection(
         gradients = *results, *(None,) * (len(parameters) + 1), *upstream
         # All Gaussians add to the camera's gradients: on the CPU one thread must.
         ranges = None if all(result is None for result in results[4:]) else single_range(count)
-        unread = (None,) * len(upstream)
-        launch(kernel, count, *inputs, *parameters, culling, *unread, gradients=gradients, ranges=ranges)
+        arguments = *inputs, *parameters, culling, *(None,) * len(upstream)
+        launch(kernel, count, *arguments, gradients=gradients, ranges=ranges)
 
     return with_projection_gradient(inputs, outputs, adjoint)
 

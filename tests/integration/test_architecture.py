@@ -120,6 +120,14 @@ def test_imports_go_down_the_line(path, package):
             assert package in ONLY_IN[top], f"{package} may not import {name}"
 
 
+@pytest.mark.parametrize("path,_", list(sources()))
+def test_no_call_unpacks_two_tuples(path, _):
+    """Nobody can tell which argument is which; name one tuple of arguments, or write them one by one."""
+    calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+    wrong = [node.lineno for node in calls if sum(isinstance(each, ast.Starred) for each in node.args) > 1]
+    assert not wrong, f"{path.relative_to(ROOT)}, lines {wrong}: pass the arguments one by one, or as one list"
+
+
 def test_the_page_names_files_and_functions_that_exist():
     section = (ROOT / "docs" / "architecture.md").read_text().partition("## Follow a command")[2].partition("## ")[0]
     named = {}
