@@ -22,7 +22,8 @@ def response_from_file(path: Path, selector: str | None = None) -> Response:
     curve's name where the file holds names. emor.txt (f = f0 + sum c_i h_i) and invemor.txt (the same for the inverse):
     coefficients c_1,c_2,... separated by commas, none for the mean curve. CSV or text: two columns, exposure and value,
     or four, exposure, red, green and blue; an optional line of headings, `#` comments. JSON: {"exposures": [...],
-    "values": [...]} or Response.to_dict's.
+    "values": [...]} or Response.to_dict's. A `.cube` LUT of one dimension: from light to codes, or with the selector
+    `decode` from codes to light.
 
     Raises:
         InputError: for a file that is missing, too large, of another content, or whose curve cannot be used.
@@ -33,6 +34,8 @@ def response_from_file(path: Path, selector: str | None = None) -> Response:
         return _emor(path, text, selector)
     if suffix == ".mat" or _is_dorf(text):
         return _select(path, responses_in_file(path), selector)
+    if suffix == ".cube":
+        return _cube(path, text, selector)
     if selector is not None:
         raise InputError(path, f"holds one curve, and {selector!r} asks for one of several", "leave out the selector")
     return _json_curve(path) if suffix == ".json" else _text_curve(path, text)
@@ -170,6 +173,28 @@ def _json_curve(path: Path) -> Response:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, f"has no two lists of numbers ({error!r})", remedy) from error
     return TabulatedResponse(str(fields.get("name", path.stem)), exposures, values, source=str(path))
+
+
+def _cube(path: Path, text: str, selector: str | None) -> Response:
+    """Read an Iridas/Adobe `.cube` LUT of one dimension; its axis is light, or codes if the selector is `decode`."""
+    remedy = "give a LUT of one dimension from light to codes, or one from codes to light as FILE.cube:decode"
+    if "LUT_3D_SIZE" in text:
+        raise InputError(path, "is a LUT of three dimensions, which mixes channels", remedy)
+    if selector not in (None, "decode"):
+        raise InputError(path, f"selector {selector!r:.40} is not 'decode'", remedy)
+    from colour.io.luts.iridas_cube import read_LUT_IridasCube
+
+    try:
+        lut = read_LUT_IridasCube(path)
+        low, high = np.asarray(lut.domain, np.float64)
+        table = np.asarray(lut.table, np.float64).reshape(-1, 3)
+    except (ValueError, IndexError, KeyError, AssertionError, TypeError) as error:
+        raise InputError(path, f"cannot be read as a .cube LUT ({error!s:.80})", remedy) from None
+    axis = np.linspace(low, high, len(table))
+    exposures, values = (table.T, axis.T) if selector == "decode" else (axis.T, table.T)
+    if np.ptp(exposures, axis=0).max() == 0 and np.ptp(values, axis=0).max() == 0:
+        return TabulatedResponse(path.stem, exposures[0], values[0], source=str(path))
+    return ChannelResponse(path.stem, exposures, values, source=str(path))
 
 
 def _text_curve(path: Path, text: str) -> Response:

@@ -58,7 +58,7 @@ def run_responses(args: Responses) -> None:
         print(json.dumps(names))
         return
     names["colour:NAME"] = "a camera's encoding of colour-science, such as colour:S-Log3"
-    names["FILE"] = "a curve in CSV, JSON or EMoR's layout, FILE:INDEX of DoRF's; `sehdr-warp calibrate` makes one"
+    names["FILE"] = "CSV, JSON, .cube or EMoR's layout, FILE:INDEX of DoRF's; `sehdr-warp calibrate` makes one"
     for name, meaning in names.items():
         print(f"{name:<12}  {meaning}")
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import Response, response_by_name, responses_in_file
-from sehdr_warp.response.table import FLAT_TILT, TabulatedResponse
+from sehdr_warp.response.table import FLAT_TILT, ChannelResponse, TabulatedResponse
 
 
 def dorf_text(curves: dict[str, np.ndarray]) -> str:
@@ -224,3 +224,39 @@ def test_photos_of_a_camera_whose_channels_differ(tmp_path):
         seen = scene.response.decode(scene.views[0].image.astype(float))
         row = seen[seen.shape[0] // 2, 4:-4:8]
         np.testing.assert_allclose(row, row[:, 1:2].repeat(3, 1), rtol=0.03)
+
+
+def cube(path, table, domain=(0, 1), size="LUT_1D_SIZE"):
+    low, high = (" ".join([str(value)] * 3) for value in domain)
+    rows = "".join(" ".join(map(str, row)) + "\n" for row in table)
+    path.write_text(f'TITLE "a camera"\n{size} {len(table)}\nDOMAIN_MIN {low}\nDOMAIN_MAX {high}\n{rows}')
+    return str(path)
+
+
+def test_cube_luts_from_light_to_codes_and_back(tmp_path):
+    light = np.linspace(0, 4, 400)
+    values = np.log1p(20 * light) / np.log1p(80)
+    encodes = response_by_name(cube(tmp_path / "a.cube", np.stack([values] * 3, 1), (0, 4)))
+    np.testing.assert_allclose(encodes.encode(light), values, atol=1e-4)
+    codes = np.linspace(0, 1, 500)
+    decoded = np.expm1(codes * np.log1p(80)) / 20
+    decodes = response_by_name(cube(tmp_path / "b.cube", np.stack([decoded] * 3, 1)) + ":decode")
+    np.testing.assert_allclose(decodes.decode(values[5:-5]), light[5:-5], rtol=5e-3)
+    assert not isinstance(decodes, ChannelResponse)
+
+
+def test_cube_luts_of_channels_that_differ(tmp_path):
+    light = np.linspace(0, 1, 64)
+    response = response_by_name(cube(tmp_path / "a.cube", np.stack([light**p for p in (0.4, 0.5, 0.6)], 1)))
+    assert isinstance(response, ChannelResponse)
+    np.testing.assert_allclose(response.curves[2].encode(light), light**0.6, atol=0.01)
+
+
+@pytest.mark.parametrize("options, words", [
+    ({"size": "LUT_3D_SIZE"}, "is a LUT of three dimensions, which mixes channels; give a LUT of one dimension"),
+    ({"table": [[0, 0, 0], [2, 2, 2], [3, 3, 3]]}, r"value 3 is outside \[0, 1\]"),
+    ({"table": [[0.0, 0.0, "x"]] * 3}, "cannot be read as a .cube LUT"),
+])  # fmt: skip
+def test_cube_luts_that_are_no_response(tmp_path, options, words):
+    with pytest.raises(InputError, match=words):
+        response_by_name(cube(tmp_path / "a.cube", **{"table": np.eye(3) * 0.5, **options}))

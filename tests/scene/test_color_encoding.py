@@ -149,6 +149,22 @@ def test_colors_beyond_the_gamut_keep_their_light_above_white():
     assert np.ptp(image.pixels[0, 3]) <= 16
 
 
+def test_photos_of_one_light_agree_in_srgb_and_in_display_p3():
+    """The codes of 8 bits differ, their light only by rounding: 42 dB in mu-law values, of dark channels above all."""
+    light = srgb_to_linear(pattern(160, 120, 3) / 255) * 0.9
+    spaces = colour.RGB_COLOURSPACES
+    to_p3 = colour.matrix_RGB_to_RGB(spaces["ITU-R BT.709"], spaces["Display P3"])
+    pictures = []
+    for values, profile in ((light, icc_profile("sRGB")), (light @ to_p3.T, icc_profile("Display P3"))):
+        codes = np.rint(255 * linear_to_srgb(values)).astype(np.uint8)
+        image = encoding_of_profile(profile).convert(EncodedImage(codes, None))
+        pictures.append(srgb_to_linear(image.pixels / image.levels))
+    for picture in pictures:
+        np.testing.assert_allclose(picture, light, atol=0.012)
+    ours, theirs = (np.log1p(5000 * picture) / np.log1p(5000) for picture in pictures)
+    assert -10 * np.log10(((ours - theirs) ** 2).mean()) > 42
+
+
 def test_srgb_profiles_leave_codes_as_they_are(tmp_path):
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     scene = load(write_set(tmp_path, lambda image, path: image.save(path.with_suffix(".png"), icc_profile=profile)))
