@@ -63,7 +63,7 @@ def read_colmap(folder: Path) -> DataparserOutputs:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         raise InputError(images, problem, _REMEDY)
     records, repeated = distinct(records)
-    notes = [*other_models(source), *renamed_note(photo_names), *repeated]
+    notes = [*other_models(source), *renamed_note(photo_names), *repeated, *truth.notes(records)]
     if absent:
         notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
     return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))
@@ -84,6 +84,18 @@ class _TruthFiles:
         names = [path, Path(path.name)] if self.stems[path.stem] <= 1 else [path]
         files = (sibling(place / name, HDR_SUFFIXES) for name in names for place in self.places)
         return next((file for file in files if file), None)
+
+    def notes(self, records: Sequence[ImageRecord]) -> list[str]:
+        """Return a note for each folder with files that are the truth of no photo."""
+        used, notes = {record.hdr for record in records}, []
+        for place in self.places:
+            files = (file for file in place.rglob("*") if file.suffix.lower() in HDR_SUFFIXES)
+            others = sorted(file.relative_to(place).as_posix() for file in files if file not in used)
+            if others:
+                listing = ", ".join(others[:3]) + " ..." * (len(others) > 3)
+                count = f"{len(others)} files that are" if len(others) > 1 else "1 file that is"
+                notes.append(f"{place.name}/ holds {count} the truth of no photo: {listing}")
+        return notes
 
 
 def is_hdr_gs(folder: Path) -> bool:

@@ -99,6 +99,7 @@ def test_times_and_truth_are_by_path(tmp_path):
     scene = load(tmp_path, holdout=0)
     assert [view.exposure_time for view in scene.views] == pytest.approx([0.01 * 2**i for i in range(6)])
     assert [view.hdr is not None for view in scene.views] == [False, False, False, True, False, False]
+    assert said(scene, "truth") == ["hdr/ holds 1 file that is the truth of no photo: 0000.exr"]
     (tmp_path / "exposures.json").write_text(json.dumps({"0000.png": 0.01}))
     scene = load(tmp_path, holdout=0)
     assert not scene.exposure_times_known
