@@ -1,4 +1,4 @@
-"""Count the cameras that show each Gaussian of a scene."""
+"""How many cameras show each Gaussian of a scene, and how much it contributes to their pictures."""
 
 from collections.abc import Sequence
 
@@ -24,11 +24,29 @@ def count_views(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
         field: The scene.
         cameras: At least one.
     """
-    device = field.gaussians.means.device
-    subset = cameras[:: -(-len(cameras) // MOST_VIEWS)]
-    views = torch.zeros(field.gaussians.count, device=device)
+    subset = _subset(cameras)
+    views = torch.zeros(field.gaussians.count, device=field.gaussians.means.device)
     for camera in subset:
-        small = camera.within(VIEW_SIZE)
-        ones = torch.ones((small.height, small.width, 3), device=device)
-        views += field.weighted_sums(CameraTensors.of(small, device), ones)[:, 0] > LEAST_WEIGHT
+        views += _blending_weights(field, camera) > LEAST_WEIGHT
     return views * (len(cameras) / len(subset))
+
+
+@torch.no_grad()
+def contributions(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
+    """Return [N], the sum of each Gaussian's blending weights over cameras, pixels; arguments as in count_views."""
+    total = torch.zeros(field.gaussians.count, device=field.gaussians.means.device)
+    for camera in _subset(cameras):
+        total += _blending_weights(field, camera)
+    return total
+
+
+def _subset(cameras: Sequence[Camera]) -> Sequence[Camera]:
+    """Return at most MOST_VIEWS cameras, evenly chosen."""
+    return cameras[:: -(-len(cameras) // MOST_VIEWS)]
+
+
+def _blending_weights(field: RadianceField, camera: Camera) -> Tensor:
+    """Return [N], the sum of each Gaussian's blending weights in a small picture of a camera, pixels."""
+    device, small = field.gaussians.means.device, camera.within(VIEW_SIZE)
+    ones = torch.ones((small.height, small.width, 3), device=device)
+    return field.weighted_sums(CameraTensors.of(small, device), ones)[:, 0]

@@ -26,7 +26,7 @@ from ..splats import (
     read_gaussians,
     write_gaussians,
 )
-from .splat_edits import SplatEdits, merged, without_strays
+from .splat_edits import SplatEdits, merged, most_visible, without_strays
 from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
 
 log = logging.getLogger(__name__)
@@ -101,7 +101,12 @@ def export(
         gaussians = _converted(scene, color_model, time)
         whole.append(gaussians)
         mask = edits.mask(gaussians.opacities, upright.points(gaussians.means), scene)
-        parts.append(without_strays(gaussians.rows(mask), training_cameras(scene)))
+        part = gaussians.rows(mask)
+        if edits.max_gaussians is not None and part.count > (most := max(1, edits.max_gaussians // (1 + len(merge)))):
+            kept = gaussians.rows(most_visible(mask, most, scene))
+            picture = _edited(part, time) if edits.changes_pictures else _photographed(scene, time)
+            part = kept if color_model != "display" else refine(kept, picture, training_cameras(scene))
+        parts.append(without_strays(part, training_cameras(scene)))
     gaussians = merged(parts)
     delivered = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
     if isinstance(run, Splats) and run.world_matrix is not None:
@@ -194,8 +199,7 @@ def _log_file_loss(
     if reference is None:
         picture, beside = _photographed(run, time), "the scene"
     else:
-        field, beside = field_of(reference), "what was exported"
-        picture = lambda camera: field.render_ldr(camera, time)  # noqa: E731
+        picture, beside = _edited(reference, time), "what was exported"
     decibels = agreement(gaussians, picture, views, time)
     files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
     size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
@@ -211,6 +215,12 @@ def _judged(run) -> Sequence[Camera]:
 def _photographed(run, time: float) -> Callable:
     """Return a function that renders simulated photos, or light for a scene in a sensor's colors."""
     return _shown(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
+
+
+def _edited(gaussians: GaussianArrays, time: float) -> Callable:
+    """Return a function that renders simulated photos of Gaussians in the scene's own coordinates."""
+    field = field_of(gaussians)
+    return lambda camera: field.render_ldr(camera, time)
 
 
 def _shown(run, time: float) -> Callable:

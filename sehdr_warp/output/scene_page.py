@@ -19,7 +19,7 @@ from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
 from .light_pictures import curve_table, display_gain
-from .splat_edits import SplatEdits, without_strays
+from .splat_edits import SplatEdits, most_visible, without_strays
 from .world_transform import world_transform
 
 _HALF = float(np.finfo(np.float16).max)
@@ -47,7 +47,10 @@ def write_scene_page(run: Any, path: Path | str, *, edits: SplatEdits | None = N
     cameras = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
     gaussians = gaussians_of(run.model, "linear", np.array([camera.position for camera in cameras]))
     transform = world_transform(run)
-    mask = (edits or SplatEdits()).mask(gaussians.opacities, transform.points(gaussians.means), run)
+    edits = edits or SplatEdits()
+    mask = edits.mask(gaussians.opacities, transform.points(gaussians.means), run)
+    if edits.max_gaussians is not None:
+        mask = most_visible(mask, edits.max_gaussians, run)
     gaussians = without_strays(gaussians.rows(mask), cameras)
     gaussians.require_finite(path)
     harmonics = np.clip(gaussians.harmonics * np.float32(run.base_time), -_HALF, _HALF)

@@ -36,6 +36,8 @@ class EditOptions:
     """Least opacity; below 1/255 no program draws a Gaussian."""
     min_views: int = 0
     """Leave out what fewer training cameras show: 2 removes most floaters."""
+    max_gaussians: int | None = None
+    """Keep this many, those that pictures show most, and fit their colors again: a small file to share."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 
-from ..model.visibility import count_views
+from ..model.visibility import contributions, count_views
 from ..splats import GaussianArrays
 from .camera_paths import common_focus
 
@@ -81,12 +81,14 @@ class SplatEdits:
         cut: Region to leave out.
         min_opacity: Least opacity of a Gaussian, in [0, 1).
         min_views: Least number of training cameras that show a Gaussian; 2 removes most floaters.
+        max_gaussians: Number of Gaussians to keep, those that contribute most to the training views.
     """
 
     crop: str | None = None
     cut: str | None = None
     min_opacity: float = LEAST_OPACITY
     min_views: int = 0
+    max_gaussians: int | None = None
 
     def __post_init__(self):
         """Raise SehdrError for values that cannot be."""
@@ -96,6 +98,8 @@ class SplatEdits:
             raise SehdrError(f"min_opacity {self.min_opacity} is not at least 0 and below 1")
         if self.min_views < 0:
             raise SehdrError(f"min_views {self.min_views} is negative; 2 leaves out what a single camera shows")
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise SehdrError(f"max_gaussians {self.max_gaussians} leaves nothing; give 1 or more")
 
     @property
     def changes_pictures(self) -> bool:
@@ -134,6 +138,26 @@ class SplatEdits:
             extent = " to ".join(", ".join(f"{v:.3g}" for v in corner) for corner in (low, high))
             raise SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in upright coordinates")
         return stays
+
+
+def most_visible(stays: np.ndarray, count: int, run: Any) -> np.ndarray:
+    """Return [N], which of the Gaussians that stay are the `count` that contribute most to the training views.
+
+    Raises:
+        SehdrError: If the scene has no training cameras.
+    """
+    if stays.sum() <= count:
+        return stays
+    cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
+    if not cameras:
+        raise SehdrError(f"{run.path}: has no training cameras that tell what contributes; leave max_gaussians out")
+    share = np.where(stays, contributions(run.model, cameras).cpu().numpy(), -1)
+    chosen = np.zeros(len(stays), bool)
+    chosen[np.argsort(-share, kind="stable")[:count]] = True
+    lost = stays & ~chosen
+    part = share[lost].sum() / max(share[stays].sum(), 1e-12)
+    log.info("left out: %d Gaussians that make %.1f %% of the pictures", lost.sum(), 100 * part)
+    return chosen
 
 
 def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> GaussianArrays:

@@ -4,6 +4,7 @@ import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.export import export
+from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.splat_edits import Box, Sphere, SplatEdits, read_region, without_strays
 from sehdr_warp.runs.run import load_splats
 from sehdr_warp.splats import GaussianArrays, read_gaussians, write_gaussians
@@ -64,6 +65,22 @@ def test_regions(tmp_path, run):
     for text in ("box:1,2,3", "sphere:0,0,0,-1", "sphere:0,0,0,nan", "ball:0,0,0,1", "box:0,0,0,0,1,1", "1,2,3"):
         with pytest.raises(SehdrError, match="is not box:x0,y0,z0,x1,y1,z1 or sphere"):
             SplatEdits(crop=text)
+
+
+def test_the_most_visible_are_kept_and_refitted(tmp_path, logged):
+    """Of two Gaussians in one place the one that stays becomes denser; a far one that hardly shows goes."""
+    run = run_of(tmp_path, splats([(0, 0, 0), (0, 0, 0.01), (0, 0, -20)], [0.5, 0.4, 0.9], scale=0.3))
+    assert export_means(run, tmp_path / "a.ply", max_gaussians=1) == [(0, 0, 0)]
+    assert read_gaussians(tmp_path / "a.ply").opacities[0] > 0.55
+    assert any(line.startswith("left out: 2 Gaussians that make") for line in logged)
+    [page] = [write_scene_page(run, tmp_path / "a.html", edits=SplatEdits(max_gaussians=1))]
+    assert page.stat().st_size < write_scene_page(run, tmp_path / "b.html").stat().st_size
+    assert len(export_means(run, tmp_path / "b.ply", max_gaussians=3)) == 3
+    with pytest.raises(SehdrError, match="max_gaussians 0 leaves nothing"):
+        SplatEdits(max_gaussians=0)
+    run.cameras = ()
+    with pytest.raises(SehdrError, match="no training cameras that tell"):
+        export_means(run, tmp_path / "c.ply", max_gaussians=1)
 
 
 def test_crops_are_in_upright_coordinates(tmp_path, run):
