@@ -10,6 +10,7 @@ import logging
 import math
 import re
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -130,9 +131,10 @@ def has_gain_map(path: Path) -> bool:
     """Return whether a photo has a gain map that read_gain_map() decodes."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-    marked = (
-        b"MPF\0" in head if head[:2] == b"\xff\xd8" else head[4:8] == b"ftyp" and (b"tmap" in head or b"auxC" in head)
-    )
+    if head[:2] == b"\xff\xd8":
+        marked = b"MPF\0" in head or b"GainMap" in head
+    else:
+        marked = head[4:8] == b"ftyp" and (b"tmap" in head or b"auxC" in head)
     return marked and read_gain_map(path) is not None
 
 
@@ -143,14 +145,10 @@ def _is_jpeg(path: Path) -> bool:
 
 def _of_jpeg(path: Path) -> GainMap | None:
     with open_image(path) as image:
-        count = getattr(image, "n_frames", 1)
-        if image.format != "MPO":
-            return None
         photo, exif = image.size, exif_of(image)
-        for number in range(1, count):
-            image.seek(number)
-            iso = next((data for _, data in getattr(image, "applist", ()) if data.startswith(_ISO_JPEG)), None)
-            xmp = _text(image.info.get("xmp", b""))
+        for second in _further_pictures(image, path):
+            iso = next((data for _, data in getattr(second, "applist", ()) if data.startswith(_ISO_JPEG)), None)
+            xmp = _text(second.info.get("xmp", b""))
             if iso is not None and len(iso) > len(_ISO_JPEG) + 4:
                 make = _of_iso(iso[len(_ISO_JPEG) :])
             elif "hdrgm:" in xmp:
@@ -159,8 +157,33 @@ def _of_jpeg(path: Path) -> GainMap | None:
                 make = _of_apple(xmp, exif)
             else:
                 continue
-            return _gain_map_of(make, _pixels(image, photo))
+            return _gain_map_of(make, _pixels(second, photo))
     return None
+
+
+def _further_pictures(image: Image.Image, path: Path) -> Iterator[Image.Image]:
+    """Yield the pictures behind the first of a JPEG.
+
+    They are listed in its multi-picture index (MPF), or in its XMP (GContainer), which editors keep more often.
+    """
+    if image.format == "MPO":
+        for number in range(1, getattr(image, "n_frames", 1)):
+            image.seek(number)
+            yield image
+        return
+    items = []
+    for text in re.findall(r"<\w+:Item\b[^>]*>", _text(image.info.get("xmp", b""))):
+        attributes = dict(re.findall(r'\b\w+:(\w+)\s*=\s*["\']([^"\']*)["\']', text))
+        length = int(attributes.get("Length") or 0)
+        items.append((attributes.get("Semantic"), length, length + int(attributes.get("Padding") or 0)))
+    # Items follow each other up to the end of the file; the first one states no length.
+    for number, (semantic, length, _) in enumerate(items):
+        if semantic == "GainMap" and number and 0 < length < path.stat().st_size:
+            with path.open("rb") as file:
+                file.seek(-sum(size for _, _, size in items[number:]), 2)
+                data = file.read(length)
+            with Image.open(io.BytesIO(data), formats=("JPEG", "MPO")) as second:
+                yield second
 
 
 def _of_items(path: Path) -> GainMap | None:

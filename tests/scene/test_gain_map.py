@@ -12,7 +12,7 @@ from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
 from sehdr_warp.scene.images import read_ldr
 
-from .gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
+from .gain_map_files import iso_metadata, jpeg_bytes, write_heif_pair, write_jpeg_pair, xmp_segment
 from .test_color_encoding import icc_profile
 
 HEIGHT, WIDTH = 96, 128
@@ -260,3 +260,21 @@ def test_values_as_elements_and_sequences(tmp_path):
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [(0xFFE1, b"http://ns.adobe.com/xap/1.0/\0" + inner.encode())])
     found = read_gain_map(tmp_path / "a.jpg")
     assert found.maximum.tolist() == [1, 2, 3] and found.gamma.tolist() == [2, 2, 2]
+
+
+@pytest.mark.parametrize("behind", [b"", b"a film" * 50], ids=["alone", "motion photo"])
+def test_a_gain_map_without_a_multi_picture_index(tmp_path, behind):
+    """As editors leave it: its place is in the photo's XMP alone."""
+    light, base, gain = pair()
+    second = jpeg_bytes(gain, [hdrgm()])
+    items = [("Primary", 0), ("GainMap", len(second)), *([("MotionPhoto", len(behind))] if behind else [])]
+    listing = "".join(
+        f'<rdf:li><Container:Item Item:Mime="image/jpeg" Item:Semantic="{semantic}" Item:Length="{length}"/></rdf:li>'
+        for semantic, length in items
+    )
+    segment = 0xFFE1, b"http://ns.adobe.com/xap/1.0/\0" + f"<rdf:Seq>{listing}</rdf:Seq>".encode()
+    (tmp_path / "a.jpg").write_bytes(jpeg_bytes(base, [segment]) + second + behind)
+    assert has_gain_map(tmp_path / "a.jpg")
+    assert_light(decoded(tmp_path / "a.jpg"), light)
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[: -len(second) // 2])
+    assert read_gain_map(tmp_path / "cut.jpg") is None
