@@ -18,7 +18,7 @@ from .progress import LINE_INTERVAL, Stage, format_seconds, shown_by
 
 BAR_INTERVAL = 0.25
 """Least seconds between updates of the bar. Each reads the loss, which waits for the device."""
-READ_INTERVAL = 1.0
+READ_INTERVAL = 2.0
 """Least seconds between two readings of the figures for plain lines, of which a line shows the mean."""
 MEAN_OF = 20
 """Readings of loss and PSNR that their running mean is over: each is of one photo, and photos differ by decibels."""
