@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..scene import Camera
+from ..subsets import every_nth
 from .baking import sphere_directions
 from .radiance_field import RadianceField
 
@@ -90,7 +91,7 @@ def find_lights(
     white = field.response.white / float(np.median([time for _, time in views]))
     cameras = [camera for camera, _ in views]
     middle = np.mean([camera.position for camera in cameras], axis=0)
-    cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
+    cameras = every_nth(cameras, MOST_VIEWS)
     sums = [_view_sums(field, camera, degree) for camera in cameras]
     pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
     mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]

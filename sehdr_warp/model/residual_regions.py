@@ -11,6 +11,7 @@ from ..progress import tracked
 from ..response import Response
 from ..response.curve import HALF_CODE
 from ..scene import View
+from ..subsets import every_nth
 from .radiance_field import RadianceField
 
 log = logging.getLogger(__name__)
@@ -53,7 +54,7 @@ def find_residual_regions(field: RadianceField, views: Sequence[View], *, degree
     as edges leave them, are ignored.
     """
     regions = []
-    compared = views[:: -(-len(views) // MAX_VIEWS) or 1]
+    compared = every_nth(views, MAX_VIEWS)
     for _, view in tracked("comparing photos with the scene", compared, log):
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         for row, column, stops in _regions(view, exposure, field.response):
@@ -72,7 +73,7 @@ def brightness_offsets(field: RadianceField, views: Sequence[View], *, degree: i
     pixels are left out. At most MAX_VIEWS photos are compared, evenly chosen.
     """
     medians = {}
-    for view in views[:: -(-len(views) // MAX_VIEWS) or 1]:
+    for view in every_nth(views, MAX_VIEWS):
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         stops, _ = _differences(view, exposure, field.response)
         exposed = ((view.image > _EXPOSED[0]) & (view.image < _EXPOSED[1])).all(2)

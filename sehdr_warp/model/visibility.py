@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ..scene import Camera
+from ..subsets import every_nth
 from .camera_tensors import CameraTensors
 from .radiance_field import RadianceField
 
@@ -24,7 +25,7 @@ def count_views(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
         field: The scene.
         cameras: At least one.
     """
-    subset = _subset(cameras)
+    subset = every_nth(cameras, MOST_VIEWS)
     views = torch.zeros(field.gaussians.count, device=field.gaussians.means.device)
     for camera in subset:
         views += _blending_weights(field, camera) > LEAST_WEIGHT
@@ -35,14 +36,9 @@ def count_views(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
 def contributions(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
     """Return [N], the sum of each Gaussian's blending weights over cameras, pixels; arguments as in count_views."""
     total = torch.zeros(field.gaussians.count, device=field.gaussians.means.device)
-    for camera in _subset(cameras):
+    for camera in every_nth(cameras, MOST_VIEWS):
         total += _blending_weights(field, camera)
     return total
-
-
-def _subset(cameras: Sequence[Camera]) -> Sequence[Camera]:
-    """Return at most MOST_VIEWS cameras, evenly chosen."""
-    return cameras[:: -(-len(cameras) // MOST_VIEWS)]
 
 
 def _blending_weights(field: RadianceField, camera: Camera) -> Tensor:

@@ -26,6 +26,7 @@ from ..splats import (
     read_gaussians,
     write_gaussians,
 )
+from ..subsets import every_nth
 from .splat_edits import SplatEdits, merged, most_visible, without_strays
 from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
 
@@ -209,7 +210,7 @@ def _log_file_loss(
 def _judged(run) -> Sequence[Camera]:
     held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
     views = held_out or [entry.camera for entry in run.cameras]
-    return views[:: -(-len(views) // _JUDGED) or 1]
+    return every_nth(views, _JUDGED)
 
 
 def _photographed(run, time: float) -> Callable:

@@ -10,6 +10,7 @@ import struct
 import numpy as np
 from PIL import Image
 
+from ..scene.primaries import srgb_to_linear
 from .images import quantize
 
 MOST_STOPS = 5.5
@@ -39,7 +40,7 @@ def ultra_hdr(light: np.ndarray, base: np.ndarray) -> bytes:
         base: [H, W, 3] sRGB-encoded, in [0, 1].
     """
     codes = quantize(base).astype(np.float32) / 255
-    plain = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    plain = srgb_to_linear(codes)
     light = np.clip(light, 0, 2**MOST_STOPS)
     gain = np.log2((light + _OFFSET) / (plain + _OFFSET))
     low, high = float(gain.min()), max(float(gain.max()), float(gain.min()) + 0.1)

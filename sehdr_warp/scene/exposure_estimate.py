@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..response import Response
+from ..subsets import every_nth
 from .exposure import LONGEST, SHORTEST, shutter
 from .exposure_compensation import initial_gains, point_light
 from .types import Scene, View
@@ -42,7 +43,7 @@ def with_estimated_times(scene: Scene, names: Collection[str], response: Respons
 
 def _factor(view: View, timed: list[View], points: np.ndarray, response: Response) -> tuple[float, int]:
     """Return the factor on a view's time, and the number of points that it is by; 0 if it is by brightness alone."""
-    timed = timed[:: -(-len(timed) // _MOST_VIEWS)]
+    timed = every_nth(timed, _MOST_VIEWS)
     points = points[:: max(1, len(points) // _MOST)]
     if len(points):
         visible = np.ones((1 + len(timed), len(points)), bool)

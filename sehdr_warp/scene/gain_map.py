@@ -22,6 +22,7 @@ from ..errors import InputError
 from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, with_primary
 from .images import PILLOW_ERRORS, EncodedImage, check_size, exif_of, open_image, orientation_of, turn_upright
 from .linear_photos import linear_codes
+from .primaries import srgb_to_linear
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -94,8 +95,7 @@ def with_light_above_white(photo: EncodedImage, gain_map: GainMap) -> EncodedIma
 def _decoded(photo: EncodedImage) -> np.ndarray:
     """Return [H, W, 3] float32 light by sRGB's transfer function (that of Display P3, too), 1 at white."""
     codes = np.arange(photo.levels + 1) / photo.levels
-    table = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
-    return table.astype(np.float32)[photo.pixels]
+    return srgb_to_linear(codes).astype(np.float32)[photo.pixels]
 
 
 def _above_white(light: np.ndarray, white: np.ndarray) -> np.ndarray | None:

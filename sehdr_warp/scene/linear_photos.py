@@ -14,11 +14,13 @@ import numpy as np
 
 from ..errors import InputError, SehdrError
 from ..quiet import silent_stderr
+from ..subsets import every_nth
 from .dataparser import reinhard_gamma
 from .dng import read_dng
 from .dng_develop import CLIPPED, clipping_level, develop_dng
 from .hdr_files import read_hdr
 from .images import HDR_SUFFIXES, RAW_SUFFIXES, EncodedImage, check_size, require_file
+from .primaries import linear_to_srgb
 from .types import codes_of
 
 CURVES = {"raw": "srgb", "linear": "srgb", "gain-map": "srgb", "float": "hdr-nerf"}
@@ -50,7 +52,7 @@ def float_time(photos: Sequence[Path]) -> float:
         InputError: if none of those that are sampled can be read; others are left out.
     """
     averages, problems = [], []
-    for photo in photos[:: -(-len(photos) // _MOST_JUDGED)]:
+    for photo in every_nth(photos, _MOST_JUDGED):
         try:
             averages.append(np.log(_log_average(read_hdr(photo))))
         except InputError as error:
@@ -127,9 +129,7 @@ def linear_codes(linear: np.ndarray) -> np.ndarray:
 
     The codes of a curve keep more of the dark than 16 linear bits.
     """
-    linear = np.where(linear >= CLIPPED, 1, linear)
-    bright = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    return codes_of(np.where(linear <= 0.0031308, 12.92 * linear, bright), 16)
+    return codes_of(linear_to_srgb(np.where(linear >= CLIPPED, 1, linear)), 16)
 
 
 def raw_exposure(path: Path) -> tuple[float | None, float | None, float | None]:

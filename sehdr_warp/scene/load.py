@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
+from ..subsets import every_nth
 from .dataparser import DataparserOutputs
 from .exposure import are_camera_jpegs
 from .gain_map import has_gain_map, read_gain_map
@@ -195,7 +196,7 @@ def choose_response(
 
 def sample_photos(photos: Sequence, method: str) -> Sequence:
     """Return those of the training photos that a response is chosen from."""
-    sample = photos[:: -(-len(photos) // _MOST_SAMPLED)]
+    sample = every_nth(photos, _MOST_SAMPLED)
     if method == "paper":
         sample = (photos[int(np.random.default_rng(0).integers(len(photos)))],)
     _log.info("choosing the response from %d photos", len(sample))

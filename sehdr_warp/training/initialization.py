@@ -22,6 +22,7 @@ from ..scene.load import sample_photos, select_response_for
 from ..scene.normalization import Normalization, normalization_of
 from ..scene.wide_camera import perspective_views
 from ..splats import read_gaussians
+from ..subsets import every_nth
 from .matching import Matcher
 from .strategies import mcmc_cap
 from .strategies.mcmc import MAX_DISTANCE
@@ -212,7 +213,7 @@ def start_count(config: Config, pixels: int) -> int:
 def make_matcher(scene: Scene, response: Response, device: torch.device | str) -> Matcher:
     """Create a matcher of the training views, with depths around those of the points or of the cameras' focus."""
     views = perspective_views(scene.train_views)
-    points = scene.points[:: -(-len(scene.points) // MOST_DEPTHS) or 1]
+    points = every_nth(scene.points, MOST_DEPTHS)
     homogeneous = np.c_[points, np.ones(len(points))]
     depths = [homogeneous[pixels_of(points, view)[2]] @ view.camera.world_to_camera[2] for view in views]
     depths = np.concatenate(depths)

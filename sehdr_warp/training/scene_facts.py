@@ -10,6 +10,7 @@ from ..scene import Scene, View, encoded_values
 from ..scene.exposure import are_camera_jpegs
 from ..scene.linear_photos import kind_of
 from ..scene.wide_camera import perspective_views
+from ..subsets import every_nth
 from .initialization import focus_distance, pixels_of, points_on_rays
 
 PROBES = 2000  # Number of places at which overlap and visibility are measured
@@ -82,7 +83,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     visible, on_rays = (
         np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, ray_points)
     )
-    read_views = views[:: -(-len(views) // MOST_VIEWS)]
+    read_views = every_nth(views, MOST_VIEWS)
     figures = np.array([_codes(view) for view in read_views])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     gaze, ahead = _gaze(np.stack([view.camera.world_to_camera for view in views]))

@@ -26,6 +26,7 @@ ANY = {
     "limits",
     "caches",
     "progress",
+    "subsets",
 }
 ALLOWED = {
     "kernels": set(),

@@ -1,0 +1,8 @@
+"""Subsets of photos and points, small enough to look at."""
+
+from typing import Any
+
+
+def every_nth(items: Any, most: int) -> Any:
+    """Return every n-th of a sequence or array, with the smallest n that leaves at most `most`, from 1."""
+    return items[:: -(-len(items) // most) or 1]
