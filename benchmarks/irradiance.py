@@ -18,7 +18,9 @@ from sehdr_warp.scene.hdr_files import read_exr_channels
 FOLDER = "light"
 NORMALS = 200  # Directions that surfaces face, evenly over the sphere
 LEAST_SEEN = 0.1  # Of the hemisphere before a surface, weighted by the cosine, that photos must show for it to count
-FINER = 4  # Pixels of a render, across, for one of the truth's
+FINER, FINEST = 4, 32
+"""Least and most pixels of a render, across, for one of the truth's. Pixels as fine as the photos' are needed: in
+larger ones small Gaussians no longer hide each other, and a small lamp of several came out twice as bright."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +93,12 @@ def rendered_map(run: Any, truth: LightMap, focal: float, without: Sequence[torc
     focal: pixels, of the training cameras. without: groups of Gaussians that give no light.
     """
     height, width = truth.seen.shape
-    fine = FINER * width
+    finer = int(np.clip(np.ceil(2 * np.pi * focal / width), FINER, FINEST))
+    fine = finer * width
     options: dict[str, Any] = {"focal_length": focal, "pixel_angle": 2 * np.pi / fine}
     options |= {"without": without} if without else {}
     light = run.render_directions(truth.position, latlong(fine), **options).hdr.cpu().numpy()
-    return light.reshape(height, FINER, width, FINER, 3).mean(axis=(1, 3))
+    return light.reshape(height, finer, width, finer, 3).mean(axis=(1, 3))
 
 
 def typical_focal(cameras: Sequence[Camera]) -> float:

@@ -19,7 +19,9 @@ REACH = 3.0  # Gaussians join one light if they are nearer than this many median
 FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras
 MOST_LIGHTS, MOST_VIEWS = 64, 24
-DIRECTIONS = 1 << 15  # In which the light at a point is measured
+DIRECTIONS, MOST_DIRECTIONS = 1 << 15, 1 << 20
+"""In which the light at a point is measured: as fine as the photos' pixels, within these bounds. In coarser pixels
+small Gaussians would no longer hide each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +130,10 @@ def find_lights(
 
 def _light_at(field: RadianceField, point: np.ndarray, cameras: Sequence[Camera], degree: int | None) -> float:
     """Return the light that reaches a point: the mean of the channels' radiance, integrated over all directions."""
-    directions = torch.tensor(sphere_directions(DIRECTIONS), dtype=torch.float32).view(-1, 256, 3)
     focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras]))
-    options = {"focal_length": focal, "pixel_angle": float(np.sqrt(4 * np.pi / DIRECTIONS)), "degree": degree}
+    count = int(np.clip(4 * np.pi * focal**2, DIRECTIONS, MOST_DIRECTIONS)) // 256 * 256
+    directions = torch.tensor(sphere_directions(count), dtype=torch.float32).view(-1, 256, 3)
+    options = {"focal_length": focal, "pixel_angle": float(np.sqrt(4 * np.pi / count)), "degree": degree}
     visible = field.render_directions(point, directions.to(field.gaussians.means.device), **options)
     return 4 * np.pi * float(visible.hdr.mean())
 

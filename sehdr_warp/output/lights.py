@@ -11,9 +11,8 @@ import numpy as np
 from sehdr_warp.errors import SehdrError
 
 from ..files import atomic_path, check_absent
-from .environment_map import envmap, latlong
+from .environment_map import envmap, render_map
 from .exr import exr_header, rgb_channels, write_exr
-from .images import as_array
 from .light_unit import luminance_of_one
 from .render_views import provenance
 from .world_transform import WorldTransform, world_transform
@@ -189,9 +188,9 @@ def _write_rest(run: Any, path: Path, lights: Sequence[Any], transform: WorldTra
     """Write the map of a scene from the middle of its training cameras, with the lights dark."""
     cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
     middle = np.mean([camera.position for camera in cameras], axis=0)
-    options = {"focal_length": float(np.median([np.sqrt(c.fx * c.fy) for c in cameras]))}
-    options |= {"pixel_angle": 2 * np.pi / MAP_SIZE, "without": [light.members for light in lights]}
-    hdr = as_array(run.render_directions(middle, latlong(MAP_SIZE) @ transform.rotation, **options).hdr)
+    focal = float(np.median([np.sqrt(c.fx * c.fy) for c in cameras]))
+    rest = render_map(run, middle, MAP_SIZE, "latlong", transform.rotation, focal, without=[x.members for x in lights])
+    hdr = rest.hdr
     header = exr_header("rec709", 1.0, provenance=provenance(run), white_luminance=luminance_of_one(run))
     header["envmap"] = envmap("latlong")
     write_exr(path, rgb_channels(hdr), header=header, overwrite=overwrite)
