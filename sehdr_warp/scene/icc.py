@@ -22,6 +22,7 @@ _REC709_FROM_D50 = np.array(
         [0.0719453, -0.2289914, 1.4052427],
     ]
 )
+_MOST_OF_NAME = 80  # Characters that lines show
 _SAMPLES = 65_536  # Of a curve that a formula describes: exact at all codes of 8 and 16 bits
 
 
@@ -60,7 +61,7 @@ def read_profile(data: bytes) -> IccProfile:
         raise ValueError(f"has {len(data)} bytes")
     try:
         profile: Any = ImageCms.ImageCmsProfile(io.BytesIO(data)).profile
-        name = (profile.profile_description or "").strip() or "an unnamed profile"
+        name = " ".join((profile.profile_description or "").split())[:_MOST_OF_NAME] or "an unnamed profile"
         colors = profile.xcolor_space.strip()
     except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError):
         raise ValueError("is damaged") from None

@@ -264,6 +264,14 @@ def test_bad_profiles_are_named_and_count_as_srgb(tmp_path, case):
     assert [note for note in scene.notes if f"its ICC profile {words}" in note and "sRGB is assumed" in note]
 
 
+def test_names_of_profiles_fit_a_line(tmp_path):
+    profile = icc_profile("Display P3", name="n\n" * 20_000)
+    Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(tmp_path / "a.png", icc_profile=profile)
+    with open_image(tmp_path / "a.png") as image:
+        encoding = stated_encoding(image)
+    assert len(encoding.name) < 200 and "\n" not in encoding.name
+
+
 def test_bad_gamma_and_primaries_of_png_are_named(tmp_path):
     line = struct.pack(">8I", 31270, 32900, 10000, 10000, 20000, 20000, 30000, 30000)
     for chunk, words in (((b"gAMA", bytes(4)), "its gAMA is 0"),

@@ -655,7 +655,8 @@ def change_set(kind: str, photos: Path) -> None:
         (photos / "masks").mkdir()
         Image.new("L", (24, 16), 0).save(photos / "masks" / first.name)
     elif kind == "times":
-        (photos / "exposures.json").write_text(json.dumps({first.name: 9.0}))
+        names = [path.name for path in sorted((photos / "images").glob("*.png"))]
+        (photos / "exposures.json").write_text(json.dumps(dict.fromkeys(names, 1.0) | {first.name: 9.0}))
     elif kind == "date":
         os.utime(first, (1, 1))
     elif kind == "saved again":
