@@ -9,15 +9,15 @@ ROOT = TESTS.parent
 NOT_PACKAGES = {"integration", "fuzz", "trial", "scenes_generator"}
 TOPICS = {
     "benchmarks": {"bench"},
-    "compat/gsplat": {"against_gsplat"},
+    "compat/gsplat": {"against_gsplat", "simple_trainer"},
     "output": {"blender", "pictures"},
     "rasterizer": {"blend_blocks", "culling", "extremes", "properties", "rasterize"},
     "response": {"responses"},
     "scene": {"hdr_colors", "scene_colmap", "scene_images", "scene_load", "scene_transforms"},
     "splats": {"compressed_files", "npm_parsers", "other_tools", "splat_files"},
     "training": {
-        "bad_input", "confidence", "deterministic", "divergence", "fields", "out_of_memory", "reserved_rows", "resume",
-        "rivals", "units",
+        "bad_input", "confidence", "deterministic", "divergence", "fields", "nodes", "out_of_memory", "reserved_rows",
+        "resume", "rivals", "units",
     },
     "viewer": {"page", "proxies", "scene_page"},
 }  # fmt: skip
