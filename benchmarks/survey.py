@@ -110,7 +110,7 @@ def write_survey(
     (folder / "images").mkdir(parents=True, exist_ok=True)
     cameras = make_cameras(views, size, length, width)
     names = [f"images/photo_{index:05d}.png" for index in range(views)]
-    photos = (codes_of(field.render_ldr(camera).cpu().numpy(), 8) for camera in cameras)
+    photos = ((255 * field.render_ldr(camera)).round().to(torch.uint8).cpu().numpy() for camera in cameras)
 
     def save(photo: tuple[str, np.ndarray]) -> None:
         Image.fromarray(photo[1]).save(folder / photo[0], compress_level=1)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..scene import Camera
-from .gaussians import Gaussians
+from .gaussians import PARAMETER_NAMES, Gaussians
 from .radiance_field import RadianceField, RenderedView, Surroundings
 
 CELL = 1 << 16  # Gaussians of a cell
@@ -55,6 +55,7 @@ class PagedField(RadianceField):
         self._low = torch.stack([part.amin(0) for part in (means - reach).split(CELL)]).double().numpy()
         self._high = torch.stack([part.amax(0) for part in (means + reach).split(CELL)]).double().numpy()
         self._pages: OrderedDict[tuple[int, int], dict[str, Tensor]] = OrderedDict()
+        self._versions: tuple[int, ...] = ()
 
     @property
     def render_device(self) -> torch.device:
@@ -122,6 +123,11 @@ class PagedField(RadianceField):
 
     def _part(self, levels: list[tuple[int, int]]) -> RadianceField:
         """Return the field of some cells, on the device."""
+        # An edit of the Gaussians, such as a gain of a light, makes the copies out of date.
+        versions = tuple(getattr(self.gaussians, name)._version for name in PARAMETER_NAMES)
+        if versions != self._versions:
+            self._pages.clear()
+            self._versions = versions
         pages = [self._page(key) for key in levels]
         # Pages beyond the budget that this picture does not need are dropped, the longest unused first.
         rows = sum(len(page["means"]) for page in self._pages.values())

@@ -106,6 +106,15 @@ def test_pages_stay_within_the_budget(street):
         assert sum(len(page["means"]) for page in paged._pages.values()) <= 1500
 
 
+def test_edits_of_gaussians_show(street):
+    paged, place = PagedField(street, CPU, budget=10**9), camera(20)
+    before = paged.render(place).hdr
+    with torch.no_grad():
+        street.gaussians.harmonics_dc.add_(0.5)  # In place, as the viewer does.
+    after = paged.render(place).hdr
+    assert torch.equal(after, street.render(place).hdr) and not torch.equal(before, after)
+
+
 def test_only_fields_that_do_not_fit_are_paged(street, logged):
     assert on_device(street, CPU) is street
     row = PagedField(street, CPU, 0).row_bytes
