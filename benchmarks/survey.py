@@ -30,7 +30,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def make_town(count: int, length: float, width: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 3] points on the surfaces of a town and their log exposures [N, 3]; x in 0..length, y in 0..width."""
+    """Return [N, 3] points on the surfaces of a town and their log exposures [N, 3]; x in 0..length, y in 0..width."""
     rng = np.random.default_rng(seed)
     pitch = BUILDING + STREET
     columns, rows = math.ceil(length / pitch), math.ceil(width / pitch)
@@ -54,7 +54,7 @@ def make_town(count: int, length: float, width: float, seed: int = 0) -> tuple[n
 
 
 def _texture(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """[N] in about -1..1: waves of several lengths, as bricks, tiles and stains."""
+    """Return [N] in about -1..1: waves of several lengths, as bricks, tiles and stains."""
     value = np.zeros(len(points))
     for octave in range(6):
         for _ in range(3):
@@ -81,7 +81,7 @@ def make_field(points: np.ndarray, log_exposures: np.ndarray, area: float, devic
 
 
 def make_cameras(views: int, size: int, length: float, width: float) -> list[Camera]:
-    """Lanes along x; cameras look down, tilted forwards and backwards by turns."""
+    """Return cameras on lanes along x, which look down, tilted forwards and backwards by turns."""
     lanes = max(1, round(math.sqrt(views * width / length / 2)))
     each = math.ceil(views / lanes)
     height, focal = round(size * ASPECT), 0.9 * size

@@ -129,6 +129,11 @@ def test_finished_blocks_are_not_run_again(merged, monkeypatch):
     assert (merged / "checkpoints").stat().st_mtime_ns != before, "merged again"
 
 
+def test_a_block_is_a_run_of_its_own(merged, capfd):
+    assert call("train", "--resume", "--out", merged / "blocks" / "block_02", "--device", "cpu") == 0
+    assert "nothing is left to train" in capfd.readouterr().err
+
+
 def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capfd):
     def line(*words):
         return refused(capfd, "train", survey, *words, "--device", "cpu", "--response", "srgb")
