@@ -10,6 +10,8 @@ from ..errors import UsageError
 from ..runs.open import open_run, open_scene
 from .options import WorldOptions, changed_flags
 
+_MESH_SUFFIXES = (".obj", ".abc", ".fbx", ".stl")
+
 
 @dataclass(frozen=True)
 class SplatFileOptions:
@@ -109,6 +111,8 @@ def run_export(args: Export) -> None:
     """Run `sehdr-warp export`."""
     from ..splats import check_suffix
 
+    if args.out.suffix.lower() in _MESH_SUFFIXES:
+        raise UsageError(f"{args.out}: meshes are written by sehdr-warp mesh {args.run} --out {args.out.stem}.usdc")
     if check_suffix(args.out, ".html") == ".html":
         from .scene_page import write_scene_page
         from .splat_edits import SplatEdits

@@ -16,7 +16,7 @@ from sehdr_warp.output.colorspace import color_space
 from sehdr_warp.output.commands import FilmOptions, Render, ViewFileOptions, _ramp, run_render
 from sehdr_warp.output.film import encode, write_film
 from sehdr_warp.output.light_pictures import display_gain
-from sehdr_warp.output.splat_commands import Convert, run_convert
+from sehdr_warp.output.splat_commands import Convert, Export, run_convert, run_export
 from sehdr_warp.own_files import LIST
 
 from .helpers import AnalyticRun
@@ -138,6 +138,8 @@ def test_words_that_people_type_find_what_they_mean(tmp_path):
         run_convert(Convert(source=tmp_path, out=tmp_path / "x.ply"))
     with pytest.raises(SehdrError, match="'srgb' is an encoding"):
         color_space("sRGB")
+    with pytest.raises(UsageError, match="meshes are written by sehdr-warp mesh runs/a --out x.usdc"):
+        run_export(Export(run=Path("runs/a"), out=Path("x.obj")))
 
 
 def test_old_flags_name_the_new_ones(tmp_path):
