@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 REPORTS = ROOT / "docs" / "reports"
 PAGES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("pages.toml").read_text(encoding="utf-8"))
 """Title, text, caption and commands of each page."""
+FIRST_TITLE = "trained by"  # Of the README's table
 NOTHING_CLIPS = 0.001  # Of the pixels
 
 
@@ -271,22 +272,27 @@ def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
 def write_readme(path: Path, result: dict) -> None:
     """Write the figures of the page of quality into the table of the README."""
     text, table = path.read_text(encoding="utf-8"), readme_table(result["rows"])
-    start = text.index(table.partition("\n")[0])
+    start = text.index(f"| {FIRST_TITLE} |")
     with atomic_path(path, ours=True) as temporary:
         temporary.write_text(text[:start] + table + text[text.index("\n\n", start) :], encoding="utf-8")
 
 
 def readme_table(rows: Sequence[Mapping]) -> str:
-    """Return the rows of in_short() that the README shows, as Markdown."""
-    short, lines = {row["method"]: row for row in in_short(rows)}, []
-    for method, label in PAGES["quality"]["readme"].items():
-        row = short[method]
+    """Return the rows of in_short() that the README shows, as Markdown; figures that no row has are left out."""
+    labels = PAGES["quality"]["readme"]
+    short = {row["method"]: row for row in in_short(rows) if row["method"] in labels}
+    irradiance = any(row["irradiance off"] is not None for row in short.values())
+    titles = [FIRST_TITLE, "HDR", "photos", "lights lost", *["irradiance off: mean, worst"] * irradiance]
+    titles += ["light energy: median, nine in ten"]
+    lines = []
+    for method, label in labels.items():
+        if (row := short.get(method)) is None:
+            continue
         off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}, {row['worst room']:.0%}"
         energy = "-" if row["light energy"] is None else f"{row['light energy']:.2f}, {row['nine in ten lights']}"
-        cells = label, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", row["lost"].removesuffix(" lights"), off
-        lines.append(f"| {' | '.join((*cells, energy))} |")
-    titles = "trained by", "HDR", "photos", "lights lost"
-    titles += "irradiance off: mean, worst", "light energy: median, nine in ten"
+        lost = row["lost"].removesuffix(" lights")
+        cells = [label, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", lost, *[off] * irradiance, energy]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([f"| {' | '.join(titles)} |", f"| ---{' | -:' * (len(titles) - 1)} |", *lines])
 
 
