@@ -1,4 +1,4 @@
-"""Energy and gradient of clipped pixels: smoothness, a lift at edges, and the distance from an estimate."""
+"""Energy and gradient of clipped pixels: smoothness, and the distance from an estimate."""
 
 from functools import cache
 
@@ -18,23 +18,20 @@ def _terms_function(dtype):
 
     @wp.func
     def terms_of(
-        v: real, total: real, clipped: real, pixels: int, smoothness: real, lift: real,
-        expected: real, precision: real, hold: real,
+        v: real, total: real, clipped: real, smoothness: real, expected: real, precision: real, hold: real,
     ):
         """Return the energy of a clipped value with logarithm v, and its derivative by v.
 
-        `clipped` of the `pixels` around the value, itself included, are clipped; `total` is the sum of their
-        logarithms and m their mean, which is held constant. The energy is smoothness / 2 (v - m)^2
-        - lift (1 - clipped / pixels) v + hold / 2 (precision (v - expected))^2. Below white, where v is 0, only the
-        last part has a derivative.
+        `clipped` values around it, itself included, are clipped; `total` is the sum of their logarithms and m their
+        mean, which is held constant. The energy is smoothness / 2 (v - m)^2 + hold / 2 (precision (v - expected))^2.
+        Below white, where v is 0, only the last part has a derivative.
         """
         away = v - total / clipped
-        lifted = lift * (real(1.0) - clipped / real(pixels))
         off = precision * (v - expected)
-        energy = real(0.5) * (smoothness * away * away + hold * off * off) - lifted * v
+        energy = real(0.5) * (smoothness * away * away + hold * off * off)
         by_v = hold * precision * off
         if v > real(0.0):
-            by_v += smoothness * away - lifted
+            by_v += smoothness * away
         return energy, by_v
 
     return terms_of
@@ -101,7 +98,7 @@ def clipped_light_kernel(dtype):
     def clipped_light(
         first: int,
         image: wp.array(dtype=real), logarithms: wp.array(dtype=real), white: real, height: int, width: int,
-        smoothness: real, lift: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
+        smoothness: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
         terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
         """Add terms_of() each clipped value, and its derivative.
@@ -116,18 +113,16 @@ def clipped_light_kernel(dtype):
             column = i // 3 - width * row
             total = real(0.0)
             clipped = real(0.0)
-            pixels = int(0)
             for y in range(wp.max(row - wp.static(REACH), 0), wp.min(row + wp.static(REACH + 1), height)):
                 for x in range(wp.max(column - wp.static(REACH), 0), wp.min(column + wp.static(REACH + 1), width)):
                     near = logarithms[i + 3 * ((y - row) * width + x - column)]
-                    pixels += 1
                     if near >= real(0.0):
                         clipped += real(1.0)
                         total += near
             expected, precision = estimate_of(
                 estimates, rows, columns, row, column, i - 3 * (i // 3), height, width
             )
-            energy, by_v = terms_of(v, total, clipped, pixels, smoothness, lift, expected, precision, hold)
+            energy, by_v = terms_of(v, total, clipped, smoothness, expected, precision, hold)
             terms[i] = terms[i] + energy
             if slopes:
                 slopes[i] = slopes[i] + by_v / wp.max(image[i], white)
@@ -149,7 +144,7 @@ def clipped_light_patch_kernel(dtype, code):
     def clipped_light_in_patches(
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
         mask: wp.array(dtype=real), white_code: int, white: real, height: int, width: int,
-        smoothness: real, lift: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
+        smoothness: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
         terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
     ):
         """Do what the two kernels above do; a patch's energy is added to its term of terms [patches]."""
@@ -194,12 +189,8 @@ def clipped_light_patch_kernel(dtype, code):
                     figures = vec3()
                     for k in range(wp.static(2 * REACH + 1)):
                         figures += wp.tile_extract(sums, row, at + wp.static(CHANNELS) * k)
-                    down = wp.min(y + wp.static(REACH + 1), height) - wp.max(y - wp.static(REACH), 0)
-                    across = wp.min(x + wp.static(REACH + 1), width) - wp.max(x - wp.static(REACH), 0)
                     expected, precision = estimate_of(estimates, rows, columns, y, x, channel, height, width)
-                    term, by_v = terms_of(
-                        v, figures[0], figures[1], down * across, smoothness, lift, expected, precision, hold
-                    )
+                    term, by_v = terms_of(v, figures[0], figures[1], smoothness, expected, precision, hold)
                     energy += term
                     if slopes:
                         slopes[i] = slopes[i] + by_v / wp.max(image[i], white)

@@ -155,7 +155,7 @@ def _clipped_light(device):
     spike = torch.full_like(noise, 4.0)
     spike[5, 6] = 2.0**100
     cases = {"around white": noise.exp(), "far above": 2**20 * noise.exp(), "equal": 0 * noise + 4, "one spike": spike}
-    weights = ClippedWeights(smoothness=1.0, lift=0.3)
+    weights = ClippedWeights(smoothness=1.0)
     for name, image in cases.items():
 
         def energy(image):

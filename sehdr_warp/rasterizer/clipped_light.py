@@ -19,17 +19,16 @@ from .warp_launch.launching import launch, warp_scalar
 class ClippedWeights:
     """Weights of the parts of clipped_light_energy(), each at least 0.
 
-    smoothness: of squared differences to the mean of clipped neighbours. lift: of the logarithm at edges. hold: of
-    the squared distance from an estimate, in its deviations.
+    smoothness: of squared differences to the mean of clipped neighbours. hold: of the squared distance from an
+    estimate, in its deviations.
     """
 
     smoothness: float = 0.0
-    lift: float = 0.0
     hold: float = 0.0
 
     def __bool__(self) -> bool:
         """Return whether any part counts."""
-        return self.smoothness > 0 or self.lift > 0 or self.hold > 0
+        return self.smoothness > 0 or self.hold > 0
 
 
 def clipped_light_energy(
@@ -47,8 +46,6 @@ def clipped_light_energy(
     values of its channel within a few pixels, which is held constant, a clipped value has
 
         smoothness / 2 (v - m)^2              light is smooth
-        - lift (1 - share) v                  the blur of Gaussians takes light from edges; share: of pixels around
-                                              that are clipped
         + hold / 2 ((v - mean) / deviation)^2   an estimate of its light
 
     Args:
@@ -76,7 +73,7 @@ def add_clipped_light(image, codes, white, weights, index, mask, estimates, term
     rows, columns = (0, 0) if estimates is None else estimates.shape[:2]
     estimates = None if estimates is None else estimates.contiguous().view(-1)
     # The mean is in the weights: it costs no launch, here and for the gradient.
-    scaled = [weight / image.numel() for weight in (weights.smoothness, weights.lift, weights.hold)]
+    scaled = [weight / image.numel() for weight in (weights.smoothness, weights.hold)]
     energy = [image.shape[0], image.shape[1], *scaled, estimates, rows, columns, terms, slopes]
     scalar, code = warp_scalar(image.dtype), CODES[codes.dtype]
     if patches.in_patches(image.device):

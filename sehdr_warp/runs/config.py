@@ -107,9 +107,6 @@ class LossConfig(_Table):
     clipped_smoothness: Weight = 0.001
     """weight of the squared difference between the log light of a clipped pixel and the mean around it; applies if
     exposures are compared"""
-    clipped_lift: Weight = 0.0
-    """weight of a term that raises the light of clipped pixels at the border of a highlight, to compensate for the
-    light that the blur of Gaussians removes there"""
     clipped_estimate: Weight = 0.003
     """weight of the squared distance between the log light of clipped pixels and its estimate, in standard deviations;
     applies if exposures are compared; estimates come from the learned prior and from gain maps"""

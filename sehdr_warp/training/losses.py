@@ -129,7 +129,8 @@ def _distance_weight(form: str, weight: float) -> float:
 def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
     """Return L_LDR on the target's scale.
 
-    If exposures are compared, the light of clipped pixels, which the photo does not determine, is smoothed and lifted.
+    If exposures are compared, the light of clipped pixels, which the photo does not determine, is smoothed and held at
+    estimates.
     """
     image = compared_image(photo, target)
     codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
@@ -152,9 +153,9 @@ def compared_image(photo: TrainRender, target: Target) -> Tensor:
 
 
 def clipped_weights(config: LossConfig, target: Target) -> ClippedWeights:
-    """Return the weights of the terms for clipped light; without estimates, the third is 0."""
+    """Return the weights of the terms for clipped light; without estimates, the second is 0."""
     hold = 0.0 if target.estimates is None else config.clipped_estimate
-    return ClippedWeights(config.clipped_smoothness, config.clipped_lift, hold)
+    return ClippedWeights(config.clipped_smoothness, hold)
 
 
 def compares_exposures(config: LossConfig, field: RadianceField) -> bool:

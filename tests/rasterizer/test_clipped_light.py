@@ -12,7 +12,7 @@ from sehdr_warp.rasterizer.code_residual import code_tensor
 
 from .scenes import relative_error
 
-WHITE, WEIGHTS = 1.3, ClippedWeights(smoothness=0.7, lift=0.2, hold=0.4)
+WHITE, WEIGHTS = 1.3, ClippedWeights(smoothness=0.7, hold=0.4)
 
 
 @pytest.fixture(params=["values", "patches"])
@@ -54,11 +54,10 @@ def reference(light, codes, mask=None, means_of=None, estimates=None):
         around = np.s_[max(y - REACH, 0) : y + REACH + 1, max(x - REACH, 0) : x + REACH + 1, channel]
         near, value = torch.from_numpy(clipped[around]), logs[y, x, channel]
         total = total + WEIGHTS.smoothness / 2 * (value - others[around][near].mean()) ** 2
-        total = total - WEIGHTS.lift * (1 - near.double().mean()) * value
         if estimates is not None:
             rows, columns = estimates.shape[:2]
             found = estimates[y * rows // light.shape[0], x * columns // light.shape[1]].double()
-            # Light below white counts as white and is lifted all the same.
+            # Light below white counts as white and is held all the same.
             above = light[y, x, channel] / WHITE
             value = value if above > 1 else above - above.detach()
             total = total + WEIGHTS.hold / 2 * (found[channel + 3] * (value - found[channel])) ** 2

@@ -75,7 +75,7 @@ def test_clipped_pixels_push_up_and_black_ones_down_alone(name, bits):
         encoded = torch.where(encoded > 1, 3 * clipped, torch.where(encoded < 0, 0.0, clipped))
     encoded.requires_grad_()
     target = target_of(photo, response, bits=bits)
-    config = LossConfig(ssim_weight=0.0, clipped_smoothness=0.0, clipped_lift=0.0)
+    config = LossConfig(ssim_weight=0.0, clipped_smoothness=0.0)
     ldr_loss(TrainRender(encoded, None, None, None, encoded), target, config).backward()
     assert encoded.grad[0, :, 0].sign().tolist() == [0, 0, -1, 1, 0, 0, 1]
 
@@ -84,20 +84,11 @@ def test_clipped_pixels_push_up_and_black_ones_down_alone(name, bits):
 def test_clipped_light_evens_out_where_exposures_are_compared(clipping):
     response = response_by_name("srgb")
     light = (response.white * torch.tensor([[1.5, 6.0, 1.5, 1.5]])[..., None].expand(1, 4, 3)).double().requires_grad_()
-    config = LossConfig(clipping=clipping, ssim_weight=0.0, clipped_smoothness=1.0, clipped_lift=0.0)
+    config = LossConfig(clipping=clipping, ssim_weight=0.0, clipped_smoothness=1.0)
     target = target_of(torch.ones(1, 4, 3).double(), response, clipping=clipping)
     ldr_loss(TrainRender(light, light, light, None, light), target, config).backward()
     # Without clipping each is too bright for a photo that shows white.
     assert light.grad[0, :, 0].sign().tolist() == ([-1, 1, -1, -1] if clipping else [1, 1, 1, 1])
-
-
-def test_clipped_light_is_lifted_beside_what_does_not_clip():
-    response = response_by_name("srgb")
-    light = torch.full((1, 9, 3), 2 * response.white).double().requires_grad_()
-    target = target_of(row(*8 * [1.0], 0.9).double(), response)
-    config = LossConfig(ssim_weight=0.0, clipped_smoothness=0.0, clipped_lift=1.0)
-    ldr_loss(TrainRender(light, light, light, None, light), target, config).backward()
-    assert light.grad[0, :, 0].sign().tolist() == [0, 0, 0, 0, 0, -1, -1, -1, 1]
 
 
 def test_clipped_light_is_held_at_its_estimate_as_firmly_as_that_is_sure():
@@ -107,7 +98,7 @@ def test_clipped_light_is_held_at_its_estimate_as_firmly_as_that_is_sure():
     estimates = torch.zeros(1, 5, 6, dtype=torch.float16)
     estimates[..., :3] = math.log(4)
     estimates[..., 3:] = torch.tensor([1.0, 1.0, 0.1, 0.1, 1.0])[None, :, None]
-    config = LossConfig(ssim_weight=0.0, clipped_smoothness=0.0, clipped_lift=0.0, clipped_estimate=1.0)
+    config = LossConfig(ssim_weight=0.0, clipped_smoothness=0.0, clipped_estimate=1.0)
     light.requires_grad_()
     ldr_loss(TrainRender(light, light, light, None, light), replace(target, estimates=estimates), config).backward()
     slopes = (light.grad * light.detach())[0, :, 0]
