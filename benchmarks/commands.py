@@ -13,7 +13,7 @@ from sehdr_warp.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """Where the result goes."""
+    """Options of the result."""
 
     json: Path | None = None
     """Write the result to this file."""
@@ -29,7 +29,7 @@ class Output:
 
 @dataclass(frozen=True, kw_only=True)
 class Timed(Output):
-    """How things are timed."""
+    """Options of timing."""
 
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
@@ -177,7 +177,7 @@ class Quality(Output):
 
 @dataclass(frozen=True, kw_only=True)
 class Responses(Output):
-    """How well the camera's response is found from photos alone, on scenes with HDR truth."""
+    """Measure how well the camera's response is chosen from photos alone, on scenes with HDR truth."""
 
     data: tyro.conf.Positional[tuple[str, ...]] = ("embedded",)
     """Scenes with HDR truth."""

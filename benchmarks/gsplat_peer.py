@@ -17,7 +17,7 @@ BOUND = 1e-3
 
 
 def note_missing(result: dict, device: torch.device) -> bool:
-    """Whether gsplat can run here; a note in the result says why not."""
+    """Return whether gsplat can run here; a note in the result says why not."""
     if device.type != "cuda":
         result["notes"].append("gsplat not compared: it needs CUDA")
         return False

@@ -121,7 +121,7 @@ def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[],
 
 
 def _from_the_start(variant: Variant) -> Variant:
-    """As many calls as end in a replay, none of them recorded before: memory of recordings counts."""
+    """Return a variant of as many calls as end in a replay, without earlier captures, because their memory counts."""
 
     def calls() -> None:
         for _ in range(WARMUP_CALLS + 2):

@@ -20,7 +20,7 @@ EXPOSURE_TIME, BALLS = 0.25, 24
 
 @dataclass(frozen=True)
 class Size:
-    """How many Gaussians on how many pixels."""
+    """Number of Gaussians, and size of the image."""
 
     gaussians: int
     width: int

@@ -27,7 +27,7 @@ def cell_of(position: float, last_cell: int) -> int:
 
 @wp.func
 def node_weights(part: float) -> _weights4:
-    """Of the four nodes around a cell, for a place 0 <= part <= 1 within it, or beyond the last cell."""
+    """Return the weights of the four nodes around a cell, for a place 0 <= part <= 1 in it, or beyond the last cell."""
     t = wp.min(part, 1.0)
     beyond = part - t
     right_value = t * t * (3.0 - 2.0 * t)

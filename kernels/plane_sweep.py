@@ -33,7 +33,7 @@ def color_at(photos: wp.array(dtype=wp.vec4ub), place: wp.int64) -> wp.vec4:
 
 @wp.func
 def difference(a: wp.vec4, b: wp.vec4) -> float:
-    """Of the codes, all channels together."""
+    """Return the sum over channels of the absolute differences of codes."""
     apart = a - b
     return wp.abs(apart[0]) + wp.abs(apart[1]) + wp.abs(apart[2])
 

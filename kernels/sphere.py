@@ -129,7 +129,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
 
     @wp.func
     def falloff(squared: real, forward: real) -> real:
-        """Of a Gaussian's opacity; 0 behind the viewer, and where exp(-18) would be below every threshold in use."""
+        """Return the factor of a Gaussian's opacity; 0 behind the viewer, and below exp(-18), under every threshold."""
         value = real(0.0)
         if forward > real(0.0) and squared < real(36.0) * forward * forward:
             value = wp.exp(real(-0.5) * squared / (forward * forward))

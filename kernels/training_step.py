@@ -168,7 +168,7 @@ def find_nonfinite(
 
 @wp.func
 def place_in_turn(k: int, turn: int, turns: int) -> int:
-    """Of the numbers, TURN in each turn, the k-th of those whose turn it is."""
+    """Return the index of the k-th number that is updated in a turn; numbers take turns in blocks of TURN."""
     return k + (k // wp.static(TURN) * (turns - 1) + turn) * wp.static(TURN)
 
 

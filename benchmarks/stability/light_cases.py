@@ -148,7 +148,7 @@ def _loss(prediction, photo):
 
 
 def _clipped_light(device):
-    """Of a disk that clips: light around white, far above it, equal, and with one pixel at 2^100."""
+    """Check a disk that clips: light around white, far above it, equal, and with one pixel at 2^100."""
     noise = torch.randn(11, 13, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(11), torch.arange(13), indexing="ij")
     codes = torch.where(((y - 5) ** 2 + (x - 6) ** 2 < 20)[..., None], 255, 90).expand(11, 13, 3).to(torch.uint8)
@@ -167,7 +167,7 @@ def _clipped_light(device):
 
 
 def _similarity(device):
-    """Of 1 x 1, of odd size, of flat, nearly equal and tiny images."""
+    """Check images of 1 x 1, of odd size, flat, nearly equal and tiny ones."""
     generator = torch.Generator().manual_seed(0)
     for name, shape, change in (
         ("1 x 1", (1, 1, 3), lambda a: (a, 1 - a)),

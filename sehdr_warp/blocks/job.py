@@ -23,7 +23,7 @@ MOST_POINTS = 4  # Sparse points that are looked at, relative to the largest num
 
 
 class BlockResult(NamedTuple):
-    """How the training of a block ended."""
+    """Result of the training of a block."""
 
     index: int
     error: str | None

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 class TrainedBlock(NamedTuple):
-    """What the merged run takes from a block.
+    """Parts of a block that go into the merged run.
 
     Attributes:
         gaussians: Parameters of the Gaussians in its core, in the coordinates of the merged run.

@@ -29,14 +29,7 @@ _CLIPPED = 0.1  # Share of clipped values at the reading's place from which its 
 
 @dataclass(frozen=True)
 class LightUnit:
-    """What a radiance of 1 is.
-
-    Attributes:
-        luminance: cd/m^2 of a radiance of 1 in each channel of linear Rec.709.
-        view: Name of the view in which the reading was taken.
-        pixel: x and y of its place, from the view's upper left corner.
-        reading: The reading in words.
-    """
+    """Luminance of a radiance of 1."""
 
     luminance: float
     view: str

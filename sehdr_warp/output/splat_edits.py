@@ -103,7 +103,7 @@ class SplatEdits:
 
     @property
     def changes_pictures(self) -> bool:
-        """Whether the file is meant to show something else than the scene."""
+        """True if the file is meant to show something else than the scene."""
         return bool(self.crop or self.cut or self.min_views or self.min_opacity > LEAST_OPACITY)
 
     def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: Any) -> np.ndarray:

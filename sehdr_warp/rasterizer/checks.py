@@ -54,7 +54,7 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
 
 
 def _fit(arguments: Iterable[tuple[Any, tuple[int | str, ...]]]) -> bool:
-    """Whether check_tensors() has nothing to say, found in the least time: it is asked at every call."""
+    """Return whether check_tensors() has no objection; as fast as possible, because every call asks."""
     sizes: dict[str, int] = {}
     dtype = device = None
     for value, shape in arguments:

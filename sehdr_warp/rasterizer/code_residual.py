@@ -35,12 +35,14 @@ def code_values(codes: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class CodeScale:
-    """What codes are worth where images are compared with them.
+    """Table of the values by which codes are compared with images.
 
-    table: [256, 3] or [65536, 3] by code, of the images' type and on their device: what it is worth, the least and the
-        most that it stands for; -inf or inf where that has no end. What a code is worth increases.
-    mu, white: images are exposures x, and compared as log(1 + mu x / white) / log(1 + mu); mu = 0: as they are.
-    wide: the table where codes that stand for much light are intervals; None where none does.
+    Attributes:
+        table: [256, 3] or [65536, 3] by code, of the images' type and on their device: value, lower and upper bound of
+            a code; -inf or inf for a bound that does not exist. Values increase with the code.
+        mu: Images are exposures x, and compared as log(1 + mu x / white) / log(1 + mu); 0 compares them as they are.
+        white: Exposure that photos show as white.
+        wide: The table in which bright codes are intervals; None if there are no such codes.
     """
 
     table: Tensor

@@ -11,7 +11,7 @@ from .warp_launch.threads import torch_threads
 
 
 def in_patches(device: torch.device) -> bool:
-    """Whether kernels of this device work on patches."""
+    """Return whether kernels of this device work on patches."""
     return device.type == "cuda"
 
 

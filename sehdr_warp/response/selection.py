@@ -77,12 +77,19 @@ GRID = np.arange(255 * FINE + 1) / (255 * FINE)
 
 @dataclass(frozen=True)
 class ResponseScore:
-    """What the photos say about one candidate; nats are minus log likelihoods, so that smaller is better.
+    """Score of one candidate; nats are minus log likelihoods, so that smaller is better.
 
-    dynamic_range: stops between the 0.1th and 99.9th percentile of decoded, unclipped values; roughness: mean absolute
-    second difference of their log2; paper_score: range minus roughness, each over its median among the candidates,
-    larger is better. In nats: edges, of an edge (NaN for under 50 usable ones); highlights, of the pixels at and below
-    the brightest code; span and density of light; prior. posterior: the sum, edges times edge_facts(their number).
+    Attributes:
+        response: The candidate.
+        dynamic_range: Stops between the 0.1th and 99.9th percentile of decoded, unclipped values.
+        roughness: Mean absolute second difference of the logarithms (base 2) of decoded values.
+        paper_score: Range minus roughness, each over its median among the candidates; larger is better.
+        edges: Nats of an edge; NaN for under 50 usable ones.
+        highlights: Nats of the pixels at and below the brightest code.
+        span: Nats of the spread of log exposure.
+        density: Nats of the density of log exposure.
+        prior: Nats of the candidate before any photo.
+        posterior: The sum, with edges times edge_facts(their number).
     """
 
     response: Response
@@ -187,7 +194,7 @@ def select_response(
 
 
 def edge_facts(count: int) -> float:
-    """How many independent observations so many edges of one set of photos count as."""
+    """Return as how many independent observations `count` edges of one set of photos count."""
     return min(count / EDGES_PER_FACT, MOST_FACTS)
 
 
@@ -239,10 +246,11 @@ def family_logs() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _highlights(shares: np.ndarray, fine: np.ndarray) -> np.ndarray:
-    """Of the shares of values at the brightest code and at the nine codes below it; fine: on GRID.
+    """Return minus log likelihoods by the shares of values at the brightest code and at the nine codes below it.
 
     If radiance falls off as exp(-rate stops) over the S stops of the nine codes and beyond, near / (white + near) is
     1 - exp(-rate S): a camera that clips piles values up at white, others spread them. The rate is log-normal.
+    fine: ln x on GRID.
     """
     stops = (fine[:, 509 * FINE // 2] - fine[:, 491 * FINE // 2]) / np.log(2)
     white, near = shares[255] + HIGHLIGHT_FLOOR / 2, shares[246:255].sum() + HIGHLIGHT_FLOOR / 2
@@ -267,7 +275,7 @@ def _span(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
 
 
 def _density(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """Of the density of log exposure: smooth in a scene, while a wrong curve heaps it up or thins it out."""
+    """Return minus log likelihoods by the density of log exposure, which is smooth unless the curve is wrong."""
     edges = 0.5 * (logs[:, DENSITY_EDGES - 1] + logs[:, DENSITY_EDGES]) / np.log(2)
     widths = np.maximum(np.diff(edges), 1e-6)
     counts = np.add.reduceat(shares, DENSITY_EDGES)[:-1]

@@ -306,7 +306,7 @@ def describe_scene(scene: Scene) -> dict:
 
 @dataclass(frozen=True)
 class SceneDifference:
-    """What differs between two scenes: "layout", "views", or the names of photos.
+    """Difference of two scenes: "layout", "views", or the names of photos.
 
     Attributes:
         text: In words.

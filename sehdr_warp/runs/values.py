@@ -100,7 +100,7 @@ class RegionValues(Values):
 
 
 class UnexplainedValues(Values):
-    """How many regions of how many photos are not explained, and the worst of them."""
+    """Number of regions that are not explained, number of their photos, and the worst regions."""
 
     regions: Count
     photos: Count

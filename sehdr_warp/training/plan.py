@@ -107,7 +107,7 @@ class Plan:
             lines.append(f"{row.name:{name}}  {row.choice:{choice}}  {row.reason}")
             if row.fields:
                 lines.append(f"{'':{name}}  {'':{choice}}  -> {', '.join(_format_fields(row.fields))}")
-        return "\n".join([*lines, *(f"kept as given: {line}" for line in _format_fields(self.user_fields))])
+        return "\n".join([*lines, *(f"set by you: {line}" for line in _format_fields(self.user_fields))])
 
     def lines(self) -> list[str]:
         """Return a line for each decision that changes something, and for each field that the user set."""
@@ -119,7 +119,7 @@ class Plan:
         if code := self.facts.plateau:
             problem = f"no photo is brighter than code {code} of 255, which many pixels have: they clip there"
             lines.append(f"plan: {problem}, and that is taken for their light; export them with white at 255")
-        return lines + [f"plan: {line}, as given" for line in _format_fields(self.user_fields)]
+        return lines + [f"plan: {line}, as you set it" for line in _format_fields(self.user_fields)]
 
 
 def _format_fields(fields: dict) -> list[str]:

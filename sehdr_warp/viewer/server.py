@@ -294,7 +294,7 @@ class Server(ThreadingHTTPServer):
         log.debug("a connection of %s ended", client_address)
 
     def allowed(self, host: str, origin: str | None) -> bool:
-        """Whether a request comes from a page of this server: another site's could reach it by a name of its own."""
+        """Return whether a request comes from a page of this server: another site could reach it by another name."""
         name = re.sub(r":[0-9]*$", "", host)
         own = f"[{self.host}]" if ":" in self.host else self.host
         proxies = [each.partition("://")[2] for each in self.origins]

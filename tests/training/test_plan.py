@@ -188,7 +188,7 @@ def test_what_the_user_gave_stays(scene):
     assert plan.config.schedule.iterations == 9000
     assert plan.user_fields == {"schedule.iterations": 9000}
     assert "schedule.iterations" not in fields(plan)
-    assert "kept as given: schedule.iterations = 9000" in plan.table()
+    assert "set by you: schedule.iterations = 9000" in plan.table()
 
 
 def outwards(index):

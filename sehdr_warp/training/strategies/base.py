@@ -36,7 +36,7 @@ SeedFunction = Callable[[Tensor, int], Seeds]
 
 @dataclass
 class Schedule:
-    """When a strategy refines, in iterations of this training."""
+    """Iterations of this training at which a strategy refines."""
 
     start: int
     stop: int
