@@ -38,7 +38,7 @@ MAX_SHARE = 1 / 16
 
 
 class _Signature(NamedTuple):
-    """What calls of one graph have in common."""
+    """Properties that the calls of one graph share."""
 
     options: RenderOptions
     stream: int

@@ -129,7 +129,7 @@ class LossConfig(_Table):
 
 
 class DensificationConfig(_Table):
-    """When and how far the number of Gaussians changes; options of one strategy are in the tables mcmc and adc."""
+    """Changes of the number of Gaussians; options of one strategy are in the tables mcmc and adc."""
 
     strategy: Literal["mcmc", "adc"] = "mcmc"
     """mcmc: relocate transparent Gaussians to opaque ones (3DGS-MCMC); adc: duplicate and split where image gradients

@@ -83,6 +83,8 @@ ONLY_IN = {
     "warp": {"kernels", "rasterizer"},
 }
 LARGEST_FILE = 400
+NOT_FIRST = {"as", "how", "of", "that", "those", "what", "when", "where", "whether", "which", "who"}
+"""Words that no docstring starts with."""
 
 
 def sources():
@@ -119,6 +121,17 @@ def test_imports_go_down_the_line(path, package):
             assert fits, f"{package} may not import {name}"
         if top in ONLY_IN and package in ALLOWED:
             assert package in ONLY_IN[top], f"{package} may not import {name}"
+
+
+@pytest.mark.parametrize("path,_", list(sources()))
+def test_docstrings_start_with_a_verb_or_a_noun(path, _):
+    wrong = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            first, *_rest = (ast.get_docstring(node) or "-").split()
+            if first.lower() in NOT_FIRST:
+                wrong.append(f"{node.name} ({first} ...)")
+    assert not wrong, f"{path.relative_to(ROOT)}: start with a verb, as Return or Write, not {', '.join(wrong)}"
 
 
 @pytest.mark.parametrize("path,_", list(sources()))
