@@ -237,9 +237,9 @@ def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice
     if facts.light_known:
         return Choice({}, "no search", "the photos hold light itself")
     if name != "auto":
-        return Choice({}, "no search", "learned with the scene" if name == "learned" else f"{name} was named")
-    writer = "a camera made the files" if facts.from_camera else "nothing says what made the files"
-    return Choice({}, "search", f"no curve was named, and {writer}: it is chosen from {facts.photos} photos")
+        return Choice({}, "no search", "learned with the scene" if name == "learned" else f"response.name is {name}")
+    origin = "files of a camera" if facts.from_camera else "files of unknown origin"
+    return Choice({}, "search", f"response.name is auto, {origin}: chosen from {facts.photos} photos")
 
 
 def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
@@ -247,7 +247,11 @@ def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
         unneeded: dict[str, object] = (
             {} if facts.clipped else dict.fromkeys(("loss.clipped_smoothness", "loss.clipped_estimate"), 0.0)
         )
-        return Choice(unneeded, "as photos show it", f"{facts.clipped:.1%} of the pixels are a bound alone")
+        return Choice(
+            unneeded,
+            "from the photos",
+            f"{facts.clipped:.1%} of the pixels are clipped",
+        )
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
     reason = f"{facts.truths} float pictures hold all light: behind a photo's curve the brightest would hardly count"
     return Choice(fields, "in the mu-law", reason)
@@ -257,7 +261,7 @@ def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice
     darker, brighter = (2 if facts.clipped < 0.001 else 4), (2 if facts.black < 0.001 else 4)
     reason = (
         f"{facts.clipped:.1%} of the pixels clip, {facts.black:.1%} are black: look at -{darker} to +{brighter} EV "
-        f"(render --evs=-{darker},0,{brighter}); all are scalings of one render, made at export"
+        f"(render --evs=-{darker},0,{brighter}); brackets are computed at export, from one render"
     )
     if not config.fusion.enabled:
         return Choice({}, "plain scaling", reason)
@@ -337,13 +341,15 @@ def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     if haste == 1 or not as_usual:
         return Choice({}, "as they are", f"{steps} steps")
     fields: dict[str, object] = {f"optimizer.{name}": float(f"{getattr(usual, name) * haste:.3g}") for name in as_usual}
-    return Choice(fields, f"{haste:g} times", f"{steps} steps, and the rates are made for {RATES_FOR}")
+    return Choice(
+        fields, f"{haste:g} times", f"learning rates are tuned for {RATES_FOR} steps; this training has {steps}"
+    )
 
 
 def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     unsure = facts.clipped + facts.black
-    reason = f"{unsure:.1%} of the pixels state a bound alone, and a place is seen by {facts.seen:.1f} photos"
-    return Choice({}, "worth a look" if unsure >= 0.001 or facts.seen < 4 else "high throughout", reason)
+    reason = f"{unsure:.1%} of the pixels are clipped or black, and a point is visible in {facts.seen:.1f} photos"
+    return Choice({}, "low in places" if unsure >= 0.001 or facts.seen < 4 else "high throughout", reason)
 
 
 RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {
