@@ -243,4 +243,4 @@ def boxes_in_view(camera: Camera, low: np.ndarray, high: np.ndarray) -> np.ndarr
     )
     normals = edges @ camera.world_to_camera[:3, :3]
     inside = (middle - camera.position) @ normals.T + half @ np.abs(normals).T >= 0
-    return inside.all(axis=1)
+    return np.all(inside, axis=1)

@@ -81,7 +81,7 @@ class Ranks:
             begin = partial(dist.init_process_group, backend, timeout=_EVER, **options)
             run_interruptibly(begin, self._log_wait)
             # Messages between hosts must not wait for their devices.
-            self._hosts = dist.new_group(backend="gloo", timeout=_EVER) if self._cuda else dist.group.WORLD
+            self._hosts: Any = dist.new_group(backend="gloo", timeout=_EVER) if self._cuda else dist.group.WORLD
         self._check_versions()
         self._watcher = threading.Thread(target=self._watch, name="sehdr-warp ranks", daemon=True)
         self._watcher.start()
