@@ -34,6 +34,7 @@ _COVERED, _LEAST_COVERED, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
 # what is nearer to it than this part of the distance of the nearest camera is then left out of a map at the center.
 _FACING, _SIDES, _CLEARANCE = 0.7, 0.5, 0.5
 _FINEST = {"latlong": 4096, "cube": 1024}  # Most pixels across that are rendered for a map that is smaller
+_MOST_PIXELS = 1 << 21  # Of those, at once
 _COARSE, _DARKEST = 128, 1e-9  # Inpainting: columns of the coarse map, and the least light
 # The nearest axes of a cube's faces in OpenEXR's order (+X -X +Y -Y +Z -Z): to the right, down, and out.
 _FACES = np.array(
@@ -197,30 +198,42 @@ def render_map(
         options: Of render_directions().
     """
     angle = 2 * np.pi / size if layout == "latlong" else 2 / size
-    most = max(1, _FINEST[layout] // size)
-    finer = int(np.clip(np.ceil(angle * focal), 1, most))
-    rays = (latlong if layout == "latlong" else cube)(size * finer) @ to_scene
-    seen = run.render_directions(position, rays, focal_length=focal or 1 / angle, pixel_angle=angle / finer, **options)
+    finer = int(np.clip(np.ceil(angle * focal), 1, max(1, _FINEST[layout] // size)))
+    rows = size // 2 if layout == "latlong" else 6 * size
+    # In bands, because the fine pixels of a whole map would take a gigabyte.
+    step = max(1, _MOST_PIXELS // (size * finer * finer))
+    options |= {"focal_length": focal or 1 / angle, "pixel_angle": angle / finer}
+    bands = []
+    for start in range(0, rows, step):
+        band = slice(start * finer, min(rows, start + step) * finer)
+        rays = (latlong if layout == "latlong" else cube)(size * finer, band) @ to_scene
+        bands.append(_averaged_map(run.render_directions(position, rays, **options), finer))
+    parts = zip(*((band.hdr, band.alpha, band.distance, band.confidence, band.clipped) for band in bands), strict=True)
+    return RenderedMap(*(None if part[0] is None else np.concatenate(part) for part in parts))
+
+
+def _averaged_map(seen: Any, finer: int) -> RenderedMap:
+    """Return a render along directions as pixels of `finer` x `finer` of its own."""
 
     def averaged(values: np.ndarray) -> np.ndarray:
         height, width, *channels = values.shape
         return values.reshape(height // finer, finer, width // finer, finer, *channels).mean(axis=(1, 3))
 
-    def weighted(values: Any, weight: np.ndarray) -> np.ndarray | None:
+    def weighted(values: Any, weight: np.ndarray) -> np.ndarray:
         """Return the mean of values with weights; the mean without where all are 0."""
-        if values is None:
-            return None
-        values = as_array(values)
-        total = averaged(weight)
+        values, total = as_array(values), averaged(weight)
         mean = averaged(values * weight) / np.where(total > 0, total, 1)
         return np.where(total > 0, mean, averaged(values)).astype(np.float32)
 
     hdr, alpha, distance = (as_array(values) for values in (seen.hdr, seen.alpha, seen.distance))
     shown, light = alpha * (distance > 0), np.maximum(hdr.mean(2), 0)
-    distances = weighted(distance, shown)
-    assert distances is not None
-    parts = weighted(seen.confidence, shown), weighted(seen.clipped, light)
-    return RenderedMap(averaged(hdr), averaged(alpha), distances, *parts)
+    return RenderedMap(
+        averaged(hdr),
+        averaged(alpha),
+        weighted(distance, shown),
+        None if seen.confidence is None else weighted(seen.confidence, shown),
+        None if seen.clipped is None else weighted(seen.clipped, light),
+    )
 
 
 def envmap(layout: str) -> Any:
@@ -230,20 +243,21 @@ def envmap(layout: str) -> Any:
     return OpenEXR.Envmap.ENVMAP_LATLONG if layout == "latlong" else OpenEXR.Envmap.ENVMAP_CUBE
 
 
-def latlong(size: int) -> np.ndarray:
-    """Return [size / 2, size, 3] unit directions of the pixel centers of a latitude-longitude map."""
+def latlong(size: int, rows: slice = slice(None)) -> np.ndarray:
+    """Return [size / 2, size, 3] unit directions of the pixel centers of a latitude-longitude map, or some rows."""
     longitude = np.pi - 2 * np.pi * (np.arange(size) + 0.5) / size
-    latitude = (np.pi / 2 - np.pi * (np.arange(size // 2) + 0.5) / (size // 2))[:, None]
+    latitude = (np.pi / 2 - np.pi * (np.arange(size // 2)[rows] + 0.5) / (size // 2))[:, None]
     across = np.cos(latitude)
-    up = np.broadcast_to(np.sin(latitude), (size // 2, size))
+    up = np.broadcast_to(np.sin(latitude), (len(latitude), size))
     return np.stack([across * np.sin(longitude), up, across * np.cos(longitude)], axis=2)
 
 
-def cube(size: int) -> np.ndarray:
-    """Return [6 size, size, 3] unit directions of OpenEXR's cube map."""
-    place = 2 * (np.arange(size) + 0.5) / size - 1
-    local = np.stack([*np.meshgrid(place, place), np.ones((size, size))], axis=2)
-    faces = np.concatenate([local @ axes for axes in _FACES])
+def cube(size: int, rows: slice = slice(None)) -> np.ndarray:
+    """Return [6 size, size, 3] unit directions of OpenEXR's cube map, or some rows."""
+    place, row = 2 * (np.arange(size) + 0.5) / size - 1, np.arange(6 * size)[rows]
+    across, down = np.meshgrid(place, place[row % size])
+    local = np.stack([across, down, np.ones(across.shape)], axis=2)
+    faces = np.einsum("hwk,hkj->hwj", local, _FACES[row // size])
     return faces / np.linalg.norm(faces, axis=2, keepdims=True)
 
 

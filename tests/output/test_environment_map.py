@@ -8,6 +8,7 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
+from sehdr_warp.output import environment_map
 from sehdr_warp.output.environment_map import (
     cube,
     inpainted,
@@ -302,3 +303,13 @@ def test_a_small_lamp_of_hidden_gaussians_has_its_light_in_maps_of_any_size(tmp_
         light.append(float((pixels.hdr.mean(2) * weight).sum() / weight.sum()))
         assert pixels.distance.max() == pytest.approx(4, rel=0.01) and pixels.hdr.shape == (*weight.shape, 3)
     assert light[1:] == pytest.approx([light[0]] * 2, rel=0.05)
+
+
+@pytest.mark.parametrize("layout", ["latlong", "cube"])
+def test_bands_make_the_same_map(run, layout, monkeypatch):
+    whole = render_map(run, np.zeros(3), 32, layout, np.eye(3), 20.0)
+    monkeypatch.setattr(environment_map, "_MOST_PIXELS", 1000)
+    parts = render_map(run, np.zeros(3), 32, layout, np.eye(3), 20.0)
+    for name in ("hdr", "alpha", "distance"):
+        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-5, atol=1e-6)
+    assert whole.hdr.max() > 1
