@@ -51,15 +51,15 @@ def main(jobs: tyro.conf.Positional[Path], /, json: Path, picture: Path | None =
     mi: Any = load_mitsuba()
     result = new_result("relight", torch.device("cpu"), {"samples": samples})
     strips, truths = [], {}
-    for config, folder in _stored(jobs):
+    for config, folder in _finished_jobs(jobs):
         scene, exposure, method = config["scene"]["name"], config["exposure"], config["method"]
         place = read_light_maps(embedded_folder(f"embedded:{scene}"))[0]
         if scene not in truths:
             truths[scene] = balls(mi, place, place.radiance, (), samples)
-        truth, stored = truths[scene], read_light(folder / LIGHT)
-        pictures = {"map": balls(mi, place, stored.maps[0], (), samples)}
-        if stored.lights and method == METHODS[0]:
-            pictures["lights"] = balls(mi, place, stored.rest[0], stored.lights, samples)
+        truth, light = truths[scene], read_light(folder / LIGHT)
+        pictures = {"map": balls(mi, place, light.maps[0], (), samples)}
+        if light.lights and method == METHODS[0]:
+            pictures["lights"] = balls(mi, place, light.rest[0], light.lights, samples)
         for by, lit in pictures.items():
             row = {"scene": scene, "exposure": exposure, "method": method, "by": by}
             row |= {"off": float(np.abs(lit - truth).mean() / truth.mean()), "energy": float(lit.mean() / truth.mean())}
@@ -76,17 +76,17 @@ def main(jobs: tyro.conf.Positional[Path], /, json: Path, picture: Path | None =
         write_picture(picture, quantize(_montage(strips)))
 
 
-def _stored(jobs: Path) -> list[tuple[dict, Path]]:
+def _finished_jobs(jobs: Path) -> list[tuple[dict, Path]]:
     """Return config and folder of the finished jobs that are compared, ordered."""
-    found = []
+    result = []
     for path in sorted(jobs.glob(f"jobs/*/{RESULT}")):
         config = read_json(path)["config"]
-        wanted = config["scene"]["name"] in SHOWN[0] and config["exposure"] in SHOWN[1] and config["seed"] == 0
-        known = config["response"] in (KNOWN, "linear") or config["sees_truth"]
-        if wanted and known and config["method"] in METHODS and (path.parent / LIGHT).is_file():
-            found.append((config, path.parent))
-    order = [(config["scene"]["name"], config["exposure"], METHODS.index(config["method"])) for config, _ in found]
-    return [found[i] for i in sorted(range(len(found)), key=order.__getitem__)]
+        is_shown = config["scene"]["name"] in SHOWN[0] and config["exposure"] in SHOWN[1] and config["seed"] == 0
+        knows_curve = config["response"] in (KNOWN, "linear") or config["sees_truth"]
+        if is_shown and knows_curve and config["method"] in METHODS and (path.parent / LIGHT).is_file():
+            result.append((config, path.parent))
+    order = [(config["scene"]["name"], config["exposure"], METHODS.index(config["method"])) for config, _ in result]
+    return [result[i] for i in sorted(range(len(result)), key=order.__getitem__)]
 
 
 def balls(
@@ -101,9 +101,9 @@ def balls(
         lights: shapes in the scene's coordinates, with their radiance [3].
         samples: paths of a pixel.
     """
-    seen = np.maximum(radiance, 0) * place.seen[..., None]
+    visible_light = np.maximum(radiance, 0) * place.seen[..., None]
     scene: dict[str, Any] = {"type": "scene", "integrator": {"type": "path", "max_depth": DEPTH}}
-    scene["map"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(seen, np.float32))}
+    scene["map"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(visible_light, np.float32))}
     for index, (shape, light) in enumerate(lights):
         scene[f"light_{index}"] = _emitter(mi, shape, light, place.position)
     weight = solid_angles(place.seen.shape[1], "latlong") * place.seen

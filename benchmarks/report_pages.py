@@ -290,8 +290,15 @@ def readme_table(rows: Sequence[Mapping]) -> str:
             continue
         off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}, {row['worst room']:.0%}"
         energy = "-" if row["light energy"] is None else f"{row['light energy']:.2f}, {row['nine in ten lights']}"
-        lost = row["lost"].removesuffix(" lights")
-        cells = [label, f"{row['HDR dB']:.1f} dB", f"{row['photos dB']:.1f} dB", lost, *[off] * irradiance, energy]
+        lights_lost = row["lost"].removesuffix(" lights")
+        cells = [
+            label,
+            f"{row['HDR dB']:.1f} dB",
+            f"{row['photos dB']:.1f} dB",
+            lights_lost,
+            *[off] * irradiance,
+            energy,
+        ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([f"| {' | '.join(titles)} |", f"| ---{' | -:' * (len(titles) - 1)} |", *lines])
 

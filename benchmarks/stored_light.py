@@ -57,7 +57,7 @@ def read_light(path: Path) -> StoredLight:
     try:
         with np.load(path) as arrays:
             count = range(len(arrays))
-            found = {n: [arrays[f"{n}_{i}"] for i in count if f"{n}_{i}" in arrays] for n in ("map", "rest")}
+            lists = {n: [arrays[f"{n}_{i}"] for i in count if f"{n}_{i}" in arrays] for n in ("map", "rest")}
             rows = json.loads(str(arrays["lights"]))
         lights = [
             (
@@ -68,4 +68,4 @@ def read_light(path: Path) -> StoredLight:
         ]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(path, f"is not the light of a job ({error!s:.100})", "run the job again") from None
-    return StoredLight(found["map"], found["rest"], lights)
+    return StoredLight(lists["map"], lists["rest"], lights)

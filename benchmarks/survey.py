@@ -121,9 +121,9 @@ def write_survey(
         for name, camera in zip(names, cameras)
     ]
     camera = cameras[0]
-    kept = np.random.default_rng(seed).permutation(len(points))[: 40 * views]
-    colors = codes_of(field.response.encode(np.exp(log_exposures[kept])), 8) / 255
-    _write_points(folder / "points.ply", points[kept], colors)
+    subset = np.random.default_rng(seed).permutation(len(points))[: 40 * views]
+    colors = codes_of(field.response.encode(np.exp(log_exposures[subset])), 8) / 255
+    _write_points(folder / "points.ply", points[subset], colors)
     lens = {"w": camera.width, "h": camera.height, "cx": camera.cx, "cy": camera.cy}
     lens |= {"fl_x": camera.fx, "fl_y": camera.fy}
     (folder / "transforms.json").write_text(json.dumps({**lens, "ply_file_path": "points.ply", "frames": frames}))

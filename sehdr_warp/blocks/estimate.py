@@ -27,9 +27,11 @@ def estimate(plan: Plan, device: torch.device, gpus: int = 1) -> tuple[list[Choi
     gaussians = max(min(facts.points, config.densification.cap_max), start_count(config, facts.pixels), cap)
     whole = Workload(facts.photos, facts.pixels / facts.photos, gaussians, config.schedule.iterations)
     blocks = blocks_for(facts.photos, facts.pixels, config)
-    wanted = config.mcmc.cap_density * math.sqrt(facts.pixels) if blocks > 1 else 0.0
+    gaussians_needed = config.mcmc.cap_density * math.sqrt(facts.pixels) if blocks > 1 else 0.0
     divided = replace(
-        whole, gaussians=max(whole.gaussians, wanted), iterations=max(whole.iterations, STEPS_PER_PHOTO * facts.photos)
+        whole,
+        gaussians=max(whole.gaussians, gaussians_needed),
+        iterations=max(whole.iterations, STEPS_PER_PHOTO * facts.photos),
     )
     if device.type == "cuda":
         memory = float(torch.cuda.get_device_properties(device).total_memory)

@@ -81,8 +81,8 @@ def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
     info |= {"color_matrix": matrix} if (matrix := blocks[0].info.get("color_matrix")) else {}
     info |= {"exposure_compensation": gains.to_dict()} if (gains := plan.shared.gains) else {}
     seconds = sum(block.values["seconds"] for block in blocks)
-    named = {f"gaussians.{name}": tensor for name, tensor in tensors.items()}
-    state = named, {"iteration": iterations, "seconds": seconds}
+    arrays = {f"gaussians.{name}": tensor for name, tensor in tensors.items()}
+    state = arrays, {"iteration": iterations, "seconds": seconds}
     folder = RunWriter(out)
     folder.lock()
     try:

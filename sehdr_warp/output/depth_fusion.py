@@ -114,10 +114,10 @@ def fuse_depth(
             index = torch.where(ahead, row * camera.width + column, torch.zeros_like(row))
             depth = view.depth.reshape(-1)[index]
             signed = (depth - z) / reach
-            measured = ahead & (depth > 0) & (signed > -1)
-            distance[part] += torch.where(measured, signed.clamp(-1, 1), 0)
-            weight[part] += measured
-            close = measured & (signed < 1)
+            has_depth = ahead & (depth > 0) & (signed > -1)
+            distance[part] += torch.where(has_depth, signed.clamp(-1, 1), 0)
+            weight[part] += has_depth
+            close = has_depth & (signed < 1)
             light[part] += view.radiance.reshape(-1, 3)[index] * close[:, None]
             near[part] += close
     mean = distance / weight.clamp_min(1)
@@ -135,15 +135,15 @@ def _chunks(low: np.ndarray, voxel: float, shape: tuple[int, ...]) -> Iterator[t
         yield first * slab, torch.from_numpy(voxel_centers(origin, voxel, part).reshape(-1, 3)).float()
 
 
-def zero_surface(distance: np.ndarray, measured: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+def zero_surface(distance: np.ndarray, has_depth: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [V, 3], from the first voxel, and faces [F, 3] of the zero of a distance field."""
     try:
-        found = marching_cubes_function()(
-            distance, 0.0, spacing=(voxel,) * 3, mask=measured, gradient_direction="descent"
+        surface = marching_cubes_function()(
+            distance, 0.0, spacing=(voxel,) * 3, mask=has_depth, gradient_direction="descent"
         )
     except (ValueError, RuntimeError):  # Nothing of the field is measured, or it has no zero.
         raise SehdrError("there is no surface to mesh; take another --crop, or train longer") from None
-    vertices, faces = found[:2]
+    vertices, faces = surface[:2]
     finite = np.isfinite(vertices).all(axis=1)
     return vertices, faces[finite[faces].all(axis=1)]
 

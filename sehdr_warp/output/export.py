@@ -78,9 +78,9 @@ def export(
         InputError: For an unknown suffix, if a file exists, or if a value is not finite.
     """
     path, edits = Path(path), edits or SplatEdits()
-    held = color_model_of(path)
-    kind = kind or ("hdr" if held == "linear" else "ldr")
-    _check(path, kind, held, exposure_time, degree)
+    file_model = color_model_of(path)
+    kind = kind or ("hdr" if file_model == "linear" else "ldr")
+    _check(path, kind, file_model, exposure_time, degree)
     beside = path.with_name(f"{path.stem}.cameras.json")
     if path.name == STREAMED_SOG:
         check_absent(path.parent, overwrite, folder=True)
@@ -95,7 +95,7 @@ def export(
         upright = world_transform(run, axes, up=up, scale=scale)
         to_file = file_transform(upright, path) if axes == "upright" else upright
     time = run.base_time if exposure_time is None else float(exposure_time)
-    radiance = held or ("linear" if run.model.color_model.name == "linear" else "log")
+    radiance = file_model or ("linear" if run.model.color_model.name == "linear" else "log")
     color_model = "display" if kind == "ldr" else radiance
     whole, parts = [], []
     for scene in (run, *merge):
@@ -104,9 +104,9 @@ def export(
         mask = edits.mask(gaussians.opacities, upright.points(gaussians.means), scene)
         part = gaussians.rows(mask)
         if edits.max_gaussians is not None and part.count > (most := max(1, edits.max_gaussians // (1 + len(merge)))):
-            kept = gaussians.rows(most_visible(mask, most, scene))
+            subset = gaussians.rows(most_visible(mask, most, scene))
             picture = _edited(part, time) if edits.changes_pictures else _photographed(scene, time)
-            part = kept if color_model != "display" else refine(kept, picture, training_cameras(scene))
+            part = subset if color_model != "display" else refine(subset, picture, training_cameras(scene))
         parts.append(without_strays(part, training_cameras(scene)))
     gaussians = merged(parts)
     delivered = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
@@ -146,11 +146,11 @@ def _converted(run: Any, color_model: str, time: float) -> GaussianArrays:
     return gaussians
 
 
-def _check(path: Path, kind: str, held: str | None, exposure_time: float | None, degree: int | None) -> None:
+def _check(path: Path, kind: str, file_model: str | None, exposure_time: float | None, degree: int | None) -> None:
     if kind not in KINDS:
         raise SehdrError(f"kind {kind!r} is not one of {', '.join(KINDS)}")
-    if held not in (None, "linear" if kind == "hdr" else "display"):
-        limit = "is tagged as scene-linear" if held == "linear" else "knows display colors only"
+    if file_model not in (None, "linear" if kind == "hdr" else "display"):
+        limit = "is tagged as scene-linear" if file_model == "linear" else "knows display colors only"
         raise InputError(path, f"{check_suffix(path)} {limit}, and kind {kind} is not", "leave the kind out")
     if exposure_time is not None and kind == "hdr":
         raise SehdrError("an HDR file has no exposure time; leave it out, or write kind ldr")
@@ -182,7 +182,7 @@ def _log_loss(path: Path, run: Any, gaussians: GaussianArrays, kind: str, time: 
         )
     else:
         dark = time / 2**_DARKER
-        bright, dim = (agreement(gaussians, _shown(run, t), views, t) for t in (time, dark))
+        bright, dim = (agreement(gaussians, _display_picture(run, t), views, t) for t in (time, dark))
         words = loss_in_words(min(bright, dim))
         text = "kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s (%s)"
         log.info(text, bright, dim, _DARKER, where, words)
@@ -215,7 +215,7 @@ def _judged(run) -> Sequence[Camera]:
 
 def _photographed(run, time: float) -> Callable:
     """Return a function that renders simulated photos, or light for a scene in a sensor's colors."""
-    return _shown(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
+    return _display_picture(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
 
 def _edited(gaussians: GaussianArrays, time: float) -> Callable:
@@ -224,7 +224,7 @@ def _edited(gaussians: GaussianArrays, time: float) -> Callable:
     return lambda camera: field.render_ldr(camera, time)
 
 
-def _shown(run, time: float) -> Callable:
+def _display_picture(run, time: float) -> Callable:
     """Return a function that renders radiance at an exposure time, encoded by sRGB."""
     from ..response import response_by_name
 

@@ -47,12 +47,12 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
         raise InputError(config, f"has no role {_ROLE}, by which light enters", "take a config for OpenColorIO 2")
     display, _, name = view.rpartition("/")
     display = display or read.getDefaultDisplay()
-    for what, value, known in (
+    for what, value, options in (
         ("display", display, list(read.getDisplays())),
         ("view", name, list(read.getViews(display))),
     ):
-        if value not in known:
-            raise InputError(config, f"has no {what} {value!r}", f"choose one of {', '.join(known)}")
+        if value not in options:
+            raise InputError(config, f"has no {what} {value!r}", f"choose one of {', '.join(options)}")
     try:
         processor = read.getProcessor(_ROLE, display, name, OCIO.TRANSFORM_DIR_FORWARD).getDefaultCPUProcessor()
     except refused as error:
@@ -110,16 +110,16 @@ def _open_config(OCIO: Any, config: str) -> tuple[Any, Any]:
             if not os.path.lexists(name):
                 return ""
             try:
-                known.setdefault(name, bytearray(read_bytes(Path(name), _LARGEST)))
+                contents.setdefault(name, bytearray(read_bytes(Path(name), _LARGEST)))
             except InputError as error:
                 # Of a name without content OpenColorIO would open the file itself.
-                self.refusal, known[name] = error, bytearray(1)
+                self.refusal, contents[name] = error, bytearray(1)
             return name
 
         def getLutData(self, name: str) -> bytearray:
-            return known[name]
+            return contents[name]
 
-    known: dict[str, bytearray] = {}
+    contents: dict[str, bytearray] = {}
     files = Files()
     OCIO.ClearAllCaches()  # It would take another file's content for that of the same name.
     read = OCIO.Config.CreateFromConfigIOProxy(files)

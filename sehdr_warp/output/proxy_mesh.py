@@ -189,8 +189,8 @@ def _large_parts(
     faces = faces[np.bincount(part)[part] >= _LEAST_PART * len(faces)]
     if not len(faces):
         raise SehdrError("there is no surface to mesh: only scattered pieces; take another --crop, or train longer")
-    used, faces = np.unique(faces, return_inverse=True)
-    return vertices[used], faces.reshape(-1, 3), colors[used]
+    corners, faces = np.unique(faces, return_inverse=True)
+    return vertices[corners], faces.reshape(-1, 3), colors[corners]
 
 
 def _areas(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -221,15 +221,15 @@ def find_ground(vertices: np.ndarray, faces: np.ndarray, cameras: np.ndarray, vo
     peak = int(np.flatnonzero(profile >= profile.max() / 3)[0])
     while peak + 1 < len(profile) and profile[peak + 1] > profile[peak]:
         peak += 1
-    chosen = np.flatnonzero(level)[np.abs(bins - peak) <= 2]
-    if areas[chosen].sum() < 0.02 * areas.sum():
+    near_peak = np.flatnonzero(level)[np.abs(bins - peak) <= 2]
+    if areas[near_peak].sum() < 0.02 * areas.sum():
         return None
-    root, points = np.sqrt(areas[chosen]), middles[chosen]
+    root, points = np.sqrt(areas[near_peak]), middles[near_peak]
     matrix = np.stack([points[:, 0], points[:, 2], np.ones(len(points))], axis=1)
     slope_x, slope_z, height = np.linalg.lstsq(matrix * root[:, None], points[:, 1] * root, rcond=None)[0]
     normal = np.array([-slope_x, 1.0, -slope_z])
     normal /= np.linalg.norm(normal)
-    return Ground(float(height), normal, float(areas[chosen].sum() / areas.sum()))
+    return Ground(float(height), normal, float(areas[near_peak].sum() / areas.sum()))
 
 
 def mesh_depth(mesh: ProxyMesh, camera: Camera) -> np.ndarray:
@@ -247,8 +247,8 @@ def mesh_depth(mesh: ProxyMesh, camera: Camera) -> np.ndarray:
             x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
             with np.errstate(divide="ignore", invalid="ignore"):
                 column, row = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
-            seen = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-            np.minimum.at(depth, (row[seen] * camera.width + column[seen]).astype(int), z[seen])
+            inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            np.minimum.at(depth, (row[inside] * camera.width + column[inside]).astype(int), z[inside])
     return np.where(np.isfinite(depth), depth, 0).reshape(camera.height, camera.width)
 
 
@@ -264,9 +264,11 @@ def _log_agreement(mesh: ProxyMesh, run: Any, transform: WorldTransform) -> None
         rows, columns = np.nonzero(depth)
         inside = ((points >= low) & (points <= high)).all(axis=1)
         rows, columns = rows[inside], columns[inside]
-        found = mesh_depth(mesh, view.camera)[rows, columns]
-        total, covered = total + len(found), covered + int((found > 0).sum())
-        differences.append(np.abs(found - depth[rows, columns])[found > 0] / depth[rows, columns][found > 0])
+        depth_of_mesh = mesh_depth(mesh, view.camera)[rows, columns]
+        total, covered = total + len(depth_of_mesh), covered + int((depth_of_mesh > 0).sum())
+        differences.append(
+            np.abs(depth_of_mesh - depth[rows, columns])[depth_of_mesh > 0] / depth[rows, columns][depth_of_mesh > 0]
+        )
     values = np.concatenate(differences) if differences else np.zeros(0)
     if values.size:
         text = "depth beside the scene, %d views: %.1f %% off in the median, %.0f %% within 3 %%, %.0f %% not covered"

@@ -152,12 +152,12 @@ def most_visible(stays: np.ndarray, count: int, run: Any) -> np.ndarray:
     if not cameras:
         raise SehdrError(f"{run.path}: has no training cameras that tell what contributes; leave max_gaussians out")
     share = np.where(stays, contributions(run.model, cameras).cpu().numpy(), -1)
-    chosen = np.zeros(len(stays), bool)
-    chosen[np.argsort(-share, kind="stable")[:count]] = True
-    lost = stays & ~chosen
-    part = share[lost].sum() / max(share[stays].sum(), 1e-12)
-    log.info("left out: %d Gaussians that make %.1f %% of the pictures", lost.sum(), 100 * part)
-    return chosen
+    largest = np.zeros(len(stays), bool)
+    largest[np.argsort(-share, kind="stable")[:count]] = True
+    removed_rows = stays & ~largest
+    part = share[removed_rows].sum() / max(share[stays].sum(), 1e-12)
+    log.info("left out: %d Gaussians that make %.1f %% of the pictures", removed_rows.sum(), 100 * part)
+    return largest
 
 
 def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> GaussianArrays:

@@ -87,8 +87,8 @@ def has_room(tensors: Sequence[Tensor], options: RenderOptions, memory: int) -> 
     """Return whether a graph of the call would hold a small part of a GPU's memory, in bytes."""
     count, channels = _features_of(tensors).shape
     # Copies, 2D Gaussians, lists and gradients by Gaussian; images and their gradients.
-    held = 4 * (count * (80 + 8 * channels) + options.width * options.height * (4 + 3 * channels))
-    return held <= MAX_SHARE * memory
+    bytes_needed = 4 * (count * (80 + 8 * channels) + options.width * options.height * (4 + 3 * channels))
+    return bytes_needed <= MAX_SHARE * memory
 
 
 def _features_of(tensors: Sequence[Tensor]) -> Tensor:

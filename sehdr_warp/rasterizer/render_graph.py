@@ -102,8 +102,8 @@ class RenderGraph:
         self._count.value = -1
         torch._foreach_copy_(self._inputs, tuple(tensors))  # pyright: ignore[reportPrivateImportUsage]
         self._runner.replay()
-        known = len(self._outputs) - len(outputs)
-        results = [*map(torch.empty_like, self._outputs[:known]), *outputs]
+        first_output = len(self._outputs) - len(outputs)
+        results = [*map(torch.empty_like, self._outputs[:first_output]), *outputs]
         torch._foreach_copy_(results, self._outputs)  # pyright: ignore[reportPrivateImportUsage]
         return results
 

@@ -182,8 +182,8 @@ def select_response(
     best = candidates[order[0]]
     costs = posteriors
     if beside:
-        named = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
-        costs = np.concatenate([named, evidence[count:] + np.log((len(logs) - count) / NO_FORMULA)])
+        formula_scores = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
+        costs = np.concatenate([formula_scores, evidence[count:] + np.log((len(logs) - count) / NO_FORMULA)])
     chances = np.exp(costs.min() - costs)
     chances /= chances.sum()
     if beside and chances[order[0]] < DECISIVE:

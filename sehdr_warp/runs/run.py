@@ -159,12 +159,12 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
     own, shared, cameras = path.with_name(f"{path.stem}.cameras.json"), path.with_name("cameras.json"), ()
     beside = next((file for file in (own, shared) if file.is_file()), None)
     if beside is not None:
-        named = load_cameras(beside)
+        views = load_cameras(beside)
         if beside == shared:
             log.info(
-                "%s: %d cameras from %s beside it, which does not say what it belongs to", path, len(named), beside
+                "%s: %d cameras from %s beside it, which does not say what it belongs to", path, len(views), beside
             )
-        cameras = tuple(CameraEntry(name, "train", camera, model.base_time) for name, camera in named)
+        cameras = tuple(CameraEntry(name, "train", camera, model.base_time) for name, camera in views)
     return Splats(path, model, cameras, gaussians.world_matrix)
 
 
@@ -312,7 +312,7 @@ def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, base_time: floa
 
 def exposure_compensation(info: dict) -> ExposureCompensation | None:
     """Return the exposure compensation that run.json contains, if any."""
-    return ExposureCompensation.from_dict(stored) if (stored := info.get("exposure_compensation")) else None
+    return ExposureCompensation.from_dict(fields) if (fields := info.get("exposure_compensation")) else None
 
 
 def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:

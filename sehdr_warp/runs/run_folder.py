@@ -300,8 +300,8 @@ def describe_scene(scene: Scene) -> dict:
         }
         for view in scene.views
     ]
-    known = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
-    return {"format": FORMAT, "name": scene.name, "layout": scene.format, **known, "views": views}
+    facts = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
+    return {"format": FORMAT, "name": scene.name, "layout": scene.format, **facts, "views": views}
 
 
 @dataclass(frozen=True)

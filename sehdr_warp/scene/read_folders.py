@@ -87,10 +87,10 @@ class _TruthFiles:
 
     def notes(self, records: Sequence[ImageRecord]) -> list[str]:
         """Return a note for each folder with files that are the truth of no photo."""
-        used, notes = {record.hdr for record in records}, []
+        in_use, notes = {record.hdr for record in records}, []
         for place in self.places:
             files = (file for file in place.rglob("*") if file.suffix.lower() in HDR_SUFFIXES)
-            others = sorted(file.relative_to(place).as_posix() for file in files if file not in used)
+            others = sorted(file.relative_to(place).as_posix() for file in files if file not in in_use)
             if others:
                 listing = ", ".join(others[:3]) + " ..." * (len(others) > 3)
                 count = f"{len(others)} files that are" if len(others) > 1 else "1 file that is"

@@ -94,12 +94,12 @@ class Ranks:
         """Wait until all ranks are there; raise SehdrError that names the nodes of those that do not come."""
         keys = [f"here/{rank}" for rank in range(self.count)]
         self.store.set(keys[self.rank], platform.node())
-        began, told = time.monotonic(), False
+        began, logged_once = time.monotonic(), False
         while not self.store.check(keys):
             waited = time.monotonic() - began
-            if waited > WAITING_NOTICE and not told:
+            if waited > WAITING_NOTICE and not logged_once:
                 self._log_wait()
-                told = True
+                logged_once = True
             if waited > self._patience:
                 absent = [rank for rank, key in enumerate(keys) if not self.store.check([key])]
                 nodes = ", ".join(str(node) for node in sorted({self.place.node_of(rank) for rank in absent}))
