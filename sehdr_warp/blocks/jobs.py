@@ -5,6 +5,7 @@ its newest checkpoint; SLURM jobs that reach their time limit or are preempted a
 """
 
 import logging
+import secrets
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ from typing import Any
 
 from ..errors import SehdrError
 from .block_plan import BlockPlan
-from .job import BlockResult, folder_of, is_finished, train_block
+from .job import FOLDER, BlockResult, folder_of, is_finished, train_block
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +99,7 @@ def run_blocks(
     if errors:
         name, error = next(iter(errors.items()))
         others = f" and {len(errors) - 1} more blocks" if len(errors) > 1 else ""
-        remedy = f"{finished} blocks are finished; --resume trains the others (logs in {out / 'blocks' / 'logs'})"
+        remedy = f"{finished} blocks are finished; --resume trains the others (logs in {out / FOLDER / 'logs'})"
         raise SehdrError(f"{name}{others}: {error}; {remedy}")
 
 
@@ -109,13 +110,11 @@ def _executors(out: Path, device: str | None, gpus: int, slurm: Mapping[str, str
     except ImportError:
         problem = "submitit, which runs blocks as jobs, is not installed"
         raise SehdrError(f"{problem}; run `pip install sehdr-warp[blocks]`") from None
-    logs = out / "blocks" / "logs"
+    # submitit exchanges pickled values through this folder, so it is a new one that nobody can have prepared.
+    logs = out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
     if slurm is not None:
         executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
-        own = {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
-        one = {} if device == "cpu" else {"gpus_per_node": 1}
-        executor.update_parameters(name="sehdr-warp", timeout_min=MONTH, **one)
-        executor.update_parameters(**own)
+        executor.update_parameters(name="sehdr-warp", **_slurm_parameters(slurm, gpu=device != "cpu"))
         return [executor] * count
     executors = []
     for slot in range(min(gpus, count)):
@@ -125,6 +124,16 @@ def _executors(out: Path, device: str | None, gpus: int, slurm: Mapping[str, str
             executor.update_parameters(gpus_per_node=1, visible_gpus=[slot])
         executors.append(executor)
     return executors
+
+
+def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any]:
+    """Return the parameters of submitit for SLURM: one GPU a job, and `time` in minutes."""
+    parameters: dict[str, Any] = {"timeout_min": MONTH} | ({"gpus_per_node": 1} if gpu else {})
+    for name, text in options.items():
+        value = int(text) if text.isdecimal() else text
+        own = {"time": "timeout_min"}.get(name, name)
+        parameters[own if own in parameters else f"slurm_{own}"] = value
+    return parameters
 
 
 def _error_of(job: Any) -> str | None:

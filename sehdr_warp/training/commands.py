@@ -238,9 +238,9 @@ def _in_blocks(args: Train) -> bool:
         if output.view or output.tensorboard:
             raise UsageError("--view and --tensorboard are without effect with --blocks; view the run when it is done")
         return not options.plan_only
-    if args.machine.slurm is not None:
-        raise UsageError("--slurm is of --blocks, whose blocks become SLURM jobs")
     if output.out is None or not is_in_blocks(output.out) or options.plan_only:
+        if args.machine.slurm is not None:
+            raise UsageError("--slurm is of --blocks, whose blocks become SLURM jobs")
         return False
     if output.overwrite:
         raise InputError(output.out, "holds a training in blocks", "choose another folder, or add --blocks")

@@ -25,7 +25,7 @@ from sehdr_warp.splats import read_gaussians
 
 from ..refusals import call, refused
 
-pytest.importorskip("submitit")
+submitit = pytest.importorskip("submitit")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 
 FLAGS = ["--device", "cpu", "--response", "srgb", "--iterations", "200", "--preset", "fast"]
@@ -67,7 +67,6 @@ def kill_first(out):
 @pytest.fixture(scope="module", autouse=True)
 def hasty_submitit():
     """submitit waits for what a dead process may still write."""
-    submitit = pytest.importorskip("submitit")
     before, submitit.LocalJob._results_timeout_s = submitit.LocalJob._results_timeout_s, 1
     yield
     submitit.LocalJob._results_timeout_s = before
@@ -75,7 +74,7 @@ def hasty_submitit():
 
 def test_a_killed_job_goes_on_and_both_blocks_are_finished(merged):
     plan = BlockPlan.read(merged)
-    logs = list((merged / "blocks" / "logs").glob("*_log.err"))
+    logs = list((merged / "blocks" / "logs").glob("*/*_log.err"))
     assert len(plan.blocks) == 2 and len(logs) == 3, "one of them twice"
     for index in (0, 1):
         assert RunFolder(folder_of(merged, plan, index)).read_summary()["finished"]
@@ -146,6 +145,19 @@ def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capf
         capfd, "train", survey, "--out", tmp_path / "run", "--blocks", "2", "--response", "learned", "--device", "cpu"
     )
     assert not (tmp_path / "run").exists()
+    capfd.readouterr()
+    for words in (["--blocks", "1"], ["--blocks", "many"], ["--slurm", "partition=gpu"], ["--blocks", "2", "--view"]):
+        assert call("train", survey, "--out", tmp_path / "run", *words, "-q") == 2
+    assert len(capfd.readouterr().err.splitlines()) == 4
+
+
+def test_slurm_jobs_take_the_parameters(tmp_path):
+    slurm = {"partition": "gpu", "time": "90", "mem": "64GB"}
+    parameters = jobs._slurm_parameters(slurm, gpu=True)
+    assert parameters == {"timeout_min": 90, "gpus_per_node": 1, "slurm_partition": "gpu", "slurm_mem": "64GB"}
+    executor = submitit.AutoExecutor(folder=tmp_path, cluster="debug")  # Checks names and types as for SLURM.
+    executor.update_parameters(name="town", **parameters)
+    assert "gpus_per_node" not in jobs._slurm_parameters(slurm, gpu=False)
 
 
 def test_the_number_of_blocks_follows_photos_and_gaussians():
