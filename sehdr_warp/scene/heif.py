@@ -236,9 +236,9 @@ def _properties(data: bytes, start: int, end: int) -> dict[int, tuple[tuple[str,
             for _ in range(min(count, _MOST_ITEMS)):
                 number = int.from_bytes(data[at : at + (4 if wide_item else 2)])
                 at += 4 if wide_item else 2
-                size, number = 2 if wide_index else 1, data[at]
-                indices = [int.from_bytes(data[at + 1 + i * size : at + 1 + (i + 1) * size]) for i in range(number)]
-                at += 1 + number * size
+                size, length = 2 if wide_index else 1, data[at]
+                indices = [int.from_bytes(data[at + 1 + i * size : at + 1 + (i + 1) * size]) for i in range(length)]
+                at += 1 + length * size
                 indices = [index & (0x7FFF if wide_index else 0x7F) for index in indices]
                 properties[number] = tuple(every[index - 1] for index in indices if 0 < index <= len(every))
     return properties
