@@ -241,11 +241,14 @@ class BlockAdjoint:
 
     def __call__(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
         """Return the gradients by Gaussian."""
-        if not self.deterministic:
-            gathered = self.transmittance.new_zeros(len(self.features), self.columns)
-            self.add_to(gathered, by_image, by_transmittance)
-            return gathered
+        if by_transmittance is None:
+            by_transmittance = self.transmittance.view(-1)[:0]
         lists = self.lists
+        if not self.deterministic:
+            gathered = self._zeros()
+            arguments = *self._arguments(by_image, by_transmittance), 0, lists.gaussians, gathered
+            launch_blocks(self._kernel(), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
+            return gathered
         by_intersection = self.transmittance.new_zeros(lists.intersection_count, self.channels + 6)
         unsorted, arguments = lists.unsorted, self._arguments(by_image, by_transmittance)
         assert unsorted is not None, "sums in a fixed order need the intersections as they were emitted"
@@ -253,24 +256,11 @@ class BlockAdjoint:
             launch_blocks(self._kernel(), lists, 1, *arguments, corner, unsorted.places, by_intersection)
         return gather_by_gaussian(unsorted, by_intersection)
 
-    @property
-    def columns(self) -> int:
-        """Numbers of each Gaussian among the gradients, unless these are summed in a fixed order."""
-        columns = self.channels + 6
-        by_rows = blend_cuda_adjoint.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda)
-        return blend_cuda.padded_channels(columns) if by_rows else columns
-
-    def add_to(self, gathered: Tensor, by_image: Tensor, by_transmittance: Tensor | None) -> None:
-        """Add the gradients to gathered [N, columns], in any order."""
-        arguments = *self._arguments(by_image, by_transmittance), 0, self.lists.gaussians, gathered
-        launch_blocks(self._kernel(), self.lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
-
     def on_fixed_memory(self) -> Adjoint:
         """Return the adjoint for less host time; for use while all tensors stay where they are."""
         assert not self.deterministic, "sums in a fixed order are several launches"
         by_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
-        by_transmittance = torch.empty_like(self.transmittance)
-        gathered = self.transmittance.new_empty(len(self.features), self.columns)
+        by_transmittance, gathered = torch.empty_like(self.transmittance), self._zeros()
         fixed = fixed_launch(
             self._kernel(),
             block_threads(self.lists, blend_cuda.BLOCKS_PER_TILE),
@@ -290,6 +280,12 @@ class BlockAdjoint:
 
         return adjoint
 
+    def _zeros(self) -> Tensor:
+        columns = self.channels + 6
+        if blend_cuda_adjoint.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
+            columns = blend_cuda.padded_channels(columns)
+        return self.transmittance.new_zeros(len(self.features), columns)
+
     @property
     def _cuda(self) -> bool:
         return self.features.device.type == "cuda"
@@ -298,9 +294,7 @@ class BlockAdjoint:
         scalar = warp_scalar(self.features.dtype)
         return blend_cuda_adjoint.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
 
-    def _arguments(self, by_image: Tensor, by_transmittance: Tensor | None) -> tuple:
-        if by_transmittance is None:
-            by_transmittance = self.transmittance.view(-1)[:0]
+    def _arguments(self, by_image: Tensor, by_transmittance: Tensor) -> tuple:
         lists, packed = self.lists, self.packed
         height, width = self.transmittance.shape
         return (

@@ -6,6 +6,7 @@ in, outputs are copied out.
 """
 
 import atexit
+import ctypes
 import logging
 import threading
 from collections import OrderedDict
@@ -17,13 +18,22 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .blending import BlendResult
-from .cuda_graphs import is_capturing
-from .render_graph import FEATURES, AdjointGraph, RenderGraph
+from ..kernels.project import projection_kernel
+from .blending import Adjoint, BlendResult, BlockAdjoint, blend_on_cuda
+from .cuda_graphs import CudaGraphRunner, is_capturing
+from .projection import ProjectedGaussians, ProjectionAdjoint, project_to_camera
 from .render_options import RenderOptions
-from .tile_lists import ONE_SORT, Splats
-from .torch_contract import direct_apply, keeps_graph, once_differentiable
-from .warp_launch.launching import stream_handle
+from .tile_lists import (
+    MAX_INTERSECTIONS,
+    ONE_SORT,
+    IntersectionOffsets,
+    PackedSplats,
+    Splats,
+    build_tile_lists,
+    order_intersections,
+    pack_splats,
+)
+from .warp_launch.launching import fixed_launch, stream_handle, warp_scalar, warp_stream
 
 LOG = logging.getLogger(__name__)
 
@@ -31,10 +41,9 @@ WARMUP_CALLS = 4  # Launched calls of a size before one is captured: a capture t
 MAX_SIZES = 3  # Sizes of calls with graphs, the most recent ones.
 MAX_GRAPHS = 4  # Graphs of a size: each holds a render until its backward pass.
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without graphs.
-MAX_GAUSSIANS = 1 << 21  # Without a backward pass.
-MAX_DIFFERENTIABLE = ONE_SORT  # Gaussians with one, whose graphs hold four times as much.
-MAX_SHARE = 1 / 16
-"""Largest share of a GPU's memory for one graph: what it holds is not there for others between calls."""
+MAX_GAUSSIANS = 1 << 21  # Without a backward pass; with one the host is the bottleneck only up to ONE_SORT.
+HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
+MIN_INTERSECTIONS = 1 << 12
 
 
 class _Signature(NamedTuple):
@@ -71,32 +80,16 @@ def add_graphs(tensors: Sequence[Tensor], options: RenderOptions) -> "_CallGraph
         tensors: as _CallGraphs.replay() takes them, of one device.
         options: of the image.
     """
-    first, features = tensors[0], _features_of(tensors)
+    first, features = tensors[0], tensors.features if isinstance(tensors, Splats) else tensors[FEATURES]
     if not on_gpu(first) or first.dtype != torch.float32:
         return None
     if options.max_intersections is not None or options.deterministic:
         return None
     signature = _signature(tensors, options)
-    small = 0 < len(features) <= (MAX_DIFFERENTIABLE if signature.differentiable else MAX_GAUSSIANS)
+    small = 0 < len(features) <= (ONE_SORT if signature.differentiable else MAX_GAUSSIANS)
     if not small or options.width * options.height > MAX_PIXELS or is_capturing(first.device):
         return None
     return _graphs_of(signature)
-
-
-def has_room(tensors: Sequence[Tensor], options: RenderOptions, memory: int) -> bool:
-    """Return whether a graph of the call would hold a small part of a GPU's memory, in bytes."""
-    count, channels = _features_of(tensors).shape
-    # Copies, 2D Gaussians, lists and gradients by Gaussian; images and their gradients.
-    bytes_needed = 4 * (count * (80 + 8 * channels) + options.width * options.height * (4 + 3 * channels))
-    return bytes_needed <= MAX_SHARE * memory
-
-
-def _features_of(tensors: Sequence[Tensor]) -> Tensor:
-    return tensors.features if isinstance(tensors, Splats) else tensors[FEATURES]
-
-
-def _memory_of(device: torch.device) -> int:
-    return torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else 1 << 40
 
 
 def on_gpu(tensor: Tensor) -> bool:
@@ -110,33 +103,31 @@ def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> _Signature:
     return _Signature(options, stream_handle(tensors[0].device), differentiable, layouts)
 
 
+FEATURES = 4
+"""Place of features among a call's tensors: means, log_scales, quaternions, opacities, features, pose, lens."""
+
+
 class GraphRender:
     """A render by a CUDA graph, which no other call uses until the adjoints are freed.
 
     Attributes:
-        image: [H, W, C].
-        transmittance: [H, W].
-        means2d: [N, 2] of a whole call, else None.
-        depths: [N] of a whole call, else None.
-        extents: [N, 2].
-        intersections: the number that fits() found.
+        projected: 2D Gaussians; None if the graph began with them. Their conics and opacities are the graph's memory.
+        result: of the blend.
     """
 
-    def __init__(self, graphs: "_CallGraphs", graph: RenderGraph, results: Sequence[Tensor]) -> None:
+    def __init__(self, graphs: "_CallGraphs", graph: "_RenderGraph", result: Sequence[Tensor]) -> None:
         """Lease the graph."""
-        self._graphs, self._graph, self._lease = graphs, graph, _Lease(graphs.idle, graph)
-        self.means2d: Tensor | None = None
-        self.depths: Tensor | None = None
-        if graph.projects:
-            self.image, self.transmittance, self.means2d, self.depths, self.extents = results
-        else:
-            self.image, self.transmittance, self.extents = results
+        self._graphs, self._graph = graphs, graph
+        lease = _Lease(graphs.idle, graph)
+        image, transmittance, *others = result
+        self.result = BlendResult(image, transmittance, lease.adjoint)
+        self.projected: ProjectedGaussians | None = None
+        if graph.projection_adjoint is not None:
+            means2d, depths, extents = others
+            conics, opacities = graph.splats.conics.detach(), graph.splats.opacities.detach()
+            self.projected = ProjectedGaussians(means2d, conics, depths, opacities, extents)
+        self.projection_adjoint: ProjectionAdjoint = lease.projection_adjoint
         self.intersections = 0
-
-    @property
-    def result(self) -> BlendResult:
-        """The blend, with the adjoint of 2D Gaussians."""
-        return BlendResult(self.image, self.transmittance, self._lease.adjoint)
 
     def fits(self) -> bool:
         """Wait until the GPU has counted the intersections; return whether the graph has memory for them.
@@ -149,82 +140,110 @@ class GraphRender:
         self._graphs.grow(self.intersections)
         return False
 
-    def project(self, gaussians: Sequence[Tensor]) -> "GraphProjection":
-        """Return the 2D Gaussians as functions of means, log_scales, quaternions, opacities, pose and lens."""
-        means2d, depths, extents = self.means2d, self.depths, self.extents
-        assert means2d is not None and depths is not None, "the graph begins with 2D Gaussians"
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in gaussians):
-            return GraphProjection(*_apply_projection(self._lease, means2d, depths, extents, *gaussians))
-        return GraphProjection(means2d, depths, extents, None)
 
-    def blend(self, means2d: Tensor, link: Tensor | None, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return image and transmittance as functions of the centres, of project()'s link and of the features."""
-        if torch.is_grad_enabled() and (link is not None or features.requires_grad):
-            return _apply_blend(self._lease, self.image, self.transmittance, means2d, link, features)
-        return self.image, self.transmittance
+class _RenderGraph:
+    """One render on fixed memory, in two graphs, between which the number of intersections is copied to the host.
 
-
-class GraphProjection(NamedTuple):
-    """2D Gaussians that a graph projected.
-
-    Attributes:
-        means2d: [N, 2].
-        depths: [N].
-        extents: [N, 2].
-        link: through which the blend's gradients reach the projection; None without gradients.
+    Args:
+        tensors: the seven tensors of a call, or Splats.
+        options: of the image.
+        intersections: the least number to allocate memory for.
+        differentiable: whether adjoints may be called.
     """
 
-    means2d: Tensor
-    depths: Tensor
-    extents: Tensor
-    link: Tensor | None
+    def __init__(
+        self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
+    ) -> None:
+        width, height, threshold = options.width, options.height, options.alpha_threshold
+        inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
+        device = inputs[0].device
+        projects = not isinstance(tensors, Splats)
+        channels = inputs[FEATURES].shape[1] + options.depth if projects else Splats(*inputs).features.shape[1]
+        image, transmittance = inputs[0].new_empty(height, width, channels), inputs[0].new_empty(height, width)
+        counter = torch.empty(1, dtype=torch.int64, pin_memory=True)
+        self._counter, self._count = counter, ctypes.c_int64.from_address(counter.data_ptr())
+        self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(device)
+        self._counting = CudaGraphRunner(device)
+        self._blending = CudaGraphRunner(device, self._counting.stream)
+
+        def count() -> tuple[Splats, PackedSplats, IntersectionOffsets]:
+            splats = _project(inputs, options) if projects else Splats(*inputs)
+            packed = pack_splats(splats, threshold, width, height)
+            offsets = order_intersections(packed.counts, splats.depths, splats.extents, unsorted=False)
+            counter.copy_(offsets.ends[-1:], non_blocking=True)
+            return splats, packed, offsets
+
+        def blend(splats: Splats, packed: PackedSplats, offsets: IntersectionOffsets, limit: int) -> BlockAdjoint:
+            depths, extents = splats.depths, splats.extents
+            lists = build_tile_lists(packed, offsets, depths, extents, width, height, limit, unsorted=False)
+            return blend_on_cuda(splats.features, lists, packed, image, transmittance, threshold, False)
+
+        # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
+        with self._counting.on_capture_stream():
+            splats, packed, offsets = count()
+            limit = int(HEADROOM * max(intersections, int(offsets.ends[-1])))
+            self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
+            blend(splats, packed, offsets, self.max_intersections)
+            del splats, packed, offsets
+        self.splats, packed, offsets = self._counting.capture(None, count)
+        limit = self.max_intersections
+        adjoint = self._blending.capture(None, lambda: blend(self.splats, packed, offsets, limit))
+        self.adjoint: Adjoint = adjoint.on_fixed_memory() if differentiable else adjoint
+        """Adjoint of the last render; one launch, which needs no graph."""
+        self.projection_adjoint = _projection_adjoint(inputs, options, self.splats) if projects else None
+        outputs = self.splats.means2d, self.splats.depths, self.splats.extents
+        self._inputs = inputs
+        self._outputs = [image, transmittance, *(outputs if projects else outputs[2:])]
+
+    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> list[Tensor]:
+        """Render; return image and transmittance, and what follows them among the outputs.
+
+        outputs: to write the latter to. By default they are new tensors.
+        """
+        torch._foreach_copy_(self._inputs, tuple(tensors))  # pyright: ignore[reportPrivateImportUsage]
+        self._counting.replay()
+        self._counted.record(self._stream)
+        self._blending.replay()
+        known = len(self._outputs) - len(outputs)
+        results = [*map(torch.empty_like, self._outputs[:known]), *outputs]
+        torch._foreach_copy_(results, self._outputs)  # pyright: ignore[reportPrivateImportUsage]
+        return results
+
+    def count_intersections(self) -> int:
+        """Wait for the last render's count; return it. Those beyond max_intersections were left out."""
+        self._counted.synchronize()
+        return self._count.value
 
 
-class _GraphProjection(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, lease: "_Lease", means2d: Tensor, depths: Tensor, extents: Tensor, *gaussians: Tensor):
-        ctx.lease = lease
-        # Never read: that they are saved makes torch refuse what was changed in place, as it does elsewhere.
-        ctx.save_for_backward(*gaussians, extents)
-        ctx.mark_non_differentiable(extents)
-        ctx.set_materialize_grads(False)
-        return means2d, depths, extents, lease.adjoint_graph.link.detach()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_means2d, by_depths, _, vector):
-        _ = ctx.saved_tensors
-        lease = ctx.lease
-        if not keeps_graph():
-            ctx.lease = None
-        gradients = lease.adjoint_graph.by_gaussians(vector, by_means2d, by_depths, ctx.needs_input_grad[4:])
-        return None, None, None, None, *gradients
+def _project(inputs: Sequence[Tensor], options: RenderOptions) -> Splats:
+    means, log_scales, quaternions, opacities, features, pose, lens = inputs
+    projected = project_to_camera(means, log_scales, quaternions, opacities, pose, lens, options)
+    if options.depth:
+        features = torch.cat([features, projected.depths[:, None]], 1)
+    return Splats(
+        projected.means2d, projected.conics, projected.opacities, features, projected.depths, projected.extents
+    )
 
 
-class _GraphBlend(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, lease: "_Lease", image: Tensor, transmittance: Tensor, means2d, link, features):
-        ctx.lease = lease
-        ctx.save_for_backward(features)
-        ctx.set_materialize_grads(False)
-        return image, transmittance
+def _projection_adjoint(inputs: Sequence[Tensor], options: RenderOptions, splats: Splats) -> ProjectionAdjoint:
+    """Return the adjoint of _project() on fixed memory; it reads the copies of its first and second argument there."""
+    copies = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
+    forward = splats.means2d, splats.conics, splats.depths, splats.opacities
+    rows, whole = [torch.empty_like(tensor) for tensor in forward], [torch.empty_like(tensor) for tensor in copies]
+    kernel = projection_kernel(warp_scalar(splats.depths.dtype), options.antialiased)
+    parameters = options.width, options.height, options.near_plane, options.eps2d, options.alpha_threshold
+    gradients = *whole, *(None,) * (len(parameters) + 1), *rows, None
+    unread = (None,) * (len(rows) + 1)
+    arguments = *copies, *parameters, splats.extents, *unread
+    fixed = fixed_launch(kernel, len(splats.depths), *arguments, gradients=gradients, rows=rows, whole=whole)
+    device = splats.depths.device
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, by_image, by_transmittance):
-        _ = ctx.saved_tensors
-        lease = ctx.lease
-        if not keeps_graph():
-            ctx.lease = None
-        if by_image is None and by_transmittance is None:
-            return (None,) * 6
-        adjoint = lease.adjoint_graph
-        vector = adjoint.replay(by_image, by_transmittance)
-        by_link = vector if ctx.needs_input_grad[4] else None
-        return None, None, None, adjoint.by_means2d(vector), by_link, adjoint.by_features(vector)
+    def adjoint(
+        inputs: Sequence[Tensor], culling: Tensor, upstream: Sequence[Tensor | None], results: Sequence[Tensor | None]
+    ) -> None:
+        fixed.launch(upstream[:-1], results, warp_stream(device))
 
-
-_apply_projection, _apply_blend = direct_apply(_GraphProjection), direct_apply(_GraphBlend)
+    return adjoint
 
 
 @dataclass
@@ -243,9 +262,9 @@ class _CallGraphs:
     launched: int = 0
     captured: int = 0
     intersections: int = 0
-    idle: list[RenderGraph] = field(default_factory=list)
+    idle: list[_RenderGraph] = field(default_factory=list)
 
-    def take(self, capture: Callable[[int], RenderGraph]) -> RenderGraph | None:
+    def take(self, capture: Callable[[int], _RenderGraph]) -> _RenderGraph | None:
         """Return a graph that is the caller's until it is idle again; None for a call that is to be launched."""
         if self.idle:
             with suppress(IndexError):
@@ -272,11 +291,9 @@ class _CallGraphs:
             outputs: for Splats (extents,), to be written to.
         """
 
-        def capture(intersections: int) -> RenderGraph:
-            if not has_room(tensors, options, _memory_of(tensors[0].device)):
-                raise torch.OutOfMemoryError("a graph would hold too much of the GPU's memory")
+        def capture(intersections: int) -> _RenderGraph:
             with torch.inference_mode(False), torch.no_grad():
-                return RenderGraph(tensors, options, intersections, self.differentiable)
+                return _RenderGraph(tensors, options, intersections, self.differentiable)
 
         with torch.no_grad():
             graph = self.take(capture)
@@ -290,17 +307,16 @@ class _CallGraphs:
 class _Lease:
     """Keeps a graph from other calls for as long as it lives."""
 
-    def __init__(self, idle: list[RenderGraph], graph: RenderGraph) -> None:
+    def __init__(self, idle: list[_RenderGraph], graph: _RenderGraph) -> None:
         self._idle, self._graph = idle, graph
-
-    @property
-    def adjoint_graph(self) -> AdjointGraph:
-        adjoint = self._graph.adjoint_graph
-        assert adjoint is not None, "the graph is not differentiable, or begins with 2D Gaussians"
-        return adjoint
 
     def adjoint(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
         return self._graph.adjoint(by_image, by_transmittance)
+
+    def projection_adjoint(self, *arguments: Any) -> None:
+        adjoint = self._graph.projection_adjoint
+        assert adjoint is not None, "the graph begins with 2D Gaussians"
+        adjoint(*arguments)
 
     def __del__(self) -> None:
         self._idle.append(self._graph)

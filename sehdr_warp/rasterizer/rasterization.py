@@ -11,10 +11,9 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .blending import blend, with_gradient
 from .checks import check_cameras, check_opacities, check_tensors
-from .graph_cache import GraphProjection, GraphRender, add_graphs, find_graphs
+from .graph_cache import FEATURES, GraphRender, add_graphs, find_graphs
 from .memory import oom_context
-from .projection import ProjectedGaussians, project_to_camera
-from .render_graph import FEATURES
+from .projection import ProjectedGaussians, project_to_camera, with_projection_gradient
 from .render_options import RenderOptions
 from .tile_lists import (
     PackedSplats,
@@ -155,7 +154,7 @@ def rasterize(
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
         if world_to_camera.ndim == 2:
             view = _project(tensors, options, graphs or add_graphs(tensors, options))
-            rendering = _render(view, view.means2d, features, options)
+            rendering = _render(view, view.projected.means2d, features, options)
         else:
             rendering = _render_cameras(tensors, options)
         if background is None:
@@ -201,11 +200,10 @@ def check_shapes(
 
 
 class _View(NamedTuple):
-    """Gaussians projected to a camera: by a CUDA graph, which has rendered them too, or by a launch."""
+    """Gaussians projected to a camera, and their render if a CUDA graph made it."""
 
-    means2d: Tensor
-    graph: tuple[GraphRender, GraphProjection] | None
-    launched: ProjectedGaussians | None
+    projected: ProjectedGaussians
+    graph_render: GraphRender | None
 
 
 def _project(tensors: Sequence[Tensor], options: RenderOptions, graphs: Any) -> _View:
@@ -214,24 +212,26 @@ def _project(tensors: Sequence[Tensor], options: RenderOptions, graphs: Any) -> 
     graphs: of calls like this one; None if it is to be launched.
     """
     means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
+    gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
     graph_render = None if graphs is None else graphs.replay(tensors, options)
-    if graph_render is not None:
-        projection = graph_render.project((means, log_scales, quaternions, opacities, world_to_camera, intrinsics))
+    if graph_render is not None and graph_render.projected is not None:
+        outputs = with_projection_gradient(gaussians, graph_render.projected, graph_render.projection_adjoint)
         if graph_render.fits():
-            return _View(projection.means2d, (graph_render, projection), None)
+            return _View(ProjectedGaussians(*outputs), graph_render)
     dense = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
-    projected = project_to_camera(*dense, opacities, world_to_camera, intrinsics, options)
-    return _View(projected.means2d, None, projected)
+    return _View(project_to_camera(*dense, opacities, world_to_camera, intrinsics, options), None)
 
 
 def _render(view: _View, means2d: Tensor, features: Tensor, options: RenderOptions) -> Rendering:
     """Render a view with features [N, C], as a function of means2d [N, 2]."""
-    if view.graph is None:
-        assert view.launched is not None
-        return render_projected(view.launched._replace(means2d=means2d), features, options, replays=False)
-    graph_render, (_, depths, extents, link) = view.graph
-    image, transmittance = graph_render.blend(means2d, link, features)
-    return _rendering(image, transmittance, means2d, depths, extents, graph_render.intersections, options)
+    projected, graph_render = view
+    if graph_render is None:
+        return render_projected(projected._replace(means2d=means2d), features, options, replays=False)
+    if options.depth:
+        features = torch.cat([features, projected.depths[:, None]], 1)
+    image, transmittance = with_gradient(means2d, projected.conics, projected.opacities, features, graph_render.result)
+    count = graph_render.intersections
+    return _rendering(image, transmittance, projected._replace(means2d=means2d), count, None, None, options)
 
 
 def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
@@ -248,7 +248,7 @@ def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Render
     calls = [(means, log_scales, quaternions, *own) for own in each]
     views = [_project(call, options, add_graphs(call, options)) for call in calls]
     # One tensor that every image is rendered from, so that its gradient holds every camera's.
-    means2d = torch.stack([view.means2d for view in views])
+    means2d = torch.stack([view.projected.means2d for view in views])
     renderings = [
         _render(view, own, call[FEATURES], options) for view, own, call in zip(views, means2d, calls, strict=True)
     ]
@@ -273,30 +273,29 @@ def render_projected(
     graph_render = None if graphs is None else graphs.replay(splats, options, (splats.extents,))
     if graph_render is not None and graph_render.fits():
         image, transmittance = with_gradient(means2d, conics, opacities, features, graph_render.result)
-        return _rendering(image, transmittance, means2d, depths, extents, graph_render.intersections, options)
+        return _rendering(image, transmittance, projected, graph_render.intersections, None, None, options)
     lists, packed = list_splats(splats._replace(features=features.detach()), options)
     image, transmittance = blend(
         means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic
     )
-    rendering = _rendering(image, transmittance, means2d, depths, extents, lists.intersection_count, options)
-    if options.max_intersections is None:
-        return rendering
-    return replace(rendering, overflow=lists.overflow, needed_intersections=lists.total)
+    needed = None if options.max_intersections is None else lists.total
+    return _rendering(image, transmittance, projected, lists.intersection_count, lists.overflow, needed, options)
 
 
 def _rendering(
     image: Tensor,
     transmittance: Tensor,
-    means2d: Tensor,
-    depths: Tensor,
-    extents: Tensor,
-    intersections: int,
+    projected: ProjectedGaussians,
+    count: int,
+    overflow: Tensor | None,
+    needed: Tensor | None,
     options: RenderOptions,
 ) -> Rendering:
     depth = None
     if options.depth:
         image, depth = image[..., :-1], image[..., -1]
-    return Rendering(image, transmittance, means2d, depths, extents, intersections, depth=depth)
+    means2d, _, depths, _, extents = projected
+    return Rendering(image, transmittance, means2d, depths, extents, count, overflow, needed, depth)
 
 
 def list_splats(splats: Splats, options: RenderOptions, *, blocks: bool = False) -> tuple[TileLists, PackedSplats]:

@@ -7,7 +7,7 @@ from dataclasses import fields, is_dataclass
 import torch
 import warp as wp
 
-from sehdr_warp.rasterizer import graph_cache, render_graph, tile_lists
+from sehdr_warp.rasterizer import graph_cache, tile_lists
 from sehdr_warp.rasterizer.warp_launch import packing
 
 
@@ -15,7 +15,7 @@ class Runner:
     """A CudaGraphRunner whose replays run the function again and copy its results to those of the capture."""
 
     def __init__(self, device, stream=None):
-        self.device, self.stream = device, None
+        self.stream = None
 
     def on_capture_stream(self):
         return nullcontext()
@@ -31,9 +31,6 @@ class Runner:
 
 
 class Event:
-    def __init__(self, external):
-        assert external, "recorded within a graph"
-
     def record(self, stream):
         pass
 
@@ -55,7 +52,7 @@ def tensors_of(value) -> Iterator[torch.Tensor]:
 def emulate(monkeypatch) -> None:
     """Let calls on the CPU be replayed, with block kernels on fibers; ordinary kernels must not run in blocks."""
     empty = torch.empty
-    monkeypatch.setattr(render_graph, "CudaGraphRunner", Runner)
+    monkeypatch.setattr(graph_cache, "CudaGraphRunner", Runner)
     monkeypatch.setattr(graph_cache, "on_gpu", lambda tensor: True)
     monkeypatch.setattr(graph_cache, "stream_handle", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "Event", Event)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import blending, graph_cache, rasterize, tile_lists
+from sehdr_warp.rasterizer import graph_cache, rasterize, tile_lists
 from sehdr_warp.rasterizer.render_options import RenderOptions
 
 from .emulated_graphs import emulate
@@ -70,42 +70,6 @@ def test_replays_follow_their_arguments_and_their_need_of_room(options):
                 scene.tensors[0] -= 0.01
             assert_alike(ours, values_and_gradients(launched, scene, **options))
     assert recordings()
-
-
-def test_many_gaussians_are_ordered_before_their_intersections(monkeypatch):
-    monkeypatch.setattr(tile_lists, "ONE_SORT", 0)
-    monkeypatch.setattr(blending, "ONE_SORT", 0)
-    scene = scene_of()
-    for _ in range(CALLS):
-        ours = values_and_gradients(rasterize, scene)
-    assert recordings()
-    assert_alike(ours, values_and_gradients(launched, scene))
-
-
-def test_what_else_depends_on_the_2d_gaussians_has_its_gradient():
-    scene = scene_of()
-
-    def gradients(splat):
-        for tensor in scene.tensors:
-            tensor.grad = None
-        rendering = splat(*scene.arguments)
-        extra = (rendering.means2d * random_like(rendering.means2d, 1)).sum()
-        extra = extra + (rendering.depths * random_like(rendering.depths, 2)).sum()
-        (extra * 1e-3 + (rendering.image * random_like(rendering.image, 3)).sum()).backward()
-        return [tensor.grad.clone() for tensor in scene.tensors]
-
-    results = [gradients(rasterize) for _ in range(CALLS)]
-    assert recordings()
-    assert_alike(results[-1], gradients(launched))
-    # Also alone, and by the transmittance alone.
-    for part in (lambda rendering: rendering.means2d, lambda rendering: rendering.transmittance):
-        pair = []
-        for splat in (rasterize, launched):
-            value = part(splat(*scene.arguments))
-            pair.append(
-                torch.autograd.grad((value * random_like(value, 4)).sum(), scene.tensors[:4], allow_unused=True)
-            )
-        assert_alike(*[[g for g in gradients if g is not None] for gradients in pair])
 
 
 def test_pictures_stay_and_backward_passes_come_in_any_order():
@@ -213,11 +177,3 @@ def test_only_calls_whose_arguments_were_checked_are_known():
         wrong = [change(t) if k == place else t for k, t in enumerate(scene.arguments)]
         with pytest.raises((ValueError, TypeError), match="means|features|intrinsics"):
             rasterize(*wrong)
-
-
-def test_a_graph_holds_a_small_part_of_the_memory():
-    def fits(count, side, gibibytes):
-        tensors = [torch.empty(count, 1).expand(count, width) for width in (3, 3, 4, 1, 3)]
-        return graph_cache.has_room(tensors, RenderOptions(side, side), gibibytes << 30)
-
-    assert fits(50_000, 400, 4) and fits(1_000_000, 1400, 24) and not fits(1_000_000, 1400, 4)
