@@ -96,7 +96,13 @@ def make_cameras(views: int, size: int, length: float, width: float) -> list[Cam
 
 
 def write_survey(
-    folder: Path, views: int, size: int, gaussians: int, device="cpu", aspect: float = 4.0, seed: int = 0
+    folder: Path,
+    views: int,
+    size: int,
+    gaussians: int,
+    device: torch.device | str = "cpu",
+    aspect: float = 4.0,
+    seed: int = 0,
 ) -> None:
     """Write photos, poses and points.
 

@@ -9,6 +9,7 @@ ROOT = TESTS.parent
 NOT_PACKAGES = {"integration", "fuzz", "trial", "scenes_generator"}
 TOPICS = {
     "benchmarks": {"bench"},
+    "blocks": {"shared_decisions"},
     "compat/gsplat": {"against_gsplat", "simple_trainer"},
     "output": {"blender", "pictures"},
     "rasterizer": {"blend_blocks", "culling", "extremes", "properties", "rasterize"},
