@@ -10,6 +10,8 @@ FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE
 PROJECTIONS = ("pinhole", "equirectangular", *FISHEYES)
 MAX_SIDE = 1 << 20
 """Pixels of a side of an image that can be rendered."""
+MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9
+"""Pixels of a focal length; beyond them single precision cannot project."""
 
 
 def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
@@ -54,7 +56,7 @@ class Camera:
         distortion: the fisheye model's parameters behind the principal point.
 
     Raises:
-        ValueError: if a size or focal length is not positive, a value is not finite or the pose is not rigid.
+        ValueError: if a size or focal length is out of range, a value is not finite or the pose is not rigid.
     """
 
     width: int
@@ -84,6 +86,9 @@ class Camera:
             raise ValueError("distortion is not finite")
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths ({self.fx}, {self.fy}) are not positive")
+        if min(self.fx, self.fy) < MIN_FOCAL or max(self.fx, self.fy) > MAX_FOCAL:
+            problem = f"focal lengths ({self.fx:g}, {self.fy:g}) pixels are not between {MIN_FOCAL:g} and {MAX_FOCAL:g}"
+            raise ValueError(problem)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError("world_to_camera is not a finite 4 x 4 matrix")
         rotation = pose[:3, :3]

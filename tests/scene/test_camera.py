@@ -1,0 +1,27 @@
+"""Cameras that cannot be are refused when they are made."""
+
+import numpy as np
+import pytest
+
+from sehdr_warp.scene import Camera
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ({"fx": 0.0}, "not positive"),
+        ({"fy": -5.0}, "not positive"),
+        ({"fx": 1e-300}, "between 0.001 and 1e"),
+        ({"fy": 1e30}, "between 0.001 and 1e"),
+        ({"cx": np.nan}, "not finite"),
+        ({"width": 0}, "not positive"),
+        ({"width": 1 << 21}, "more than 1048576 pixels"),
+        ({"world_to_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "not a proper rotation"),
+        ({"world_to_camera": np.eye(3)}, "4 x 4"),
+    ],
+)
+def test_an_impossible_camera_is_refused(values, problem):
+    camera = {"width": 8, "height": 6, "fx": 9.0, "fy": 9.0, "cx": 4.0, "cy": 3.0, "world_to_camera": np.eye(4)}
+    assert Camera(**camera).fx == 9.0
+    with pytest.raises(ValueError, match=problem):
+        Camera(**camera | values)
