@@ -148,13 +148,18 @@ def _loss(prediction, photo):
 
 
 def _clipped_light(device):
-    """Check a disk that clips: light around white, far above it, equal, and with one pixel at 2^100."""
+    """Check a disk that clips: light around white, far above it, nearly equal, and one pixel at 2^100."""
     noise = torch.randn(11, 13, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(11), torch.arange(13), indexing="ij")
     codes = torch.where(((y - 5) ** 2 + (x - 6) ** 2 < 20)[..., None], 255, 90).expand(11, 13, 3).to(torch.uint8)
     spike = torch.full_like(noise, 4.0)
     spike[5, 6] = 2.0**100
-    cases = {"around white": noise.exp(), "far above": 2**20 * noise.exp(), "equal": 0 * noise + 4, "one spike": spike}
+    cases = {
+        "around white": noise.exp(),
+        "far above": 2**20 * noise.exp(),
+        "nearly equal": 4 + 0.1 * noise,
+        "one spike": spike,
+    }
     weights = ClippedWeights(smoothness=1.0)
     for name, image in cases.items():
 
@@ -193,6 +198,6 @@ LIGHT_CASES = (
     _case("logits", "softmax logits of +-1e4", partial(_fused, 1e3, 1e5),
          note="a logit of 1e4 is known to 1e-3 in float32, and the weights of the brackets to no better"),
     _case("photos", "photos all clipped, all black, and with one bright pixel", _photos),
-    _case("clipped-light", "clipped light around white, far above it, equal, and one pixel at 2^100", _clipped_light),
+    _case("clipped-light", "clipped light near white, far above, nearly equal, and one pixel at 2^100", _clipped_light),
     _case("similarity", "SSIM of flat, equal, opposite and tiny images", _similarity),
 )  # fmt: skip

@@ -220,7 +220,7 @@ def select_response_for(
     curves = [response for name in candidates for response in responses_named(name)] or None
     selection = select_response(codes, curves, method=method, from_camera=are_camera_jpegs(files))
     if selection.uncertainty > _UNSURE:
-        _log.warning(
+        _log.info(
             "the response %s is a guess: curves that explain the photos as well differ from it by %.1f stops between "
             "dark and bright; name it with --response, or measure it with `sehdr-warp calibrate`",
             selection.response.name,

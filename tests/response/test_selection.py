@@ -191,6 +191,7 @@ def test_uncertainty_is_small_with_edges_and_large_without():
 
 
 def test_a_guess_is_told(caplog):
+    caplog.set_level("INFO")
     ramp = np.rint(255 * np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))).astype(np.uint8)
     select_response_for([ramp], [None], "posterior", ())
     assert "is a guess: curves that explain the photos as well differ from it by" in caplog.text

@@ -30,5 +30,5 @@ def test_the_line_names_gaussians_photo_and_remedy(tmp_path, monkeypatch, place,
         train(toy_scene(), tmp_path / "run", load_config("fast", {"model.initial_density": 0.0}), device="cpu")
     assert str(caught.value) == (
         f"out of memory on cpu: {asked} could not be allocated with 60 Gaussians, an image of 32 x 32; "
-        "use fewer Gaussians (densification.cap_max) or a smaller image (--max-size)"
+        "use fewer Gaussians (densification.cap_max) or a smaller image (max_size)"
     )
