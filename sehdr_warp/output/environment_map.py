@@ -2,7 +2,7 @@
 
 import json
 import logging
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -208,8 +208,12 @@ def render_map(
         band = slice(start * finer, min(rows, start + step) * finer)
         rays = (latlong if layout == "latlong" else cube)(size * finer, band) @ to_scene
         bands.append(_averaged_map(run.render_directions(position, rays, **options), finer))
-    parts = zip(*((band.hdr, band.alpha, band.distance, band.confidence, band.clipped) for band in bands), strict=True)
-    return RenderedMap(*(None if part[0] is None else np.concatenate(part) for part in parts))
+
+    def joined(name: str) -> Any:
+        parts = [getattr(band, name) for band in bands]
+        return None if parts[0] is None else np.concatenate(parts)
+
+    return RenderedMap(*(joined(field.name) for field in fields(RenderedMap)))
 
 
 def _averaged_map(seen: Any, finer: int) -> RenderedMap:
