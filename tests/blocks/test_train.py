@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -78,6 +79,12 @@ def test_a_killed_job_goes_on_and_both_blocks_are_finished(merged):
     assert len(plan.blocks) == 2 and len(logs) == 3, "one of them twice"
     for index in (0, 1):
         assert RunFolder(folder_of(merged, plan, index)).read_summary()["finished"]
+
+
+def test_jobs_exchange_values_in_a_new_folder(merged):
+    """They are pickled, so nobody may have prepared the folder."""
+    folders = [path.name for path in (merged / "blocks" / "logs").iterdir()]
+    assert folders and all(re.fullmatch(r"\d{8}-\d{6}-[0-9a-f]{8}", name) for name in folders)
 
 
 def test_the_merged_run_is_as_good_as_one_training(merged, survey, tmp_path):

@@ -136,6 +136,7 @@ HELD_BY = {
         "viewer/test_connections.py::test_a_save_ends_when_its_client_leaves",
         "viewer/test_connections.py::test_a_save_that_would_fill_the_disk_is_refused",
     ],
+    "Blocks exchange them": ["blocks/test_train.py::test_jobs_exchange_values_in_a_new_folder"],
 }
 """Beginnings of sentences, and the functions that hold them."""
 TRUSTED = ("The user who types", "TOML presets", "The installed packages")
