@@ -1,4 +1,4 @@
-"""How well surfaces would be lit by a trained scene: irradiance at some places, by direction, against the truth's."""
+"""Error of the light that a trained scene casts on surfaces: irradiance at some places, by direction."""
 
 import json
 from collections.abc import Sequence

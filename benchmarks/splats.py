@@ -1,4 +1,4 @@
-"""What is measured on: random Gaussians before a camera, and photos of a synthetic scene, at any count and size."""
+"""Scenes to measure on: random Gaussians before a camera, and photos of a synthetic scene, at any count and size."""
 
 import math
 import re

@@ -19,7 +19,7 @@ LIGHT = "light.npz"
 
 @dataclass(frozen=True, eq=False)
 class StoredLight:
-    """What a training shows at the places of its scene's maps, in the truth's unit.
+    """Light of a training at the places of its scene's maps, in the truth's unit.
 
     maps: [H, W, 3] of each place. rest: the same without the lights; empty if the run does not state what clipped.
     lights: shapes in the scene's coordinates, each with its radiance [3].

@@ -48,8 +48,8 @@ def make_town(count: int, length: float, width: float, seed: int = 0) -> tuple[n
     offset = np.where((side < 2)[:, None], np.stack([along, across], 1), np.stack([across, along], 1))
     wall = np.column_stack([walls * pitch + offset, up * heights[walls[:, 0], walls[:, 1]]])
     wall_tint = tints[walls[:, 0], walls[:, 1]] - 0.5 - 0.2 * (side[:, None] % 3)
-    kept = (heights[walls[:, 0], walls[:, 1]] > 0) & (wall[:, 0] < length) & (wall[:, 1] < width)
-    points, tint = np.concatenate([flat, wall[kept]]), np.concatenate([flat_tint, wall_tint[kept]])
+    has_wall = (heights[walls[:, 0], walls[:, 1]] > 0) & (wall[:, 0] < length) & (wall[:, 1] < width)
+    points, tint = np.concatenate([flat, wall[has_wall]]), np.concatenate([flat_tint, wall_tint[has_wall]])
     return points, tint + _texture(points, rng)[:, None] * (0.6, 0.5, 0.55)
 
 

@@ -1,4 +1,4 @@
-"""How alike photos look at points along the rays of pixels: the costs of a plane sweep (Collins 1996).
+"""Similarity of photos at points along the rays of pixels: the costs of a plane sweep (Collins 1996).
 
 A patch around a pixel is carried to a depth, parallel to its photo's plane, and from there into neighboring photos.
 Each of the patch's pixels counts as far as its color is that of the pixel in the middle (Yoon and Kweon 2006): a small

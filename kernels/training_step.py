@@ -1,4 +1,4 @@
-"""What a training does at every step beside rendering, each in one launch: torch would make a dozen of it.
+"""Work of every training step beside rendering, each in one launch: torch would make a dozen of it.
 
 Adam (Kingma and Ba 2015) takes one thread a number. torch's fused Adam hands each block 65536 numbers: a scene of
 100,000 Gaussians then keeps 90 blocks busy on a GPU that has room for thousands.

@@ -16,7 +16,7 @@ _ARGUMENTS = {
     "--max-size": "max_size",
     "--holdout": "holdout",
 }
-"""What flags in messages are called in Python."""
+"""Python names of the flags in messages."""
 _shows_flags = False
 
 

@@ -16,7 +16,7 @@ LINE_INTERVAL = 10.0
 
 Display = Callable[["Stage"], None]
 _displays: list[Display] = []
-"""What shows stages in place of log lines; the last one does."""
+"""Displays that show stages in place of log lines; the last one is used."""
 
 
 class Stage:

@@ -1,4 +1,4 @@
-"""What type checkers see of every public name: pyright and mypy read this file strictly, and nothing runs it."""
+"""Types of every public name: pyright and mypy read this file strictly, and nothing runs it."""
 
 from pathlib import Path
 from typing import Any, assert_type

@@ -1,4 +1,4 @@
-"""What all blocks of a set share, decided once and written to blocks.json in the folder of the merged run.
+"""Decisions that all blocks of a set share, made once and written to blocks.json in the folder of the merged run.
 
 Response, exposure times, exposure compensation, base time and coordinates are those of the whole set, measured on
 reduced photos. They are decided before any block is trained, so colors agree at the borders between blocks.

@@ -1,1 +1,1 @@
-"""How good a trained run is: metrics, the protocols that bring two scales together, and held-out evaluation."""
+"""Evaluation of a trained run: metrics, the protocols that bring two scales together, and held-out evaluation."""

@@ -22,7 +22,7 @@ MARGIN = 2
 MAX_AREA_RATIO = 3.3
 """Largest ratio between the areas of two regions that can show the same light."""
 TOLERANCE_PIXELS, TOLERANCE_RADII = 1.0, 0.35
-"""How far a light's point may lie from the center of its region: pixels, plus this part of the region's radius."""
+"""Largest distance of a light's point from the center of its region: pixels, plus this part of the region's radius."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""How many cameras show each Gaussian of a scene, and how much it contributes to their pictures."""
+"""Count the cameras that show each Gaussian of a scene, and measure how much it contributes to their pictures."""
 
 from collections.abc import Sequence
 

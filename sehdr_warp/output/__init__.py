@@ -1,1 +1,1 @@
-"""What leaves a trained scene: EXR, brackets, PLY, previews and reports; files appear whole or not at all."""
+"""Output of a trained scene: EXR, brackets, PLY, previews and reports; files appear whole or not at all."""

@@ -34,7 +34,7 @@ class ViewFileOptions:
     multipart: bool = False
     """One multi-part EXR file for all exposures of a view."""
     group_by: Literal["view", "exposure"] = "view"
-    """What a folder of brackets holds: all exposures of a view, or the sequence of all views at an exposure."""
+    """Contents of a folder of brackets: all exposures of a view, or the sequence of all views at an exposure."""
     ldr_brackets: Literal["jpeg", "png", "png16"] | None = None
     """Also write the brackets as simulated photos, through the camera response."""
     colorspace: str = "rec709"
@@ -56,7 +56,7 @@ class FilmOptions:
     fps: float = 24.0
     """Frames a second."""
     transfer: Literal["sdr", "hlg", "hdr10", "logc3", "slog3", "acescct"] = "sdr"
-    """What the film is for: any display (H.264), HDR displays (hlg, hdr10: HEVC, 10 bits), or grading (ProRes 4444 in a
+    """Purpose of the film: any display (H.264), HDR displays (hlg, hdr10: HEVC, 10 bits), or grading (ProRes 4444 in a
     camera's logarithm, .mov)."""
     ev_ramp: str | None = None
     """Exposure from the first frame to the last, in stops from the photos': --ev-ramp=-4:4."""

@@ -230,12 +230,12 @@ def _averaged_map(seen: Any, finer: int) -> RenderedMap:
         return np.where(total > 0, mean, averaged(values)).astype(np.float32)
 
     hdr, alpha, distance = (as_array(values) for values in (seen.hdr, seen.alpha, seen.distance))
-    shown, light = alpha * (distance > 0), np.maximum(hdr.mean(2), 0)
+    coverage, light = alpha * (distance > 0), np.maximum(hdr.mean(2), 0)
     return RenderedMap(
         averaged(hdr),
         averaged(alpha),
-        weighted(distance, shown),
-        None if seen.confidence is None else weighted(seen.confidence, shown),
+        weighted(distance, coverage),
+        None if seen.confidence is None else weighted(seen.confidence, coverage),
         None if seen.clipped is None else weighted(seen.clipped, light),
     )
 

@@ -1,4 +1,4 @@
-"""How a run shows itself in a notebook: its figures, and a view under an exposure slider that needs no kernel."""
+"""Display of a run in a notebook: its figures, and a view under an exposure slider that needs no kernel."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What a Gaussian's parameters become before it is drawn, as torch operations (kernels/activations.py)."""
+"""Activations of a Gaussian's parameters before it is drawn, as torch operations (kernels/activations.py)."""
 
 import torch
 from torch import Tensor

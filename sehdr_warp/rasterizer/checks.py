@@ -1,4 +1,4 @@
-"""What public operations say of arguments that do not fit: one line with the argument's name and what it takes.
+"""Errors of public operations for arguments that do not fit: one line with the argument's name and what it takes.
 
 Nothing here waits for a GPU: values are looked at on the CPU alone.
 """

@@ -19,7 +19,7 @@ from .torch_contract import HALF, register_compiled
 
 Run = Callable[..., list[Tensor]]
 _KEYS = torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
-"""How torch dispatches outside of an operator: within one it records no gradients."""
+"""Dispatch keys of torch outside of an operator: within one it records no gradients."""
 
 
 def define_node(name: str, options: str, run: Run, fake: Run) -> Callable[..., list[Tensor]]:

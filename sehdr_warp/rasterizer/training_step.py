@@ -1,4 +1,4 @@
-"""What a training does at every step beside rendering, on either device without waiting for it."""
+"""Work of every training step beside rendering, on either device without waiting for it."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a camera response is: the interface and the differentiation that every curve shares."""
+"""Camera response: the interface and the differentiation that every curve shares."""
 
 import math
 from abc import ABC, abstractmethod
@@ -18,7 +18,7 @@ HALF_CODE = 0.5 / 255
 EXTENSION_SLOPE = 0.05
 START_FLOOR = 1e-6
 Numbers: TypeAlias = np.ndarray | float | Sequence[Any]
-"""What is turned into an array."""
+"""Values that can be turned into an array."""
 
 
 class Response(ABC):

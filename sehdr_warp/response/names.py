@@ -10,4 +10,4 @@ DESCRIPTIONS = {
     "filmic": "Hable's filmic curve (Uncharted 2), shown as sRGB",
     "aces": "Narkowicz's fit to the ACES display transform, shown as sRGB",
 }
-"""What each name stands for; without aliases and without other exponents of `gamma-`."""
+"""Response of each name; without aliases and without other exponents of `gamma-`."""

@@ -50,12 +50,12 @@ _REMEDIES = {
     "a Git LFS pointer": "fetch it with `git lfs pull`", "a web page": "download the photo again",
     "a TIFF of floats": "export it with 16 bits, or as OpenEXR",
 }  # fmt: skip
-"""What users are to do with files of other kinds, if it is not to export them."""
+"""Remedies for files of other kinds, where exporting them is not the remedy."""
 PILLOW_ERRORS = (
     ArithmeticError, AttributeError, EOFError, Image.DecompressionBombError, LookupError, MemoryError, OSError,
     RuntimeError, SyntaxError, TypeError, ValueError, struct.error,
 )  # fmt: skip
-"""What Pillow raises for damaged files. If it does so for EXIF, the pixels may still be good."""
+"""Exceptions that Pillow raises for damaged files. If it does so for EXIF, the pixels may still be good."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a training costs: time, memory, network and disk as functions of photos, pixels, Gaussians, GPUs and nodes.
+"""Cost of a training: time, memory, network and disk as functions of photos, pixels, Gaussians, GPUs and nodes.
 
 The constants are fitted to the measurements in docs/reports (step, gpus, large) on one and two H100 and H200. Estimates
 within their range are marked as such, and all others as predictions: more than two GPUs, several nodes, or more

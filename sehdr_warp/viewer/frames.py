@@ -1,4 +1,4 @@
-"""What the page asks of a run: float frames of a camera, and the facts that it draws with."""
+"""Answers of a run to the page: float frames of a camera, and the facts that it draws with."""
 
 import json
 import threading

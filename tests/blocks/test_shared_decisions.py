@@ -1,4 +1,4 @@
-"""What a block takes from the whole set: base time and the compensation of its photos."""
+"""Decisions that a block takes from the whole set: base time and the compensation of its photos."""
 
 import pytest
 

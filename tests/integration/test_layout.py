@@ -1,4 +1,4 @@
-"""Where tests are: beside the packages of the package, named after the modules that they test."""
+"""Places of tests: in folders named after the packages, named after the modules that they test."""
 
 from pathlib import Path
 

@@ -26,7 +26,7 @@ RANGES_PER_THREAD = 8
 """Ranges differ in work, so a thread that finishes early takes another one."""
 
 _forked = False
-"""Whether this process was forked from one that had loaded this module: OpenMP's threads are then gone for good."""
+"""True if this process was forked from one that had loaded this module: OpenMP's threads are then gone for good."""
 
 
 def _after_fork() -> None:
