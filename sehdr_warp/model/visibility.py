@@ -7,7 +7,6 @@ from torch import Tensor
 
 from ..scene import Camera
 from ..subsets import every_nth
-from .camera_tensors import CameraTensors
 from .radiance_field import RadianceField
 
 VIEW_SIZE = 320  # Longest side, in pixels, of the views that are counted
@@ -23,7 +22,7 @@ def count_views(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
 
     Args:
         field: The scene.
-        cameras: At least one.
+        cameras: At least one, in scene coordinates.
     """
     subset = every_nth(cameras, MOST_VIEWS)
     views = torch.zeros(field.gaussians.count, device=field.gaussians.means.device)
@@ -43,6 +42,6 @@ def contributions(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
 
 def _blending_weights(field: RadianceField, camera: Camera) -> Tensor:
     """Return [N], the sum of each Gaussian's blending weights in a small picture of a camera, pixels."""
-    device, small = field.gaussians.means.device, camera.within(VIEW_SIZE)
-    ones = torch.ones((small.height, small.width, 3), device=device)
-    return field.weighted_sums(CameraTensors.of(small, device), ones)[:, 0]
+    small = camera.within(VIEW_SIZE)
+    ones = torch.ones((small.height, small.width, 3), device=field.gaussians.means.device)
+    return field.weighted_sums(field.camera_tensors(small), ones)[:, 0]

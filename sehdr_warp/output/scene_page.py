@@ -45,7 +45,9 @@ def write_scene_page(run: Any, path: Path | str, *, edits: SplatEdits | None = N
     if not run.cameras:
         raise InputError(path, "the scene has no cameras to look from", "export the run, or put cameras.json beside it")
     cameras = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
-    gaussians = gaussians_of(run.model, "linear", np.array([camera.position for camera in cameras]))
+    gaussians = gaussians_of(
+        run.model, "linear", np.array([camera.position for camera in cameras]), color_matrix=run.color_matrix
+    )
     transform = world_transform(run)
     edits = edits or SplatEdits()
     mask = edits.mask(gaussians.opacities, transform.points(gaussians.means), run)

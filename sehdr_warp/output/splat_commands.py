@@ -164,7 +164,10 @@ def _export(
     splat_edits = SplatEdits(**vars(edits)) if edits else SplatEdits(min_opacity=0)
     run = open_scene(source, device)
     others = [open_scene(path, device) for path in merge]
-    time = None if options.exposure is None else exposure_times(run.base_time, options.exposure)[0]
+    times = () if options.exposure is None else exposure_times(run.base_time, options.exposure)
+    if len(times) > 1:
+        raise UsageError(f"--exposure {options.exposure}: a splat file holds the colors of one exposure; name one")
+    time = times[0] if times else None
     frame: dict[str, Any] = {"axes": None} if world is None else vars(world)
     colors: dict[str, Any] = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
     print(export(run, out, **colors, **frame, edits=splat_edits, merge=others, **flags))

@@ -304,6 +304,9 @@ def test_nothing_is_replaced(trained, tmp_path, capfd):
     (tmp_path / "a.ply").mkdir()
     assert "is a file" in refused(capfd, "render", trained, "--out", tmp_path / "scene.ply", "--device", "cpu")
     assert "is a folder" in refused(capfd, "export", trained, "--out", tmp_path / "a.ply")
+    several = ("--kind", "ldr", "--exposure", "1/60,1/125")
+    assert call("export", trained, "--out", tmp_path / "b.ply", *several, "-q") == 2
+    assert "one exposure; name one" in capfd.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------- full disks and signals

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -81,6 +83,22 @@ def test_the_most_visible_are_kept_and_refitted(tmp_path, logged):
     run.cameras = ()
     with pytest.raises(SehdrError, match="no training cameras that tell"):
         export_means(run, tmp_path / "c.ply", max_gaussians=1)
+
+
+def test_a_page_has_the_colors_of_rec709(tmp_path):
+    """A run in sensor RGB, here with red and blue exchanged, gives the page of the same scene in Rec.709."""
+    pages = []
+    for name, colors, matrix in (
+        ("sensor", (0.2, 0.4, 0.8), np.eye(3)[::-1].copy()),
+        ("rec709", (0.8, 0.4, 0.2), None),
+    ):
+        gaussians = replace(splats([(0, 0, 0)], [0.9]), harmonics=np.float32([[colors]]))
+        folder = tmp_path / name
+        folder.mkdir()
+        run = run_of(folder, gaussians)
+        run.color_matrix = matrix
+        pages.append(write_scene_page(run, folder / "s.html").read_bytes())
+    assert pages[0] == pages[1]
 
 
 def test_crops_are_in_upright_coordinates(tmp_path, run):
