@@ -57,7 +57,7 @@ def parse(options: type[Options], words: list[str], program: str) -> Options:
         with redirect_stderr(output):
             return tyro.cli(options, prog=program, args=words, config=MARKERS)
     except SystemExit as end:
-        if not end.code:
+        if not end.code or not output.getvalue():  # After --help, or by a signal.
             raise
     raise UsageError(f"{_one_line(output.getvalue())}; see {program} --help")
 

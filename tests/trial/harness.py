@@ -85,6 +85,8 @@ def call(
     at which it comes. Raises AssertionError for what no command line may do: a traceback, a hang, a program started."""
     said, started = [folder / f".{name}" for name in ("out", "err")], time.monotonic()
     count = folder / ".count"
+    for path in said:
+        path.write_bytes(b"")
     child = os.fork()
     if child == 0:
         _run([str(word) for word in words], folder, said, count, kill_at, prepare)

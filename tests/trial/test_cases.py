@@ -262,6 +262,7 @@ def test_interrupts(space, number):
     kind = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP][0 if number < 14 else number % 2 + 1]
     words = [word if word not in ("24", "run") else {"24": "100000", "run": "new"}[word] for word in TRAIN]
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    code += "signal.signal(signal.SIGHUP, signal.SIG_DFL); "  # The trial may itself run under nohup.
     code += "import runpy; runpy.run_module('sehdr_warp', run_name='__main__')"
     child = subprocess.Popen(
         [sys.executable, "-c", code, *words], cwd=space, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
