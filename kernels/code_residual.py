@@ -37,9 +37,9 @@ def code_residual_kernel(dtype, code, mu_law: bool):
     ):
         """Compare an image with photo index[0] of a stack of codes.
 
-        table: radiance of each code, and the ends of the interval of radiances that map to it. truth: radiances of the
-        photo. rendered: truth plus the image's distance from the interval. slopes: derivatives of rendered by the
-        image.
+        table: value of each code, and the ends of the interval of values that map to it. Values are exposures in the
+        mu-law, or encoded values. truth: values of the photo. rendered: truth plus the image's distance from the
+        interval. slopes: derivatives of rendered by the image.
         """
         i = first + wp.tid()
         row = table[int(codes[wp.int32(index[0]), i])]

@@ -59,7 +59,7 @@ class Adam:
             skipped: Scalar on the device; 1 leaves parameters, moments and step counts as they are. Default: 0.
             applied: Scalar 1 - skipped.
             harmonics: Gradients of the harmonics in factored form, for groups whose parameters have no gradient of
-                their steps_with_gradient.
+                their own.
             live: [1] int32, number of Gaussians, if parameters have more rows than that; the gradients of the others
                 are 0.
         """

@@ -92,7 +92,7 @@ def render_views(
             `hdr/<view>.exr`.
         size: Width and height in pixels, or "1920x1080", instead of the cameras' own. The vertical field of view stays.
         ocio: OpenColorIO config for the previews (see ocio_view).
-        view: ViewData in that config.
+        view: View of that config, or "DISPLAY/VIEW"; required with ocio.
         axes: Coordinates of camera matrices, positions, normals and depths in the files, and of cameras read from
             OpenUSD and .chan files: "upright" (see world_transform) or "scene". Camera files of other kinds are in the
             scene's own coordinates.

@@ -59,14 +59,14 @@ class CodeScale:
 def code_residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return prediction and target of a photo loss, both [H, W, 3] in the domain of the scale.
 
-    Within the interval of radiances that map to a pixel's code, prediction and target are equal (zero residual).
+    Within the interval of values that map to a pixel's code, prediction and target are equal (zero residual).
     Outside, their difference is the distance to the nearest end of the interval. Differentiable once with respect to
     the image.
 
     Args:
         image: [H, W, 3] float32 or float64.
         codes: code_tensor()'s of the photo, [H, W, 3], or of a stack of photos [V, H, W, 3].
-        scale: radiances of codes.
+        scale: values of codes: exposures in the mu-law if scale.mu > 0, else encoded values.
         index: [1] int64, of the photo in a stack.
 
     Raises:

@@ -87,7 +87,7 @@ def usd_camera_arrays(path: Path) -> dict[str, Any]:
     stems = [prim.GetName() for prim in prims]
     names, lenses, matrices = [], [], []
     for prim, stem in zip(prims, stems, strict=True):
-        if stems.count(stem) > 1:  # One of several of this name: the whole path tells them sandbox.
+        if stems.count(stem) > 1:  # Several cameras have this name, so the whole path names each.
             stem = str(prim.GetPath()).strip("/").replace("/", "_")
         camera, times = UsdGeom.Camera(prim), _sample_times(stage, prim)
         size = [(prim.GetAttribute(name).Get() if prim.HasAttribute(name) else 0) or 0 for name in USD_SIZE]

@@ -137,7 +137,7 @@ def estimates_compensation(scene: Scene, config: Config, response: Response) -> 
 
 def estimate_compensation(scene: Scene, config: Config, response: Response, device: torch.device | str) -> Compensation:
     """Match points between the photos of a scene and estimate the compensation that explains their differences."""
-    use_times = scene.exposure_times_known and config.model.exposure_compensation != "always"
+    times_stated = scene.exposure_times_known and config.model.exposure_compensation != "always"
     views, others = scene.train_views, scene.test_views
     cameras = [view.camera for view in others]
 
@@ -154,27 +154,29 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
 
     def no_drift(matcher: Matcher) -> Compensation:
         least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
-        reason = "do not contradict the stated times" if use_times else f"differ by less than {least}"
+        reason = "do not contradict the stated times" if times_stated else f"differ by less than {least}"
         return Compensation(None, matcher, Decision("exposure-compensation", {}, "none", f"matched points {reason}"))
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=tuple(prefetch_map(at_matching_size, views, RESIZED_AT_ONCE)))
     matcher = matcher_of(small)
-    if use_times and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
+    if times_stated and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
         return no_drift(matcher)
     shared, guess = match(matcher), initial_gains(small.views, response)
-    if not use_times and len(shared) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
+    if not times_stated and len(shared) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
         shared = max(shared, match(matcher_of(guess.normalize_photos(small, response))), key=len)
     if len(shared) < MIN_POINTS:
         return no_drift(matcher)
     gains = fit(shared)
-    parts = _explanatory_parts(gains, views, shared, response, use_times)
+    parts = _explanatory_parts(gains, views, shared, response, times_stated)
     if not (parts.exposure or parts.white_balance or parts.vignetting):
         return no_drift(matcher)
     # Match again in photos that are already similar: more points are found.
     matcher = matcher_of(parts.of(gains).normalize_photos(small, response))
     gains = parts.of(fit(match(matcher)))
-    return Compensation(gains, matcher_of(gains.normalize_photos(small, response)), _decision(gains, parts, use_times))
+    return Compensation(
+        gains, matcher_of(gains.normalize_photos(small, response)), _decision(gains, parts, times_stated)
+    )
 
 
 def _may_drift(views: Sequence[View], shared: SharedPoints, response: Response) -> bool:
@@ -187,17 +189,17 @@ def _may_drift(views: Sequence[View], shared: SharedPoints, response: Response) 
 
 
 def _explanatory_parts(
-    gains: ExposureCompensation, views: Sequence[View], shared: SharedPoints, response: Response, on_request: bool
+    gains: ExposureCompensation, views: Sequence[View], shared: SharedPoints, response: Response, times_stated: bool
 ) -> Parts:
     """Return the parts of gains that explain how photos differ at shared points."""
     before = shared.disagreement(views, response, None)
     after = shared.disagreement(views, response, gains.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
-    exposure = white_balance = not on_request and gains.stops >= MIN_STOPS and explains
-    if not exposure and (gains.white_balance >= MIN_WHITE_BALANCE or (on_request and _exceeds_stated(gains, views))):
+    exposure = white_balance = not times_stated and gains.stops >= MIN_STOPS and explains
+    if not exposure and (gains.white_balance >= MIN_WHITE_BALANCE or (times_stated and _exceeds_stated(gains, views))):
         drift, colors = _cross_validate(views, shared, response)
         exposure = (
-            on_request and gains.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS and drift <= MAX_REMAINING_CROSS
+            times_stated and gains.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS and drift <= MAX_REMAINING_CROSS
         )
         white_balance = (exposure or gains.white_balance >= MIN_WHITE_BALANCE) and colors <= MAX_REMAINING_WHITE_BALANCE
     vignetting = gains.corner_loss >= MIN_CORNER_LOSS
@@ -235,7 +237,7 @@ def _cross_validate(views: Sequence[View], shared: SharedPoints, response: Respo
     return float(drift), float(colors)
 
 
-def _decision(gains: ExposureCompensation, parts: Parts, on_request: bool) -> Decision:
+def _decision(gains: ExposureCompensation, parts: Parts, times_stated: bool) -> Decision:
     """Return the line of the plan for gains that are corrected."""
     figures = []
     if parts.exposure:
@@ -245,5 +247,5 @@ def _decision(gains: ExposureCompensation, parts: Parts, on_request: bool) -> De
     if parts.vignetting:
         figures.append(f"{gains.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
-    choice = f"taken out of the photos{over if on_request else ''}"
+    choice = f"taken out of the photos{over if times_stated else ''}"
     return Decision("exposure-compensation", {}, choice, f"matched points differ by {', '.join(figures)}", told=True)

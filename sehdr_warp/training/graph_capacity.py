@@ -17,32 +17,32 @@ class GraphCapacity:
     """Chooses the intersection capacity of the next capture from counts that steps keep on the device.
 
     Attributes:
-        tally: [3] int64, kept by training_step.judge_step(): steps that were not finite; largest number of
-            intersections, reset when Gaussians rescale; steps that overflows capacity.
+        step_counters: [3] int64, added up by training_step.judge_step(): steps that were not finite; largest number
+            of intersections, set to 0 by rescale(); steps with more intersections than the capacity.
     """
 
     def __init__(self, device: torch.device | str):
         """Start without counts."""
-        self.tally = torch.zeros(3, dtype=torch.int64, device=device)
+        self.step_counters = torch.zeros(3, dtype=torch.int64, device=device)
         self._intersections = self._capacity = self._largest = 0
-        self._host_tally, self._copied = self.tally, None
-        if self.tally.device.type == "cuda":
-            self._host_tally = torch.zeros(3, dtype=torch.int64, pin_memory=True)
+        self._host_counters, self._copied = self.step_counters, None
+        if self.step_counters.device.type == "cuda":
+            self._host_counters = torch.zeros(3, dtype=torch.int64, pin_memory=True)
             self._copied = torch.cuda.Event()
 
     @property
     def has_counts(self) -> bool:
-        """True after a observe step whose intersections were counted exactly."""
+        """Whether observe() has recorded a step."""
         return self._intersections > 0
 
     def observe(self, intersections: int) -> None:
-        """Record that a step was observe with exactly `intersections` intersections."""
+        """Record the exact number of intersections of a step."""
         self._intersections = max(self._intersections, intersections)
 
     @property
     def overflows(self) -> int:
-        """Number of steps that overflows capacity. Waits for the device."""
-        return int(self.tally[2])
+        """Number of steps with more intersections than the capacity. Waits for the device."""
+        return int(self.step_counters[2])
 
     def capacity(self) -> int:
         """Return the capacity for the step that is captured or replayed now; it stays until poll() or rescale()."""
@@ -59,12 +59,12 @@ class GraphCapacity:
             The number of steps that were not finite, and whether the capacity was too small.
         """
         if wait or self._copied is None:
-            skipped, needed, _ = self.tally.tolist()
+            skipped, needed, _ = self.step_counters.tolist()
         else:
             self._copied.synchronize()
-            skipped, needed, _ = self._host_tally.tolist()
-            self._host_tally.copy_(self.tally, non_blocking=True)
-            self._copied.record(torch.cuda.current_stream(self.tally.device))
+            skipped, needed, _ = self._host_counters.tolist()
+            self._host_counters.copy_(self.step_counters, non_blocking=True)
+            self._copied.record(torch.cuda.current_stream(self.step_counters.device))
         self._largest = needed
         if not 0 < self._capacity < needed:
             return skipped, False
@@ -81,10 +81,10 @@ class GraphCapacity:
         Returns:
             True if the current capacity, and with it the captured graphs, can be kept.
         """
-        needed = self._largest or int(self.tally[1]) or self._intersections
+        needed = self._largest or int(self.step_counters[1]) or self._intersections
         # The lower bound does not grow: new Gaussians are small, so intersections grow more slowly than the count.
         self._intersections = math.ceil(max(needed * growth, MIN_SHRINK * self._intersections))
-        self.tally[1].zero_()
+        self.step_counters[1].zero_()
         self._largest = 0
         if keep and self._capacity >= MIN_HEADROOM * self._intersections:
             return True

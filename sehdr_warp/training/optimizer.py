@@ -74,7 +74,7 @@ def guarded_step(
     incomplete: Tensor | None = None,
     harmonics: HarmonicsGradients | None = None,
     *,
-    tally: Tensor | None = None,
+    step_counters: Tensor | None = None,
     pairs: Tensor | None = None,
     live: Tensor | None = None,
 ) -> Tensor:
@@ -87,7 +87,7 @@ def guarded_step(
         loss: Scalar loss.
         incomplete: Scalar bool, whether the rendering lacked intersections.
         harmonics: Gradients of the harmonics in factored form.
-        tally: As in judge_step().
+        step_counters: As in judge_step().
         pairs: As in judge_step().
         live: As in Adam.step().
 
@@ -96,7 +96,7 @@ def guarded_step(
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.by_values]
-    skipped, applied = judge_step(loss, norms(gradients), incomplete, tally, pairs)
+    skipped, applied = judge_step(loss, norms(gradients), incomplete, step_counters, pairs)
     optimizer.step(skipped, applied, harmonics, live)
     return applied
 

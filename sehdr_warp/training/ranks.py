@@ -132,10 +132,10 @@ class Ranks:
             time.sleep(_POLL / 10)
 
     def all_reduce_mean(self, buffer: Tensor) -> None:
-        """Replace a buffer by its all_reduce_mean over the ranks, the same bits on all."""
+        """Replace a buffer by its mean over the ranks, with the same bits on all of them."""
         with self._together():
             dist.all_reduce(buffer, dist.ReduceOp.AVG if self._cuda else dist.ReduceOp.SUM)
-        if not self._cuda:  # gloo has no all_reduce_mean.
+        if not self._cuda:  # gloo lacks ReduceOp.AVG.
             buffer.mul_(1 / self.count)
 
     def reduce_to_leader(self, totals: list[Tensor]) -> None:

@@ -270,7 +270,7 @@ class Trainer(TrainingState):
             loss,
             incomplete,
             harmonics,
-            tally=self.capacity.tally,
+            step_counters=self.capacity.step_counters,
             pairs=rendering.needed_intersections,
             live=self.field.gaussians.live,
         )

@@ -139,7 +139,7 @@ class TrainingState:
     @property
     def skipped_steps(self) -> int:
         """Number of steps that were skipped because the loss or a gradient was not finite."""
-        return int(self.capacity.tally[0])
+        return int(self.capacity.step_counters[0])
 
     @property
     def overflowed_steps(self) -> int:
@@ -201,7 +201,7 @@ class TrainingState:
         if self.generator.get_state().numel() == generators["device"].numel():
             self.generator.set_state(generators["device"].cpu())
         self.iteration = self.first_iteration = values["iteration"]
-        self.capacity.tally[0] = values["skipped_steps"]
+        self.capacity.step_counters[0] = values["skipped_steps"]
 
     def _reserve_rows(self) -> None:
         """Reserve rows for the Gaussians that refinements will add; the same number on all ranks."""

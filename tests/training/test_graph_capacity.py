@@ -11,10 +11,10 @@ MANY = 10 * MIN_CAPACITY
 
 def replay(capacity, pairs):
     """Recorded steps that need so many pairs each; the capacity that they were given."""
-    loss = torch.zeros((), device=capacity.tally.device)
+    loss = torch.zeros((), device=capacity.step_counters.device)
     for needed in pairs:
         given, needed = capacity.capacity(), torch.tensor(needed, device=loss.device)
-        judge_step(loss, loss[None], needed > given, capacity.tally, needed)
+        judge_step(loss, loss[None], needed > given, capacity.step_counters, needed)
     return given
 
 
@@ -60,9 +60,9 @@ def test_looks_that_do_not_wait_tell_what_the_one_before_asked_for(device):
     capacity, nan = GraphCapacity(device), torch.full((1,), float("nan"), device=device)
     capacity.observe(MANY)
     pairs = torch.tensor(5 * MANY, device=device)
-    judge_step(nan[0], nan, pairs > capacity.capacity(), capacity.tally, pairs)
+    judge_step(nan[0], nan, pairs > capacity.capacity(), capacity.step_counters, pairs)
     late = [capacity.poll(wait=False) for _ in range(2)]
-    assert late[-1 if capacity.tally.is_cuda else 0] == (1, True)
+    assert late[-1 if capacity.step_counters.is_cuda else 0] == (1, True)
     assert capacity.overflows == 1
 
 

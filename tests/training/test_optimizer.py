@@ -21,9 +21,9 @@ def test_a_guarded_step_is_made_or_left_out_whole(device, incomplete, bad):
     loss = (means * (nan if bad else 1.0)).sum()
     loss.backward()
     told = None if incomplete is None else torch.tensor(incomplete, device=device)
-    tally = torch.zeros(3, dtype=torch.int64, device=device)
-    made = guarded_step(optimizer, loss, told, tally=tally)
-    assert tally.tolist() == [bad, 0, 0]
+    step_counters = torch.zeros(3, dtype=torch.int64, device=device)
+    made = guarded_step(optimizer, loss, told, step_counters=step_counters)
+    assert step_counters.tolist() == [bad, 0, 0]
     assert bool(made) == (not bad and not incomplete)
     assert torch.equal(means, before) == (not bool(made))
     assert float(optimizer.state[means]["step"]) == float(made)
