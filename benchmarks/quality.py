@@ -37,7 +37,7 @@ from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
 MONTH = 30 * 24 * 60  # Minutes, the longest that a worker may take
-FORMAT = 6  # Of a job and of its result; others are run again.
+FORMAT = 7  # Of a job and of its result; others are run again.
 RESULT, FAILURE = "result.json", "failure.json"
 TESTS, FIRST_TEST = 16, 100
 """A training tests its held-out views this often, at iterations spaced evenly on a log scale from 1/100 of all."""
@@ -47,6 +47,12 @@ KNOWN, BLIND, LEARNED = "known", "blind", "learned"
 """Whether a method is told the curve, chooses one, or learns it: then known and blind are one training."""
 UPPER_BOUND = "truth"
 """3DGS trained on the HDR truth, which every method is compared with."""
+METHOD_FIELDS = (
+    "response.name",
+    *("fusion.enabled", "loss.form", "loss.ldr_weight", "loss.hdr_weight", "loss.linear_weight"),
+)
+"""What makes a method, which its plan does not change. Steps, learning rates and the largest number of Gaussians are
+planned for every method alike, also where its preset has no plan."""
 WARM_UP_ITERATIONS = 30
 """Of a training that is thrown away before the first of its kind in a process: kernels are compiled, steps recorded.
 All schedules scale with the length, so every part of a training is in it."""
@@ -156,14 +162,13 @@ def plan_jobs(
 
 
 def _training(method: str, iterations: int | None, seed: int) -> Config:
-    """Return the method's training, tested on a log scale of its length; its plan keeps what the caller states."""
+    """Return the method's training by the plan, tested on a log scale of its length."""
     changes = {} if iterations is None else {"schedule.iterations": iterations}
     steps = {max(1, round(REFERENCE_ITERATIONS * FIRST_TEST ** (-k / (TESTS - 1)))) for k in range(TESTS)}
     config = load_config(method, {"seed": seed, **changes})
     times = {"schedule.evaluate_at": sorted(steps), "schedule.checkpoint_every": REFERENCE_ITERATIONS}
-    return override_config(
-        config, times | {"plan.keep": sorted({*config.plan.keep, *changes, "response.name"})}, method
-    )
+    plan = {"plan.enabled": True, "plan.keep": sorted({*config.plan.keep, *changes, *METHOD_FIELDS})}
+    return override_config(config, times | plan, method)
 
 
 def _read(path: Path) -> dict:

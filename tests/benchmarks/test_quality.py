@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,8 @@ from benchmarks import quality
 from benchmarks.quality import FAILURE, FORMAT, RESULT, Job, exposed, plan_jobs, run_job, run_jobs
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import write_json
+from sehdr_warp.runs.config_files import config_from_dict
+from sehdr_warp.training.plan import make_plan
 
 from ..make_scenes import write_blender
 from .command_line import call, refused
@@ -81,6 +84,25 @@ def test_jobs_are_every_combination_and_their_keys_tell_them_apart(tmp_path):
             assert (training["loss"]["clipping"], training["loss"]["ssim_weight"]) == (False, 0.1)
     assert jobs()[0].key == jobs()[0].key != jobs(max_size=40)[0].key
     assert jobs(iterations=None)[0].config["training"]["schedule"]["iterations"] > 10
+
+
+def test_every_method_gets_the_same_plan_and_stays_what_it_is():
+    methods = ("default", "3dgs", "truth", "hdr-gs", "paper")
+    planned = {}
+    for job in jobs(methods, iterations=None, max_size=32):
+        scene = exposed(job.place, 32, "hdr-nerf", 2)
+        views = tuple(view if job.config["sees_truth"] else replace(view, hdr=None) for view in scene.views)
+        config = config_from_dict(job.config["training"], job.label)
+        planned[job.config["method"]] = (config, make_plan(replace(scene, views=views), config, "cpu").config)
+    default = planned["default"][1]
+    for config, plan in planned.values():
+        assert plan.schedule.iterations == default.schedule.iterations < 30_000
+        for rate in ("means", "means_final", "log_scales", "opacity_logits"):
+            assert getattr(plan.optimizer, rate) == getattr(default.optimizer, rate) > getattr(config.optimizer, rate)
+        for table in ("form", "ldr_weight", "hdr_weight", "linear_weight"):
+            assert getattr(plan.loss, table) == getattr(config.loss, table)
+        assert (plan.fusion, plan.response, plan.model) == (config.fusion, config.response, config.model)
+    assert planned["paper"][1].fusion.enabled and planned["3dgs"][1].densification.cap_max < 3_000_000
 
 
 def test_what_cannot_be_planned_is_named(capfd, tmp_path):
