@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import InputError, SehdrError
 from ..sandbox import read_sandboxed
+from .chroma import upsample_chroma
 from .images import MAX_PIXELS, check_size
 
 _log = logging.getLogger("sehdr_warp.scene")
@@ -213,27 +214,65 @@ def grey(frame: Any, width: int) -> np.ndarray:
 
 def codes(frame: Any, color: VideoColor) -> np.ndarray:
     """Return [H, W, 3] codes of a frame, upright: uint8 for 8 bits, else uint16."""
-    from av.video.reformatter import ColorRange, Interpolation
-
-    planar = "rgb48le" if color.matrix is None else "yuv444p16le"
-    same = ColorRange.JPEG if color.full_range else ColorRange.MPEG
-    converted = frame.reformat(
-        format=planar, src_color_range=same, dst_color_range=same, interpolation=Interpolation.BICUBIC
-    ).to_ndarray()
-    values = converted.astype(np.float32)
-    top = float((2**color.bits - 1) << (16 - color.bits))  # The largest code, as it stands in 16 bits
     if color.matrix is None:
-        rgb = values / np.float32(65535)
+        rgb = _reformatted(frame, "rgb48le", color).to_ndarray() / np.float32(65535)
     else:
         kr, kb = color.matrix
-        unit = 256.0
-        low, luma, chroma = (0.0, top, top) if color.full_range else (16 * unit, 219 * unit, 224 * unit)
-        y, u, v = (values[..., 0] - low) / luma, (values[..., 1] - 32768) / chroma, (values[..., 2] - 32768) / chroma
-        red, blue = y + 2 * (1 - kr) * v, y + 2 * (1 - kb) * u
+        y, uv = _luma_and_chroma(frame, color)
+        red, blue = y + 2 * (1 - kr) * uv[..., 1], y + 2 * (1 - kb) * uv[..., 0]
         rgb = np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], axis=2)
     levels, kind = (255, np.uint8) if color.bits == 8 else (65535, np.uint16)
     upright = np.rot90(rgb, _rotation(frame) // 90)
     return np.ascontiguousarray(np.rint(np.clip(upright, 0, 1) * levels).astype(kind))
+
+
+def _luma_and_chroma(frame: Any, color: VideoColor) -> tuple[np.ndarray, np.ndarray]:
+    """Return luma [H, W] from 0 to 1 and chroma [H, W, 2] from -0.5 to 0.5, as float32."""
+    component = frame.format.components[1]
+    sizes = (frame.height, component.height), (frame.width, component.width)
+    halved = tuple(2 * small - size in (0, 1) and small < size for size, small in sizes)
+    # FFmpeg interpolates chroma of other sizes, such as a quarter of the width.
+    layout = {(False, True): "yuv422p16le", (True, True): "yuv420p16le"}.get(halved, "yuv444p16le")
+    y, u, v = _planes(_reformatted(frame, layout, color))
+    top = np.float32((2**color.bits - 1) << (16 - color.bits))  # The largest code, as it stands in 16 bits
+    low, luma, chroma = (0, top, top) if color.full_range else (16 * 256, 219 * 256, 224 * 256)
+    y, uv = (y - np.float32(low)) / np.float32(luma), (np.stack([u, v], axis=2) - 32768) / np.float32(chroma)
+    if uv.shape[:2] == y.shape:
+        return y, uv
+    places = _chroma_places(frame, layout)
+    return y, upsample_chroma(y, uv, tuple(p if half else None for p, half in zip(places, halved, strict=True)))
+
+
+def _reformatted(frame: Any, layout: str, color: VideoColor | None = None) -> Any:
+    from av.video.reformatter import ColorRange, Interpolation
+
+    same = ColorRange.JPEG if color is not None and color.full_range else ColorRange.MPEG
+    return frame.reformat(
+        format=layout, src_color_range=same, dst_color_range=same, interpolation=Interpolation.BICUBIC
+    )
+
+
+def _planes(frame: Any) -> list[np.ndarray]:
+    """Return the samples of each plane of a frame of 16 bits as float32 [h, w]."""
+    rows = [np.frombuffer(plane, "<u2").reshape(-1, plane.line_size // 2) for plane in frame.planes]
+    return [row[: p.height, : p.width].astype(np.float32) for row, p in zip(rows, frame.planes, strict=True)]
+
+
+def _chroma_places(frame: Any, layout: str) -> tuple[float, float]:
+    """Return where a frame's first chroma sample lies, down and to the right of its first luma sample, in luma samples.
+
+    PyAV does not tell what the stream states, so FFmpeg interpolates a ramp of chroma with this frame's properties.
+    """
+    probe = frame.reformat(width=32, height=32, format=layout)
+    steps = (2 if layout == "yuv420p16le" else 1), 2
+    for plane, axis in zip(probe.planes, (None, 1, 0), strict=True):
+        rows, columns = np.indices((plane.height, plane.line_size // 2))
+        ramp = 0 * rows if axis is None else 1000 * steps[axis] * (columns if axis else rows)
+        plane.update((20_000 + ramp).astype("<u2").tobytes())
+    _, right, down = _planes(_reformatted(probe, "yuv444p16le"))
+    found = (16 - (ramp[16, 16] - 20_000) / 1000 for ramp in (down, right))
+    first, second = (float(np.clip(round(2 * place) / 2, 0, 1)) for place in found)
+    return first, second
 
 
 def _rotation(frame: Any) -> int:

@@ -27,7 +27,7 @@ from .video import Clip, codes, decode, grey, open_clip, sharpness, shift
 
 _log = logging.getLogger("sehdr_warp.scene")
 
-_VERSION = 1
+_VERSION = 2
 _STEP = 0.08
 """Movement between two frames in parts of the width: neighbors overlap by more than nine tenths."""
 _FEWEST, _MOST = 24, 240  # Frames of a clip

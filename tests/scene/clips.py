@@ -53,7 +53,7 @@ def write_clip(path: Path, frames, *, tags=(1, 1, 1), codec="libx265", pixels="y
             planes = np.rint(np.clip(planes, 0, 65535)).astype(np.uint16)
             frame = av.VideoFrame.from_ndarray(planes, format="yuv444p16le")
             same = {"src_color_range": 2 if full else 1, "dst_color_range": 2 if full else 1}
-            frame = frame.reformat(format=pixels, **same)
+            frame = frame.reformat(format=pixels, interpolation="AREA", **same)  # As cameras average chroma
             frame.pts = i if times is None else times[i]
             for packet in stream.encode(frame):
                 container.mux(packet)
