@@ -52,7 +52,7 @@ def write_reports(folder: Path) -> list[Path]:
         index.append({"report": f"[{page['title']}]({name}.md)", "machine": place, "build": build})
     if (folder / "tried.csv").is_file():
         pages.append(_write(folder / "tried.md", _tried_page(folder / "tried.csv")))
-        index.append({"report": "[Tried and lost](tried.md)"})
+        index.append({"report": "[Negative results](tried.md)"})
     text = (
         "What was measured. `python -m benchmarks.measure PAGE` measures a page again. "
         "`python -m benchmarks.report_pages` writes pages and the README's table from the results."
@@ -185,14 +185,14 @@ def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
 
 
 SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": "", "irradiance off": ".0%", "worst room": ".0%"}
-SHORT |= {"light energy": ".2f", "nine in ten lights": ""}
+SHORT |= {"light energy": ".2f", "5th to 95th percentile": ""}
 
 
 def in_short(rows: Sequence[Mapping]) -> list[dict]:
     """Return a row for each method: means over scenes of one seed at the middle exposure, with the curve known.
 
     "irradiance off" is a mean over scenes, and "worst room" the largest; "light energy" is the median over lights that
-    clip, and "nine in ten lights" the range of the 5th to the 95th percentile. None and a dash without figures.
+    clip, and "5th to 95th percentile" the range of the 5th to the 95th percentile. None and a dash without figures.
     """
     middle = [row for row in rows if (row["exposure"], row["seed"]) == (EXPOSURES // 2, rows[0]["seed"])]
     return [
@@ -220,9 +220,9 @@ def _light_energy(rows: Sequence[Mapping]) -> dict[str, Any]:
     """Return the median and the range of the energy of lights that clip, as in_short() has them."""
     energies = sorted(energy for row in rows for energy in row.get("light_energies") or ())
     if not energies:
-        return {"light energy": None, "nine in ten lights": "-"}
+        return {"light energy": None, "5th to 95th percentile": "-"}
     low, high = (energies[round(part * (len(energies) - 1))] for part in (0.05, 0.95))
-    return {"light energy": median(energies), "nine in ten lights": f"{low:.2f} to {high:.2f}"}
+    return {"light energy": median(energies), "5th to 95th percentile": f"{low:.2f} to {high:.2f}"}
 
 
 def _energy_tables(rows: Sequence[Mapping]) -> Iterable[str]:
@@ -241,7 +241,7 @@ def _energy_tables(rows: Sequence[Mapping]) -> Iterable[str]:
     if table:
         yield "## Energy of the lights that photos clip, over the truth's"
         columns = {"method": "", "exposure": "d", "lights that clip=n": "d", "median=light energy": ".2f"}
-        columns |= {"nine in ten=nine in ten lights": "", "half to twice=near": ".0%"}
+        columns |= {"percentiles=5th to 95th percentile": "", "half to twice=near": ".0%"}
         columns |= {"all lights=lights": "d", "lost": "d"}
         yield markdown_table(table, columns)
 
@@ -282,14 +282,14 @@ def readme_table(rows: Sequence[Mapping]) -> str:
     labels = PAGES["quality"]["readme"]
     short = {row["method"]: row for row in in_short(rows) if row["method"] in labels}
     irradiance = any(row["irradiance off"] is not None for row in short.values())
-    titles = [FIRST_TITLE, "HDR", "photos", "lights lost", *["irradiance off: mean, worst"] * irradiance]
-    titles += ["light energy: median, nine in ten"]
+    titles = [FIRST_TITLE, "HDR", "photos", "lights below half", *["irradiance off: mean, worst"] * irradiance]
+    titles += ["light energy: median, 5th to 95th percentile"]
     lines = []
     for method, label in labels.items():
         if (row := short.get(method)) is None:
             continue
         off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}, {row['worst room']:.0%}"
-        energy = "-" if row["light energy"] is None else f"{row['light energy']:.2f}, {row['nine in ten lights']}"
+        energy = "-" if row["light energy"] is None else f"{row['light energy']:.2f}, {row['5th to 95th percentile']}"
         lights_lost = row["lost"].removesuffix(" lights")
         cells = [
             label,
@@ -447,11 +447,12 @@ def _tried_page(path: Path) -> list[str]:
         topics = groups(csv.DictReader(file), "topic")
     columns: dict[str, str] = dict.fromkeys(("option", "idea", "gave", "on"), "")
     text = (
-        "Ideas that were built, measured and taken out again, or never turned on. dB are differences in held-out "
-        "mu-law PSNR under `gt-max` to the same training without, where nothing else is said; 0.2 dB are within chance."
+        "Ideas that were built, measured and taken out again, or never turned on. dB are differences in "
+        "held-out mu-law PSNR under `gt-max` to the same training without, where nothing else is said; 0.2 dB are within "
+        "seed variance."
     )
     tables = [part for (topic,), rows in topics.items() for part in (f"## {topic}", markdown_table(rows, columns))]
-    return ["# Tried and lost", text, *tables]
+    return ["# Negative results", text, *tables]
 
 
 if __name__ == "__main__":

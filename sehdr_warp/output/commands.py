@@ -1,4 +1,4 @@
-"""Command lines of `sehdr-warp render`, `report` and `envmap`. torch is imported when they run."""
+"""Command lines of `sehdr-warp render`, `report`, `envmap`, `lights` and `meter`. torch is imported when they run."""
 
 import json
 import logging

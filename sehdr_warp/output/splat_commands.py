@@ -1,4 +1,4 @@
-"""Command lines of `sehdr-warp export` and `convert`. torch is imported when they run."""
+"""Command lines of `sehdr-warp export`, `mesh` and `convert`. torch is imported when they run."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

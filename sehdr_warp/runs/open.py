@@ -42,7 +42,7 @@ def open_run(path: Path, device: str | None) -> Run:
 
 
 def open_scene(path: Path, device: str | None) -> Run | Splats:
-    """Load the run in a folder, or the Gaussians in a PLY, glTF or OpenUSD file; arguments as of open_run."""
+    """Load the run in a folder, or the Gaussians in a file of one of splats.SUFFIXES; arguments as of open_run."""
     from ..splats import SUFFIXES
     from .device import pick_device
     from .run import load_splats
