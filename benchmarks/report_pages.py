@@ -448,8 +448,8 @@ def _tried_page(path: Path) -> list[str]:
     columns: dict[str, str] = dict.fromkeys(("option", "idea", "gave", "on"), "")
     text = (
         "Ideas that were built, measured and taken out again, or never turned on. dB are differences in "
-        "held-out mu-law PSNR under `gt-max` to the same training without, where nothing else is said; 0.2 dB are within "
-        "seed variance."
+        "held-out mu-law PSNR under `gt-max` to the same training without, where nothing else is said; 0.2 dB are "
+        "within seed variance."
     )
     tables = [part for (topic,), rows in topics.items() for part in (f"## {topic}", markdown_table(rows, columns))]
     return ["# Negative results", text, *tables]
