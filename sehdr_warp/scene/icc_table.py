@@ -1,8 +1,7 @@
 """Tables of ICC profiles (`mft1`, `mft2`, `mAB `; ICC.1:2022, 10.10 to 10.12), evaluated in floating point.
 
 LittleCMS through Pillow converts color of 8 bits only, limited to the gamut of the target. Scanners and converters
-write 16 bits with such profiles, so their tables are read here. colour-science interpolates between their entries by
-tetrahedra, as LittleCMS does.
+write 16 bits with such profiles, so their tables are read here, and interpolated by tetrahedra, as LittleCMS does.
 """
 
 import struct
@@ -39,22 +38,22 @@ class IccTable:
 
     def to_xyz(self, codes: np.ndarray) -> np.ndarray:
         """Return CIE XYZ relative to D50 [..., 3], Y 1 at the medium's white, of codes [..., 3] in [0, 1]."""
-        values = _through(self.device_curves, codes)
-        if self.entries is not None:
-            from colour.algebra import table_interpolation_tetrahedral
-
-            values = np.asarray(table_interpolation_tetrahedral(values, self.entries))
+        values = _through(self.device_curves, np.asarray(codes, np.float32))
+        values = values if self.entries is None else _interpolated(self.entries, values)
         values = _through(self.middle_curves, values)
         if self.matrix is not None:
-            values = values @ self.matrix[:, :3].T + self.matrix[:, 3]
+            values = values @ self.matrix[:, :3].T.astype(np.float32) + self.matrix[:, 3].astype(np.float32)
         values = _through(self.output_curves, values)
         if self.space == "XYZ":
-            return values * (65535 / 32768)
+            return values * np.float32(65535 / 32768)
         scale = 65535 / 65280 if self.space == "Lab 16" else 1.0
-        lightness, a, b = np.moveaxis(values * scale * [100, 255, 255] - [0, 128, 128], -1, 0)
-        y = (lightness + 16) / 116
-        cubes = np.stack([y + a / 500, y, y - b / 200], axis=-1)
-        return _D50 * np.where(cubes**3 > _EPSILON, cubes**3, (116 * cubes - 16) / _KAPPA)
+        # (L + 16) / 116 + (a / 500, 0, -b / 200) of CIELAB from values of 0 to 1
+        to_cubes = np.array([[100 / 116] * 3, [255 / 500, 0, 0], [0, 0, -255 / 200]], np.float32) * np.float32(scale)
+        offset = np.array([16 / 116 - 128 / 500, 16 / 116, 16 / 116 + 128 / 200], np.float32)
+        roots = values @ to_cubes + offset
+        cubes = roots * roots * roots
+        light = np.where(cubes > _EPSILON, cubes, (116 * roots - 16) / np.float32(_KAPPA))
+        return light * _D50.astype(np.float32)
 
 
 def read_table(tag: bytes, space: str, read_curve: _ReadCurve) -> IccTable:
@@ -126,9 +125,41 @@ def _curve_size(tag: bytes, at: int) -> int:
 
 
 def _through(curves: tuple[np.ndarray, ...] | None, values: np.ndarray) -> np.ndarray:
-    """Return values [..., 3], each channel through its curve; values outside of 0 to 1 are clipped."""
+    """Return float32 values [..., 3], each channel through its curve; values outside of 0 to 1 are clipped."""
     if curves is None:
         return values
-    samples = (np.linspace(0, 1, len(curve)) for curve in curves)
-    parts = [np.interp(values[..., i], x, y) for i, (x, y) in enumerate(zip(samples, curves, strict=True))]
-    return np.stack(parts, axis=-1)
+    result = np.empty_like(values)
+    for channel, curve in enumerate(curves):
+        # Samples are even, so that no search is needed, as numpy.interp's.
+        samples = curve.astype(np.float32)
+        first, part = _below(values[..., channel], len(samples))
+        result[..., channel] = samples[first] + part * np.diff(samples)[first]
+    return result
+
+
+def _below(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of the sample below each value in [0, 1], of `count` even ones, and the part of the way on."""
+    places = np.clip(values, 0, 1) * np.float32(count - 1)
+    first = np.minimum(places.astype(np.int32), count - 2)
+    return first, places - first
+
+
+def _interpolated(entries: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return entries [r, g, b, 3] at values [..., 3]: between corners of the tetrahedron that holds each value.
+
+    From the cell's lowest corner the way goes along the axis of the largest part first, then of the middle one.
+    """
+    strides = np.array([entries.shape[1] * entries.shape[2], entries.shape[2], 1])
+    axes = [_below(values[..., axis], entries.shape[axis]) for axis in range(3)]
+    corner = sum(first * stride for (first, _), stride in zip(axes, strides, strict=True))
+    (_, r), (_, g), (_, b) = axes
+    largest, least = np.maximum(np.maximum(r, g), b), np.minimum(np.minimum(r, g), b)
+    middle = r + g + b - largest - least
+    along = np.where((r >= g) & (r >= b), strides[0], np.where(g >= b, strides[1], strides[2]))
+    last = np.where((b <= r) & (b <= g), strides[2], np.where(g <= r, strides[1], strides[0]))
+    table = entries.reshape(-1, 3).astype(np.float32)
+    result = table[corner] * (1 - largest)[..., None]
+    result += table[corner + along] * (largest - middle)[..., None]
+    result += table[corner + (strides.sum() - last)] * (middle - least)[..., None]
+    result += table[corner + strides.sum()] * least[..., None]
+    return result
