@@ -4,19 +4,20 @@ All images are opened by open_image. The content decides the format, whatever th
 decoded: Pillow knows many more, and passes some (EPS) to other programs.
 """
 
-import io
 import re
 import struct
 import threading
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageFile, TiffImagePlugin
+from PIL import Image, ImageFile
 
 from ..errors import InputError
+from ..quiet import silent_stderr
 from .heif import HEIF_SUFFIXES, heif_installed, is_heif, read_deep_heif, register_heif
+from .tiff import BIG_ENDIAN, describe_tiff, has_planes_of_16_bits, has_thumbnails, read_planes, whole_range
 
 MAX_PIXELS = 160_000_000
 """Above the frame of any camera (the largest backs have 151 megapixels), far below what would exhaust memory."""
@@ -27,7 +28,6 @@ HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
 PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512
-_MOST_PAGES = 16  # Of a TIFF that are looked at
 _opening = threading.Lock()  # Pillow's pixel limit, which is lifted while opening, is shared by all threads
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "AVIF")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
@@ -39,16 +39,16 @@ _OTHER_MODES = {
 }
 DAMAGED = "copy or export the image again"
 _EXPORT = "export it as RGB or grey, in PNG or JPEG"
-_TIFF_HEADS = (b"II*\0", b"MM\0*")
 _SIGNATURES = {
     b"\xff\x0a": "JPEG XL", b"\0\0\0\x0cJXL ": "JPEG XL", b"\0\0\0\x0cjP  ": "JPEG 2000", b"GIF8": "a GIF",
+    b"II\xbc": "JPEG XR",
     b"8BPS": "a Photoshop file", b"v/1\x01": "OpenEXR", b"#?R": "a Radiance picture", b"%PDF": "a PDF",
     b"<!DOCTYPE": "a web page", b"<html": "a web page", b"version https://git-lfs": "a Git LFS pointer",
 }  # fmt: skip
 _REMEDIES = {
     "OpenEXR": "name it .exr", "a Radiance picture": "name it .hdr",
     "a Git LFS pointer": "fetch it with `git lfs pull`", "a web page": "download the photo again",
-    "a TIFF of floats": "export it with 16 bits, or as OpenEXR",
+    "a TIFF of floats": "export it with 16 bits, or as OpenEXR", BIG_ENDIAN: "save it as TIFF of less than 4 GB",
 }  # fmt: skip
 """Remedies for files of other kinds, where exporting them is not the remedy."""
 PILLOW_ERRORS = (
@@ -101,7 +101,10 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
     """
     with open_image(path, mask=mask) as image:
         try:
-            pixels, alpha = _decode(image, path)
+            with (
+                silent_stderr() if image.format == "TIFF" else nullcontext()
+            ):  # libtiff prints of what it cannot decode.
+                pixels, alpha = _decode(image, path)
             turn = orientation_of(image) if oriented else 1
         except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
@@ -111,7 +114,8 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
 def has_16_bits(path: Path) -> bool:
     """Return whether a photo that read_ldr decodes has 16 bits; raises as open_image."""
     with open_image(path) as image:
-        return image.mode.startswith("I") or bool(_low_byte_tiles(image)) or _has_planes_of_16_bits(image, path)
+        deep = image.mode.startswith("I") or _is_grey_alpha_of_16_bits(image) or bool(_low_byte_tiles(image))
+        return deep or has_planes_of_16_bits(image)
 
 
 def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
@@ -134,7 +138,7 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
         limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             image = Image.open(path, formats=("HEIF",) if heif else _FORMATS)
-            several = getattr(image, "is_animated", False) and image.format != "MPO" and not _has_thumbnails(image)
+            several = getattr(image, "is_animated", False) and image.format != "MPO" and not has_thumbnails(image)
         except PILLOW_ERRORS as error:
             if kind := _kind_by_content(path):
                 raise InputError(
@@ -158,19 +162,6 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
     return image
 
 
-def _has_thumbnails(image: ImageFile.ImageFile) -> bool:
-    """Return whether all pictures of a TIFF behind the first are smaller copies of it, or masks (NewSubfileType)."""
-    if image.format != "TIFF":
-        return False
-    count = min(image.n_frames, _MOST_PAGES + 1)  # pyright: ignore[reportAttributeAccessIssue]
-    for page in range(1, count):
-        image.seek(page)
-        if not image.tag_v2.get(254, 0) & 5:  # pyright: ignore[reportAttributeAccessIssue]
-            return False
-    image.seek(0)
-    return count <= _MOST_PAGES
-
-
 def _kind_by_content(path: Path) -> str | None:
     """Return in words what a file is that Pillow does not read, None if it is not known."""
     with path.open("rb") as file:
@@ -178,15 +169,11 @@ def _kind_by_content(path: Path) -> str | None:
     for signature, kind in _SIGNATURES.items():
         if head.startswith(signature):
             return kind
-    if head[:2] == b"\xff\xd8" and re.search(rb"\xff[\xc0-\xc2]\0.\x0c", head, re.DOTALL):
-        return "a JPEG of 12 bits"
-    if head[:4] in _TIFF_HEADS:
-        with suppress(*PILLOW_ERRORS):
-            tags = TiffImagePlugin.ImageFileDirectory_v2(head[:8])
-            with path.open("rb") as file:
-                file.seek(tags.next)
-                tags.load(file)
-            return "a TIFF of floats" if 3 in tags.get(339, ()) else None
+    if head[:2] == b"\xff\xd8" and (frame := re.search(rb"\xff([\xc0-\xc3])\0.([\x08-\x10])", head, re.DOTALL)):
+        lossless, bits = frame[1] == b"\xc3", frame[2][0]
+        return "a lossless JPEG" if lossless else "a JPEG of 12 bits" if bits == 12 else None
+    with suppress(*PILLOW_ERRORS):
+        return describe_tiff(path)
     return None
 
 
@@ -237,8 +224,15 @@ def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndar
     """Return code values [H, W, 3] and alpha [H, W] in [0, 1] or None."""
     if image.format == "HEIF" and image.info.get("bit_depth", 8) > 8:
         return _split(read_deep_heif(path))
-    if _has_planes_of_16_bits(image, path):
-        return _split(_planes(image, path))
+    if has_planes_of_16_bits(image):
+        return _split(read_planes(image, path))
+    if _is_grey_alpha_of_16_bits(image):
+        with open_image(path) as second:
+            # Pillow keeps the high bytes. As RGBA of 8 bits the same samples give all bytes.
+            second._mode = "RGBA"
+            second.tile = [tile._replace(args="RGBA") for tile in second.tile]
+            grey, alpha = np.moveaxis(np.asarray(second).view(">u2").astype(np.uint16), 2, 0)
+        return _split(np.stack([grey, grey, grey, alpha], axis=2))
     if image.mode in ("RGB", "RGBA") and (low := _low_byte_tiles(image)):
         with open_image(path) as second:
             second.tile = low
@@ -247,11 +241,15 @@ def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndar
     if image.mode.startswith("I"):
         values = np.asarray(image)
         if values.min() < 0 or values.max() > 65535:
-            problem = f"32-bit values up to {int(values.max())} have no known white"
+            problem = f"signed or 32-bit values up to {int(values.max())} have no known white"
             raise InputError(path, problem, "export it with 16 bits")
-        return _split(values.astype(np.uint16))
+        return _split(whole_range(image, values.astype(np.uint16)))
     transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     return _split(_converted(image, "RGBA" if transparent else "RGB"))
+
+
+def _is_grey_alpha_of_16_bits(image: ImageFile.ImageFile) -> bool:
+    return bool(image.tile) and image.tile[0].args == "LA;16B"
 
 
 def _converted(image: Image.Image, mode: str) -> np.ndarray:
@@ -288,50 +286,6 @@ def _low_byte_tiles(image: ImageFile.ImageFile) -> list | None:
         mode = f"{layout};{other[depth]}"
         tiles.append(tile._replace(args=mode if isinstance(tile.args, str) else (mode, *rest)))
     return tiles or None
-
-
-def _has_planes_of_16_bits(image: ImageFile.ImageFile, path: Path) -> bool:
-    """Return whether an image is a TIFF with a plane of 16 bits for each channel, of which Pillow reads 8 bits."""
-    if image.format != "TIFF":
-        return False
-    tags = image.tag_v2  # pyright: ignore[reportAttributeAccessIssue]
-    with path.open("rb") as file:
-        small = file.read(4) in _TIFF_HEADS  # Else BigTIFF, whose directories are others
-    return small and tags.get(284) == 2 and len(tags.get(258, ())) > 1 and set(tags[258]) == {16}
-
-
-def _planes(image: ImageFile.ImageFile, path: Path) -> np.ndarray:
-    """Return [H, W, 3 or 4] uint16 of a TIFF with a plane for each channel: each is read as a picture of its own.
-
-    Raises PILLOW_ERRORS if it is damaged.
-    """
-    tags, planes = image.tag_v2, []  # pyright: ignore[reportAttributeAccessIssue]
-    data = path.read_bytes()
-    order = "<" if data[:2] == b"II" else ">"
-    for plane in range(len(image.mode)):
-        fields = {tag: (tags[tag],) for tag in (256, 257, 259, 278, 317, 322, 323) if tag in tags}
-        fields |= {258: (16,), 262: (1,), 277: (1,)}  # Bits, grey, one sample
-        for tag in (273, 279, 324, 325):  # Places and lengths of strips or tiles
-            if tag in tags:
-                count = len(tags[tag]) // tags[277]
-                fields[tag] = tags[tag][plane * count : (plane + 1) * count]
-        single = data[:4] + struct.pack(f"{order}I", len(data)) + data[8:] + _directory(fields, len(data), order)
-        with Image.open(io.BytesIO(single), formats=("TIFF",)) as one:
-            planes.append(np.asarray(one).astype(np.uint16))
-    return np.stack(planes, axis=2)
-
-
-def _directory(fields: dict[int, tuple[int, ...]], place: int, order: str) -> bytes:
-    """Return a TIFF directory (TIFF 6.0, section 2) of whole numbers that lies at a place in its file."""
-    behind = place + 2 + 12 * len(fields) + 4
-    entries, values = struct.pack(f"{order}H", len(fields)), b""
-    for tag, numbers in sorted(fields.items()):
-        short = tag in (258, 259, 262, 277, 317)
-        packed = struct.pack(f"{order}{len(numbers)}{'H' if short else 'I'}", *numbers).ljust(4, b"\0")
-        entries += struct.pack(f"{order}HHI", tag, 3 if short else 4, len(numbers))
-        entries += packed if len(packed) == 4 else struct.pack(f"{order}I", behind + len(values))
-        values += packed if len(packed) > 4 else b""
-    return entries + bytes(4) + values
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:

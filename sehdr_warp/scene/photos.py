@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+from ..errors import InputError
 from .hdr_files import hdr_size
-from .images import EncodedImage, image_sizes, read_ldr
+from .images import EncodedImage, image_sizes, read_ldr, require_file
 from .linear_photos import kind_of, raw_sizes, read_raw, tone_mapped
+
+_ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
 
 
 def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -12,6 +15,7 @@ def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     kind = kind_of(path)
     if kind == "encoded":
         return image_sizes(path)
+    _refuse_renamed(path)
     if kind == "raw":
         return raw_sizes(path)
     size = hdr_size(path)
@@ -34,3 +38,13 @@ def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:
     if kind == "encoded":
         return read_ldr(path, oriented=oriented)
     return read_raw(path, oriented=oriented) if kind == "raw" else EncodedImage(tone_mapped(path), None)
+
+
+def _refuse_renamed(path: Path) -> None:
+    """Raise InputError for a photo of codes under the name of a RAW file or a float image."""
+    require_file(path)
+    with path.open("rb") as file:
+        head = file.read(8)
+    for signature, (kind, suffix) in _ENCODED.items():
+        if head.startswith(signature):
+            raise InputError(path, f"is a {kind} photo, not what its name says", f"name it {suffix}")

@@ -17,6 +17,7 @@ from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
 from sehdr_warp.scene.images import exif_of, has_16_bits, image_sizes, open_image, read_ldr
 from sehdr_warp.scene.lens import area_average
 from sehdr_warp.scene.masks import read_mask
+from sehdr_warp.scene.photos import photo_sizes
 
 cv2 = pytest.importorskip("cv2")
 RNG = np.random.default_rng(1)
@@ -267,12 +268,73 @@ def test_16_bits_of_every_kind_of_tiff(tmp_path, options, order):
     assert has_16_bits(tmp_path / "a.tif") and (read.alpha is not None) == (options.get("extrasamples") == [2])
 
 
+@pytest.mark.parametrize("interlaced", [False, True])
+def test_16_bits_of_a_png_of_grey_and_alpha(tmp_path, interlaced):
+    pixels = RNG.integers(0, 65536, (1, 7, 2), dtype=np.uint16)
+    # Of one row in seven passes, those that hold a pixel of it start at 0, 4, 2 and 1.
+    passes = [pixels[0, 0::8], pixels[0, 4::8], pixels[0, 2::4], pixels[0, 1::2]] if interlaced else [pixels[0]]
+    rows = b"".join(b"\0" + part.astype(">u2").tobytes() for part in passes)
+    chunks = {
+        b"IHDR": struct.pack(">IIBBBBB", 7, 1, 16, 4, 0, 0, interlaced),
+        b"IDAT": zlib.compress(rows),
+        b"IEND": b"",
+    }
+    png = b"\x89PNG\r\n\x1a\n"
+    for kind, data in chunks.items():
+        png += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    (tmp_path / "a.png").write_bytes(png)
+    read = read_ldr(tmp_path / "a.png")
+    np.testing.assert_array_equal(read.pixels, np.repeat(pixels[..., :1], 3, 2))
+    np.testing.assert_allclose(read.alpha, pixels[..., 1] / 65535, atol=1e-6)
+    assert has_16_bits(tmp_path / "a.png")
+
+
+def test_grey_tiffs_of_16_bits_whose_white_is_0_or_that_hold_12(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    grey = RNG.integers(0, 4096, (12, 16), dtype=np.uint16)
+    grey[0, :2] = 0, 4095
+    tifffile.imwrite(tmp_path / "white.tif", grey << 4, photometric="miniswhite")
+    np.testing.assert_array_equal(read_ldr(tmp_path / "white.tif").pixels[..., 0], 65535 - (grey << 4))
+    pytest.importorskip("imagecodecs")
+    tifffile.imwrite(tmp_path / "packed.tif", grey, photometric="minisblack", bitspersample=12)
+    read = read_ldr(tmp_path / "packed.tif").pixels
+    assert read.min() == 0 and read.max() == 65535
+    np.testing.assert_allclose(read[..., 1], grey * (65535 / 4095), atol=0.51)
+
+
+@pytest.mark.parametrize("planes", [False, True])
+def test_bigtiff(tmp_path, planes):
+    tifffile = pytest.importorskip("tifffile")
+    pixels = RNG.integers(0, 65536, (12, 16, 3), dtype=np.uint16)
+    stored = np.moveaxis(pixels, 2, 0) if planes else pixels
+    options = {"photometric": "rgb", "bigtiff": True} | ({"planarconfig": "separate"} if planes else {})
+    tifffile.imwrite(tmp_path / "a.tif", stored, byteorder="<", **options)
+    np.testing.assert_array_equal(read_ldr(tmp_path / "a.tif").pixels, pixels)
+    tifffile.imwrite(tmp_path / "b.tif", stored, byteorder=">", **options)
+    with pytest.raises(
+        InputError, match="is a BigTIFF whose bytes are in big-endian order, .*; save it as TIFF of less"
+    ):
+        read_ldr(tmp_path / "b.tif")
+
+
+@pytest.mark.parametrize("stored, words", [
+    (np.zeros((8, 8, 5), np.uint16), "5 channels of 16 bits"), (np.zeros((8, 8, 3), np.uint32), "3 channels of 32 bits")
+])  # fmt: skip
+def test_tiffs_that_pillow_does_not_read_are_described(tmp_path, stored, words):
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb")
+    with pytest.raises(InputError, match=f"is a TIFF of {words} .compression 1., .*; export it as RGB or grey"):
+        read_ldr(tmp_path / "a.tif")
+
+
 CONTENTS = {
     "is JPEG XL, which is not read as a photo; export it": b"\xff\x0a" + bytes(50),
     "is JPEG 2000": b"\0\0\0\x0cjP  \r\n\x87\n" + bytes(50),
     "is OpenEXR, which is not read as a photo; name it .exr": b"v/1\x01" + bytes(50),
     "is a Git LFS pointer, .*; fetch it with `git lfs pull`": b"version https://git-lfs.github.com/spec/v1",
     "is a web page, .*; download the photo again": b"<!DOCTYPE html><html></html>",
+    "is JPEG XR": b"II\xbc\1" + bytes(50),
+    "is a lossless JPEG": b"\xff\xd8\xff\xc3\0\x0b\x10\0\x10\0\x10\1\1\x11\0",
     "is a JPEG of 12 bits": b"\xff\xd8\xff\xe0\0\x04\0\0\xff\xc1\0\x11\x0c\0\x10\0\x10\x03",
 }
 
@@ -282,6 +344,13 @@ def test_what_a_file_is_that_is_not_read(tmp_path, words):
     (tmp_path / "a.jpg").write_bytes(CONTENTS[words])
     with pytest.raises(InputError, match=f"a.jpg: {words}"):
         read_ldr(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("name", ["a.dng", "a.ARW", "a.exr", "a.hdr"])
+def test_photos_of_codes_under_other_names_are_named(tmp_path, name):
+    RGB.save(tmp_path / name, format="JPEG")
+    with pytest.raises(InputError, match="is a JPEG photo, not what its name says; name it .jpg"):
+        photo_sizes(tmp_path / name)
 
 
 def test_a_tiff_of_floats_is_named(tmp_path):
