@@ -1,11 +1,11 @@
-"""Count the cameras that show each Gaussian of a scene, and measure how much it contributes to their pictures."""
+"""Measure where cameras show each Gaussian of a scene: in how many views, how much of it, and inside of masks."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ..scene import Camera
+from ..scene import Camera, View
 from ..subsets import every_nth
 from .radiance_field import RadianceField
 
@@ -38,6 +38,25 @@ def contributions(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
     for camera in every_nth(cameras, MOST_VIEWS):
         total += _blending_weights(field, camera)
     return total
+
+
+@torch.no_grad()
+def mask_shares(field: RadianceField, views: Sequence[View]) -> Tensor:
+    """Return [N], the share of each Gaussian's blending weights that the masks of views keep; 0 if no view shows it.
+
+    Args:
+        field: The scene.
+        views: Views with masks, in scene coordinates.
+    """
+    device = field.gaussians.means.device
+    sums = torch.zeros((field.gaussians.count, 2), device=device)
+    for view in every_nth(views, MOST_VIEWS):
+        small = view.camera.within(VIEW_SIZE)
+        mask = torch.as_tensor(view.mask, dtype=torch.float32, device=device)[None, None]
+        mask = torch.nn.functional.interpolate(mask, (small.height, small.width), mode="area")[0, 0]
+        images = torch.stack([torch.ones_like(mask), mask], dim=2)
+        sums += field.weighted_sums(field.camera_tensors(small), images)
+    return torch.where(sums[:, 0] > LEAST_WEIGHT, sums[:, 1] / sums[:, 0].clamp_min(LEAST_WEIGHT), 0.0)
 
 
 def _blending_weights(field: RadianceField, camera: Camera) -> Tensor:

@@ -43,6 +43,12 @@ def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
     return focus if np.median(np.sum((focus - positions) * forward, axis=1)) > 0 else None
 
 
+def middle_index(cameras: Sequence[Camera]) -> int:
+    """Return the index of the camera nearest to the median position."""
+    places = _positions(cameras)
+    return int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))
+
+
 def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[Camera]:
     """Return a closed path of cameras around the common focus of a set, upright, all looking at the focus.
 
@@ -185,7 +191,7 @@ def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
     """Return what a page needs to fly through a scene, as plain values.
 
     `up` and `focus` are [3] (focus may be None), `size` is the extent of the camera positions, `views` lists name,
-    split and camera.
+    split and camera, and `first` is the index of the view in the middle, which a page opens with.
     """
     cameras = [entry.camera for entry in entries]
     focus, up, size = None, np.array([0.0, -1.0, 0.0]), 0.0
@@ -196,6 +202,7 @@ def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
         "up": up.tolist(),
         "focus": None if focus is None else focus.tolist(),
         "size": size or 1.0,
+        "first": middle_index(cameras) if cameras else 0,
         "views": [
             {"name": e.name, "split": e.split, "time": e.exposure_time, "camera": e.camera.to_dict()} for e in entries
         ],

@@ -18,7 +18,7 @@ from .world_transform import WorldTransform
 
 log = logging.getLogger(__name__)
 MOST_VIEWS, _VIEW_SIZE = 40, 400  # Training views that are fused, and their longest side in pixels
-_TRUNCATION = 3.0  # Voxels around the surface within which the distance field is not clamped
+_TRUNCATION = 6.0  # Voxels around the surface in which the distance is not clamped; 3 leaves holes in short trainings
 _EDGE = 0.08  # Relative depth step to a neighboring pixel from which depth is a mean over an edge, and is not used
 _LEAST_ALPHA = 0.5
 _PERCENTILES, _FAR = (2, 98), 2.5  # Of the points within this many times the median depth: the box without a crop

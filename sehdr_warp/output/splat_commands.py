@@ -1,14 +1,20 @@
 """Command lines of `sehdr-warp export`, `mesh` and `convert`. torch is imported when they run."""
 
-from dataclasses import dataclass, field
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
 from ..errors import UsageError
-from ..runs.open import open_run, open_scene
+from ..runs.open import load_run_photos, open_run, open_scene
 from .options import WorldOptions, changed_flags
+
+if TYPE_CHECKING:
+    from ..runs.run import Run, Splats
+    from .splat_edits import SplatEdits
 
 _MESH_SUFFIXES = (".obj", ".abc", ".fbx", ".stl")
 
@@ -38,6 +44,10 @@ class EditOptions:
     """Least opacity; below 1/255 no program draws a Gaussian."""
     min_views: int = 0
     """Leave out what fewer training cameras show: 2 removes most floaters."""
+    mask_only: bool = False
+    """Keep only what the masks of the photos show white; masks of a few photos are enough."""
+    data: str | None = None
+    """The photos with these masks, if they have moved since the training."""
     max_gaussians: int | None = None
     """Keep this many, those that pictures show most, and fit their colors again: a small file to share."""
 
@@ -98,6 +108,26 @@ class Mesh:
     """cpu or cuda:N; by default the first GPU if there is one."""
 
 
+def _splat_edits(options: EditOptions) -> SplatEdits:
+    """Return edits that need no photos; raise SehdrError for values that cannot be."""
+    from .splat_edits import SplatEdits
+
+    if options.data is not None and not options.mask_only:
+        raise UsageError("--data: the photos are only read for --mask-only")
+    return SplatEdits(**{name: value for name, value in vars(options).items() if name not in ("mask_only", "data")})
+
+
+def _with_masks(edits: SplatEdits, options: EditOptions, run: Run | Splats) -> SplatEdits:
+    """Return edits with the photos' masks, if --mask-only asks for them."""
+    from ..runs.run import Run
+
+    if not options.mask_only:
+        return edits
+    if not isinstance(run, Run):
+        raise UsageError("--mask-only: needs a run and its photos; a file of Gaussians has none")
+    return replace(edits, mask_views=load_run_photos(run, options.data).views)
+
+
 def run_mesh(args: Mesh) -> None:
     """Run `sehdr-warp mesh`."""
     from .proxy_mesh import check_mesh, write_proxy_mesh
@@ -114,15 +144,17 @@ def run_export(args: Export) -> None:
     if args.out.suffix.lower() in _MESH_SUFFIXES:
         raise UsageError(f"{args.out}: meshes are written by sehdr-warp mesh {args.run} --out {args.out.stem}.usdc")
     if check_suffix(args.out, ".html") == ".html":
+        from ..files import check_absent
         from .scene_page import write_scene_page
-        from .splat_edits import SplatEdits
 
         flags = [*changed_flags(args.world), *changed_flags(args.file), *["--cameras"] * args.cameras]
         if flags or args.merge:
             refused = ", ".join([*flags, *["--merge"] * bool(args.merge)])
             raise UsageError(f"{refused}: without effect on a page, which has its own exposure, cameras and axes")
-        edits = SplatEdits(**vars(args.edits))
+        check_absent(args.out, args.overwrite)
+        edits = _splat_edits(args.edits)
         run = open_scene(args.run, args.device)
+        edits = _with_masks(edits, args.edits, run)
         print(write_scene_page(run, args.out, edits=edits, overwrite=args.overwrite))
         return
     flags = {"cameras": args.cameras, "overwrite": args.overwrite}
@@ -161,8 +193,10 @@ def _export(
     from .splat_edits import SplatEdits
 
     check_suffix(out)  # Before the scene is opened.
-    splat_edits = SplatEdits(**vars(edits)) if edits else SplatEdits(min_opacity=0)
+    splat_edits = _splat_edits(edits) if edits else SplatEdits(min_opacity=0)
     run = open_scene(source, device)
+    if edits:
+        splat_edits = _with_masks(splat_edits, edits, run)
     others = [open_scene(path, device) for path in merge]
     times = () if options.exposure is None else exposure_times(run.base_time, options.exposure)
     if len(times) > 1:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Camera
+from sehdr_warp.scene import Camera, View
 
-from ..model.visibility import contributions, count_views
+from ..model.visibility import contributions, count_views, mask_shares
 from ..splats import GaussianArrays
 from .camera_paths import common_focus
 
@@ -21,12 +21,8 @@ LEAST_OPACITY = 1 / 255
 # seen from the middle nothing changes, and from the other cameras it shifts by less than 1/100 rad. Viewers sort by
 # depth over a file's whole extent, so a single stray would cost the rest its order.
 FAR = 100.0
+_LEAST_SHARE = 0.5  # Part of a Gaussian's pixels in photos with masks that the masks must keep
 _FAINT = 0.05  # Strays of less opacity than this are dropped instead
-_SEEN_PIXELS = (
-    0.05  # Blending weight, in pixels of a view of _VIEW_SIZE, with which a view counts as showing a Gaussian
-)
-_VIEW_SIZE = 320
-_MOST_VIEWS = 100
 
 
 @dataclass(frozen=True)
@@ -82,6 +78,7 @@ class SplatEdits:
         min_opacity: Least opacity of a Gaussian, in [0, 1).
         min_views: Least number of training cameras that show a Gaussian; 2 removes most floaters.
         max_gaussians: Number of Gaussians to keep, those that contribute most to the training views.
+        mask_views: Photos with masks: what shows mostly outside of these is left out. None for no such edit.
     """
 
     crop: str | None = None
@@ -89,6 +86,7 @@ class SplatEdits:
     min_opacity: float = LEAST_OPACITY
     min_views: int = 0
     max_gaussians: int | None = None
+    mask_views: Sequence[View] | None = None
 
     def __post_init__(self):
         """Raise SehdrError for values that cannot be."""
@@ -100,11 +98,14 @@ class SplatEdits:
             raise SehdrError(f"min_views {self.min_views} is negative; 2 leaves out what a single camera shows")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise SehdrError(f"max_gaussians {self.max_gaussians} leaves nothing; give 1 or more")
+        if self.mask_views is not None and all(view.mask is None for view in self.mask_views):
+            raise SehdrError("no photo has a mask; paint masks/PHOTO.png beside the photos, white where the object is")
 
     @property
     def changes_pictures(self) -> bool:
         """True if the file is meant to show something else than the scene."""
-        return bool(self.crop or self.cut or self.min_views or self.min_opacity > LEAST_OPACITY)
+        regions = self.crop or self.cut or self.mask_views is not None
+        return bool(regions or self.min_views or self.min_opacity > LEAST_OPACITY)
 
     def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: Any) -> np.ndarray:
         """Return [N], which Gaussians stay.
@@ -128,6 +129,9 @@ class SplatEdits:
                 raise SehdrError(f"{run.path}: has no training cameras to count views of; leave min_views out")
             views = count_views(run.model, cameras).cpu().numpy()
             steps[f"shown by fewer than {self.min_views} cameras"] = views < self.min_views
+        if self.mask_views is not None:
+            masked = [view for view in self.mask_views if view.mask is not None]
+            steps["outside of the masks"] = mask_shares(run.model, masked).cpu().numpy() < _LEAST_SHARE
         stays = np.ones(len(opacities), bool)
         for reason, goes in steps.items():
             stays &= ~goes

@@ -20,7 +20,7 @@ from sehdr_warp.scene import Camera
 
 from ..files import read_json, write_json
 from ..splats import STREAMED_SOG
-from .camera_paths import common_focus, typical_roll, up_direction
+from .camera_paths import common_focus, middle_index, typical_roll, up_direction
 
 log = logging.getLogger(__name__)
 AXES = ("upright", "scene")
@@ -137,7 +137,7 @@ def world_transform(
         if roll > _WORST_ROLL:
             text = "the photos share no up direction (typically %.0f degrees off); set --up x,y,z, or --axes scene"
             log.warning(text, math.degrees(roll))
-    rotation, origin = _rotation(direction, middle_camera(cameras) if cameras else None), np.zeros(3)
+    rotation, origin = _rotation(direction, cameras[middle_index(cameras)] if cameras else None), np.zeros(3)
     if cameras:
         focus = common_focus(cameras)
         origin = np.mean([camera.position for camera in cameras], axis=0) if focus is None else focus
@@ -159,12 +159,6 @@ def file_transform(transform: WorldTransform, path: Path | str) -> WorldTransfor
         return transform
     turn = np.diag([-1.0, -1.0, 1.0])
     return WorldTransform(turn @ transform.rotation, turn @ transform.translation, transform.scale)
-
-
-def middle_camera(cameras: Sequence[Camera]) -> Camera:
-    """Return the camera nearest to the median position."""
-    places = np.stack([camera.position for camera in cameras])
-    return cameras[int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
 
 
 def read_direction(text: str | Sequence[float]) -> np.ndarray:

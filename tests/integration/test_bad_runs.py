@@ -307,6 +307,9 @@ def test_nothing_is_replaced(trained, tmp_path, capfd):
     several = ("--kind", "ldr", "--exposure", "1/60,1/125")
     assert call("export", trained, "--out", tmp_path / "b.ply", *several, "-q") == 2
     assert "one exposure; name one" in capfd.readouterr().err
+    assert "no photo has a mask" in refused(capfd, "export", trained, "--out", tmp_path / "b.ply", "--mask-only")
+    assert call("export", trained, "--out", tmp_path / "b.ply", "--data", tmp_path, "-q") == 2
+    assert "only read for --mask-only" in capfd.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------- full disks and signals

@@ -9,6 +9,7 @@ from sehdr_warp.output.export import export
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.splat_edits import Box, Sphere, SplatEdits, read_region, without_strays
 from sehdr_warp.runs.run import load_splats
+from sehdr_warp.scene import View
 from sehdr_warp.splats import GaussianArrays, read_gaussians, write_gaussians
 
 from .helpers import Entry, camera
@@ -114,6 +115,21 @@ def test_views_that_show_a_gaussian_are_counted(tmp_path, run, logged):
     run.cameras = ()
     with pytest.raises(SehdrError, match="has no training cameras"):
         export(run, tmp_path / "b.ply", edits=SplatEdits(min_views=1))
+
+
+def test_what_masks_show_is_kept(tmp_path, run, logged):
+    """Two photos, one of them with a mask, which keeps its side of one of the two Gaussians in sight."""
+    photo = run.cameras[2].camera
+    places = np.array([(0, 0, 0), (1, 0, 0)]) @ photo.world_to_camera[:3, :3].T + photo.world_to_camera[:3, 3]
+    columns = photo.fx * places[:, 0] / places[:, 2] + photo.cx
+    nearer = np.abs(np.arange(photo.width) + 0.5 - columns[0]) < np.abs(np.arange(photo.width) + 0.5 - columns[1])
+    mask = np.tile(nearer.astype(np.float32), (photo.height, 1))
+    codes = np.zeros((*mask.shape, 3), np.uint8)
+    views = [View(str(i), codes, photo, 1.0, "train", mask if i else None) for i in range(2)]
+    assert export_means(run, tmp_path / "a.ply", mask_views=views) == [(0, 0, 0)]
+    assert any("outside of the masks" in line for line in logged)
+    with pytest.raises(SehdrError, match="no photo has a mask; paint masks/PHOTO.png"):
+        SplatEdits(mask_views=views[:1])
 
 
 def test_edits_that_leave_nothing_say_where_the_scene_is(tmp_path, run):

@@ -38,7 +38,7 @@ async function start() {
   splat.gsplat.instance.sorter.on("updated", () => { sorted++; request(timer !== 0); });
   facts.views.forEach((view, i) => $("view").add(new Option(view.name, i)));
   new ResizeObserver(moved).observe(stage);
-  jump(0);
+  jump(facts.first);
 }
 
 // The engine's Gaussians end early, are lifted to make up for it, and left out where small; ours end at the same opacity alone.

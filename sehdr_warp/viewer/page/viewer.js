@@ -36,7 +36,7 @@ async function start() {
   else setInterval(renew, 2000);
   useRun(0);
   new ResizeObserver(resize).observe(stage);
-  jump(0);
+  jump(facts.first);
 }
 
 // Shows what a training of another process has written meanwhile.
