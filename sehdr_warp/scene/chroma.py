@@ -8,7 +8,6 @@ model gets wrong by more than noise is added from the stored chroma, so that ave
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 _RADIUS = 1.0  # Standard deviation of the neighborhood of a fit, in chroma samples
 _NOISE = 3e-4  # Variance of luma codes in [0, 1] below which luma says little: flat areas keep smooth chroma
@@ -63,6 +62,8 @@ def upsample_chroma(luma: np.ndarray, chroma: np.ndarray, offsets: Sequence[floa
 
 
 def _blurred(values: np.ndarray) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter  # Takes a second to load
+
     return gaussian_filter(values, (_RADIUS, _RADIUS, 0)[: values.ndim], mode="nearest", truncate=3)
 
 

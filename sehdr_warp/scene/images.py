@@ -25,7 +25,10 @@ MAX_SIDE = 65_536  # No photo has a longer side; a damaged one with few pixels i
 LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".avif", *HEIF_SUFFIXES * heif_installed())
 """HEIF's among them if the package that decodes it is installed."""
 HDR_SUFFIXES = (".exr", ".hdr")
-RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
+RAW_SUFFIXES = (
+    ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".rw2", ".rwl", ".orf", ".pef", ".srw",
+    ".3fr", ".fff", ".iiq", ".mos", ".mef", ".erf", ".mrw",
+)  # fmt: skip
 PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512
 _opening = threading.Lock()  # Pillow's pixel limit, which is lifted while opening, is shared by all threads

@@ -136,6 +136,11 @@ def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted((file for file in photos if file.is_file()), key=lambda file: natural_key(file.name))
 
 
+def is_kept_by_system(folder: str) -> bool:
+    """Return whether a folder's name is one that systems and network storage use for copies and thumbnails."""
+    return folder.startswith((".", "@", "#", "$")) or folder == "__MACOSX"
+
+
 def unique_names(records: Sequence[ImageRecord]) -> list[str]:
     """Return a name for each photo that can name a file, unique without regard to case.
 

@@ -28,12 +28,11 @@ from .read_folders import (
 from .read_opensfm import FILE as OPENSFM_FILE
 from .read_opensfm import read_opensfm
 from .read_transforms import read_hdr_nerf, read_transforms
-from .unused_files import unused_notes
-from .video import is_video
+from .unused_files import ARCHIVE_SUFFIXES, unused_notes
+from .video import UNSTITCHED_SUFFIXES, is_video
 from .video_frames import read_video
 
 _MARK = "transforms_train.json"  # A file of every embedded scene
-_UNSTITCHED = (".insv", ".360", ".lrv")  # Of Insta360 and GoPro, before their own programs join both lenses
 _HOLDOUT = 8  # Every eighth view is held out, as LLFF, Mip-NeRF 360 and 3DGS do
 _FEWEST_FOR_TEST = 5  # In smaller sets no view is held out
 
@@ -121,8 +120,10 @@ def _folder(path: Path | str) -> Path:
         raise InputError(folder, "not found", "give a folder of photos, or 'embedded'") from None
     except NotADirectoryError:
         problem, remedy = "is not a folder", "give the folder that holds the photos"
-        if folder.suffix.lower() in _UNSTITCHED:
+        if folder.suffix.lower() in UNSTITCHED_SUFFIXES:
             problem, remedy = "holds the pictures of two lenses", "export it as one equirectangular MP4"
+        elif folder.suffix.lower() in ARCHIVE_SUFFIXES:
+            problem, remedy = "is an archive", "unpack it, and give the folder with its photos"
         raise InputError(folder, problem, remedy) from None
     except OSError as error:
         raise InputError(folder, f"cannot be read ({error.strerror or error})", "check its rights") from None

@@ -19,18 +19,35 @@ from .heif import HEIF_SUFFIXES, register_heif
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
 from .linear_photos import color_matrix
-from .names import distinct, find_image, list_images, natural_key, renamed_note, sibling, view_and_exposure
+from .names import (
+    distinct,
+    find_image,
+    is_kept_by_system,
+    list_images,
+    natural_key,
+    renamed_note,
+    sibling,
+    view_and_exposure,
+)
 from .photo_checks import FEWEST_PHOTOS
 from .sfm import reconstruct
 from .sfm_panorama import are_panoramas, reconstruct_panoramas
 from .stack import refuse_stack
-from .unused_files import unread_kinds
+from .unused_files import ARCHIVE_SUFFIXES, unread_kinds
+from .video import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
 
 _OTHERS = ("masks", "mask", "hdr", "exr")  # Folders of pictures that are not photos
 # From the full size to reduced copies.
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 # HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
 _HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)
+_DEEPEST = 3  # Levels of folders in which photos are looked for, to name their folder
+# By which a program states cameras, in lower case.
+_POSE_FILES = {
+    "cameras.xml": "Metashape", "bundle.out": "Bundler", "bundle.rd.out": "Bundler", "sfm_data.json": "OpenMVG",
+    "cameras.sfm": "Meshroom", "model.nvm": "VisualSFM", "registration.csv": "RealityCapture",
+    "mesh_info.json": "Polycam", "metadata.json": "Record3D", "arposes.txt": "ARKit",
+}  # fmt: skip
 _REMEDY = "copy the images that COLMAP used"
 _POSES_REMEDY = "export the poses again with LLFF's imgs2poses"
 
@@ -43,7 +60,8 @@ def image_folder(folder: Path) -> Path | None:
 def read_colmap(folder: Path) -> DataparserOutputs:
     """Parse a COLMAP set: one record for each image of the model, in the natural order of the names."""
     model, source = _model(folder)
-    images = image_folder(folder)
+    beside = (place for place in source.parents if place.is_relative_to(folder))  # dense/images is beside dense/sparse
+    images = image_folder(folder) or next(filter(None, map(image_folder, beside)), None)
     if images is None:
         raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
     records, absent, photo_names = [], [], []
@@ -246,17 +264,17 @@ def find_photos(folder: Path) -> DataparserOutputs:
     if not photos:
         if heif := next((file for file in sorted(folder.iterdir()) if file.suffix.lower() in HEIF_SUFFIXES), None):
             register_heif(heif)
-        remedy = "give photos (JPEG, PNG, TIFF, HEIC, RAW, EXR), a COLMAP set or a transforms.json"
-        with suppress(OSError):
-            inner = _folders_with_photos(folder)
-            remedy = f"give one of its folders with photos: {', '.join(inner[:5])}" if inner else remedy
         others = unread_kinds(folder)
         problem = "has no photos and no known layout" + f"; it holds {others}" * bool(others)
-        raise InputError(folder, problem, remedy)
+        raise InputError(folder, problem, _remedy_without_photos(folder))
+    if len(photos) == 1 and (inner := _folders_with_photos(folder)):
+        raise InputError(
+            photos[0], "is the only photo there", f"give one of its folders with photos: {_listing(inner)}"
+        )
     _require_photos(len(photos), photos[0], folder)
-    notes = []
+    notes = _foreign_poses(folder)
     if photos[0].parent == folder and (inner := [name for name in _folders_with_photos(folder) if name not in _OTHERS]):
-        notes = [f"photos in folders of it are not read: {', '.join(inner[:5])}"]
+        notes.append(f"photos in folders of it are not read: {_listing(inner)}")
     records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)
     return DataparserOutputs("photos", tuple(records), notes=tuple(notes))
 
@@ -307,6 +325,47 @@ def _require_photos(count: int, first: Path, folder: Path) -> None:
         raise InputError(folder, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
 
 
+def _remedy_without_photos(folder: Path) -> str:
+    """Return what to give in place of a folder that holds no photos."""
+    with suppress(OSError):
+        if inner := _folders_with_photos(folder):
+            return f"give one of its folders with photos: {_listing(inner)}"
+        for file in sorted(folder.iterdir()):
+            suffix = file.suffix.lower()
+            if suffix in VIDEO_SUFFIXES:
+                return f"give the clip itself: {file.name}"
+            if suffix in ARCHIVE_SUFFIXES:
+                return f"unpack {file.name}, and give the folder with its photos"
+            if suffix in UNSTITCHED_SUFFIXES:
+                return UNSTITCHED_REMEDY
+    return "give photos (JPEG, PNG, TIFF, HEIC, RAW, EXR), a COLMAP set or a transforms.json"
+
+
 def _folders_with_photos(folder: Path) -> list[str]:
-    inner = [place.name for place in sorted(folder.iterdir()) if place.is_dir() and not place.name.startswith(".")]
-    return [name for name in inner if list_images(folder / name, PHOTO_SUFFIXES)]
+    """List folders with photos below a folder, at most _DEEPEST levels down, as paths relative to it.
+
+    Of a set with cameras it is the folder of the set.
+    """
+    result: dict[str, None] = {}
+    for root, folders, _ in os.walk(folder):
+        place = Path(root).relative_to(folder)
+        deepest = len(place.parts) >= _DEEPEST
+        folders[:] = [] if deepest else sorted(name for name in folders if not is_kept_by_system(name))
+        if place.parts and list_images(folder / place, PHOTO_SUFFIXES):
+            above = folder / place.parent
+            is_set = place.parent.parts and (find_model(above) is not None or (above / "transforms.json").is_file())
+            result[(place.parent if is_set else place).as_posix()] = None
+    return list(result)
+
+
+def _listing(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + " ..." * (len(names) > 5)
+
+
+def _foreign_poses(folder: Path) -> list[str]:
+    """Return a note on poses of other programs beside bare photos: they are not read, and cameras are found anew."""
+    names = {file.name.lower() for file in folder.iterdir() if file.is_file()}
+    tools = [f"{tool} ({file})" for file, tool in _POSE_FILES.items() if file in names]
+    if not tools:
+        return []
+    return [f"poses of {', '.join(tools)} are not read, cameras are found anew: export them for COLMAP or nerfstudio"]

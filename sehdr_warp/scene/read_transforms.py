@@ -2,6 +2,7 @@
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
@@ -33,6 +34,7 @@ def read_transforms(folder: Path) -> DataparserOutputs:
     records, absent, cloud = [], [], NO_POINTS
     photo_names: list[tuple[str, Path]] = []
     unusable: list[InputError] = []
+    missing: list[str] = []
     for path, split in files:
         if split == "test" and not path.is_file():
             continue
@@ -54,6 +56,9 @@ def read_transforms(folder: Path) -> DataparserOutputs:
             records.append(replace(record, world_to_camera=pose))
         if not len(cloud[0]):
             cloud = _points(folder, path, values)
+        stated_points = values.get("ply_file_path")
+        if isinstance(stated_points, str) and not contained(folder, stated_points, path).is_file():
+            missing.append(f"the points that {path.name} states are not here: {stated_points!r:.90}")
     notes = tuple(left_out(unusable, len(records) + len(absent) + len(unusable)))
     if not records:
         raise InputError(
@@ -61,7 +66,9 @@ def read_transforms(folder: Path) -> DataparserOutputs:
         )
     notes += (*_absent_note(absent, len(records)), *renamed_note(photo_names))
     records, repeated = distinct(records)
-    notes += tuple(repeated)
+    notes += (*repeated, *missing)
+    records, unmasked = _without_missing_masks(records)
+    notes += unmasked
     in_splits = [record for record in records if record.split]
     if 0 < len(in_splits) < len(records):
         count = len(records) - len(in_splits)
@@ -153,6 +160,16 @@ def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:
     return (f"{len(absent)} of {len(absent) + count} frames have no photo and were left out: {names_text}",)
 
 
+def _without_missing_masks(records: list[ImageRecord]) -> tuple[list[ImageRecord], tuple[str, ...]]:
+    """Return photos without the masks that their frames state and that are not there, and a note on these."""
+    absent = [record.mask for record in records if record.mask is not None and not record.mask.is_file()]
+    if not absent:
+        return records, ()
+    names = ", ".join(mask.name for mask in absent[:3]) + (" ..." if len(absent) > 3 else "")
+    note = f"{len(absent)} masks that frames state are not here, and their photos count whole: {names}"
+    return [replace(record, mask=None) if record.mask in absent else record for record in records], (note,)
+
+
 def _frame_image(folder: Path, name: str, path: Path) -> Path | None:
     """Return the photo of a frame, None if there is no such file."""
     # Blender's file_path has no ending; a dot in the stem is not one.
@@ -188,7 +205,8 @@ def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
     Raises:
         InputError: if it is not a pose.
     """
-    return pose_from_opengl(_matrix(frame.get("transform_matrix")), path, name)
+    matrix = _matrix(frame.get("transform_matrix"))
+    return pose_from_opengl(matrix.reshape(4, 4) if matrix.shape == (16,) else matrix, path, name)
 
 
 def pose_from_opengl(matrix: np.ndarray, path: Path, name: str) -> np.ndarray:
@@ -216,6 +234,8 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         value = fields.get(key)
         if value is None:
             return absent
+        with suppress(ValueError):
+            value = float(value) if isinstance(value, str) else value
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
             raise InputError(path, f"{key} = {value!r:.40} is not a finite number", _REMEDY)
         return float(value)
@@ -237,7 +257,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     center = number("cx", width / 2), number("cy", height / 2)
     pinhole: tuple[Any, ...] = fy if fx is None else fx, fx if fy is None else fy, *center
     k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model, bent = fields.get("camera_model", "OPENCV"), (k1, k2, p1, p2)
+    model, bent = fields.get("camera_model") or "OPENCV", (k1, k2, p1, p2)
     if model == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True:
         model, bent = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL"):

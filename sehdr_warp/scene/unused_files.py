@@ -7,7 +7,7 @@ from pathlib import Path
 from .dataparser import ImageRecord
 from .heif import HEIF_SUFFIXES, heif_installed
 from .images import PHOTO_SUFFIXES
-from .names import bases_of, natural_key, without_mask_ending
+from .names import bases_of, is_kept_by_system, natural_key, without_mask_ending
 
 # What tools write beside photos, and nobody takes for one.
 _QUIET = {
@@ -16,6 +16,7 @@ _QUIET = {
     ".geo", ".npy", ".npz", ".bin", ".ply", ".obj", ".mtl", ".pt", ".h5", ".pkl", ".psx", ".zip", ".tar", ".gz", ".py",
     ".sh",
 }  # fmt: skip
+ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 _MOST_NAMED = 3
 _MOST_FILES = 20_000  # Files that are looked at
 
@@ -82,7 +83,8 @@ def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
     places = [common] if deep else sorted({image.parent for image in images})
     count = 0
     for place in places:
-        for root, _, names in os.walk(place) if deep else [(place, [], os.listdir(place))]:
+        for root, folders, names in os.walk(place) if deep else [(place, [], os.listdir(place))]:
+            folders[:] = [name for name in folders if not is_kept_by_system(name)]
             for name in sorted(names, key=natural_key):
                 count += 1
                 if count > _MOST_FILES:

@@ -24,6 +24,9 @@ _log = logging.getLogger("sehdr_warp.scene")
 VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf",
 )  # fmt: skip
+UNSTITCHED_SUFFIXES = (".insv", ".insp", ".360", ".lrv")
+"""Pictures of two lenses of Insta360 and GoPro, before their own programs join them."""
+UNSTITCHED_REMEDY = "export them from the camera's program as equirectangular photos or one equirectangular MP4"
 _REMEDY = "copy the clip again, or convert it with FFmpeg"
 # FFmpeg's demuxers of VIDEO_SUFFIXES, by content. Others, such as playlists, would open the files that they name.
 _DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mxf"

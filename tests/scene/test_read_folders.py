@@ -1,0 +1,137 @@
+"""Folders as phones, cameras and other programs leave them: what is read, and what is named instead."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene.parse import parse_dataset
+from sehdr_warp.scene.read_folders import find_photos
+from tests.make_scenes import load, pattern, write_blender, write_colmap
+
+
+def photos(folder, count=4, suffix=".jpg"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        Image.fromarray(pattern(16, 12, i)).save(folder / f"IMG_{i}{suffix}")
+
+
+def files(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"x" * 64)
+
+
+NOT_PHOTOS = {
+    "a.insp": "holds 1 INSP .*; export them from the camera's program as equirectangular",
+    "a.360": "holds 1 360 .*; export them from the camera's program as equirectangular",
+    "a.GPR": "holds 1 GPR .*; give photos .JPEG",
+    "capture.zip": "no known layout; unpack capture.zip, and give the folder with its photos",
+    "walk.MOV": "holds 1 MOV .*; give the clip itself: walk.MOV",
+    "camera.dcp": "holds 1 DCP",
+}
+
+
+@pytest.mark.parametrize("name", NOT_PHOTOS)
+def test_what_to_give_in_place_of_a_folder_without_photos(tmp_path, name):
+    files(tmp_path, name)
+    with pytest.raises(InputError, match=NOT_PHOTOS[name]):
+        parse_dataset(tmp_path)
+
+
+def test_an_archive_is_to_be_unpacked(tmp_path):
+    files(tmp_path, "scan.zip")
+    with pytest.raises(InputError, match="scan.zip: is an archive; unpack it, and give the folder with its photos"):
+        parse_dataset(tmp_path / "scan.zip")
+
+
+def test_photos_deep_in_an_export_are_found_for_the_user(tmp_path):
+    """Polycam's raw export: a thumbnail beside keyframes; and a COLMAP set two folders down."""
+    photos(tmp_path / "poly" / "keyframes" / "corrected_images")
+    Image.fromarray(pattern(16, 12)).save(tmp_path / "poly" / "thumbnail.jpg")
+    with pytest.raises(InputError, match="is the only photo there; give .* with photos: keyframes/corrected_images"):
+        parse_dataset(tmp_path / "poly")
+    write_colmap(tmp_path / "work" / "dense" / "0")
+    with pytest.raises(InputError, match="give one of its folders with photos: dense/0$"):
+        parse_dataset(tmp_path / "work")
+
+
+def test_photos_beside_the_model_in_dense(tmp_path):
+    write_colmap(tmp_path / "dense")
+    shutil.move(tmp_path / "dense" / "sparse" / "0", tmp_path / "model")
+    shutil.move(tmp_path / "model", tmp_path / "dense" / "sparse" / "0")
+    assert len(load(tmp_path, holdout=0).views) == 6
+
+
+@pytest.mark.parametrize("file, tool", [
+    ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
+    ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"),
+])  # fmt: skip
+def test_poses_of_other_programs_are_named(tmp_path, file, tool):
+    photos(tmp_path)
+    files(tmp_path, file)
+    assert any(f"poses of {tool} ({file.lower()}) are not read" in note for note in find_photos(tmp_path).notes)
+
+
+@pytest.mark.parametrize("place", ["@eaDir/000.png/SYNOPHOTO_THUMB_M.jpg", "__MACOSX/000.jpg", "#recycle/1.jpg"])
+def test_folders_that_systems_keep_are_no_photos(tmp_path, place):
+    write_colmap(tmp_path)
+    files(
+        tmp_path,
+        f"images/{place}",
+        "images/._000.png",
+        "images/.DS_Store",
+        "images/Thumbs.db",
+        "images/.IMG_1.HEIC.icloud",
+    )
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6 and not any("in no view" in note or "not used" in note for note in scene.notes)
+
+
+def test_what_cameras_write_beside_photos_is_named_by_kind(tmp_path):
+    write_colmap(tmp_path)
+    files(tmp_path, *(f"images/{name}" for name in ("a.insp", "DJI_1.SRT", "DJI_1.LRF", "p.dcp", "IMG_1.AAE", "1.xmp")))
+    note = next(note for note in load(tmp_path, holdout=0).notes if "not read" in note)
+    assert "1 DCP (p.dcp), 1 INSP (a.insp), 1 LRF (DJI_1.LRF), 1 SRT (DJI_1.SRT)" in note and "AAE" not in note
+
+
+@pytest.mark.parametrize("change", ["null model", "text numbers", "flat pose", "mark"])
+def test_transforms_as_apps_write_them(tmp_path, change):
+    write_blender(tmp_path, 6)
+    file = tmp_path / "transforms.json"
+    before, values = load(tmp_path, holdout=0), json.loads(file.read_text())
+    if change == "null model":
+        values["camera_model"] = None
+    elif change == "text numbers":
+        values |= {"w": "40", "h": "30", "camera_angle_x": str(values["camera_angle_x"])}
+    elif change == "flat pose":
+        values["frames"] = [
+            frame | {"transform_matrix": np.ravel(frame["transform_matrix"]).tolist()} for frame in values["frames"]
+        ]
+    file.write_bytes(b"\xef\xbb\xbf" * (change == "mark") + json.dumps(values).encode())
+    scene = load(tmp_path, holdout=0)
+    for view, other in zip(scene.views, before.views, strict=True):
+        np.testing.assert_array_equal(view.camera.world_to_camera, other.camera.world_to_camera)
+        assert (view.camera.fx, view.camera.width) == (other.camera.fx, other.camera.width)
+
+
+@pytest.mark.parametrize("value", ["", "wide", "nan", "inf"])
+def test_text_that_is_no_number_is_named(tmp_path, value):
+    write_blender(tmp_path, 6, fl_x=value)
+    with pytest.raises(InputError, match=f"fl_x = '?{value}'? is not a finite number"):
+        load(tmp_path)
+
+
+def test_masks_and_points_that_are_missing_are_named(tmp_path):
+    write_blender(tmp_path, 6, ply_file_path="sparse_pc.ply")
+    file = tmp_path / "transforms.json"
+    values = json.loads(file.read_text())
+    values["frames"][1]["mask_path"] = "masks/r_1.png"
+    file.write_text(json.dumps(values))
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6
+    assert "1 masks that frames state are not here, and their photos count whole: r_1.png" in scene.notes
+    assert "the points that transforms.json states are not here: 'sparse_pc.ply'" in scene.notes
