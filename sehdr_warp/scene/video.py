@@ -27,6 +27,7 @@ VIDEO_SUFFIXES = (
 UNSTITCHED_SUFFIXES = (".insv", ".insp", ".360", ".lrv")
 """Pictures of two lenses of Insta360 and GoPro, before their own programs join them."""
 UNSTITCHED_REMEDY = "export them from the camera's program as equirectangular photos or one equirectangular MP4"
+_SMALLEST = 16  # Pixels of a frame's side: fewer show no movement
 _REMEDY = "copy the clip again, or convert it with FFmpeg"
 # FFmpeg's demuxers of VIDEO_SUFFIXES, by content. Others, such as playlists, would open the files that they name.
 _DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mxf"
@@ -119,12 +120,14 @@ class Clip:
         size: (width, height) of a frame, upright.
         seconds: its length as the file states it; 0 if it does not.
         color: what the stream states.
+        interlaced: whether even and odd rows of a frame are of two moments.
     """
 
     path: Path
     size: tuple[int, int]
     seconds: float
     color: VideoColor
+    interlaced: bool = False
 
 
 def is_video(path: Path) -> bool:
@@ -148,9 +151,11 @@ def open_clip(path: Path) -> Clip:
         frame = _first_frame(container, stream, path)
         width, height = frame.width, frame.height
         check_size(path, width, height)
+        if min(width, height) < _SMALLEST:
+            raise InputError(path, f"its frames have {width} x {height} pixels", f"give {_SMALLEST} and more a side")
         size = (height, width) if _rotation(frame) % 180 else (width, height)
         seconds = float(container.duration or 0) / 1e6
-        return Clip(path, size, seconds, _color(container, stream, frame))
+        return Clip(path, size, seconds, _color(container, stream, frame), bool(frame.interlaced_frame))
 
 
 def first_frame_size(path: Path) -> dict[str, np.ndarray]:
@@ -177,7 +182,8 @@ def _first_frame(container: Any, stream: Any, path: Path) -> Any:
 def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
     """Yield the frames of a clip with their numbers, from the first.
 
-    A clip that ends early, or is damaged in the middle, yields what can be decoded, and a line says so.
+    A clip that ends early, or is damaged in the middle, yields what can be decoded, and a line says so. Frames of
+    another size than the first are left out, as where recordings were joined.
 
     Args:
         clip: the clip.
@@ -186,7 +192,7 @@ def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
     import av
 
     errors: Any = av.error  # pyright: ignore[reportAttributeAccessIssue]
-    number = -1
+    number, odd, size = -1, 0, None
     with _container(clip.path) as container:
         stream = _stream(container, clip.path)
         packets = container.demux(stream)
@@ -203,6 +209,12 @@ def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
                 return
             for frame in frames:
                 number += 1
+                size = size or (frame.width, frame.height)
+                if (frame.width, frame.height) != size:
+                    if not odd:
+                        _log.warning("%s: frames of another size from frame %d on are left out", clip.path, number)
+                    odd += 1
+                    continue
                 if counts is None or number in counts:
                     yield number, frame
 
@@ -231,7 +243,7 @@ def codes(frame: Any, color: VideoColor) -> np.ndarray:
 
 def _luma_and_chroma(frame: Any, color: VideoColor) -> tuple[np.ndarray, np.ndarray]:
     """Return luma [H, W] from 0 to 1 and chroma [H, W, 2] from -0.5 to 0.5, as float32."""
-    component = frame.format.components[1]
+    component = frame.format.components[min(1, len(frame.format.components) - 1)]  # Grey has luma alone
     sizes = (frame.height, component.height), (frame.width, component.width)
     halved = tuple(2 * small - size in (0, 1) and small < size for size, small in sizes)
     # FFmpeg interpolates chroma of other sizes, such as a quarter of the width.
@@ -310,7 +322,9 @@ def _container(path: Path, *, threads: bool = True) -> Any:
 def _stream(container: Any, path: Path) -> Any:
     if not container.streams.video:
         raise InputError(path, "has no picture", "give a clip with video")
-    return container.streams.best("video") or container.streams.video[0]
+    # Cameras put thumbnails and covers into streams of their own, of which the first may be one.
+    best = container.streams.best("video") or container.streams.video[0]
+    return max([best, *container.streams.video], key=lambda stream: stream.width * stream.height)
 
 
 def _color(container: Any, stream: Any, frame: Any) -> VideoColor:

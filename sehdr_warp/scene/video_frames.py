@@ -172,10 +172,11 @@ def read_video(path: Path, cache: Path | str | None = None) -> DataparserOutputs
     note = (
         f"video: the sharpest {count} of {facts['total']} frames are used; its curve is {color.curve}: {response_note}"
     )
+    interlaced = ("its frames are interlaced, rows of two moments each: deinterlace the clip for sharp edges",)
     return replace(
         dataset,
         format="video",
-        notes=(note, *dataset.notes),
+        notes=(note, *interlaced * clip.interlaced, *dataset.notes),
         folder=folder,
         stated_response=color.response,
         color_matrix=color.to_rec709(),

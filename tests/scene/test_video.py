@@ -249,6 +249,72 @@ def test_clips_of_older_cameras(tmp_path, name, codec):
     assert is_video(tmp_path / name) and sum(1 for _ in decode(open_clip(tmp_path / name))) == 8
 
 
+def encode(path, streams):
+    """Write a clip of (codec, pixel format, frames [H, W, 3] uint8) streams at 30 frames a second."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        opened = []
+        for codec, layout, frames in streams:
+            stream = container.add_stream(codec, rate=30)
+            stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], layout
+            if codec == "mpeg2video":
+                stream.options = {"flags": "+ilme+ildct", "qscale": "2"}
+            opened.append((stream, layout, frames))
+        for stream, layout, frames in opened:
+            for i, pixels in enumerate(frames):
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24").reformat(format=layout)
+                frame.pts = i
+                for packet in stream.encode(frame):
+                    container.mux(packet)
+        for stream, _, _ in opened:
+            for packet in stream.encode():
+                container.mux(packet)
+    return path
+
+
+def bytes_of(count, **options):
+    return [np.rint(frame * 255).astype(np.uint8) for frame in pan(count, **options)]
+
+
+LAYOUTS = ["gray", "gray10le", "ya8", "yuv411p", "yuv410p", "yuv440p", "yuva420p", "yuv422p10le", "bgr0"]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_of_samples(tmp_path, layout):
+    """Grey, a quarter of chroma, half of its height, transparency, RGB."""
+    frames = bytes_of(1)
+    clip = open_clip(encode(tmp_path / "a.mkv", [("ffv1", layout, frames)]))
+    decoded = codes(next(decode(clip))[1], clip.color)
+    luma = np.array([0.299, 0.587, 0.114])
+    assert decoded.shape == frames[0].shape
+    error = decoded / float(np.iinfo(decoded.dtype).max) @ luma - frames[0] / 255 @ luma
+    assert np.abs(error).mean() < 0.01
+
+
+@pytest.mark.parametrize("thumbnail_first", [False, True])
+def test_a_thumbnail_in_a_stream_of_its_own_is_not_the_clip(tmp_path, thumbnail_first):
+    streams = [("libx264", "yuv420p", bytes_of(8)), ("mjpeg", "yuvj420p", [bytes_of(1)[0][::2, ::2]])]
+    clip = open_clip(encode(tmp_path / "a.mp4", streams[::-1] if thumbnail_first else streams))
+    assert clip.size == (128, 96) and sum(1 for _ in decode(clip)) == 8
+
+
+def test_frames_of_another_size_are_left_out(tmp_path, caplog):
+    """Recordings that were joined."""
+    large, small = bytes_of(30), [frame[:64, :96] for frame in bytes_of(10)]
+    parts = [encode(tmp_path / f"{i}.mts", [("libx264", "yuv420p", frames)]) for i, frames in enumerate([large, small])]
+    (tmp_path / "a.mts").write_bytes(b"".join(part.read_bytes() for part in parts))
+    assert choose_frames(open_clip(tmp_path / "a.mts")).total == 30
+    assert "frames of another size from frame 30 on are left out" in caplog.text
+
+
+def test_interlaced_and_tiny_clips(tmp_path):
+    assert open_clip(encode(tmp_path / "a.mpg", [("mpeg2video", "yuv420p", bytes_of(4))])).interlaced
+    assert not open_clip(encode(tmp_path / "b.mp4", [("libx264", "yuv420p", bytes_of(4))])).interlaced
+    encode(tmp_path / "c.mkv", [("ffv1", "yuv420p", [frame[:2, :4] for frame in bytes_of(4)])])
+    with pytest.raises(InputError, match="its frames have 4 x 2 pixels; give 16 and more a side"):
+        open_clip(tmp_path / "c.mkv")
+
+
 def test_clips_of_two_lenses_are_named(tmp_path):
     (tmp_path / "a.insv").write_bytes(b"x")
     with pytest.raises(InputError, match="holds the pictures of two lenses; export it as one equirectangular MP4"):
