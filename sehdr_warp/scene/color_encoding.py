@@ -153,6 +153,8 @@ def stated_encoding(image: Image.Image) -> ColorEncoding | None:
         nclx = _nclx(Path(image.filename))  # pyright: ignore[reportAttributeAccessIssue]
         if nclx is not None:
             return nclx
+    if image.info.get("icc_profile", b"") is None:  # Pillow found parts that do not fit together
+        return ColorEncoding("ICC profile", problem="its ICC profile is damaged")
     if profile := image.info.get("icc_profile"):
         return encoding_of_profile(bytes(profile), "GRAY" if image.mode in _GREY else "RGB")
     if image.format == "PNG":
@@ -199,7 +201,7 @@ def note_of(encodings: dict[str, ColorEncoding | None]) -> list[str]:
     notes: dict[str, list[str]] = {}
     for name, encoding in encodings.items():
         if encoding is not None and encoding.problem:
-            notes.setdefault(f"{encoding.problem}: sRGB is assumed", []).append(name)
+            notes.setdefault(f"count as sRGB: {encoding.problem}", []).append(name)
         elif encoding is not None and encoding.light:
             notes.setdefault(f"state {encoding.light}, {encoding.name}: no response is guessed", []).append(name)
         elif encoding is not None and not encoding.is_srgb:

@@ -11,6 +11,7 @@ from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_ima
 
 SHORTEST, LONGEST = 1e-12, 1e12
 """Seconds: what an exposure time may be."""
+_LONGEST_EXPOSURE = 86_400  # Seconds that a camera exposes; EXIF's 4294967295 stands for unknown
 _EXIF_IFD = 0x8769
 _CAMERA, _LENS = (271, 272), (42036, 37386, 33437)  # Make and model; lens, focal length, f-number
 _EXPOSURE_TIME, _SHUTTER_APEX = 33434, 37377
@@ -57,7 +58,7 @@ def exif_exposure(path: Path) -> ExifExposure:
             speeds = [_of_tag(tables, tag) for tag in _ISO_TAGS]
     except PILLOW_ERRORS:
         return ExifExposure()
-    time = _within(numbers[_EXPOSURE_TIME], SHORTEST, LONGEST)
+    time = _within(numbers[_EXPOSURE_TIME], SHORTEST, _LONGEST_EXPOSURE)
     if time is None and (apex := _within(numbers[_SHUTTER_APEX], -64, 64)) is not None:
         time = 2.0**-apex
     f_number = _within(numbers[_F_NUMBER], 1e-3, 1e4)

@@ -261,7 +261,24 @@ def test_bad_profiles_are_named_and_count_as_srgb(tmp_path, case):
     profile, words = BAD_PROFILES[case]
     scene = load(write_set(tmp_path, lambda image, path: image.save(path.with_suffix(".png"), icc_profile=profile)))
     assert scene.views[0].codes.dtype == np.uint8
-    assert [note for note in scene.notes if f"its ICC profile {words}" in note and "sRGB is assumed" in note]
+    assert [note for note in scene.notes if f"its ICC profile {words}" in note and "count as sRGB" in note]
+
+
+@pytest.mark.parametrize("kind", ["half of it", "not packed"])
+def test_profiles_that_pillow_cannot_join_are_named(tmp_path, kind):
+    """A JPEG with one of two parts of its profile, and a PNG whose profile does not unpack."""
+    if kind == "half of it":
+        file = tmp_path / "a.jpg"
+        Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(file)
+        part = b"ICC_PROFILE\0\1\2" + icc_profile("Display P3")[:300]
+        data = file.read_bytes()
+        file.write_bytes(data[:2] + b"\xff\xe2" + struct.pack(">H", len(part) + 2) + part + data[2:])
+    else:
+        file = tmp_path / "a.png"
+        png16(file, np.full((2, 2, 3), 0.5), (b"iCCP", b"x\0\0no zlib"))
+    with open_image(file) as image:
+        encoding = stated_encoding(image)
+    assert encoding.problem == "its ICC profile is damaged" and encoding.is_srgb
 
 
 def test_names_of_profiles_fit_a_line(tmp_path):

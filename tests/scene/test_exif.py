@@ -25,6 +25,7 @@ CASES = {
     "plain": ({TIME: 0.01, ISO: 200, NUMBER: 2.8}, ExifExposure(0.01, 200, 2.8)),
     "0/0": ({TIME: IFDRational(0, 0), NUMBER: 2.8}, ExifExposure(None, None, 2.8)),
     "0/1 beside APEX": ({TIME: IFDRational(0, 1), SHUTTER: 6.65}, ExifExposure(2**-6.65)),
+    "unknown": ({TIME: IFDRational(4294967295, 1), ISO: 100}, ExifExposure(None, 100)),
     "APEX alone": ({SHUTTER: 3.0, APERTURE: 4.0}, ExifExposure(0.125, None, 4.0)),
     "f-number 0": ({TIME: 0.5, NUMBER: 0.0}, ExifExposure(0.5)),
     "f-number 0 beside APEX": ({TIME: 0.5, NUMBER: 0.0, APERTURE: 2.0}, ExifExposure(0.5, None, 2.0)),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.masks import mask_note, read_mask
 from sehdr_warp.scene.read_folders import read_llff
@@ -186,4 +187,13 @@ def test_a_photo_whose_mask_cannot_be_used_is_left_out(tmp_path):
     for i in range(6):
         write_mask(tmp_path / "masks" / f"{i:03d}.png", HALF[:30])
     with pytest.raises(InputError, match="mask is 64 x 30, its image 64 x 48; make the mask at the image's size"):
+        load(tmp_path)
+
+
+def test_masks_that_leave_out_everything_are_named(tmp_path):
+    write_colmap(tmp_path)
+    for photo in (tmp_path / "images").iterdir():
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        Image.new("L", (64, 48)).save(tmp_path / "masks" / photo.name)
+    with pytest.raises(InputError, match="masks or transparency leave out all pixels .*; white keeps a pixel"):
         load(tmp_path)
