@@ -27,7 +27,7 @@ KERNELS = {
     "projection": ("project_*_forward",),
     "harmonics": ("evaluate_*", "turns_adjoint_*"),
     "activations": ("activate_*",),
-    "lists": ("pack_records_*", "key_by_*", "emit_*", "find_lists_*", "*radix_sort*", "*DeviceScan*"),
+    "lists": ("pack_splats_*", "key_by_*", "emit_*", "find_tile_ranges_*", "*radix_sort*", "*DeviceScan*"),
     "blend": ("blend_forward_*", "pad_rows_*"),
     "response and fusion": ("encode_*", "interpolate_*", "perceptrons_*", "mix_*", "point_adjoint_*", "unit_adjoint_*"),
     "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*"),

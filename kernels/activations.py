@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 
 
 @cache
@@ -12,7 +12,7 @@ def exposures_kernel(dtype):
     """Return the kernel of exp(values), values clamped to [-bound, bound]; NaN stays NaN. Launched over the numbers."""
     real = dtype
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def activate_exposures(
         first: int,
         values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
@@ -31,7 +31,7 @@ def exposures_adjoint_kernel(dtype):
     """Write value_gradients [N C], flat, from exposure_gradients [N, C] of any strides; 0 from the bounds on."""
     real = dtype
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def activate_exposures_adjoint(
         first: int,
         values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
@@ -55,7 +55,7 @@ def opacities_kernel(dtype):
     """
     real = dtype
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def activate_opacities(
         first: int,
         logits: wp.array(dtype=real), weight: real, live: wp.array(dtype=wp.int32),
@@ -84,7 +84,7 @@ def opacities_adjoint_kernel(dtype):
     """
     real = dtype
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def activate_opacities_adjoint(
         first: int,
         opacities: wp.array(dtype=real), weight: real, live: wp.array(dtype=wp.int32),

@@ -1,4 +1,4 @@
-"""N-channel front-to-back blend and its adjoint for the CPU: rows of 8 pixels, branch-free.
+"""N-channel front-to-back blend and its backward pass for the CPU: rows of 8 pixels, branch-free.
 
 One kernel index is one tile of 16 x 16 pixels, in two halves side by side. For each Gaussian of the tile's list the
 kernel walks the pixel rows that the Gaussian reaches, of the halves that it reaches. A row is one vector of 8, and
@@ -13,8 +13,8 @@ Forward, per pixel, with T the transmittance so far:
 
 A finished pixel stays finished. Its T is stored negated meanwhile, which saves a separate flag.
 
-The adjoint walks the list back to front, from the last Gaussian that counts in each pixel, with two numbers of state
-whatever the channel count: T, and R = the part of the loss's derivative that arrives from behind,
+The backward pass walks the list back to front, from the last Gaussian that counts in each pixel, with two numbers of
+state whatever the channel count: T, and R = the part of the loss's derivative that arrives from behind,
 
     R_last = T_last dL/dT;   T = T / (1 - alpha);   q = <feature, dL/dimage>
     dL/dalpha = T q - R / (1 - alpha);   R += alpha T q
@@ -29,7 +29,8 @@ from functools import cache
 
 import warp as wp
 
-from .constants import ALPHA_MAX, FORWARD, FUSED, TILE_SIZE, TRANSMITTANCE_MIN, cpu_flags
+from .compile_options import FUSED, NO_AUTODIFF, cpu_flags
+from .constants import ALPHA_MAX, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import vector
 
 LANES = 8  # Pixels in a row: a register of AVX2. Rows of 16 are wider than most Gaussians
@@ -43,14 +44,14 @@ EXP_COEFFICIENTS = (
 
 
 @cache
-def row_functions(dtype, halvings: int):
+def row_functions(dtype, exp_squarings: int):
     """Return the type of a row of pixels and functions on rows: broadcast, step, exponential, reached halves of a tile.
 
-    float64, the reference, uses the library's exponential. halvings: the polynomial is evaluated at p / 2^halvings and
-    squared as often, so that p may go down to -0.7 * 2^halvings.
+    float64, the reference, uses the library's exponential. exp_squarings: the polynomial is evaluated at
+    p / 2^exp_squarings and squared as often, so that p may go down to -0.7 * 2^exp_squarings.
     """
     row, vec4, real = vector(LANES, dtype), vector(4, dtype), dtype
-    lowest = -0.7 * 2.0**halvings
+    lowest = -0.7 * 2.0**exp_squarings
     highest, *others = EXP_COEFFICIENTS
     degree = len(others)
     # Not wp.static(others[k]): of a function that kernels share, the cache would take it for another one once it is
@@ -58,7 +59,7 @@ def row_functions(dtype, halvings: int):
     lower = vector(degree, dtype)(*others)
 
     @wp.func
-    def spread(value: real) -> row:
+    def broadcast(value: real) -> row:
         return row(value)
 
     @wp.func
@@ -79,117 +80,120 @@ def row_functions(dtype, halvings: int):
 
         @wp.func
         def exponential(p: row) -> row:
-            x = wp.max(p, row(real(lowest))) * real(wp.static(0.5**halvings))
+            x = wp.max(p, row(real(lowest))) * real(wp.static(0.5**exp_squarings))
             e = row(real(highest))
             for k in range(wp.static(degree)):
                 e = wp.cw_mul(e, x) + row(lower[k])
-            for _ in range(wp.static(halvings)):
+            for _ in range(wp.static(exp_squarings)):
                 e = wp.cw_mul(e, e)
             return e
 
     @wp.func
-    def halves(x: real, ellipse: vec4) -> wp.vec2i:
+    def halves(x: real, conic_cutoff: vec4) -> wp.vec2i:
         """Return the first half that is reached and one past the last; x: from the tile's first pixel to the centre."""
-        determinant = ellipse[0] * ellipse[2] - ellipse[1] * ellipse[1]
+        determinant = conic_cutoff[0] * conic_cutoff[2] - conic_cutoff[1] * conic_cutoff[1]
         reached = wp.vec2i(0, wp.static(HALVES))
         # For needles rounding leaves nothing of the determinant.
-        if determinant > real(1.0e-4) * ellipse[0] * ellipse[2]:
-            extent = wp.sqrt(ellipse[3] * ellipse[2] / determinant) * real(1.01) + real(0.01)
+        if determinant > real(1.0e-4) * conic_cutoff[0] * conic_cutoff[2]:
+            extent = wp.sqrt(conic_cutoff[3] * conic_cutoff[2] / determinant) * real(1.01) + real(0.01)
             first = wp.clamp((x - extent) * real(wp.static(1.0 / LANES)), real(0.0), real(wp.static(HALVES)))
             last = wp.clamp((x + extent) * real(wp.static(1.0 / LANES)), real(-1.0), real(wp.static(HALVES - 1)))
             reached = wp.vec2i(int(first), int(wp.floor(last)) + 1)
         return reached
 
-    return row, spread, step, exponential, halves
+    return row, broadcast, step, exponential, halves
 
 
 def _options(dtype) -> dict:
     # Fusing multiply-adds is worth 1.3-1.6x here.
     fused = {"cpu_compiler_flags": cpu_flags() + FUSED} if dtype is wp.float32 else {}
-    return FORWARD | {"max_unroll": 64} | fused
+    return NO_AUTODIFF | {"max_unroll": 64} | fused
 
 
 @cache
-def forward_kernel(dtype, channels: int, halvings: int):
+def forward_kernel(dtype, channels: int, exp_squarings: int):
     """Return blend_forward(), launched over tiles from `first` on; see the module's description.
 
-    halvings: see row_functions
-    ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians
-    shapes: [N] (x, y, opacity, half-height); ellipses: [N] (conic a, b, c, level); features: [N, C]
-    columns: tiles across; width, height: of the image; iota: one row, 0 to 7
-    transmittance, accumulated, last: scratch of [tiles, 32] rows, [tiles, C, 32] rows and [tiles, 32] rows, 16 a half
-    image: [H W, C]; left_over: [H W], the transmittance behind everything
+    exp_squarings: see row_functions
+    tile_ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians
+    means_opacities: [N] (x, y, opacity, half-height); conics_cutoffs: [N] (conic a, b, c, cutoff); features: [N, C]
+    columns: tiles across; width, height: of the image; lane_offsets: one row, 0 to 7
+    tile_transmittance, accumulated: scratch of [tiles, 32] rows and [tiles, C, 32] rows, 16 a half
+    last_contributor: [tiles, 32] rows, 1 + list place of the last Gaussian that contributes
+    image: [H W, C]; final_transmittance: [H W], of all Gaussians together
     """
-    row, spread, step, exponential, halves = row_functions(dtype, halvings)
+    row, broadcast, step, exponential, halves = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_forward(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
+        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
         columns: int, width: int, height: int, alpha_threshold: real,
-        iota: wp.array(dtype=row), transmittance: wp.array2d(dtype=row), accumulated: wp.array3d(dtype=row),
-        last: wp.array2d(dtype=row), image: wp.array2d(dtype=real), left_over: wp.array(dtype=real),
+        lane_offsets: wp.array(dtype=row), tile_transmittance: wp.array2d(dtype=row),
+        accumulated: wp.array3d(dtype=row), last_contributor: wp.array2d(dtype=row),
+        image: wp.array2d(dtype=real), final_transmittance: wp.array(dtype=real),
     ):
         tile = first + wp.tid()
-        bounds = ranges[tile]
+        bounds = tile_ranges[tile]
         x0 = (tile % columns) * size
         y0 = (tile // columns) * size
-        offsets = iota[0]
+        offsets = lane_offsets[0]
         # Not a constant of 32, which the compiler would take five times as long to write out.
-        rows = transmittance.shape[1]
+        rows = tile_transmittance.shape[1]
         for j in range(rows):
-            transmittance[tile, j] = spread(real(1.0))
-            last[tile, j] = spread(real(0.0))
+            tile_transmittance[tile, j] = broadcast(real(1.0))
+            last_contributor[tile, j] = broadcast(real(0.0))
             for channel in range(wp.static(channels)):
-                accumulated[tile, channel, j] = spread(real(0.0))
+                accumulated[tile, channel, j] = broadcast(real(0.0))
 
         k = bounds[0]
         alive = bool(True)
         while k < bounds[1] and alive:
             i = intersections[k]
-            shape = shapes[i]
-            ellipse = ellipses[i]
-            x = shape[0] - real(x0) - real(0.5)
-            y = shape[1] - real(y0) - real(0.5)
-            top = wp.max(int(wp.ceil(y - shape[3])), 0)
-            bottom = wp.min(int(wp.floor(y + shape[3])) + 1, size)
-            reached = halves(x, ellipse)
+            xy_opacity = means_opacities[i]
+            conic_cutoff = conics_cutoffs[i]
+            x = xy_opacity[0] - real(x0) - real(0.5)
+            y = xy_opacity[1] - real(y0) - real(0.5)
+            top = wp.max(int(wp.ceil(y - xy_opacity[3])), 0)
+            bottom = wp.min(int(wp.floor(y + xy_opacity[3])) + 1, size)
+            reached = halves(x, conic_cutoff)
             for half in range(reached[0], reached[1]):
-                dx = spread(x - real(half * lanes)) - offsets
-                in_x = wp.cw_mul(dx, dx) * (real(-0.5) * ellipse[0])
+                dx = broadcast(x - real(half * lanes)) - offsets
+                in_x = wp.cw_mul(dx, dx) * (real(-0.5) * conic_cutoff[0])
                 for j in range(top, bottom):
                     at = half * size + j
                     dy = y - real(j)
-                    p = in_x + dx * (-ellipse[1] * dy) + spread(real(-0.5) * ellipse[2] * dy * dy)
-                    a = wp.min(exponential(wp.min(p, spread(real(0.0)))) * shape[2], spread(real(ALPHA_MAX)))
-                    t = transmittance[tile, at]
-                    counts = wp.cw_mul(step(a - spread(alpha_threshold)), step(t))
+                    p = in_x + dx * (-conic_cutoff[1] * dy) + broadcast(real(-0.5) * conic_cutoff[2] * dy * dy)
+                    a = wp.min(exponential(wp.min(p, broadcast(real(0.0)))) * xy_opacity[2], broadcast(real(ALPHA_MAX)))
+                    t = tile_transmittance[tile, at]
+                    counts = wp.cw_mul(step(a - broadcast(alpha_threshold)), step(t))
                     weight = wp.cw_mul(wp.cw_mul(a, t), counts)
-                    goes_on = step(t - weight - spread(real(TRANSMITTANCE_MIN)))
+                    goes_on = step(t - weight - broadcast(real(TRANSMITTANCE_MIN)))
                     weight = wp.cw_mul(weight, goes_on)
                     # The pixel that this Gaussian finishes keeps its T, negated; finished ones have counts = 0.
                     finished = counts - wp.cw_mul(counts, goes_on)
-                    transmittance[tile, at] = t - weight - wp.cw_mul(t, finished) * real(2.0)
+                    tile_transmittance[tile, at] = t - weight - wp.cw_mul(t, finished) * real(2.0)
                     contributes = wp.cw_mul(counts, goes_on)
-                    previous = last[tile, at]
-                    last[tile, at] = previous + wp.cw_mul(contributes, spread(real(k - bounds[0] + 1)) - previous)
+                    previous = last_contributor[tile, at]
+                    change = broadcast(real(k - bounds[0] + 1)) - previous
+                    last_contributor[tile, at] = previous + wp.cw_mul(contributes, change)
                     for channel in range(wp.static(channels)):
                         accumulated[tile, channel, at] = accumulated[tile, channel, at] + weight * features[i, channel]
             k += 1
             if (k - bounds[0]) % 32 == 0:
-                most = spread(real(0.0))
+                most = broadcast(real(0.0))
                 for j in range(rows):
-                    most += wp.max(transmittance[tile, j], spread(real(0.0)))
-                alive = wp.dot(most, spread(real(1.0))) > real(0.0)
+                    most += wp.max(tile_transmittance[tile, j], broadcast(real(0.0)))
+                alive = wp.dot(most, broadcast(real(1.0))) > real(0.0)
 
         for j in range(wp.min(size, height - y0)):
             for i in range(wp.min(size, width - x0)):
                 pixel = (y0 + j) * width + x0 + i
                 half = i // lanes
                 at = half * size + j
-                left_over[pixel] = wp.abs(transmittance[tile, at][i - half * lanes])
+                final_transmittance[pixel] = wp.abs(tile_transmittance[tile, at][i - half * lanes])
                 for channel in range(wp.static(channels)):
                     image[pixel, channel] = accumulated[tile, channel, at][i - half * lanes]
 
@@ -197,105 +201,107 @@ def forward_kernel(dtype, channels: int, halvings: int):
 
 
 @cache
-def backward_kernel(dtype, channels: int, halvings: int):
-    """Return the adjoint of forward_kernel(), whose arguments it shares.
+def backward_kernel(dtype, channels: int, exp_squarings: int):
+    """Return the backward pass of forward_kernel(), whose arguments it shares.
 
-    unsorted: [M] row of each intersection in intersection_gradients. last: as the forward kernel left it.
-    image_gradient: [H W, C]; left_over_gradient: [H W]. transmittance: as the forward kernel left it; it is
+    emit_indices: [M] row of each intersection in grad_intersections. last_contributor: as the forward kernel left it.
+    grad_image: [H W, C]; grad_transmittance: [H W]. tile_transmittance: as the forward kernel left it; it is
     overwritten.
 
-    Scratch: behind [tiles, 32] rows, incoming [tiles, C, 32], weights and slopes [tiles, 16], sums [tiles, C + 6].
+    Scratch: grad_from_behind [tiles, 32] rows, tile_grad_image [tiles, C, 32], weights and slopes [tiles, 16], sums
+    [tiles, C + 6].
 
-    intersection_gradients: [M, C + 6] in the order of `unsorted`: features, conic a b c, x, y, opacity.
+    grad_intersections: [M, C + 6] in the order of emission: features, conic a b c, x, y, opacity.
     """
-    row, spread, step, exponential, halves = row_functions(dtype, halvings)
+    row, broadcast, step, exponential, halves = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), unsorted: wp.array(dtype=wp.int32),
-        shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
+        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        emit_indices: wp.array(dtype=wp.int32),
+        means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
         columns: int, width: int, height: int, alpha_threshold: real,
-        iota: wp.array(dtype=row), last: wp.array2d(dtype=row), image_gradient: wp.array2d(dtype=real),
-        left_over_gradient: wp.array(dtype=real), transmittance: wp.array2d(dtype=row),
-        behind: wp.array2d(dtype=row), incoming: wp.array3d(dtype=row), weights: wp.array2d(dtype=row),
-        slopes: wp.array2d(dtype=row), sums: wp.array2d(dtype=row), intersection_gradients: wp.array2d(dtype=real),
+        lane_offsets: wp.array(dtype=row), last_contributor: wp.array2d(dtype=row), grad_image: wp.array2d(dtype=real),
+        grad_transmittance: wp.array(dtype=real), tile_transmittance: wp.array2d(dtype=row),
+        grad_from_behind: wp.array2d(dtype=row), tile_grad_image: wp.array3d(dtype=row), weights: wp.array2d(dtype=row),
+        slopes: wp.array2d(dtype=row), sums: wp.array2d(dtype=row), grad_intersections: wp.array2d(dtype=real),
     ):
         tile = first + wp.tid()
-        bounds = ranges[tile]
+        bounds = tile_ranges[tile]
         x0 = (tile % columns) * size
         y0 = (tile // columns) * size
-        offsets = iota[0]
-        ones = spread(real(1.0))
-        furthest = spread(real(0.0))
-        for at in range(transmittance.shape[1]):  # As in the forward kernel.
-            t = wp.max(transmittance[tile, at], transmittance[tile, at] * real(-1.0))
-            transmittance[tile, at] = t
-            furthest = wp.max(furthest, last[tile, at])
-            from_left_over = spread(real(0.0))
+        offsets = lane_offsets[0]
+        ones = broadcast(real(1.0))
+        furthest = broadcast(real(0.0))
+        for at in range(tile_transmittance.shape[1]):  # As in the forward kernel.
+            t = wp.max(tile_transmittance[tile, at], tile_transmittance[tile, at] * real(-1.0))
+            tile_transmittance[tile, at] = t
+            furthest = wp.max(furthest, last_contributor[tile, at])
+            from_transmittance = broadcast(real(0.0))
             for channel in range(wp.static(channels)):
-                incoming[tile, channel, at] = spread(real(0.0))
+                tile_grad_image[tile, channel, at] = broadcast(real(0.0))
             half = at // size
             j = at - half * size
             if y0 + j < height:
                 left = x0 + half * lanes
                 for i in range(wp.min(lanes, width - left)):
                     pixel = (y0 + j) * width + left + i
-                    from_left_over[i] = left_over_gradient[pixel]
+                    from_transmittance[i] = grad_transmittance[pixel]
                     for channel in range(wp.static(channels)):
-                        incoming[tile, channel, at][i] = image_gradient[pixel, channel]
-            behind[tile, at] = wp.cw_mul(t, from_left_over)
+                        tile_grad_image[tile, channel, at][i] = grad_image[pixel, channel]
+            grad_from_behind[tile, at] = wp.cw_mul(t, from_transmittance)
 
         blend_count = int(wp.max(furthest))
         for k in range(bounds[0] + blend_count, bounds[1]):
             for column in range(wp.static(channels + 6)):
-                intersection_gradients[unsorted[k], column] = real(0.0)
+                grad_intersections[emit_indices[k], column] = real(0.0)
 
         for step_back in range(blend_count):
             k = bounds[0] + blend_count - 1 - step_back
             i = intersections[k]
-            shape = shapes[i]
-            ellipse = ellipses[i]
-            x = shape[0] - real(x0) - real(0.5)
-            y = shape[1] - real(y0) - real(0.5)
-            top = wp.max(int(wp.ceil(y - shape[3])), 0)
-            bottom = wp.min(int(wp.floor(y + shape[3])) + 1, size)
-            place = spread(real(k - bounds[0]) + real(0.5))
-            target = unsorted[k]
+            xy_opacity = means_opacities[i]
+            conic_cutoff = conics_cutoffs[i]
+            x = xy_opacity[0] - real(x0) - real(0.5)
+            y = xy_opacity[1] - real(y0) - real(0.5)
+            top = wp.max(int(wp.ceil(y - xy_opacity[3])), 0)
+            bottom = wp.min(int(wp.floor(y + xy_opacity[3])) + 1, size)
+            place = broadcast(real(k - bounds[0]) + real(0.5))
+            target = emit_indices[k]
             for column in range(wp.static(channels + 6)):
-                sums[tile, column] = spread(real(0.0))
-            reached = halves(x, ellipse)
+                sums[tile, column] = broadcast(real(0.0))
+            reached = halves(x, conic_cutoff)
             for half in range(reached[0], reached[1]):
-                dx = spread(x - real(half * lanes)) - offsets
-                in_x = wp.cw_mul(dx, dx) * (real(-0.5) * ellipse[0])
+                dx = broadcast(x - real(half * lanes)) - offsets
+                in_x = wp.cw_mul(dx, dx) * (real(-0.5) * conic_cutoff[0])
                 for j in range(top, bottom):
                     at = half * size + j
                     dy = y - real(j)
-                    p = in_x + dx * (-ellipse[1] * dy) + spread(real(-0.5) * ellipse[2] * dy * dy)
-                    unclamped = exponential(wp.min(p, spread(real(0.0)))) * shape[2]
-                    a = wp.min(unclamped, spread(real(ALPHA_MAX)))
-                    counts = wp.cw_mul(step(a - spread(alpha_threshold)), step(last[tile, at] - place))
+                    p = in_x + dx * (-conic_cutoff[1] * dy) + broadcast(real(-0.5) * conic_cutoff[2] * dy * dy)
+                    unclamped = exponential(wp.min(p, broadcast(real(0.0)))) * xy_opacity[2]
+                    a = wp.min(unclamped, broadcast(real(ALPHA_MAX)))
+                    counts = wp.cw_mul(step(a - broadcast(alpha_threshold)), step(last_contributor[tile, at] - place))
                     inverse = wp.cw_div(ones, ones - a)
-                    t = transmittance[tile, at]
+                    t = tile_transmittance[tile, at]
                     # As an addition: t * inverse would round each of many faint factors the same way.
                     t = t + wp.cw_mul(wp.cw_mul(t, wp.cw_mul(a, inverse)), counts)
-                    transmittance[tile, at] = t
-                    q = incoming[tile, 0, at] * features[i, 0]
+                    tile_transmittance[tile, at] = t
+                    q = tile_grad_image[tile, 0, at] * features[i, 0]
                     for channel in range(1, wp.static(channels)):
-                        q += incoming[tile, channel, at] * features[i, channel]
-                    r = behind[tile, at]
+                        q += tile_grad_image[tile, channel, at] * features[i, channel]
+                    r = grad_from_behind[tile, at]
                     weight = wp.cw_mul(wp.cw_mul(a, t), counts)
                     from_a = wp.cw_mul(wp.cw_mul(t, q) - wp.cw_mul(r, inverse), counts)
-                    behind[tile, at] = r + wp.cw_mul(weight, q)
+                    grad_from_behind[tile, at] = r + wp.cw_mul(weight, q)
                     weights[tile, j] = weight
                     # alpha = opacity exp(p): the derivative by p is alpha's own, and 0 where alpha is clamped to
                     # its limit
-                    slopes[tile, j] = wp.cw_mul(wp.cw_mul(a, from_a), step(spread(real(ALPHA_MAX)) - unclamped))
+                    slopes[tile, j] = wp.cw_mul(wp.cw_mul(a, from_a), step(broadcast(real(ALPHA_MAX)) - unclamped))
 
-                s0 = spread(real(0.0))
-                sy = spread(real(0.0))
-                syy = spread(real(0.0))
+                s0 = broadcast(real(0.0))
+                sy = broadcast(real(0.0))
+                syy = broadcast(real(0.0))
                 for j in range(top, bottom):
                     dy = y - real(j)
                     slope = slopes[tile, j]
@@ -306,7 +312,7 @@ def backward_kernel(dtype, channels: int, halvings: int):
                 for channel in range(wp.static(channels)):
                     total = sums[tile, channel]
                     for j in range(top, bottom):
-                        total += wp.cw_mul(weights[tile, j], incoming[tile, channel, half * size + j])
+                        total += wp.cw_mul(weights[tile, j], tile_grad_image[tile, channel, half * size + j])
                     sums[tile, channel] = total
                 sx = wp.cw_mul(s0, dx)
                 sums[tile, wp.static(channels)] = sums[tile, wp.static(channels)] + s0
@@ -316,18 +322,18 @@ def backward_kernel(dtype, channels: int, halvings: int):
                 sums[tile, wp.static(channels + 4)] = sums[tile, wp.static(channels + 4)] + wp.cw_mul(sy, dx)
                 sums[tile, wp.static(channels + 5)] = sums[tile, wp.static(channels + 5)] + syy
             for channel in range(wp.static(channels)):
-                intersection_gradients[target, channel] = wp.dot(sums[tile, channel], ones)
+                grad_intersections[target, channel] = wp.dot(sums[tile, channel], ones)
             sum_0 = wp.dot(sums[tile, wp.static(channels)], ones)
             sum_x = wp.dot(sums[tile, wp.static(channels + 1)], ones)
             sum_y = wp.dot(sums[tile, wp.static(channels + 2)], ones)
             sum_xx = wp.dot(sums[tile, wp.static(channels + 3)], ones)
             sum_xy = wp.dot(sums[tile, wp.static(channels + 4)], ones)
             sum_yy = wp.dot(sums[tile, wp.static(channels + 5)], ones)
-            intersection_gradients[target, wp.static(channels)] = real(-0.5) * sum_xx
-            intersection_gradients[target, wp.static(channels + 1)] = -sum_xy
-            intersection_gradients[target, wp.static(channels + 2)] = real(-0.5) * sum_yy
-            intersection_gradients[target, wp.static(channels + 3)] = -(ellipse[0] * sum_x + ellipse[1] * sum_y)
-            intersection_gradients[target, wp.static(channels + 4)] = -(ellipse[1] * sum_x + ellipse[2] * sum_y)
-            intersection_gradients[target, wp.static(channels + 5)] = sum_0 / shape[2]
+            grad_intersections[target, wp.static(channels)] = real(-0.5) * sum_xx
+            grad_intersections[target, wp.static(channels + 1)] = -sum_xy
+            grad_intersections[target, wp.static(channels + 2)] = real(-0.5) * sum_yy
+            grad_intersections[target, wp.static(channels + 3)] = -(conic_cutoff[0] * sum_x + conic_cutoff[1] * sum_y)
+            grad_intersections[target, wp.static(channels + 4)] = -(conic_cutoff[1] * sum_x + conic_cutoff[2] * sum_y)
+            grad_intersections[target, wp.static(channels + 5)] = sum_0 / xy_opacity[2]
 
     return blend_backward

@@ -1,32 +1,33 @@
-"""N-channel front-to-back blend for CUDA: one warp of 32 lanes owns a corner of a tile, 8 x 4 pixels.
+"""N-channel front-to-back blend for CUDA: one warp of 32 lanes owns a subtile of a tile, 8 x 4 pixels.
 
-The mathematics is that of blend_cpu; the division of work differs. The adjoint is in blend_cuda_adjoint.py.
+The mathematics is that of blend_cpu; the division of work differs. The backward pass is in blend_cuda_backward.py.
 
-Most intersections of a 16 x 16 tile miss an 8 x 4 corner of it. `find_lists` of tiles.py tests the ellipse of every
-intersection exactly against the corners of its tile, and sets a bit for each. A warp walks its tile's list 32
-intersections at a time, ROUNDS of them together, and packs those that touch its corner into a ring buffer in shared
-memory. It blends them in batches of 32: each lane loads the shape, ellipse and features of one Gaussian, and then each
-lane blends all 32 on its own pixel.
+Most intersections of a 16 x 16 tile miss an 8 x 4 subtile of it. `find_tile_ranges` of tiles.py tests the ellipse of
+every intersection exactly against the subtiles of its tile, and sets a bit for each. A warp walks its tile's list 32
+intersections at a time, ROUNDS of them together, and packs those that touch its subtile into a ring buffer in shared
+memory. It blends them in batches of 32: each lane loads the mean, opacity, conic and features of one Gaussian, and then
+each lane blends all 32 on its own pixel.
 
 Lists differ in length by a factor of a hundred, and the longest ones decide the time of a picture, because a warp that
 waits for memory does nothing else. Therefore the next rounds and the next batch are loaded while a batch is blended,
-and the alphas of TOGETHER Gaussians, which do not depend on each other, are computed without a branch before the first
+and the alphas of UNROLL Gaussians, which do not depend on each other, are computed without a branch before the first
 of them is blended. Transmittance only falls, so one test after all of them finds whether it is still above its limit.
 
 All lanes read a batch before it is overwritten, because a vote or a scatter with its barrier always lies between.
-These kernels also run on the CPU if wp.config.enable_cpu_blocks is set: slow, but the same logic, for tests.
+These kernels also run in Warp's CPU block emulation (wp.config.enable_cpu_blocks): slow, but the same logic, for tests.
 """
 
 from functools import cache
 
 import warp as wp
 
-from .constants import ALPHA_MAX, CORNER, FORWARD, TILE_SIZE, TRANSMITTANCE_MIN
+from .compile_options import NO_AUTODIFF
+from .constants import ALPHA_MAX, SUBTILE, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import geometry, vector
 
 BLOCK_DIM = 32
-BLOCKS_PER_TILE = (TILE_SIZE // CORNER[0]) * (TILE_SIZE // CORNER[1])
-TOGETHER = 8  # Gaussians whose alphas are computed before the first of them is blended; divides 32
+BLOCKS_PER_TILE = (TILE_SIZE // SUBTILE[0]) * (TILE_SIZE // SUBTILE[1])
+UNROLL = 8  # Gaussians whose alphas are computed before the first of them is blended; divides 32
 ROUNDS = 4  # Rounds of 32 intersections that are tested together
 QUEUE = 64 * ROUNDS  # Slots of the ring buffer: at least 32 ROUNDS + 31, and a power of 2
 
@@ -42,7 +43,7 @@ def pad_rows_kernel(dtype, channels: int):
     real = dtype
     columns = padded_channels(channels)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def pad_rows(first: int, features: wp.array2d(dtype=real), rows: wp.array2d(dtype=real)):
         """Copy features to rows [N, columns] and fill the columns behind them with zeros."""
         i = first + wp.tid()
@@ -116,19 +117,22 @@ def block_functions(dtype, cuda: bool) -> tuple:
 
 @cache
 def forward_kernel(dtype, channels: int, cuda: bool = False):
-    """Return blend_forward(), launched over tiles x BLOCKS_PER_TILE x 32 threads. cuda: not for the CPU's fibers.
+    """Return blend_forward(), launched over tiles x BLOCKS_PER_TILE x 32 threads.
 
-    ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians; corners: [M] find_lists()'s;
-    shapes: [N] (x, y, opacity, -); ellipses: [N] (conic a, b, c, level);
+    cuda: False for Warp's CPU block emulation.
+
+    tile_ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians; subtile_masks: [M] of
+    find_tile_ranges(); means_opacities: [N] (x, y, opacity, -); conics_cutoffs: [N] (conic a, b, c, cutoff);
     features: [N padded_channels / 4] rows of four, flat
-    image: [H W] vectors of C; transmittance: [H W]; last: [H W] 1 + list place of the last Gaussian that contributes
+    image: [H W] vectors of C; transmittance: [H W]; last_contributor: [H W] 1 + list place of the last Gaussian that
+    contributes
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
     quads = padded_channels(channels) // 4
-    vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(TOGETHER, dtype)
+    vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(UNROLL, dtype)
     vec_rounds = vector(ROUNDS, wp.int32)
-    blocks_across = TILE_SIZE // CORNER[0]
+    blocks_across = TILE_SIZE // SUBTILE[0]
     votes, row = block_functions(dtype, cuda)
 
     @wp.kernel(
@@ -136,19 +140,21 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         module_options=module_options(dtype),
     )
     def blend_forward(
-        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
-        shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
+        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        subtile_masks: wp.array(dtype=wp.uint8),
+        means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
         columns: int, width: int, height: int, alpha_threshold: real,
-        image: wp.array(dtype=vec_image), transmittance: wp.array(dtype=real), last: wp.array(dtype=wp.int32),
+        image: wp.array(dtype=vec_image), transmittance: wp.array(dtype=real),
+        last_contributor: wp.array(dtype=wp.int32),
     ):
         thread = wp.tid()
         block = thread >> 5
         lane = thread & 31
         tile = block // wp.static(BLOCKS_PER_TILE)
-        corner = block - tile * wp.static(BLOCKS_PER_TILE)
+        subtile = block - tile * wp.static(BLOCKS_PER_TILE)
         tile_row = tile // columns
-        left = (tile - tile_row * columns) * wp.static(TILE_SIZE) + (corner % wp.static(blocks_across)) * 8
-        top = tile_row * wp.static(TILE_SIZE) + (corner // wp.static(blocks_across)) * 4
+        left = (tile - tile_row * columns) * wp.static(TILE_SIZE) + (subtile % wp.static(blocks_across)) * 8
+        top = tile_row * wp.static(TILE_SIZE) + (subtile // wp.static(blocks_across)) * 4
         px = left + (lane & 7)
         py = top + (lane >> 3)
         inside = px < width and py < height
@@ -156,18 +162,18 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         y = real(py) + real(0.5)
 
         t = real(1.0)
-        bar = wp.where(inside, alpha_threshold, real(wp.inf))
+        active_threshold = wp.where(inside, alpha_threshold, real(wp.inf))
         last_place = real(0.0)
         sums = vec_padded()
 
-        bounds = ranges[tile]
+        bounds = tile_ranges[tile]
         begin = bounds[0]
         count = bounds[1] - begin
         final = wp.max(count - 1, 0)
         lanes_below = (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
         queue = wp.tile_empty(shape=wp.static(QUEUE), dtype=wp.vec2i, storage="shared")
-        batch_shape = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
-        batch_ellipse = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
+        batch_means = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
+        batch_conics = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
         batch_features = wp.tile_empty(shape=wp.static(32 * quads), dtype=vec4, storage="shared")
         head = int(0)
         queued = int(0)
@@ -179,7 +185,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
             for k in range(wp.static(ROUNDS)):
                 at = begin + wp.min(k * 32 + lane, final)
                 gaussians[k] = intersections[at]
-                touched[k] = int(corners[at])
+                touched[k] = int(subtile_masks[at])
         turns = (count + wp.static(32 * ROUNDS - 1)) // wp.static(32 * ROUNDS)
         turn = int(0)
         alive = int(1)
@@ -188,7 +194,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                 start = turn * wp.static(32 * ROUNDS) + lane
                 for k in range(wp.static(ROUNDS)):
                     place = start + k * 32
-                    hit = place < count and ((touched[k] >> corner) & 1) == 1
+                    hit = place < count and ((touched[k] >> subtile) & 1) == 1
                     mask = votes(hit, lane)
                     slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
                     wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], place + 1), hit)
@@ -197,15 +203,15 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                 for k in range(wp.static(ROUNDS)):
                     at = begin + wp.min(start + wp.static(32 * ROUNDS) + k * 32, final)
                     gaussians[k] = intersections[at]
-                    touched[k] = int(corners[at])
+                    touched[k] = int(subtile_masks[at])
             coming = wp.min(queued, 32)
             own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))
-            shape = vec4()
-            ellipse = vec4()
+            xy_opacity = vec4()
+            conic_cutoff = vec4()
             fetched = vec_padded()
             if lane < coming:
-                shape = row(shapes, own[0])
-                ellipse = row(ellipses, own[0])
+                xy_opacity = row(means_opacities, own[0])
+                conic_cutoff = row(conics_cutoffs, own[0])
                 for e in range(wp.static(quads)):
                     quad = row(features, own[0] * wp.static(quads) + e)
                     for h in range(wp.static(4)):
@@ -213,42 +219,45 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
             head = (head + coming) & wp.static(QUEUE - 1)
             queued = queued - coming
             # The batch that was fetched before
-            for group in range((ready + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
+            for group in range((ready + wp.static(UNROLL - 1)) // wp.static(UNROLL)):
                 alphas = vec_many()
                 places = vec_many()
-                for k in range(wp.static(TOGETHER)):
-                    j = group * wp.static(TOGETHER) + k
-                    s = wp.tile_extract(batch_shape, j)
-                    q = wp.tile_extract(batch_ellipse, j)
+                for k in range(wp.static(UNROLL)):
+                    j = group * wp.static(UNROLL) + k
+                    s = wp.tile_extract(batch_means, j)
+                    q = wp.tile_extract(batch_conics, j)
                     dx = s[0] - x
                     dy = s[1] - y
                     a = s[2] * wp.exp(wp.min(dx * (q[0] * dx + q[1] * dy) + q[2] * dy * dy, real(0.0)))
                     a = wp.min(real(ALPHA_MAX), a)
-                    alphas[k] = wp.where(a > bar, a, real(0.0))
+                    alphas[k] = wp.where(a > active_threshold, a, real(0.0))
                     places[k] = s[3]
                 following = real(t)
-                for k in range(wp.static(TOGETHER)):
+                for k in range(wp.static(UNROLL)):
                     weight = alphas[k] * following
                     following = following - weight
                     on = following > real(TRANSMITTANCE_MIN)
                     last_place = wp.where(on and alphas[k] > real(0.0), places[k], last_place)
                     t = wp.where(on, following, t)
                     alphas[k] = wp.where(on, weight, real(0.0))
-                bar = wp.where(following > real(TRANSMITTANCE_MIN), bar, real(wp.inf))
-                for k in range(wp.static(TOGETHER)):
+                active_threshold = wp.where(following > real(TRANSMITTANCE_MIN), active_threshold, real(wp.inf))
+                for k in range(wp.static(UNROLL)):
                     for e in range(wp.static(quads)):
-                        at = (group * wp.static(TOGETHER) + k) * wp.static(quads) + e
+                        at = (group * wp.static(UNROLL) + k) * wp.static(quads) + e
                         quad = wp.tile_extract(batch_features, at)
                         for h in range(wp.static(4)):
                             sums[e * 4 + h] += quad[h] * alphas[k]
             # All have read the batch before it is overwritten.
-            if votes(bar < real(1.0), lane) == wp.uint32(0) or coming == 0:
+            if votes(active_threshold < real(1.0), lane) == wp.uint32(0) or coming == 0:
                 alive = 0
             ready = coming
-            wp.tile_scatter_masked(batch_shape, lane, vec4(shape[0], shape[1], shape[2], real(own[1])), True)
             wp.tile_scatter_masked(
-                batch_ellipse, lane, vec4(real(-0.5) * ellipse[0], -ellipse[1], real(-0.5) * ellipse[2], real(0.0)),
-                True,
+                batch_means, lane, vec4(xy_opacity[0], xy_opacity[1], xy_opacity[2], real(own[1])), True,
+            )
+            # Staged as -a / 2, -b, -c / 2, so that the exponent is dx (q0 dx + q1 dy) + q2 dy dy.
+            wp.tile_scatter_masked(
+                batch_conics, lane,
+                vec4(real(-0.5) * conic_cutoff[0], -conic_cutoff[1], real(-0.5) * conic_cutoff[2], real(0.0)), True,
             )
             for e in range(wp.static(quads)):
                 wp.tile_scatter_masked(
@@ -263,6 +272,6 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                 colors[channel] = sums[channel]
             image[pixel] = colors
             transmittance[pixel] = t
-            last[pixel] = int(last_place)
+            last_contributor[pixel] = int(last_place)
 
     return blend_forward

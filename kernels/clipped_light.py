@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 from .geometry import vector
 from .patches import BLOCK_DIM, CHANNELS, ROWS, TURNS, patch_functions
 
@@ -66,7 +66,7 @@ def clipped_logarithms_kernel(dtype, code):
     """Return the kernel for one scalar type and one type of codes, wp.uint8 or wp.uint16."""
     real = dtype
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def clipped_logarithms(
         first: int,
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
@@ -94,7 +94,7 @@ def clipped_light_kernel(dtype):
     real = dtype
     terms_of, estimate_of = _terms_function(dtype), _estimate_function(dtype)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def clipped_light(
         first: int,
         image: wp.array(dtype=real), logarithms: wp.array(dtype=real), white: real, height: int, width: int,
@@ -138,7 +138,7 @@ def clipped_light_patch_kernel(dtype, code):
     functions = patch_functions(REACH)
     reach, patch_of, column_of, value_of = functions.reach, functions.patch_of, functions.column_of, functions.value_of
     terms_of, estimate_of = _terms_function(dtype), _estimate_function(dtype)
-    options = {"module_options": FORWARD | {"max_unroll": 32}, "launch_bounds": BLOCK_DIM, "grid_stride": False}
+    options = {"module_options": NO_AUTODIFF | {"max_unroll": 32}, "launch_bounds": BLOCK_DIM, "grid_stride": False}
 
     @wp.kernel(module="unique", **options)
     def clipped_light_in_patches(

@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 from .geometry import vector
 
 
@@ -28,7 +28,7 @@ def code_residual_kernel(dtype, code, mu_law: bool):
                 result *= x / (u - real(1.0))
         return result
 
-    @wp.kernel(module="unique", module_options=FORWARD | {"fuse_fp": False})
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF | {"fuse_fp": False})
     def code_residual(
         first: int,
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),

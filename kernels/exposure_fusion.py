@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 
 POINTS_PER_THREAD = 64  # Of one hidden unit's gradients, summed before the atomics
 
@@ -22,7 +22,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
     encoded, exposedness, outputs and what is made of them: [3, Q]; inner [3, 2, H], inner_bias, outer [3, H],
     outer_bias [3]: the perceptrons' weights; log_sigma: [3]; results: [M, 3].
     """
-    real, options = dtype, FORWARD
+    real, options = dtype, NO_AUTODIFF
     reals, reals2d, reals3d = wp.array(dtype=real), wp.array2d(dtype=real), wp.array3d(dtype=real)
 
     @wp.func

@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .constants import TILE_SIZE
+
 
 def vector(length: int, dtype):
     """Return the Warp vector type with `length` components of `dtype`."""
@@ -14,6 +16,15 @@ def vector(length: int, dtype):
 def matrix(rows: int, columns: int, dtype):
     """Return the Warp matrix type with `rows` x `columns` components of `dtype`."""
     return wp.types.matrix(shape=(rows, columns), dtype=dtype)
+
+
+@wp.func
+def pixel_of_thread(thread: int, columns: int) -> wp.vec3i:
+    """Return tile, x and y of a thread: pixels go tile by tile, so that neighbors read the same list."""
+    tile = thread // (TILE_SIZE * TILE_SIZE)
+    place = thread - tile * (TILE_SIZE * TILE_SIZE)
+    x = (tile % columns) * TILE_SIZE + place % TILE_SIZE
+    return wp.vec3i(tile, x, (tile // columns) * TILE_SIZE + place // TILE_SIZE)
 
 
 @cache
@@ -47,9 +58,9 @@ def geometry(dtype) -> SimpleNamespace:
 
     @wp.func
     def ellipse_meets_rectangle(
-        x: real, y: real, a: real, b: real, c: real, level: real, left: real, top: real, width: real, height: real
+        x: real, y: real, a: real, b: real, c: real, cutoff: real, left: real, top: real, width: real, height: real
     ) -> bool:
-        """Return whether the ellipse a dx^2 + 2 b dx dy + c dy^2 <= level around (x, y) touches the rectangle.
+        """Return whether the ellipse a dx^2 + 2 b dx dy + c dy^2 <= cutoff around (x, y) touches the rectangle.
 
         The form is smallest on one of the edges nearest to the centre. A small allowance keeps rounding from dropping a
         border pixel.
@@ -64,7 +75,7 @@ def geometry(dtype) -> SimpleNamespace:
         best_x = wp.clamp(-b * nearest_y / a, x0, x1)
         along_vertical = a * nearest_x * nearest_x + real(2.0) * b * nearest_x * best_y + c * best_y * best_y
         along_horizontal = a * best_x * best_x + real(2.0) * b * best_x * nearest_y + c * nearest_y * nearest_y
-        return wp.min(along_vertical, along_horizontal) <= level * real(1.0001) + real(1.0e-3)
+        return wp.min(along_vertical, along_horizontal) <= cutoff * real(1.0001) + real(1.0e-3)
 
     @wp.func
     def splat_exponent(a: real, b: real, c: real, dx: real, dy: real) -> real:

@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 from .geometry import geometry, vector
 
 
@@ -148,7 +148,7 @@ def harmonics_kernel(dtype, degree: int):
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def evaluate_harmonics(
         first: int,
         constant: wp.array2d(dtype=vec3), rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3),
@@ -175,7 +175,7 @@ def channels_kernel(dtype, degree: int, turning: bool):
     direction_of, harmonic = harmonic_functions(dtype)
     turn, weight_vector = turn_function(dtype, degree)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def evaluate_channels(
         first: int,
         constant: wp.array3d(dtype=dtype), rest: wp.array3d(dtype=dtype), means: wp.array(dtype=vec3),
@@ -223,7 +223,7 @@ def turns_adjoint_kernel(dtype):
     vec3 = geometry(dtype).vec3
     without_nan = zero_if_unused(dtype)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def turns_adjoint(
         first: int,
         turns: wp.array2d(dtype=vec3), value_gradients: wp.array(dtype=vec3), mean_gradients: wp.array(dtype=vec3),
@@ -250,7 +250,7 @@ def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
     turn, weight_vector = turn_function(dtype, degree)
     columns = (degree + 1) * (degree + 1) - 1
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def harmonics_adjoint(
         first: int,
         rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3), camera_position: wp.array(dtype=vec3),
@@ -283,7 +283,7 @@ def basis_kernel(dtype, degree: int):
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def evaluate_basis(
         first: int,
         means: wp.array(dtype=vec3), positions: wp.array(dtype=vec3), basis: wp.array3d(dtype=dtype),
@@ -332,7 +332,7 @@ def coefficient_adjoint_kernel(dtype, count: int):
     """
     gradient_of = coefficient_gradient(dtype, count)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def coefficient_adjoint(
         first: int,
         basis: wp.array3d(dtype=dtype), value_gradients: wp.array3d(dtype=dtype), start: int,

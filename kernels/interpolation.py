@@ -6,7 +6,7 @@ function is constant, above the last one a straight line.
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 from .geometry import vector
 
 COPIES = 128
@@ -50,7 +50,7 @@ def weight_slopes(part: float) -> _weights4:
     )
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def interpolate(
     table: wp.array2d(dtype=wp.float32),
     low: float, inverse_step: float,
@@ -67,7 +67,7 @@ def interpolate(
     values[i, column] = wp.where(wp.isnan(positions[i, column]), positions[i, column], value)
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def interpolate_adjoint(
     table: wp.array2d(dtype=wp.float32),
     low: float, inverse_step: float,

@@ -7,7 +7,7 @@ bright thing is then compared by itself, and not together with the wall that ano
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 
 RADIUS = wp.constant(2)
 """Patches are 5 x 5 pixels."""
@@ -91,7 +91,7 @@ def better_half(costs: costs8, count: int) -> float:
     return result
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def sweep(
     first: int,
     photos: wp.array(dtype=wp.vec4ub), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
@@ -164,7 +164,7 @@ def sweep(
     costs[n, i - n * count] = better_half(best, neighbor_count)
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def trust_depths(
     first: int,
     costs: wp.array2d(dtype=wp.float32), planes: wp.array(dtype=wp.float32),
@@ -207,7 +207,7 @@ def trust_depths(
     depths[n] = depth
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def place_matches(
     first: int,
     photos: wp.array(dtype=wp.vec4ub), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),

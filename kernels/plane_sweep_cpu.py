@@ -5,7 +5,7 @@ Where a neighbor shows a pixel of the patch is linear in the depth, before the d
 
 import warp as wp
 
-from .constants import FORWARD, FUSED, cpu_flags
+from .compile_options import FUSED, NO_AUTODIFF, cpu_flags
 from .geometry import vector
 from .plane_sweep import (
     LARGEST,
@@ -21,7 +21,7 @@ from .plane_sweep import (
 )
 
 LANES = 8
-OPTIONS = FORWARD | {"cpu_compiler_flags": cpu_flags() + FUSED, "max_unroll": 8}
+OPTIONS = NO_AUTODIFF | {"cpu_compiler_flags": cpu_flags() + FUSED, "max_unroll": 8}
 PATCH = SIDE * SIDE
 
 _row, _codes, _patch = vector(LANES, wp.float32), vector(LANES, wp.int32), vector(PATCH, wp.float32)

@@ -13,12 +13,13 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FRUSTUM_MARGIN, LOG_SCALE_MAX, cpu_flags
+from .compile_options import cpu_flags
+from .constants import FRUSTUM_MARGIN, LOG_SCALE_MAX
 from .geometry import geometry, matrix
 
 
 @cache
-def projection_kernel(dtype, antialiased: bool, exact: bool = False):
+def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool = False):
     """Return the projection kernel for one scalar type.
 
     The kernel's `forward_extents` is the forward pass's extents in the adjoint, and None in the forward pass.
@@ -26,8 +27,9 @@ def projection_kernel(dtype, antialiased: bool, exact: bool = False):
     Args:
         dtype: wp.float32 or wp.float64.
         antialiased: lower the opacity by sqrt(det / det_blurred), so that the blur by eps2d keeps a Gaussian's energy
-            (Yu et al. 2024, Mip-Splatting). The factor is constant in the adjoint of the covariance.
-        exact: the factor is not constant there, as in gsplat.
+            (Yu et al. 2024, Mip-Splatting).
+        differentiate_compensation: differentiate that factor with respect to the covariance, as gsplat does; otherwise
+            it is constant in the gradient.
     """
     g = geometry(dtype)
     real, vec2, vec3, vec4, mat44 = g.real, g.vec2, g.vec3, g.vec4, g.mat44
@@ -37,7 +39,7 @@ def projection_kernel(dtype, antialiased: bool, exact: bool = False):
     def compensation(determinant: real, blurred: real) -> real:
         return wp.sqrt(wp.max(determinant / blurred, real(0.0)))
 
-    if exact:
+    if differentiate_compensation:
 
         @wp.func_grad(compensation)
         def _gradient(determinant: real, blurred: real, adj_ret: real):
@@ -71,9 +73,11 @@ def projection_kernel(dtype, antialiased: bool, exact: bool = False):
             if forward_extents[i][0] <= real(0.0):
                 return
         pose = world_to_camera[0]
-        lens = intrinsics[0]
-        fx = lens[0]
-        fy = lens[1]
+        focal_principal = intrinsics[0]
+        fx = focal_principal[0]
+        fy = focal_principal[1]
+        cx = focal_principal[2]
+        cy = focal_principal[3]
         rotation = g.mat33(
             pose[0, 0], pose[0, 1], pose[0, 2],
             pose[1, 0], pose[1, 1], pose[1, 2],
@@ -86,14 +90,14 @@ def projection_kernel(dtype, antialiased: bool, exact: bool = False):
         inverse_z = real(1.0) / z
         x_ratio = wp.where(in_front, centre[0], real(0.0)) * inverse_z
         y_ratio = wp.where(in_front, centre[1], real(0.0)) * inverse_z
-        pixel = vec2(fx * x_ratio + lens[2], fy * y_ratio + lens[3])
+        pixel = vec2(fx * x_ratio + cx, fy * y_ratio + cy)
 
         # Far off the axis the linearisation explodes: hold its ray near the frustum.
         w = real(width)
         h = real(height)
         margin = real(FRUSTUM_MARGIN)
-        jx = wp.clamp(x_ratio, -(lens[2] + margin * w * real(0.5)) / fx, (w - lens[2] + margin * w * real(0.5)) / fx)
-        jy = wp.clamp(y_ratio, -(lens[3] + margin * h * real(0.5)) / fy, (h - lens[3] + margin * h * real(0.5)) / fy)
+        jx = wp.clamp(x_ratio, -(cx + margin * w * real(0.5)) / fx, (w - cx + margin * w * real(0.5)) / fx)
+        jy = wp.clamp(y_ratio, -(cy + margin * h * real(0.5)) / fy, (h - cy + margin * h * real(0.5)) / fy)
         jacobian = mat23(
             fx * inverse_z, real(0.0), -fx * jx * inverse_z,
             real(0.0), fy * inverse_z, -fy * jy * inverse_z,
@@ -128,9 +132,9 @@ def projection_kernel(dtype, antialiased: bool, exact: bool = False):
         extent_x = real(0.0)
         extent_y = real(0.0)
         if usable:
-            level = real(2.0) * wp.log(opacity / alpha_threshold)
-            extent_x = wp.sqrt(level * variance_x)
-            extent_y = wp.sqrt(level * variance_y)
+            cutoff = real(2.0) * wp.log(opacity / alpha_threshold)
+            extent_x = wp.sqrt(cutoff * variance_x)
+            extent_y = wp.sqrt(cutoff * variance_y)
         # Keep only what reaches the centre of a pixel of this image.
         usable = (
             usable and pixel[0] + extent_x > real(0.0) and pixel[0] - extent_x < w

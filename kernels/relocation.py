@@ -7,7 +7,7 @@ makes them together as opaque as the one was, and a size that makes up for the s
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 from .geometry import vector
 
 AT_ONCE = 6  # Tensors whose rows one launch copies or clears
@@ -17,7 +17,7 @@ SMALLEST = 1.0e-3  # Times which a Gaussian may become smaller at once
 _vec3 = vector(3, wp.float32)
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def share_opacities(
     first: int,
     copies: wp.array(dtype=wp.int32), sums: wp.array2d(dtype=wp.float64), least: float,
@@ -46,7 +46,7 @@ def share_opacities(
         log_scales[i] = log_scales[i] + _vec3(smaller, smaller, smaller)
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def number_places(
     first: int,
     dead: wp.array(dtype=wp.bool), numbers: wp.array(dtype=wp.int64), places: wp.array(dtype=wp.int32),
@@ -65,7 +65,7 @@ def number_places(
     places[i] = place
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def count_copies(
     first: int,
     sampled_rows: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), begin: wp.array(dtype=wp.int64),
@@ -93,7 +93,7 @@ def copy_row(sources: _rows, source: int, values: _rows, row: int):
         values[row, column] = sources[source, column]
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def copy_rows(
     first: int,
     places: wp.array(dtype=wp.int32), begin: wp.array(dtype=wp.int64), end: wp.array(dtype=wp.int64),
@@ -133,7 +133,7 @@ def clear_row(values: _rows, row: int):
         values[row, column] = 0.0
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def clear_rows(
     first: int,
     which: wp.array(dtype=wp.bool), a: _rows, b: _rows, c: _rows, d: _rows, e: _rows, f: _rows,

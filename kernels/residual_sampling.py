@@ -4,14 +4,14 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 
 
 @cache
 def error_weights_kernel(code):
     """Return error_weights() for one type of codes, wp.uint8 or wp.uint16, launched over the pixels."""
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def error_weights(
         first: int,
         rendered: wp.array(dtype=wp.vec3), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64), white: float,
@@ -35,7 +35,7 @@ def error_weights_kernel(code):
     return error_weights
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def sampled_pixels(
     first: int,
     places: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), width: int, view: int,

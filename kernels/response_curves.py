@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 from .geometry import vector
 
 NO_TONE, REINHARD, FILMIC, KNEE = 0, 1, 2, 3
@@ -16,7 +16,7 @@ def encode_kernel(dtype, tone: int):
     real = dtype
     vec4, vec5 = vector(4, dtype), vector(5, dtype)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def encode(
         first: int,
         exposures: wp.array(dtype=real),

@@ -9,7 +9,7 @@ import ctypes
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 
 LARGEST = 4096
 """Bytes of a kernel's parameters."""
@@ -76,7 +76,7 @@ def share(work: wp.uint64, fork: wp.uint64, threads: wp.int32):
     """Take part in the Work at an address; see SHARE."""
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def share_ranges(work: wp.uint64, fork: wp.uint64, threads: wp.int32):
     """Run the Work at an address. fork: address of GOMP_parallel(), or 0."""
     share(work, fork, threads)

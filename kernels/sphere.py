@@ -9,7 +9,8 @@ its poles. The inverse covariance is kept as two vectors a and b across n, such 
 
 Within a cap around n a Gaussian counts. Directions come in tiles of 16 x 16, and these in blocks; each has a cap as
 well, and two caps that do not meet share no pixel. A tile's list is ordered by distance and blended by one thread a
-pixel, front to back. The adjoint walks it back to front as blend_cpu.py's does; that of the projection is Warp's own.
+pixel, front to back. The backward pass walks it back to front as that of blend_cpu.py does. Warp generates the adjoint
+of the projection.
 """
 
 from functools import cache
@@ -17,8 +18,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constants import ALPHA_MAX, FORWARD, LOG_SCALE_MAX, TILE_SIZE, TRANSMITTANCE_MIN, cpu_flags
-from .geometry import geometry, vector
+from .compile_options import NO_AUTODIFF, cpu_flags
+from .constants import ALPHA_MAX, LOG_SCALE_MAX, TRANSMITTANCE_MIN
+from .geometry import geometry, pixel_of_thread, vector
 
 # Tiles along the side of a block: the pairs of Gaussians and blocks are few, and so are the tiles of a block.
 BLOCK_TILES = 8
@@ -92,14 +94,14 @@ def projection_kernel(dtype, antialiased: bool):
         usable = usable and wp.isfinite(opacity) and wp.isfinite(log_scale[0]) and wp.isfinite(log_scale[1])
         usable = usable and wp.isfinite(log_scale[2])
         if usable:
-            level = real(2.0) * wp.log(opacity / alpha_threshold)
+            cutoff = real(2.0) * wp.log(opacity / alpha_threshold)
             half = real(0.5) * (v00 + v11)
             widest = half + wp.sqrt(wp.max(real(0.25) * (v00 - v11) * (v00 - v11) + v01 * v01, tiny))
             # The inverse covariance's root: rows of a triangular matrix.
             r00 = wp.sqrt(v11 / blurred)
             r01 = -v01 / (blurred * r00)
             r11 = wp.sqrt(real(1.0) / v11)
-            caps[i] = vec4(n[0], n[1], n[2], wp.atan(wp.sqrt(level * widest)))
+            caps[i] = vec4(n[0], n[1], n[2], wp.atan(wp.sqrt(cutoff * widest)))
             across[i] = r00 * e0 + r01 * e1
             along[i] = r11 * e1
             opacities2d[i] = opacity
@@ -116,11 +118,11 @@ def projection_kernel(dtype, antialiased: bool):
 
 @cache
 def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
-    """Return list_tiles, blend and blend_adjoint for one scalar type and number of channels."""
+    """Return list_tiles, blend and blend_backward for one scalar type and number of channels."""
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
     features_type = vector(channels, dtype)
-    options = FORWARD | {"fuse_fp": False}
+    options = NO_AUTODIFF | {"fuse_fp": False}
 
     @wp.func
     def caps_meet(one: vec4, other: vec4) -> bool:
@@ -134,14 +136,6 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         if forward > real(0.0) and squared < real(36.0) * forward * forward:
             value = wp.exp(real(-0.5) * squared / (forward * forward))
         return value
-
-    @wp.func
-    def pixel_of(thread: int, columns: int) -> wp.vec3i:
-        """Tile, x and y of a thread: pixels go tile by tile, so that neighbors read the same list."""
-        tile = thread // (TILE_SIZE * TILE_SIZE)
-        place = thread - tile * (TILE_SIZE * TILE_SIZE)
-        x = (tile % columns) * TILE_SIZE + place % TILE_SIZE
-        return wp.vec3i(tile, x, (tile // columns) * TILE_SIZE + place // TILE_SIZE)
 
     @wp.kernel(module="unique", module_options=options)
     def list_tiles(
@@ -175,19 +169,20 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def blend(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), directions: wp.array(dtype=vec3),
+        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real), features: wp.array(dtype=features_type),
         columns: int, width: int, height: int, alpha_threshold: real,
         image: wp.array(dtype=features_type), transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32),
     ):
         """Blend each pixel's list front to back. ends: one past the last intersection that a pixel shows."""
-        place = pixel_of(first + wp.tid(), columns)
+        place = pixel_of_thread(first + wp.tid(), columns)
         if place[1] < width and place[2] < height:
             pixel = place[2] * width + place[1]
             d = directions[pixel]
-            bounds = ranges[place[0]]
-            left_over = real(1.0)
+            bounds = tile_ranges[place[0]]
+            t = real(1.0)
             total = features_type()
             end = bounds[0]
             k = bounds[0]
@@ -200,36 +195,38 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
                 value = falloff(a * a + b * b, cap[0] * d[0] + cap[1] * d[1] + cap[2] * d[2])
                 alpha = wp.min(real(ALPHA_MAX), opacities[i] * value)
                 if alpha > alpha_threshold:
-                    remaining = left_over - left_over * alpha
+                    remaining = t - t * alpha
                     if remaining <= real(TRANSMITTANCE_MIN):
                         k = bounds[1]
                     else:
-                        total += features[i] * (alpha * left_over)
-                        left_over = remaining
+                        total += features[i] * (alpha * t)
+                        t = remaining
                         end = k
             image[pixel] = total
-            transmittance[pixel] = left_over
+            transmittance[pixel] = t
             ends[pixel] = end
 
     @wp.kernel(module="unique", module_options=options)
-    def blend_adjoint(
+    def blend_backward(
         first: int,
-        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), directions: wp.array(dtype=vec3),
+        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real), features: wp.array(dtype=features_type),
         columns: int, width: int, height: int, alpha_threshold: real,
-        transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32),
-        by_image: wp.array(dtype=features_type), by_transmittance: wp.array(dtype=real), rows: wp.array2d(dtype=real),
+        transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32), emit_indices: wp.array(dtype=wp.int32),
+        grad_image: wp.array(dtype=features_type), grad_transmittance: wp.array(dtype=real),
+        rows: wp.array2d(dtype=real),
     ):
-        """Add gradients to rows[places[intersection]]: cap direction, across, along (3 each), opacity, features."""
-        place = pixel_of(first + wp.tid(), columns)
+        """Add to rows[emit_indices[k]] the gradients of cap direction, across, along (3 each), opacity, features."""
+        place = pixel_of_thread(first + wp.tid(), columns)
         if place[1] < width and place[2] < height:
             pixel = place[2] * width + place[1]
             d = directions[pixel]
-            incoming = by_image[pixel]
-            left_over = transmittance[pixel]
-            behind = left_over * by_transmittance[pixel]
-            begin = ranges[place[0]][0]
+            grad_pixel = grad_image[pixel]
+            t = transmittance[pixel]
+            grad_from_behind = t * grad_transmittance[pixel]
+            begin = tile_ranges[place[0]][0]
             k = ends[pixel]
             while k > begin:
                 k -= 1
@@ -242,23 +239,23 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
                 unclamped = opacities[i] * value
                 alpha = wp.min(real(ALPHA_MAX), unclamped)
                 if alpha > alpha_threshold:
-                    row = places[k]
+                    row = emit_indices[k]
                     inverse = real(1.0) / (real(1.0) - alpha)
-                    # As an addition: left_over * inverse would round each of many faint factors the same way.
-                    left_over += left_over * (alpha * inverse)
-                    through = wp.dot(features[i], incoming)
-                    by_alpha = left_over * through - behind * inverse
-                    weight = alpha * left_over
-                    behind += weight * through
+                    # As an addition: t * inverse would round each of many faint factors the same way.
+                    t += t * (alpha * inverse)
+                    through = wp.dot(features[i], grad_pixel)
+                    grad_alpha = t * through - grad_from_behind * inverse
+                    weight = alpha * t
+                    grad_from_behind += weight * through
                     for channel in range(wp.static(channels)):
-                        wp.atomic_add(rows, row, 10 + channel, weight * incoming[channel])
+                        wp.atomic_add(rows, row, 10 + channel, weight * grad_pixel[channel])
                     if unclamped < real(ALPHA_MAX):
-                        slope = alpha * by_alpha / (forward * forward)
-                        by_forward = slope * (a * a + b * b) / forward
+                        slope = alpha * grad_alpha / (forward * forward)
+                        grad_forward = slope * (a * a + b * b) / forward
                         for axis in range(3):
-                            wp.atomic_add(rows, row, axis, by_forward * d[axis])
+                            wp.atomic_add(rows, row, axis, grad_forward * d[axis])
                             wp.atomic_add(rows, row, 3 + axis, -slope * a * d[axis])
                             wp.atomic_add(rows, row, 6 + axis, -slope * b * d[axis])
-                        wp.atomic_add(rows, row, 9, value * by_alpha)
+                        wp.atomic_add(rows, row, 9, value * grad_alpha)
 
-    return SimpleNamespace(list_tiles=list_tiles, blend=blend, blend_adjoint=blend_adjoint)
+    return SimpleNamespace(list_tiles=list_tiles, blend=blend, blend_backward=blend_backward)

@@ -19,7 +19,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 from .geometry import vector
 
 RADIUS = 5
@@ -83,9 +83,9 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     real, run = dtype, vector(lanes, dtype)
     taps, radius = wp.constant(2 * RADIUS + 1), wp.constant(RADIUS)
     similarity_of = comparison(dtype, lanes)
-    options = FORWARD
+    options = NO_AUTODIFF
     # The compiler takes many times as long where the loop over the window is written out.
-    compare_options = FORWARD | {"max_unroll": 8}
+    compare_options = NO_AUTODIFF | {"max_unroll": 8}
 
     @wp.func
     def place_of(index: int, length: int):

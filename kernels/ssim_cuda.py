@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constants import FORWARD
+from .compile_options import NO_AUTODIFF
 from .geometry import vector
 from .patches import BLOCK_DIM, CHANNELS, ROWS, TURNS, patch_functions
 from .ssim import RADIUS, comparison
@@ -26,7 +26,7 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
     reach, patch_of, column_of, value_of = functions.reach, functions.patch_of, functions.column_of, functions.value_of
     vec1, vec3, vec4 = vector(1, dtype), vector(3, dtype), vector(4, dtype)
     around, column, window = vector(ROWS + 2 * RADIUS, dtype), vector(ROWS, dtype), vector(2 * RADIUS + 1, dtype)
-    options = {"module_options": FORWARD | {"max_unroll": 32}, "launch_bounds": BLOCK_DIM, "grid_stride": False}
+    options = {"module_options": NO_AUTODIFF | {"max_unroll": 32}, "launch_bounds": BLOCK_DIM, "grid_stride": False}
     similarity_of = comparison(dtype, 1)
 
     @wp.func

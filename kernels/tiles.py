@@ -4,8 +4,8 @@
 sum over the counts gives every Gaussian its range of intersections. There are two ways to lists in depth order, both by
 stable sorts. With many Gaussians, these are sorted by depth, `emit_intersections` fills their ranges in that order, and
 a sort by tile keeps it: the least work for a GPU. With few, `emit_keys` fills the ranges in the Gaussians' own order,
-and one sort by tile and depth follows: the fewest launches. `find_lists` finds where each tile's list begins and ends,
-and which corners of its tile each intersection touches. Adjoints write a row for each intersection, and
+and one sort by tile and depth follows: the fewest launches. `find_tile_ranges` finds where each tile's list begins and
+ends, and which subtiles of its tile each intersection touches. Backward passes write a row for each intersection, and
 `gather_intersections` sums the rows of a Gaussian in a fixed order, whatever the order of execution.
 """
 
@@ -14,7 +14,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .constants import CORNER, FORWARD, TILE_SIZE
+from .compile_options import NO_AUTODIFF
+from .constants import SUBTILE, TILE_SIZE
 from .geometry import geometry
 
 DEPTH_BITS = 30
@@ -33,7 +34,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
     vec2s, vec4s, bools = wp.array(dtype=vec2), wp.array(dtype=vec4), wp.array(dtype=wp.bool)
     size = float(TILE_SIZE)
     # Without fused multiply-adds, which a compiler places differently in each kernel: counting and emitting must agree.
-    options = FORWARD | {"fuse_fp": False}
+    options = NO_AUTODIFF | {"fuse_fp": False}
 
     @wp.func
     def tile_span(centre: real, extent: real, tiles: int) -> wp.vec2i:
@@ -42,9 +43,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
         return wp.vec2i(first, last)
 
     @wp.func
-    def tile_is_touched(shape: vec4, conic: vec4, column: int, row: int) -> bool:
+    def tile_is_touched(xy_opacity: vec4, conic_cutoff: vec4, column: int, row: int) -> bool:
         return g.ellipse_meets_rectangle(
-            shape[0], shape[1], conic[0], conic[1], conic[2], conic[3],
+            xy_opacity[0], xy_opacity[1], conic_cutoff[0], conic_cutoff[1], conic_cutoff[2], conic_cutoff[3],
             real(column) * real(size) + real(0.5), real(row) * real(size) + real(0.5),
             real(wp.static(size - 1.0)), real(wp.static(size - 1.0)),
         )
@@ -54,11 +55,12 @@ def tile_kernels(dtype) -> SimpleNamespace:
         first: int,
         means2d: vec2s, conics: wp.array(dtype=vec3), opacities: reals, features: reals2d,
         channels: int, alpha_threshold: real, columns: int, rows: int,
-        extents: vec2s, shapes: vec4s, ellipses: vec4s, counts: int64s,
+        extents: vec2s, means_opacities: vec4s, conics_cutoffs: vec4s, counts: int64s,
     ):
         """Pack 2D Gaussians and count the tiles, of columns x rows, that each one touches.
 
-        shapes: (x, y, opacity, half-height). ellipses: (conic a, b, c, level at which alpha meets the threshold).
+        means_opacities: (x, y, opacity, half-height). conics_cutoffs: (conic a, b, c, cutoff): the ellipse in which
+        alpha exceeds the threshold is where a dx^2 + 2 b dx dy + c dy^2 <= cutoff.
 
         extents: set to 0 for a Gaussian with a feature that is not finite, because the CPU blend multiplies what a
         pixel does not show by 0, and 0 times NaN would be visible.
@@ -71,27 +73,27 @@ def tile_kernels(dtype) -> SimpleNamespace:
         conic = conics[i]
         opacity = opacities[i]
         extent = extents[i]
-        level = real(-1.0)
+        cutoff = real(-1.0)
         if extent[0] > real(0.0):
-            level = real(2.0) * wp.log(wp.max(opacity / alpha_threshold, real(1.0)))
-        shape = vec4(mean[0], mean[1], opacity, extent[1])
-        ellipse = vec4(conic[0], conic[1], conic[2], level)
-        shapes[i] = shape
-        ellipses[i] = ellipse
+            cutoff = real(2.0) * wp.log(wp.max(opacity / alpha_threshold, real(1.0)))
+        xy_opacity = vec4(mean[0], mean[1], opacity, extent[1])
+        conic_cutoff = vec4(conic[0], conic[1], conic[2], cutoff)
+        means_opacities[i] = xy_opacity
+        conics_cutoffs[i] = conic_cutoff
         touched = int(0)
         if extent[0] > real(0.0):
-            across = tile_span(shape[0], extent[0], columns)
-            down = tile_span(shape[1], extent[1], rows)
+            across = tile_span(xy_opacity[0], extent[0], columns)
+            down = tile_span(xy_opacity[1], extent[1], rows)
             for row in range(down[0], down[1]):
                 for column in range(across[0], across[1]):
-                    if tile_is_touched(shape, ellipse, column, row):
+                    if tile_is_touched(xy_opacity, conic_cutoff, column, row):
                         touched += 1
         counts[i] = wp.int64(touched)
 
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(
         first: int,
-        depths: reals, extents: vec2s, keys: reals, places: wp.array(dtype=int),
+        depths: reals, extents: vec2s, keys: reals, indices: wp.array(dtype=int),
     ):
         """Write keys that sort Gaussians nearest first and culled ones last, and their indices."""
         i = first + wp.tid()
@@ -99,21 +101,22 @@ def tile_kernels(dtype) -> SimpleNamespace:
         if not (extents[i][0] > real(0.0)):
             key = real(wp.inf)
         keys[i] = key
-        places[i] = i
+        indices[i] = i
 
-    def unsorted(key, by_depth: bool):
+    def make_emit_kernel(key, by_depth: bool):
         bits = DEPTH_BITS if by_depth else 0
 
         @wp.kernel(module="unique", module_options=options)
         def emit_intersections(
             first: int,
-            order: ints, shapes: vec4s, ellipses: vec4s, extents: vec2s, depths: wp.array(dtype=wp.float32),
+            order: ints, means_opacities: vec4s, conics_cutoffs: vec4s, extents: vec2s,
+            depths: wp.array(dtype=wp.float32),
             columns: int, rows: int,
-            ends: int64s,
+            cumulative_counts: int64s,
             max_intersections: int,
             keys: wp.array(dtype=key), gaussians: ints, overflow: bools,
         ):
-            """Write the intersections of each Gaussian, which end at ends[place].
+            """Write the intersections of each Gaussian, which end at cumulative_counts[place].
 
             If fewer tiles are touched than were counted, or no Gaussian is left, further intersections up to
             `max_intersections` get tile columns * rows, which does not exist. overflow: [1], whether more were counted
@@ -134,16 +137,16 @@ def tile_kernels(dtype) -> SimpleNamespace:
             extent = extents[i]
             entry = int(0)
             if place > 0:
-                entry = int(wp.min(ends[place - 1], wp.int64(max_intersections)))
-            end = int(wp.min(ends[place], wp.int64(max_intersections)))
+                entry = int(wp.min(cumulative_counts[place - 1], wp.int64(max_intersections)))
+            end = int(wp.min(cumulative_counts[place], wp.int64(max_intersections)))
             if extent[0] > real(0.0) and end > entry:
-                shape = shapes[i]
-                ellipse = ellipses[i]
-                across = tile_span(shape[0], extent[0], columns)
-                down = tile_span(shape[1], extent[1], rows)
+                xy_opacity = means_opacities[i]
+                conic_cutoff = conics_cutoffs[i]
+                across = tile_span(xy_opacity[0], extent[0], columns)
+                down = tile_span(xy_opacity[1], extent[1], rows)
                 for row in range(down[0], down[1]):
                     for column in range(across[0], across[1]):
-                        if entry < end and tile_is_touched(shape, ellipse, column, row):
+                        if entry < end and tile_is_touched(xy_opacity, conic_cutoff, column, row):
                             keys[entry] = (key(row * columns + column) << key(wp.static(bits))) | depth
                             gaussians[entry] = i
                             entry += 1
@@ -151,10 +154,10 @@ def tile_kernels(dtype) -> SimpleNamespace:
                 keys[entry] = no_tile
                 gaussians[entry] = i
                 entry += 1
-            count = ends.shape[0]
+            count = cumulative_counts.shape[0]
             if overflow and place == 0:
-                overflow[0] = ends[count - 1] > wp.int64(max_intersections)
-            entry = int(wp.min(ends[count - 1], wp.int64(max_intersections))) + place
+                overflow[0] = cumulative_counts[count - 1] > wp.int64(max_intersections)
+            entry = int(wp.min(cumulative_counts[count - 1], wp.int64(max_intersections))) + place
             while entry < max_intersections:
                 keys[entry] = no_tile
                 gaussians[entry] = 0
@@ -165,29 +168,30 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def gather_intersections(
         first: int,
-        order: ints, ends: int64s, intersection_gradients: reals2d,
+        order: ints, cumulative_counts: int64s, grad_intersections: reals2d,
         columns: int,
         rows: reals2d,
     ):
-        """Write rows[order[place]], the sum of Gaussian `place`'s rows of intersection_gradients [M, columns]."""
+        """Write rows[order[place]], the sum of Gaussian `place`'s rows of grad_intersections [M, columns]."""
         place = first + wp.tid()
         begin = int(0)
         if place > 0:
-            begin = int(ends[place - 1])
+            begin = int(cumulative_counts[place - 1])
         i = order[place]
         for column in range(columns):
             total = real(0.0)
-            for entry in range(begin, int(ends[place])):
-                total += intersection_gradients[entry, column]
+            for entry in range(begin, int(cumulative_counts[place])):
+                total += grad_intersections[entry, column]
             rows[i, column] = total
 
     return SimpleNamespace(
         pack_splats=pack_splats, key_by_depth=key_by_depth, gather_intersections=gather_intersections,
-        emit_intersections=unsorted(wp.int32, by_depth=False), emit_keys=unsorted(wp.int64, by_depth=True),
+        emit_intersections=make_emit_kernel(wp.int32, by_depth=False),
+        emit_keys=make_emit_kernel(wp.int64, by_depth=True),
     )
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: wp.array2d(dtype=wp.int32)):
     """Add to counts[c, t] how many intersections of chunk c, which has `size`, are in tile t; launched over chunks."""
     chunk = first + wp.tid()
@@ -195,15 +199,16 @@ def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: 
         counts[chunk, tiles[entry]] = counts[chunk, tiles[entry]] + 1
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def place_intersections(
     first: int,
     tiles: wp.array(dtype=wp.int32), emitted: wp.array(dtype=wp.int32), size: int, starts: wp.array2d(dtype=wp.int32),
-    gaussians: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.int32),
+    gaussians: wp.array(dtype=wp.int32), emit_indices: wp.array(dtype=wp.int32),
 ):
-    """Write Gaussians, and their places before, to starts[chunk, tile], counted up; launched over the chunks.
+    """Sort the intersections by tile: write their Gaussians and their indices before the sort; launched over chunks.
 
-    Places are written only if there is memory for them.
+    Those of a chunk in a tile are written from starts[chunk, tile] on, which is counted up. emitted: the Gaussians in
+    the order of emission. emit_indices: [0] if none are requested.
     """
     chunk = first + wp.tid()
     for entry in range(chunk * size, wp.min((chunk + 1) * size, tiles.shape[0])):
@@ -211,30 +216,30 @@ def place_intersections(
         slot = starts[chunk, tile]
         starts[chunk, tile] = slot + 1
         gaussians[slot] = emitted[entry]
-        if places.shape[0] > 0:
-            places[slot] = entry
+        if emit_indices.shape[0] > 0:
+            emit_indices[slot] = entry
 
 
 @cache
-def lists_kernel(dtype, key, shift: int):
-    """Return find_lists() for sorted keys, wp.int32 or wp.int64, with tiles above the lowest `shift` bits.
+def tile_ranges_kernel(dtype, key, shift: int):
+    """Return find_tile_ranges() for sorted keys, wp.int32 or wp.int64, with tiles above the lowest `shift` bits.
 
     Packed Gaussians are of one scalar type. Launched over the intersections, of which there is at least one.
 
-    ranges: [2 tiles], for each tile the first and one past the last of its intersections. corners: [intersections], bit
-    k set if the ellipse touches corner k of the tile, CORNER pixels, or [0] if none are requested. Unused intersections
-    have a tile number beyond all: they belong to no list, and their corners are 0.
+    tile_ranges: [2 tiles], for each tile the first and one past the last of its intersections. subtile_masks:
+    [intersections], bit k is set if the ellipse touches subtile k of the tile, SUBTILE pixels; [0] if none are
+    requested. Unused intersections have a tile number beyond all: they belong to no list, and their masks are 0.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
-    across, down = TILE_SIZE // CORNER[0], TILE_SIZE // CORNER[1]
+    across, down = TILE_SIZE // SUBTILE[0], TILE_SIZE // SUBTILE[1]
 
-    @wp.kernel(module="unique", module_options=FORWARD)
-    def find_lists(
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
+    def find_tile_ranges(
         first: int,
-        keys: wp.array(dtype=key), gaussians: wp.array(dtype=wp.int32), shapes: wp.array(dtype=vec4),
-        ellipses: wp.array(dtype=vec4), columns: int, tiles: int,
-        ranges: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
+        keys: wp.array(dtype=key), gaussians: wp.array(dtype=wp.int32), means_opacities: wp.array(dtype=vec4),
+        conics_cutoffs: wp.array(dtype=vec4), columns: int, tiles: int,
+        tile_ranges: wp.array(dtype=wp.int32), subtile_masks: wp.array(dtype=wp.uint8),
     ):
         entry = first + wp.tid()
         tile = int(keys[entry] >> key(shift))
@@ -244,32 +249,32 @@ def lists_kernel(dtype, key, shift: int):
         # Lists begin and end here, those of tiles without intersections both.
         for begun in range(before + 1, wp.min(tile, tiles) + 1):
             if begun < tiles:
-                ranges[2 * begun] = entry
+                tile_ranges[2 * begun] = entry
             if begun > 0:
-                ranges[2 * begun - 1] = entry
+                tile_ranges[2 * begun - 1] = entry
         if entry == keys.shape[0] - 1:
             for begun in range(tile + 1, tiles + 1):
                 if begun < tiles:
-                    ranges[2 * begun] = entry + 1
+                    tile_ranges[2 * begun] = entry + 1
                 if begun > 0:
-                    ranges[2 * begun - 1] = entry + 1
+                    tile_ranges[2 * begun - 1] = entry + 1
         touched = int(0)
-        if tile < tiles and corners.shape[0] > 0:
+        if tile < tiles and subtile_masks.shape[0] > 0:
             gaussian = gaussians[entry]
-            shape = shapes[gaussian]
-            ellipse = ellipses[gaussian]
+            xy_opacity = means_opacities[gaussian]
+            conic_cutoff = conics_cutoffs[gaussian]
             row = tile // columns
             left = real((tile - row * columns) * wp.static(TILE_SIZE)) + real(0.5)
             top = real(row * wp.static(TILE_SIZE)) + real(0.5)
-            for corner in range(wp.static(across * down)):
+            for subtile in range(wp.static(across * down)):
                 if g.ellipse_meets_rectangle(
-                    shape[0], shape[1], ellipse[0], ellipse[1], ellipse[2], ellipse[3],
-                    left + real((corner % wp.static(across)) * wp.static(CORNER[0])),
-                    top + real((corner // wp.static(across)) * wp.static(CORNER[1])),
-                    real(wp.static(CORNER[0] - 1)), real(wp.static(CORNER[1] - 1)),
+                    xy_opacity[0], xy_opacity[1], conic_cutoff[0], conic_cutoff[1], conic_cutoff[2], conic_cutoff[3],
+                    left + real((subtile % wp.static(across)) * wp.static(SUBTILE[0])),
+                    top + real((subtile // wp.static(across)) * wp.static(SUBTILE[1])),
+                    real(wp.static(SUBTILE[0] - 1)), real(wp.static(SUBTILE[1] - 1)),
                 ):
-                    touched = touched | (1 << corner)
-        if corners.shape[0] > 0:
-            corners[entry] = wp.uint8(touched)
+                    touched = touched | (1 << subtile)
+        if subtile_masks.shape[0] > 0:
+            subtile_masks[entry] = wp.uint8(touched)
 
-    return find_lists
+    return find_tile_ranges

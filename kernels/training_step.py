@@ -8,7 +8,8 @@ from functools import cache
 
 import warp as wp
 
-from .constants import FORWARD, LOG_SCALE_MAX
+from .compile_options import NO_AUTODIFF
+from .constants import LOG_SCALE_MAX
 from .geometry import geometry, vector
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
@@ -22,7 +23,7 @@ _g = geometry(wp.float32)
 _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def judge_step(
     loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), incomplete: wp.array(dtype=wp.bool),
     tally: wp.array(dtype=wp.int64), pairs: wp.array(dtype=wp.int64), verdict: wp.array(dtype=wp.float32),
@@ -88,7 +89,7 @@ def live_numbers(parameters: _floats, live: wp.array(dtype=wp.int32), width: int
     return count
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def update_by_adam(
     first: int,
     skipped: _floats, live: wp.array(dtype=wp.int32), width_a: int, width_b: int, width_c: int, width_d: int,
@@ -128,7 +129,7 @@ def update_by_adam(
             )  # fmt: skip
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def find_nonfinite(
     first: int,
     a: _floats, b: _floats, c: _floats, d: _floats, e: _floats, f: _floats,
@@ -182,7 +183,7 @@ def harmonics_adam_kernel(count: int):
     """
     numbers, whole_numbers = vector(NUMBERS, wp.float32), vector(NUMBERS, wp.int32)
 
-    @wp.kernel(module="unique", module_options=FORWARD)
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def update_harmonics_by_adam(
         first: int,
         basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int, stride: int,
@@ -234,7 +235,7 @@ def harmonics_adam_kernel(count: int):
     return update_harmonics_by_adam
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def add_gradient_statistics(
     first: int,
     gradients: wp.array(dtype=wp.vec2), radii: wp.array(dtype=wp.float32), usable: wp.array(dtype=wp.float32),
@@ -258,7 +259,7 @@ def add_gradient_statistics(
         visits[i] = visits[i] + 1.0
 
 
-@wp.kernel(module="unique", module_options=FORWARD)
+@wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def add_position_noise(
     first: int,
     log_scales: wp.array(dtype=_vec3), quaternions: wp.array(dtype=_vec4),

@@ -30,7 +30,7 @@ def watch_absolute_gradients(
         image: [H, W, C] of blend().
         transmittance: [H, W] of blend().
         features: [N, C] that were blended.
-        lists: of the Gaussians, on the CPU with TileLists.unsorted.
+        lists: of the Gaussians, on the CPU with TileLists.emit_order.
         packed: of the Gaussians.
         alpha_threshold: as of blend().
         store: called with [N, 2], the sums over pixels of |dL/dx| and |dL/dy|.
@@ -41,28 +41,28 @@ def watch_absolute_gradients(
 class _Watch(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, transmittance, features, lists, packed, alpha_threshold, store):
-        ctx.save_for_backward(features, packed.shapes, packed.ellipses)
+        ctx.save_for_backward(features, packed.means_opacities, packed.conics_cutoffs)
         ctx.lists, ctx.alpha_threshold, ctx.store = lists, alpha_threshold, store
         return image.view_as(image), transmittance.view_as(transmittance)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_image, by_transmittance):
-        features, shapes, ellipses = ctx.saved_tensors
+        features, means_opacities, conics_cutoffs = ctx.saved_tensors
         lists, channels = ctx.lists, features.shape[1]
-        unsorted = lists.unsorted
+        emit_order = lists.emit_order
         # On the CPU each intersection has a row, and whole tiles go to a thread: sums keep one order.
-        places = lists.gaussians if unsorted is None else unsorted.places
-        rows = features.new_zeros(len(features) if unsorted is None else len(places), 2)
+        emit_indices = lists.gaussians if emit_order is None else emit_order.emit_indices
+        rows = features.new_zeros(len(features) if emit_order is None else len(emit_indices), 2)
         tiles = lists.columns * lists.rows
         launch(
             absolute_gradient_kernel(warp_scalar(features.dtype)),
             tiles * _PIXELS,
-            lists.ranges,
+            lists.tile_ranges,
             lists.gaussians,
-            places,
-            shapes,
-            ellipses,
+            emit_indices,
+            means_opacities,
+            conics_cutoffs,
             features,
             lists.columns,
             lists.width,
@@ -73,5 +73,5 @@ class _Watch(torch.autograd.Function):
             rows,
             ranges=even_ranges(tiles, 1) * _PIXELS,
         )
-        ctx.store(rows if unsorted is None else gather_by_gaussian(unsorted, rows))
+        ctx.store(rows if emit_order is None else gather_by_gaussian(emit_order, rows))
         return by_image, by_transmittance, None, None, None, None, None

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..kernels import blend_cpu, blend_cuda, blend_cuda_adjoint
+from ..kernels import blend_cpu, blend_cuda, blend_cuda_backward
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
-from .tile_lists import ONE_SORT, PackedSplats, TileLists, UnsortedIntersections
+from .tile_lists import MAX_SINGLE_SORT, EmitOrder, PackedSplats, TileLists
 from .torch_contract import direct_apply, keeps_graph, once_differentiable
 from .warp_launch.launching import fixed_launch, launch, warp_scalar, warp_stream
 
@@ -121,26 +121,26 @@ def blend_on_cpu(
     deterministic: bool,
 ) -> Adjoint:
     """Fill image [H, W, C] and transmittance [H, W]: balanced pieces of tiles, a thread each."""
-    scalar, unsorted = warp_scalar(features.dtype), lists.unsorted
-    assert unsorted is not None, "sums in a fixed order need the intersections as they were emitted"
+    scalar, emit_order = warp_scalar(features.dtype), lists.emit_order
+    assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
     height, width, channels = image.shape
-    kind = scalar, channels, halvings(alpha_threshold)
+    kind = scalar, channels, exp_squarings(alpha_threshold)
     tile_count, pieces = lists.columns * lists.rows, balanced_pieces(lists)
 
     def rows(*shape):
         return features.new_empty(tile_count, *shape, blend_cpu.LANES)
 
     iota, count = torch.arange(blend_cpu.LANES, dtype=features.dtype), blend_cpu.HALVES * TILE_SIZE
-    shapes, ellipses = packed.shapes, packed.ellipses
+    means_opacities, conics_cutoffs = packed.means_opacities, packed.conics_cutoffs
     frame = features, lists.columns, width, height, alpha_threshold, iota
     tile_transmittance, last = rows(count), rows(count)
     launch(
         blend_cpu.forward_kernel(*kind),
         tile_count,
-        lists.ranges,
+        lists.tile_ranges,
         lists.gaussians,
-        shapes,
-        ellipses,
+        means_opacities,
+        conics_cutoffs,
         *frame,
         tile_transmittance,
         rows(channels, count),
@@ -159,11 +159,11 @@ def blend_on_cpu(
         launch(
             blend_cpu.backward_kernel(*kind),
             tile_count,
-            lists.ranges,
+            lists.tile_ranges,
             lists.gaussians,
-            unsorted.places,
-            shapes,
-            ellipses,
+            emit_order.emit_indices,
+            means_opacities,
+            conics_cutoffs,
             *frame,
             last,
             by_image.view(-1, channels),
@@ -177,20 +177,22 @@ def blend_on_cpu(
             by_intersection,
             ranges=pieces,
         )
-        return gather_by_gaussian(unsorted, by_intersection)
+        return gather_by_gaussian(emit_order, by_intersection)
 
     return backward
 
 
-def halvings(alpha_threshold: float) -> int:
+def exp_squarings(alpha_threshold: float) -> int:
     """Return how often the CPU's polynomial exponential halves its argument to reach down to log(alpha_threshold)."""
     return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
 
 
 def balanced_pieces(lists: TileLists) -> Tensor:
     """Return [K + 1] int32: where ranges of tiles with about the same work begin, and where the last one ends."""
-    tile_count = lists.ranges.shape[0]
-    work = (lists.ranges[:, 1] - lists.ranges[:, 0]).add(16).cumsum(0).double()  # 16: a tile costs something in itself
+    tile_count = lists.tile_ranges.shape[0]
+    work = (
+        (lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]).add(16).cumsum(0).double()
+    )  # 16: a tile costs something in itself
     pieces = min(thread_count() * PIECES_PER_THREAD, tile_count)
     goals = torch.arange(pieces + 1, dtype=torch.float64) * (float(work[-1]) / pieces)
     bounds = torch.searchsorted(work, goals, out_int32=True)
@@ -211,7 +213,7 @@ def blend_on_cuda(
     rows = pad_features(features)
     last = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
     # Padded features take more memory; few Gaussians keep them, so that they need not be padded again.
-    saved = rows if len(features) <= ONE_SORT else features
+    saved = rows if len(features) <= MAX_SINGLE_SORT else features
     return BlockAdjoint(saved, image.shape[-1], lists, packed, transmittance, last, alpha_threshold, deterministic)
 
 
@@ -250,11 +252,11 @@ class BlockAdjoint:
             launch_blocks(self._kernel(), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
             return gathered
         by_intersection = self.transmittance.new_zeros(lists.intersection_count, self.channels + 6)
-        unsorted, arguments = lists.unsorted, self._arguments(by_image, by_transmittance)
-        assert unsorted is not None, "sums in a fixed order need the intersections as they were emitted"
-        for corner in range(blend_cuda.BLOCKS_PER_TILE):
-            launch_blocks(self._kernel(), lists, 1, *arguments, corner, unsorted.places, by_intersection)
-        return gather_by_gaussian(unsorted, by_intersection)
+        emit_order, arguments = lists.emit_order, self._arguments(by_image, by_transmittance)
+        assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
+        for subtile in range(blend_cuda.BLOCKS_PER_TILE):
+            launch_blocks(self._kernel(), lists, 1, *arguments, subtile, emit_order.emit_indices, by_intersection)
+        return gather_by_gaussian(emit_order, by_intersection)
 
     def on_fixed_memory(self) -> Adjoint:
         """Return the adjoint for less host time; for use while all tensors stay where they are."""
@@ -282,7 +284,7 @@ class BlockAdjoint:
 
     def _zeros(self) -> Tensor:
         columns = self.channels + 6
-        if blend_cuda_adjoint.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
+        if blend_cuda_backward.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
             columns = blend_cuda.padded_channels(columns)
         return self.transmittance.new_zeros(len(self.features), columns)
 
@@ -292,16 +294,16 @@ class BlockAdjoint:
 
     def _kernel(self) -> Any:
         scalar = warp_scalar(self.features.dtype)
-        return blend_cuda_adjoint.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
+        return blend_cuda_backward.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
 
     def _arguments(self, by_image: Tensor, by_transmittance: Tensor) -> tuple:
         lists, packed = self.lists, self.packed
         height, width = self.transmittance.shape
         return (
-            *(lists.ranges, lists.gaussians, lists.corners, packed.shapes, packed.ellipses),
+            *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
             pad_features(self.features).reshape(-1, 4),
             *(lists.columns, width, height, self.alpha_threshold, self.transmittance, self.last),
-            *(by_image, by_transmittance, blend_cuda_adjoint.ROWS, self.channels + 6),
+            *(by_image, by_transmittance, blend_cuda_backward.ROWS, self.channels + 6),
         )
 
 
@@ -312,7 +314,7 @@ def blend_blocks(
 
     That is [H W] int32, 1 + its place in the tile's list, or 0.
     """
-    assert lists.corners is not None, "block kernels need lists with corners"
+    assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     height, width, channels = image.shape
     last = torch.empty(height * width, dtype=torch.int32, device=rows.device)
     kernel = blend_cuda.forward_kernel(warp_scalar(rows.dtype), channels, rows.device.type == "cuda")
@@ -320,11 +322,11 @@ def blend_blocks(
         kernel,
         lists,
         blend_cuda.BLOCKS_PER_TILE,
-        lists.ranges,
+        lists.tile_ranges,
         lists.gaussians,
-        lists.corners,
-        packed.shapes,
-        packed.ellipses,
+        lists.subtile_masks,
+        packed.means_opacities,
+        packed.conics_cutoffs,
         rows.reshape(-1, 4),
         lists.columns,
         width,
@@ -357,16 +359,16 @@ def pad_features(features: Tensor) -> Tensor:
     return features.clone() if features.data_ptr() % 16 else features
 
 
-def gather_by_gaussian(unsorted: UnsortedIntersections, by_intersection: Tensor) -> Tensor:
+def gather_by_gaussian(emit_order: EmitOrder, by_intersection: Tensor) -> Tensor:
     """Return [N, columns]: for each Gaussian the sum of its rows of by_intersection [M, columns], first tile to last.
 
     by_intersection: rows in the order of intersections before the sort by tile.
     """
     length, columns = by_intersection.shape
-    count = unsorted.order.shape[0]
+    count = emit_order.order.shape[0]
     gathered = by_intersection.new_zeros(count, columns)
     if length:
-        ends = unsorted.ends.clamp(0, length)  # Beyond max_intersections there are no rows.
+        cumulative_counts = emit_order.cumulative_counts.clamp(0, length)  # Beyond max_intersections there are no rows.
         kernel = tile_kernels(warp_scalar(by_intersection.dtype)).gather_intersections
-        launch(kernel, count, unsorted.order, ends, by_intersection, columns, gathered)
+        launch(kernel, count, emit_order.order, cumulative_counts, by_intersection, columns, gathered)
     return gathered

@@ -25,7 +25,7 @@ from .projection import ProjectedGaussians, ProjectionAdjoint, project_to_camera
 from .render_options import RenderOptions
 from .tile_lists import (
     MAX_INTERSECTIONS,
-    ONE_SORT,
+    MAX_SINGLE_SORT,
     IntersectionOffsets,
     PackedSplats,
     Splats,
@@ -41,7 +41,7 @@ WARMUP_CALLS = 4  # Launched calls of a size before one is captured: a capture t
 MAX_SIZES = 3  # Sizes of calls with graphs, the most recent ones.
 MAX_GRAPHS = 4  # Graphs of a size: each holds a render until its backward pass.
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without graphs.
-MAX_GAUSSIANS = 1 << 21  # Without a backward pass; with one the host is the bottleneck only up to ONE_SORT.
+MAX_GAUSSIANS = 1 << 21  # Without a backward pass; with one the host is the bottleneck only up to MAX_SINGLE_SORT.
 HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
 MIN_INTERSECTIONS = 1 << 12
 
@@ -86,7 +86,7 @@ def add_graphs(tensors: Sequence[Tensor], options: RenderOptions) -> "_CallGraph
     if options.max_intersections is not None or options.deterministic:
         return None
     signature = _signature(tensors, options)
-    small = 0 < len(features) <= (ONE_SORT if signature.differentiable else MAX_GAUSSIANS)
+    small = 0 < len(features) <= (MAX_SINGLE_SORT if signature.differentiable else MAX_GAUSSIANS)
     if not small or options.width * options.height > MAX_PIXELS or is_capturing(first.device):
         return None
     return _graphs_of(signature)
@@ -169,19 +169,19 @@ class _RenderGraph:
         def count() -> tuple[Splats, PackedSplats, IntersectionOffsets]:
             splats = _project(inputs, options) if projects else Splats(*inputs)
             packed = pack_splats(splats, threshold, width, height)
-            offsets = order_intersections(packed.counts, splats.depths, splats.extents, unsorted=False)
-            counter.copy_(offsets.ends[-1:], non_blocking=True)
+            offsets = order_intersections(packed.counts, splats.depths, splats.extents, keep_emit_order=False)
+            counter.copy_(offsets.cumulative_counts[-1:], non_blocking=True)
             return splats, packed, offsets
 
         def blend(splats: Splats, packed: PackedSplats, offsets: IntersectionOffsets, limit: int) -> BlockAdjoint:
             depths, extents = splats.depths, splats.extents
-            lists = build_tile_lists(packed, offsets, depths, extents, width, height, limit, unsorted=False)
+            lists = build_tile_lists(packed, offsets, depths, extents, width, height, limit, keep_emit_order=False)
             return blend_on_cuda(splats.features, lists, packed, image, transmittance, threshold, False)
 
         # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
         with self._counting.on_capture_stream():
             splats, packed, offsets = count()
-            limit = int(HEADROOM * max(intersections, int(offsets.ends[-1])))
+            limit = int(HEADROOM * max(intersections, int(offsets.cumulative_counts[-1])))
             self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
             blend(splats, packed, offsets, self.max_intersections)
             del splats, packed, offsets

@@ -26,7 +26,7 @@ from ..kernels import (
 )
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
-from .blending import halvings
+from .blending import exp_squarings
 from .ssim import CPU_LANES
 from .warp_launch.loading import compile_for_cpu, uses_fused_multiply_add
 
@@ -42,7 +42,7 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
     """
     real = wp.float32
     distance, lists = ssim.ssim_kernels(real, CPU_LANES, True), tiles.tile_kernels(real)
-    kind = real, channels, halvings(ALPHA_THRESHOLD)
+    kind = real, channels, exp_squarings(ALPHA_THRESHOLD)
     blend = [] if channels is None else [blend_cpu.backward_kernel(*kind), blend_cpu.forward_kernel(*kind)]
     return [
         *(shared_ranges.share_ranges, plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),

@@ -304,11 +304,18 @@ def list_splats(splats: Splats, options: RenderOptions, *, blocks: bool = False)
     blocks: make the lists of block kernels, which a GPU gets anyway unless options.deterministic.
     """
     width, height, threshold = options.width, options.height, options.alpha_threshold
-    unsorted = not blocks and (splats.features.device.type == "cpu" or options.deterministic)
+    keep_emit_order = not blocks and (splats.features.device.type == "cpu" or options.deterministic)
     packed = pack_splats(splats, threshold, width, height)
-    offsets = order_intersections(packed.counts, splats.depths, splats.extents, unsorted=unsorted)
+    offsets = order_intersections(packed.counts, splats.depths, splats.extents, keep_emit_order=keep_emit_order)
     lists = build_tile_lists(
-        packed, offsets, splats.depths, splats.extents, width, height, options.max_intersections, unsorted=unsorted
+        packed,
+        offsets,
+        splats.depths,
+        splats.extents,
+        width,
+        height,
+        options.max_intersections,
+        keep_emit_order=keep_emit_order,
     )
     return lists, packed
 

@@ -13,7 +13,7 @@ from .blending import gather_by_gaussian
 from .checks import check_opacities, check_tensors
 from .memory import oom_context
 from .projection import launch_projection
-from .tile_lists import UnsortedIntersections, check_intersection_count, depth_order, lists_by_tile
+from .tile_lists import EmitOrder, check_intersection_count, depth_order, lists_by_tile
 from .torch_contract import torch_operation
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import even_ranges
@@ -87,8 +87,8 @@ def rasterize_directions(
         splats = _project(gaussians, parameters, antialiased)
         opacities = splats.opacities.masked_fill(~features.isfinite().all(1), 0)
         blended = splats.caps, splats.across, splats.along, opacities, features.contiguous()
-        unsorted = means.is_cpu and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in blended)
-        lists = _list_tiles(splats.caps.detach(), splats.distances, directions.contiguous(), unsorted)
+        keep_emit_order = means.is_cpu and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in blended)
+        lists = _list_tiles(splats.caps.detach(), splats.distances, directions.contiguous(), keep_emit_order)
         return _Blend.apply(*blended, lists, alpha_threshold)
 
 
@@ -129,13 +129,13 @@ class _Lists:
 
     directions: Tensor
     columns: int
-    ranges: Tensor
+    tile_ranges: Tensor
     gaussians: Tensor
-    unsorted: UnsortedIntersections | None
+    emit_order: EmitOrder | None
 
 
 @torch.no_grad()
-def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, unsorted: bool) -> _Lists:
+def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_order: bool) -> _Lists:
     """List for each tile the Gaussians whose cap meets the tile's own, by distance."""
     count, (height, width) = len(caps), directions.shape[:2]
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
@@ -145,14 +145,16 @@ def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, unsorted: b
     frame = order, caps, tile_caps, block_caps, columns, rows
     counts, none = torch.empty_like(order), order[:0]
     launch(kernel, count, *frame, order, counts, none, none, min_range=256)
-    ends = counts.cumsum(0)
-    length = check_intersection_count(int(ends[-1]) if count else 0, count, columns, rows)
-    starts = (ends - counts).int()
+    cumulative_counts = counts.cumsum(0)
+    length = check_intersection_count(int(cumulative_counts[-1]) if count else 0, count, columns, rows)
+    starts = (cumulative_counts - counts).int()
     tiles, gaussians = (torch.empty(2 * length, dtype=torch.int32, device=order.device) for _ in range(2))
     launch(kernel, count * bool(length), *frame, starts, counts, tiles, gaussians, min_range=256)
-    ranges, gaussians, _, places = lists_by_tile(tiles, gaussians, length, None, columns, rows, unsorted)
-    before = None if places is None else UnsortedIntersections(order.clone(), ends, places)
-    return _Lists(directions, columns, ranges, gaussians, before)
+    tile_ranges, gaussians, _, emit_indices = lists_by_tile(
+        tiles, gaussians, length, None, columns, rows, keep_emit_order
+    )
+    emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
+    return _Lists(directions, columns, tile_ranges, gaussians, emit_order)
 
 
 class _Blend(torch.autograd.Function):
@@ -164,8 +166,8 @@ class _Blend(torch.autograd.Function):
         ends = torch.empty(height, width, dtype=torch.int32, device=image.device)
         ctx.frame = lists.columns, width, height, alpha_threshold
         ctx.kernels, ctx.lists = sphere_kernels(warp_scalar(features.dtype), channels), lists
-        ctx.pixels = lists.ranges.shape[0] * _PIXELS
-        ctx.inputs = lists.ranges, lists.gaussians, lists.directions.view(-1, 3)
+        ctx.pixels = lists.tile_ranges.shape[0] * _PIXELS
+        ctx.inputs = lists.tile_ranges, lists.gaussians, lists.directions.view(-1, 3)
         arguments = *ctx.inputs, *splats, *ctx.frame, image.view(-1, channels), transmittance, ends
         launch(ctx.kernels.blend, ctx.pixels, *arguments, min_range=_PIXELS)
         ctx.save_for_backward(*splats, transmittance, ends)
@@ -175,16 +177,16 @@ class _Blend(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, by_image, by_transmittance):
         *splats, transmittance, ends = ctx.saved_tensors
-        lists, unsorted, (count, channels) = ctx.lists, ctx.lists.unsorted, splats[-1].shape
+        lists, emit_order, (count, channels) = ctx.lists, ctx.lists.emit_order, splats[-1].shape
         # On the CPU each entry has a row, and whole tiles go to a thread: sums keep one order.
-        places = lists.gaussians if unsorted is None else unsorted.places
-        rows = by_image.new_zeros(count if unsorted is None else len(places), channels + 10)
+        emit_indices = lists.gaussians if emit_order is None else emit_order.emit_indices
+        rows = by_image.new_zeros(count if emit_order is None else len(emit_indices), channels + 10)
         gradients = by_image.contiguous().view(-1, channels), by_transmittance.contiguous()
-        arguments = *ctx.inputs, *splats, *ctx.frame, transmittance, ends, places, *gradients, rows
+        arguments = *ctx.inputs, *splats, *ctx.frame, transmittance, ends, emit_indices, *gradients, rows
         ranges = even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS
-        launch(ctx.kernels.blend_adjoint, ctx.pixels, *arguments, ranges=ranges)
-        if unsorted is not None:
-            rows = gather_by_gaussian(unsorted, rows)
+        launch(ctx.kernels.blend_backward, ctx.pixels, *arguments, ranges=ranges)
+        if emit_order is not None:
+            rows = gather_by_gaussian(emit_order, rows)
         by_axis, by_across, by_along, by_opacity, by_features = rows.split((3, 3, 3, 1, channels), dim=1)
         by_caps = torch.nn.functional.pad(by_axis, (0, 1))
         return by_caps, by_across, by_along, by_opacity[:, 0], by_features, None, None

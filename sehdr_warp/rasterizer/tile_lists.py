@@ -17,7 +17,7 @@ from .warp_launch.sorting import sort_pairs
 from .warp_launch.threads import torch_threads
 
 MAX_INTERSECTIONS = 2**31 - 1  # They are counted in int32.
-ONE_SORT = 1 << 18
+MAX_SINGLE_SORT = 1 << 18
 """Up to this many Gaussians a GPU makes the lists by one sort: the host is then the bottleneck, not memory."""
 MIN_CHUNK = 1 << 14  # Intersections that are worth a thread's time.
 
@@ -46,13 +46,14 @@ class PackedSplats(NamedTuple):
     """Values of each 2D Gaussian that blending reads, in rows of four, and its number of tiles.
 
     Attributes:
-        shapes: [N, 4] x, y, opacity, half-height.
-        ellipses: [N, 4] conic a, b, c and the level at which alpha meets the threshold; -1 if culled.
+        means_opacities: [N, 4] x, y, opacity, half-height.
+        conics_cutoffs: [N, 4] conic a, b, c, and the value of a dx^2 + 2 b dx dy + c dy^2 at which alpha meets the
+            threshold; -1 if culled.
         counts: [N] int64 tiles that the ellipse touches.
     """
 
-    shapes: Tensor
-    ellipses: Tensor
+    means_opacities: Tensor
+    conics_cutoffs: Tensor
     counts: Tensor
 
 
@@ -61,26 +62,26 @@ class IntersectionOffsets(NamedTuple):
 
     Attributes:
         order: [N] int32 Gaussians by depth; None if they emit in the order of their indices.
-        ends: [N] int64 running number of intersections, by place in the order.
+        cumulative_counts: [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order.
     """
 
     order: Tensor | None
-    ends: Tensor
+    cumulative_counts: Tensor
 
 
 @dataclass(frozen=True)
-class UnsortedIntersections:
-    """Positions of intersections before the sort by tile, those of one Gaussian next to each other.
+class EmitOrder:
+    """The order of intersections before the sort by tile, in which those of one Gaussian are neighbours.
 
     Attributes:
         order: [N] int32 Gaussians by depth, nearest first (ties by index; culled ones last).
-        ends: [N] int64 running number of intersections, by place in `order`.
-        places: [M] int32 place of each sorted intersection before the sort.
+        cumulative_counts: [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order.
+        emit_indices: [M] int32 index of each sorted intersection before the sort.
     """
 
     order: Tensor
-    ends: Tensor
-    places: Tensor
+    cumulative_counts: Tensor
+    emit_indices: Tensor
 
 
 @dataclass(frozen=True)
@@ -88,20 +89,20 @@ class TileLists:
     """For each tile the Gaussians that touch it, front to back. All indices are int32.
 
     Attributes:
-        ranges: [tiles, 2] first intersection of each tile and one past its last.
+        tile_ranges: [tiles, 2] first intersection of each tile and one past its last.
         gaussians: [M] the Gaussian of each intersection.
-        corners: [M] uint8, bit k set if the ellipse touches corner k of its tile; None on the CPU.
-        unsorted: how intersections stood by Gaussian; None unless requested.
+        subtile_masks: [M] uint8, bit k set if the ellipse touches subtile k of its tile; None on the CPU.
+        emit_order: of the intersections before the sort; None unless requested.
         width: of the image in pixels.
         height: of the image in pixels.
         overflow: scalar bool, whether max_intersections was too few; None without it.
         total: scalar int64, how many intersections there are, listed or not.
     """
 
-    ranges: Tensor
+    tile_ranges: Tensor
     gaussians: Tensor
-    corners: Tensor | None
-    unsorted: UnsortedIntersections | None
+    subtile_masks: Tensor | None
+    emit_order: EmitOrder | None
     width: int
     height: int
     overflow: Tensor | None
@@ -154,7 +155,7 @@ def pack_splats(splats: Splats, alpha_threshold: float, width: int, height: int)
 
 @torch.no_grad()
 def order_intersections(
-    counts: Tensor, depths: Tensor, extents: Tensor, *, unsorted: bool = True
+    counts: Tensor, depths: Tensor, extents: Tensor, *, keep_emit_order: bool = True
 ) -> IntersectionOffsets:
     """Return the order in which Gaussians emit intersections, by depth, and the running number of these.
 
@@ -162,10 +163,9 @@ def order_intersections(
         counts: [N] of PackedSplats.
         depths: [N].
         extents: [N, 2]; 0 if culled.
-        unsorted: as build_tile_lists() gets it.
+        keep_emit_order: as build_tile_lists() gets it.
     """
-    one_sort = len(depths) <= ONE_SORT and not unsorted and depths.dtype == torch.float32
-    if one_sort:
+    if len(depths) <= MAX_SINGLE_SORT and not keep_emit_order and depths.dtype == torch.float32:
         return IntersectionOffsets(None, counts.cumsum(0))
     order = depth_order(depths, extents)
     with torch_threads(counts.device):
@@ -183,7 +183,7 @@ def build_tile_lists(
     height: int,
     max_intersections: int | None = None,
     *,
-    unsorted: bool = True,
+    keep_emit_order: bool = True,
 ) -> TileLists:
     """List for each tile the Gaussians whose ellipse touches it, nearest first.
 
@@ -196,30 +196,33 @@ def build_tile_lists(
         height: of the image, pixels.
         max_intersections: allocate memory for this many; those beyond it are left out, see TileLists.overflow. The host
             then does not wait for the device to learn how many there are.
-        unsorted: also return TileLists.unsorted, which adjoints need that sum by Gaussian in a fixed order.
+        keep_emit_order: also return TileLists.emit_order, which backward passes need to sum by Gaussian in a fixed
+            order.
 
     Raises:
         SehdrError: if there are more than MAX_INTERSECTIONS.
     """
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
-    order, ends = offsets
+    order, cumulative_counts = offsets
     count = len(depths)
-    total = ends[-1] if count else ends.new_zeros(())
+    total = cumulative_counts[-1] if count else cumulative_counts.new_zeros(())
     overflow = None
     if max_intersections is not None:  # Written by the kernel that emits, if it is launched: a comparison is a launch.
-        overflow = (torch.empty if count else torch.zeros)((), dtype=torch.bool, device=ends.device)
+        overflow = (torch.empty if count else torch.zeros)((), dtype=torch.bool, device=cumulative_counts.device)
     length = check_intersection_count(
         int(total) if max_intersections is None else max_intersections, count, columns, rows
     )
+    keys, gaussians = emit_intersections(packed, offsets, depths, extents, columns, rows, length, overflow)
     if order is None:
-        keys, gaussians = emit_keys(packed, extents, depths, columns, rows, ends, length, overflow)
-        keys, gaussians = sort_keys(keys, gaussians, length, columns * rows)
-        ranges, corners = find_lists(keys, gaussians, packed, columns, rows)
-        return TileLists(ranges, gaussians, corners, None, width, height, overflow, total)
-    tiles, gaussians = emit_intersections(order, packed, extents, columns, rows, ends, length, overflow)
-    ranges, gaussians, corners, places = lists_by_tile(tiles, gaussians, length, packed, columns, rows, unsorted)
-    before = None if places is None else UnsortedIntersections(order.clone(), ends, places)
-    return TileLists(ranges, gaussians, corners, before, width, height, overflow, total.clone())
+        sort_pairs(keys, gaussians, length, kernels.DEPTH_BITS + (columns * rows).bit_length())
+        gaussians = gaussians[:length]
+        tile_ranges, subtile_masks = find_tile_ranges(keys[:length], gaussians, packed, columns, rows)
+        return TileLists(tile_ranges, gaussians, subtile_masks, None, width, height, overflow, total)
+    tile_ranges, gaussians, subtile_masks, emit_indices = lists_by_tile(
+        keys, gaussians, length, packed, columns, rows, keep_emit_order
+    )
+    emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
+    return TileLists(tile_ranges, gaussians, subtile_masks, emit_order, width, height, overflow, total.clone())
 
 
 def depth_order(depths: Tensor, extents: Tensor) -> Tensor:
@@ -229,10 +232,10 @@ def depth_order(depths: Tensor, extents: Tensor) -> Tensor:
     """
     count = depths.shape[0]
     keys = depths.new_empty(2 * count)
-    places = torch.empty(2 * count, dtype=torch.int32, device=depths.device)
-    launch(tile_kernels(warp_scalar(depths.dtype)).key_by_depth, count, depths, extents, keys, places)
-    sort_pairs(keys, places, count)
-    return places[:count]
+    indices = torch.empty(2 * count, dtype=torch.int32, device=depths.device)
+    launch(tile_kernels(warp_scalar(depths.dtype)).key_by_depth, count, depths, extents, keys, indices)
+    sort_pairs(keys, indices, count)
+    return indices[:count]
 
 
 def check_intersection_count(length: int, count: int, columns: int, rows: int) -> int:
@@ -246,63 +249,48 @@ def check_intersection_count(length: int, count: int, columns: int, rows: int) -
 
 
 def emit_intersections(
-    order: Tensor,
     packed: PackedSplats,
+    offsets: IntersectionOffsets,
+    depths: Tensor,
     extents: Tensor,
     columns: int,
     rows: int,
-    ends: Tensor,
     length: int,
     overflow: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return tiles and Gaussians of all intersections, front to back.
+    """Return sort keys and Gaussians of all intersections.
+
+    If the offsets have an order, the keys are int32 tiles, and intersections follow that order. Otherwise the keys are
+    int64, the tile above the bits of the depth, and intersections follow the Gaussians' indices.
 
     Both are [2 * length], of which the first half is filled; the sort needs the rest. Unused intersections belong to
     tile columns * rows. Writes to overflow, a scalar bool, whether there are more than `length`.
     """
-    tiles, gaussians = (torch.empty(2 * length, dtype=torch.int32, device=order.device) for _ in range(2))
-    if not len(order):
-        tiles[:length], gaussians[:length] = columns * rows, 0
+    order, cumulative_counts = offsets
+    count, device = len(depths), depths.device
+    keys = torch.empty(2 * length, dtype=torch.int64 if order is None else torch.int32, device=device)
+    gaussians = torch.empty(2 * length, dtype=torch.int32, device=device)
+    if not count:
+        keys[:length], gaussians[:length] = columns * rows << (kernels.DEPTH_BITS if order is None else 0), 0
     elif length:
-        kernel = tile_kernels(warp_scalar(packed.shapes.dtype)).emit_intersections
-        shapes, ellipses = packed.shapes, packed.ellipses
-        frame = columns, rows, ends, length
-        launch(kernel, len(order), order, shapes, ellipses, extents, None, *frame, tiles, gaussians, overflow)
-    return tiles, gaussians
-
-
-def emit_keys(
-    packed: PackedSplats,
-    extents: Tensor,
-    depths: Tensor,
-    columns: int,
-    rows: int,
-    ends: Tensor,
-    length: int,
-    overflow: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return int64 keys, the tile above the bits of the depth, and Gaussians of all intersections, by Gaussian.
-
-    Otherwise as emit_intersections().
-    """
-    keys = torch.empty(2 * length, dtype=torch.int64, device=ends.device)
-    gaussians = torch.empty(2 * length, dtype=torch.int32, device=ends.device)
-    if not len(depths):
-        keys[:length], gaussians[:length] = columns * rows << kernels.DEPTH_BITS, 0
-    elif length:
-        kernel, frame = tile_kernels(wp.float32).emit_keys, (columns, rows, ends, length)
-        shapes, ellipses = packed.shapes, packed.ellipses
-        launch(kernel, len(depths), None, shapes, ellipses, extents, depths, *frame, keys, gaussians, overflow)
+        emit = tile_kernels(warp_scalar(packed.means_opacities.dtype))
+        launch(
+            emit.emit_keys if order is None else emit.emit_intersections,
+            count,
+            order,
+            packed.means_opacities,
+            packed.conics_cutoffs,
+            extents,
+            depths if order is None else None,
+            columns,
+            rows,
+            cumulative_counts,
+            length,
+            keys,
+            gaussians,
+            overflow,
+        )
     return keys, gaussians
-
-
-class SortedLists(NamedTuple):
-    """Intersections sorted by tile; see TileLists and UnsortedIntersections."""
-
-    ranges: Tensor
-    gaussians: Tensor
-    corners: Tensor | None
-    places: Tensor | None
 
 
 def lists_by_tile(
@@ -312,33 +300,35 @@ def lists_by_tile(
     packed: PackedSplats | None,
     columns: int,
     rows: int,
-    unsorted: bool,
-) -> SortedLists:
-    """Sort emit_intersections()'s by tile, stably; places are None unless `unsorted`.
+    keep_emit_order: bool,
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    """Sort intersections, emitted front to back, by tile, stably.
 
-    Corners are None on the CPU and without packed Gaussians.
+    Returns:
+        tile_ranges, gaussians and subtile_masks of TileLists, and EmitOrder.emit_indices if keep_emit_order.
+        subtile_masks are None on the CPU and without packed Gaussians.
     """
     if tiles.device.type == "cpu":
-        return _count_by_tile(tiles, gaussians, length, columns * rows, unsorted)
-    return _sort_by_tile(tiles, gaussians, length, packed, columns, rows, unsorted)
+        return _count_by_tile(tiles, gaussians, length, columns * rows, keep_emit_order)
+    return _sort_by_tile(tiles, gaussians, length, packed, columns, rows, keep_emit_order)
 
 
-def _sort_by_tile(tiles, gaussians, length: int, packed, columns: int, rows: int, unsorted: bool) -> SortedLists:
-    bits, places = (columns * rows).bit_length(), None
-    if unsorted:
-        places = torch.empty(2 * length, dtype=torch.int32, device=tiles.device)
-        torch.arange(length, dtype=torch.int32, device=tiles.device, out=places[:length])
-    sort_pairs(tiles, gaussians if places is None else places, length, bits)
-    if places is None:
+def _sort_by_tile(tiles, gaussians, length: int, packed, columns: int, rows: int, keep_emit_order: bool):
+    bits, emit_indices = (columns * rows).bit_length(), None
+    if keep_emit_order:
+        emit_indices = torch.empty(2 * length, dtype=torch.int32, device=tiles.device)
+        torch.arange(length, dtype=torch.int32, device=tiles.device, out=emit_indices[:length])
+    sort_pairs(tiles, gaussians if emit_indices is None else emit_indices, length, bits)
+    if emit_indices is None:
         gaussians = gaussians[:length].clone()
     else:
-        places = places[:length].clone()
-        gaussians = gaussians[:length][places] if length else gaussians
-    ranges, corners = find_lists(tiles[:length], gaussians, packed, columns, rows)
-    return SortedLists(ranges, gaussians, corners, places)
+        emit_indices = emit_indices[:length].clone()
+        gaussians = gaussians[:length][emit_indices] if length else gaussians
+    tile_ranges, subtile_masks = find_tile_ranges(tiles[:length], gaussians, packed, columns, rows)
+    return tile_ranges, gaussians, subtile_masks, emit_indices
 
 
-def _count_by_tile(tiles, gaussians, length: int, tile_count: int, unsorted: bool) -> SortedLists:
+def _count_by_tile(tiles, gaussians, length: int, tile_count: int, keep_emit_order: bool):
     """Sort by counting: each thread takes a few chunks, and within a tile those of the first chunk come first."""
     tiles, gaussians = tiles[:length], gaussians[:length]
     chunks = max(1, min(2 * thread_count(), length // MIN_CHUNK))
@@ -347,38 +337,33 @@ def _count_by_tile(tiles, gaussians, length: int, tile_count: int, unsorted: boo
     launch(kernels.count_tiles, chunks, tiles, size, counts, ranges=spans)
     by_tile = counts.t().reshape(-1)
     starts = (by_tile.cumsum(0) - by_tile).int().view(tile_count + 1, chunks).t().contiguous()
-    ranges = torch.stack([starts[0, :-1], starts[0, 1:]], 1)
+    tile_ranges = torch.stack([starts[0, :-1], starts[0, 1:]], 1)
     ordered = torch.empty_like(gaussians)
-    places = torch.empty(length if unsorted else 0, dtype=torch.int32)
-    launch(kernels.place_intersections, chunks, tiles, gaussians, size, starts, ordered, places, ranges=spans)
-    return SortedLists(ranges, ordered, None, places if unsorted else None)
+    emit_indices = torch.empty(length if keep_emit_order else 0, dtype=torch.int32)
+    launch(kernels.place_intersections, chunks, tiles, gaussians, size, starts, ordered, emit_indices, ranges=spans)
+    return tile_ranges, ordered, None, emit_indices if keep_emit_order else None
 
 
-def sort_keys(keys: Tensor, gaussians: Tensor, length: int, tile_count: int) -> tuple[Tensor, Tensor]:
-    """Sort emit_keys()'s by tile and depth, stably; return keys [M] and Gaussians [M] in the same memory."""
-    sort_pairs(keys, gaussians, length, kernels.DEPTH_BITS + tile_count.bit_length())
-    return keys[:length], gaussians[:length]
-
-
-def find_lists(
-    tiles: Tensor, gaussians: Tensor, packed: PackedSplats | None, columns: int, rows: int
+def find_tile_ranges(
+    keys: Tensor, gaussians: Tensor, packed: PackedSplats | None, columns: int, rows: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Return the tiles' ranges [tiles, 2] and the corners [M] of sorted intersections, as TileLists has them.
+    """Return the tile_ranges [tiles, 2] and subtile_masks [M] of sorted intersections, as TileLists has them.
 
-    The ends of an empty range are equal. Corners are None without packed Gaussians. tiles: int32, or the int64 keys of
-    sort_keys().
+    Both numbers of an empty range are equal. subtile_masks are None without packed Gaussians. keys: of
+    emit_intersections(), sorted.
     """
-    ranges = torch.empty(columns * rows, 2, dtype=torch.int32, device=tiles.device)
-    corners = torch.empty(0 if packed is None else len(tiles), dtype=torch.uint8, device=tiles.device)
-    if len(tiles):
-        kind = (wp.int64, kernels.DEPTH_BITS) if tiles.dtype == torch.int64 else (wp.int32, 0)
+    tile_ranges = torch.empty(columns * rows, 2, dtype=torch.int32, device=keys.device)
+    subtile_masks = torch.empty(0 if packed is None else len(keys), dtype=torch.uint8, device=keys.device)
+    if len(keys):
+        kind = (wp.int64, kernels.DEPTH_BITS) if keys.dtype == torch.int64 else (wp.int32, 0)
         if packed is None:
-            shapes = ellipses = torch.empty(0, 4, device=tiles.device)
+            means_opacities = conics_cutoffs = torch.empty(0, 4, device=keys.device)
         else:
-            shapes, ellipses = packed.shapes, packed.ellipses
-        kernel = kernels.lists_kernel(warp_scalar(shapes.dtype), *kind)
-        tile_count = columns * rows
-        launch(kernel, len(tiles), tiles, gaussians, shapes, ellipses, columns, tile_count, ranges.view(-1), corners)
+            means_opacities, conics_cutoffs = packed.means_opacities, packed.conics_cutoffs
+        kernel = kernels.tile_ranges_kernel(warp_scalar(means_opacities.dtype), *kind)
+        frame = columns, columns * rows
+        outputs = tile_ranges.view(-1), subtile_masks
+        launch(kernel, len(keys), keys, gaussians, means_opacities, conics_cutoffs, *frame, *outputs)
     else:
-        ranges.zero_()
-    return ranges, None if packed is None else corners
+        tile_ranges.zero_()
+    return tile_ranges, None if packed is None else subtile_masks

@@ -47,18 +47,18 @@ def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) ->
         projected.means2d, projected.conics, projected.opacities, features, projected.depths, projected.extents
     )
     lists, packed = list_splats(splats, options, blocks=True)
-    assert lists.corners is not None, "block kernels need lists with corners"
+    assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     image, left = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
     last = blend_blocks(pad_features(features), lists, packed, image, left, ALPHA_THRESHOLD)
     beyond = 0, lists.columns * TILE_SIZE - width, 0, lists.rows * TILE_SIZE - height
     last = torch.nn.functional.pad(last.view(height, width), beyond)
-    # Rows of tiles, of their corners, of pixels; then columns of each.
+    # Rows of tiles, of their subtile_masks, of pixels; then columns of each.
     last = last.view(lists.rows, TILE_SIZE // 4, 4, lists.columns, TILE_SIZE // 8, 8).amax((2, 5))
-    last = last.permute(0, 2, 1, 3).reshape(len(lists.ranges), BLOCKS_PER_TILE)
-    lengths = (lists.ranges[:, 1] - lists.ranges[:, 0]).long()
+    last = last.permute(0, 2, 1, 3).reshape(len(lists.tile_ranges), BLOCKS_PER_TILE)
+    lengths = (lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]).long()
     tiles = torch.repeat_interleave(torch.arange(len(lengths), device=last.device), lengths)
     places = torch.arange(len(tiles), device=last.device) - (lengths.cumsum(0) - lengths)[tiles]
-    intersections = lists.ranges[:, 0].long()[tiles] + places
-    touched = (lists.corners[intersections, None].int() >> torch.arange(BLOCKS_PER_TILE, device=last.device)) & 1
+    intersections = lists.tile_ranges[:, 0].long()[tiles] + places
+    touched = (lists.subtile_masks[intersections, None].int() >> torch.arange(BLOCKS_PER_TILE, device=last.device)) & 1
     blended = touched.bool() & (places[:, None] < last[tiles])
     return Workload(lists.intersection_count, int(blended.sum()))

@@ -17,7 +17,7 @@ from torch import Tensor
 from ..model.radiance_field import RadianceField, RenderedView
 from ..rasterizer import HarmonicsGradients
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
-from ..rasterizer.tile_lists import ONE_SORT
+from ..rasterizer.tile_lists import MAX_SINGLE_SORT
 from ..rasterizer.training_step import differentiate
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
@@ -181,7 +181,7 @@ class Trainer(TrainingState):
 
         # Forward, loss, backward, optimizer step; as a CUDA graph if a step of this kind has been launched before.
         # Small counts use other kernels: a sort in a single pass, and an exact learned response.
-        small = gaussians.reserved < EXACT_BELOW, gaussians.reserved <= ONE_SORT
+        small = gaussians.reserved < EXACT_BELOW, gaussians.reserved <= MAX_SINGLE_SORT
         kind = (self.degree, watched, self.opacity_weight > 0, *small)
         fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
         if fixed_time and self.graphs.can_capture(views, kind, has_counts=self.capacity.has_counts):

@@ -78,7 +78,7 @@ def test_a_single_pixels_gradient_may_have_any_strides(fibers):
 
 def test_nothing_more_by_gaussian_is_kept_for_the_backward_pass(fibers, monkeypatch):
     monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
-    monkeypatch.setattr(blending, "ONE_SORT", 0)  # few are kept padded
+    monkeypatch.setattr(blending, "MAX_SINGLE_SORT", 0)  # few are kept padded
     scene = random_scene(count=600, channels=3, width=44, height=26, seed=2).to(torch.float32, "cpu")
     leaves, given, _ = leaves_and_lists(scene)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:

@@ -93,7 +93,7 @@ def test_pictures_stay_and_backward_passes_come_in_any_order():
 
 @pytest.mark.parametrize("one_sort", [1 << 18, 0])
 def test_without_gradients_pictures_stay_too(one_sort, monkeypatch):
-    monkeypatch.setattr(tile_lists, "ONE_SORT", one_sort)
+    monkeypatch.setattr(tile_lists, "MAX_SINGLE_SORT", one_sort)
     scene = scene_of()
     with torch.no_grad():
         images = [

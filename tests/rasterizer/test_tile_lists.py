@@ -8,15 +8,15 @@ import torch
 from sehdr_warp.kernels.tiles import DEPTH_BITS
 from sehdr_warp.rasterizer import tile_lists
 from sehdr_warp.rasterizer.tile_lists import (
+    IntersectionOffsets,
     PackedSplats,
     build_tile_lists,
     depth_order,
     emit_intersections,
-    emit_keys,
-    find_lists,
+    find_tile_ranges,
     order_intersections,
-    sort_keys,
 )
+from sehdr_warp.rasterizer.warp_launch.sorting import sort_pairs
 
 from .scenes import packed, random_scene
 
@@ -32,13 +32,13 @@ def counted(*scene):
     """What emit_intersections() reads, and the counts in that order."""
     splats, depths, extents = dense(*scene)
     order = depth_order(depths, extents)
-    return (order, splats, extents, COLUMNS, ROWS), splats.counts[order]
+    return (order, splats, depths, extents), splats.counts[order]
 
 
-def built(splats, depths, extents, max_intersections=None, *, unsorted=True):
-    offsets = order_intersections(splats.counts, depths, extents, unsorted=unsorted)
+def built(splats, depths, extents, max_intersections=None, *, keep_emit_order=True):
+    offsets = order_intersections(splats.counts, depths, extents, keep_emit_order=keep_emit_order)
     size = 16 * COLUMNS, 16 * ROWS
-    return build_tile_lists(splats, offsets, depths, extents, *size, max_intersections, unsorted=unsorted)
+    return build_tile_lists(splats, offsets, depths, extents, *size, max_intersections, keep_emit_order=keep_emit_order)
 
 
 def emit(arguments, counts, monkeypatch):
@@ -46,7 +46,9 @@ def emit(arguments, counts, monkeypatch):
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
     room = int(counts.sum())
-    tiles, gaussians = emit_intersections(*arguments, counts.cumsum(0), room)
+    order, splats, *others = arguments
+    offsets = IntersectionOffsets(order, counts.cumsum(0))
+    tiles, gaussians = emit_intersections(splats, offsets, *others, COLUMNS, ROWS, room)
     monkeypatch.undo()
     return tiles[:room], gaussians[:room]
 
@@ -76,7 +78,7 @@ def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gau
     dropped = int(counts[: second + 1].sum()) - 1
     assert torch.equal(tiles[~unused], torch.cat([true_tiles[:dropped], true_tiles[dropped + 1 :]]))
     ordered = tiles.sort(stable=True)
-    ranges, _ = find_lists(ordered.values, gaussians[ordered.indices], arguments[1], COLUMNS, ROWS)
+    ranges, _ = find_tile_ranges(ordered.values, gaussians[ordered.indices], arguments[1], COLUMNS, ROWS)
     assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
 
 
@@ -88,45 +90,47 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     depths = (depths * 4).round().clamp_min(1) / 4
     lists = built(splats, depths, extents)
     room = lists.intersection_count + spare
-    given = splats, extents, depths, COLUMNS, ROWS, counts.cumsum(0), room
-    keys, gaussians = sort_keys(*emit_keys(*given), room, COLUMNS * ROWS)
-    ranges, corners = find_lists(keys, gaussians, splats, COLUMNS, ROWS)
+    offsets = IntersectionOffsets(None, counts.cumsum(0))
+    keys, gaussians = emit_intersections(splats, offsets, depths, extents, COLUMNS, ROWS, room)
+    sort_pairs(keys, gaussians, room, DEPTH_BITS + (COLUMNS * ROWS).bit_length())
+    keys, gaussians = keys[:room], gaussians[:room]
+    ranges, corners = find_tile_ranges(keys, gaussians, splats, COLUMNS, ROWS)
     if spare < 0:
         assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < COLUMNS * ROWS
         return
     assert torch.equal(gaussians[: lists.intersection_count], lists.gaussians)
-    assert torch.equal(ranges, lists.ranges)
-    assert lists.corners is None or torch.equal(corners[: lists.intersection_count], lists.corners)
+    assert torch.equal(ranges, lists.tile_ranges)
+    assert lists.subtile_masks is None or torch.equal(corners[: lists.intersection_count], lists.subtile_masks)
 
 
-def test_corners_are_those_that_an_ellipse_touches(device):
-    """Beside what all pixels of a corner see of a Gaussian, drawn alone."""
+def test_subtiles_are_those_that_an_ellipse_touches(device):
+    """Beside what all pixels of a subtile see of a Gaussian, drawn alone."""
     scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)
     splats, depths, extents = packed(scene)
-    offsets = order_intersections(splats.counts, depths, extents, unsorted=False)
-    lists = build_tile_lists(splats, offsets, depths, extents, 32, 32, unsorted=False)
+    offsets = order_intersections(splats.counts, depths, extents, keep_emit_order=False)
+    lists = build_tile_lists(splats, offsets, depths, extents, 32, 32, keep_emit_order=False)
     columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
-    (x, y, *_), (a, b, c, level) = (record[lists.gaussians.long()].t()[..., None, None] for record in splats[:2])
+    (x, y, *_), (a, b, c, cutoff) = (record[lists.gaussians.long()].t()[..., None, None] for record in splats[:2])
     dx, dy = columns + 0.5 - x, rows + 0.5 - y
-    seen = a * dx * dx + 2 * b * dx * dy + c * dy * dy <= level
-    lengths = (lists.ranges[:, 1] - lists.ranges[:, 0]).long()
+    seen = a * dx * dx + 2 * b * dx * dy + c * dy * dy <= cutoff
+    lengths = (lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]).long()
     tiles = torch.repeat_interleave(torch.arange(4, device=device), lengths)
-    # Rows of tiles, of corners, of pixels; then columns of each.
-    by_corner = seen.view(-1, 2, 4, 4, 2, 2, 8).any(6).any(3)[torch.arange(len(tiles)), tiles // 2, :, tiles % 2]
-    told = (lists.corners[:, None].int() >> torch.arange(8, device=device)) & 1
+    # Rows of tiles, of subtiles, of pixels; then columns of each.
+    by_subtile = seen.view(-1, 2, 4, 4, 2, 2, 8).any(6).any(3)[torch.arange(len(tiles)), tiles // 2, :, tiles % 2]
+    told = (lists.subtile_masks[:, None].int() >> torch.arange(8, device=device)) & 1
     assert len(tiles) == lists.intersection_count > 40 and 0.1 < told.float().mean() < 0.9
-    # An ellipse may pass between the pixels of a corner that it touches.
-    assert not (by_corner.reshape(-1, 8) & ~told.bool()).any()
-    assert (by_corner.reshape(-1, 8) == told.bool()).float().mean() > 0.95
+    # An ellipse may pass between the pixels of a subtile that it touches.
+    assert not (by_subtile.reshape(-1, 8) & ~told.bool()).any()
+    assert (by_subtile.reshape(-1, 8) == told.bool()).float().mean() > 0.95
 
 
-@pytest.mark.parametrize("unsorted", [False, True])
+@pytest.mark.parametrize("keep_emit_order", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 500])
-def test_overflow_is_more_entries_than_room(device, unsorted, count):
+def test_overflow_is_more_entries_than_room(device, keep_emit_order, count):
     scene = packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS, seed=3).to(torch.float32, device))
-    intersections = built(*scene, unsorted=unsorted).intersection_count
+    intersections = built(*scene, keep_emit_order=keep_emit_order).intersection_count
     for room in {max(1, intersections + spare) for spare in (-1, 0, 1)}:
-        lists = built(*scene, room, unsorted=unsorted)
+        lists = built(*scene, room, keep_emit_order=keep_emit_order)
         assert bool(lists.overflow) == (intersections > room) and lists.total == intersections
 
 
@@ -139,24 +143,24 @@ def kept_bytes(holder):
 
 
 @pytest.mark.parametrize("spare", [None, 7])
-@pytest.mark.parametrize("unsorted", [False, True])
-def test_lists_keep_no_more_memory_than_they_use(device, unsorted, spare):
+@pytest.mark.parametrize("keep_emit_order", [False, True])
+def test_lists_keep_no_more_memory_than_they_use(device, keep_emit_order, spare):
     scene = dense(device, 500)
-    exact = built(*scene, unsorted=unsorted)
-    lists = exact if spare is None else built(*scene, exact.intersection_count + spare, unsorted=unsorted)
+    exact = built(*scene, keep_emit_order=keep_emit_order)
+    lists = exact if spare is None else built(*scene, exact.intersection_count + spare, keep_emit_order=keep_emit_order)
     intersections = exact.intersection_count + (spare or 0)
     assert torch.equal(lists.gaussians[: exact.intersection_count], exact.gaussians)
     total_and_overflow = 8 + (spare is not None)
-    by_gaussian = intersections + 3 * 500 if unsorted else 0
-    one_sort = 0 if unsorted else 4 * intersections + 8 * 500 - 8
-    corners = 0 if lists.corners is None else intersections
-    total = 4 * (2 * COLUMNS * ROWS + intersections + by_gaussian) + corners + total_and_overflow + one_sort
+    by_gaussian = intersections + 3 * 500 if keep_emit_order else 0
+    one_sort = 0 if keep_emit_order else 4 * intersections + 8 * 500 - 8
+    masks = 0 if lists.subtile_masks is None else intersections
+    total = 4 * (2 * COLUMNS * ROWS + intersections + by_gaussian) + masks + total_and_overflow + one_sort
     assert kept_bytes(lists) == total
 
 
-@pytest.mark.parametrize("unsorted", [True, False])
+@pytest.mark.parametrize("keep_emit_order", [True, False])
 @pytest.mark.parametrize("count, chunks", [(0, 1), (1, 3), (5000, 7)])
-def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, unsorted):
+def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, keep_emit_order):
     monkeypatch.setattr(tile_lists, "MIN_CHUNK", max(1, count // chunks))
     monkeypatch.setenv("SEHDR_THREADS", str(chunks))
     generator, tiles = torch.Generator().manual_seed(count), 40
@@ -164,13 +168,12 @@ def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, 
     given = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
     given.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
     splats = PackedSplats(torch.zeros(1000, 4), torch.full((1000, 4), -1.0), torch.zeros(1000, dtype=torch.int64))
-    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in given), count, tiles, unsorted)
+    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in given), count, tiles, keep_emit_order)
     copies = (tensor.clone() for tensor in given)
-    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, splats, tiles, 1, unsorted)
-    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, unsorted)
+    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, splats, tiles, 1, keep_emit_order)
+    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, keep_emit_order)
     assert torch.equal(alike, ranges) and without is None and len(corners) == count
-    for ours, sorted_ones in zip(
-        (counted.ranges, counted.gaussians, counted.places), (ranges, ones, places), strict=True
-    ):
+    ours_ranges, ours_ones, _, ours_places = counted
+    for ours, sorted_ones in zip((ours_ranges, ours_ones, ours_places), (ranges, ones, places), strict=True):
         assert (ours is None) == (sorted_ones is None)
         assert ours is None or torch.equal(ours, sorted_ones[: len(ours)])

@@ -1,7 +1,7 @@
-"""The adjoint of blend_cuda: one warp of 32 lanes owns 8 x 4 pixels of a tile.
+"""The backward pass of blend_cuda: one warp of 32 lanes owns 8 x 4 pixels of a tile.
 
 A warp walks the list as in blend_cuda, but from the last Gaussian that contributes, and treats each batch of 32 that
-touch its corner in two phases. In the first a lane is a pixel: it walks the batch back to front and writes (weight,
+touch its subtile in two phases. In the first a lane is a pixel: it walks the batch back to front and writes (weight,
 slope) for each Gaussian. In the second a lane is a Gaussian: it sums its 32 pixels, without an exchange between lanes.
 Gradients go through shared memory as whole rows, so that the atomics of a warp fall on neighbouring addresses.
 """
@@ -15,12 +15,12 @@ from .blend_cuda import (
     BLOCKS_PER_TILE,
     QUEUE,
     ROUNDS,
-    TOGETHER,
+    UNROLL,
     block_functions,
     module_options,
     padded_channels,
 )
-from .constants import ALPHA_MAX, CORNER, TILE_SIZE
+from .constants import ALPHA_MAX, SUBTILE, TILE_SIZE
 from .geometry import geometry, vector
 
 ROWS = 4  # of pixels of one warp
@@ -52,24 +52,25 @@ def adds_rows(dtype, ordered: bool, cuda: bool) -> bool:
 def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
     """Return blend_backward(), launched over tiles x BLOCKS_PER_TILE x 32 threads.
 
-    As blend_cuda.forward_kernel, and image_gradient: [H W] vectors of C; transmittance_gradient: [H W], or [0] for 0;
+    As blend_cuda.forward_kernel, and grad_image: [H W] vectors of C; grad_transmittance: [H W], or [0] for 0;
     rows: ROWS and gradient_count: C + 6, as arguments so that their loops stay loops;
     gradients: [N (C + 6)], flat rows (features, conic a b c, x, y, opacity), added to
 
-    ordered: the same sums in the same order every time, by one launch over tiles x 32 threads for each `corner` of the
-    BLOCKS_PER_TILE, within which a row of gradients has one writer. rows_of: [M] the row of each intersection;
-    gradients: [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: atomics add to the Gaussians' rows.
+    ordered: the same sums in the same order every time, by one launch over tiles x 32 threads for each `only_subtile`
+    of the BLOCKS_PER_TILE, within which a row of gradients has one writer. emit_indices: [M] the row of each
+    intersection; gradients: [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: atomics add to the
+    Gaussians' rows.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
     quads = padded_channels(channels) // 4
-    vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(TOGETHER, dtype)
-    vec_terms = vector(2 * TOGETHER, dtype)
+    vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(UNROLL, dtype)
+    vec_terms = vector(2 * UNROLL, dtype)
     vec_rounds = vector(ROUNDS, wp.int32)
     votes, row = block_functions(dtype, cuda)
     gradient_columns = channels + 6
     staging_columns = gradient_columns + 1 - gradient_columns % 2  # odd, so that lanes fall on different banks
-    blocks_across = TILE_SIZE // CORNER[0]
+    blocks_across = TILE_SIZE // SUBTILE[0]
     by_rows = adds_rows(dtype, ordered, cuda)
     row_quads = padded_channels(gradient_columns) // 4
     vec_row = vector(4 * row_quads, dtype)
@@ -79,56 +80,57 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         module_options=module_options(dtype),
     )
     def blend_backward(
-        ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.uint8),
-        shapes: wp.array(dtype=vec4), ellipses: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
+        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        subtile_masks: wp.array(dtype=wp.uint8),
+        means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
         columns: int, width: int, height: int, alpha_threshold: real,
-        transmittance: wp.array(dtype=real), last: wp.array(dtype=wp.int32),
-        image_gradient: wp.array(dtype=vec_image), transmittance_gradient: wp.array(dtype=real),
-        rows: int, gradient_count: int, only_corner: int,
-        rows_of: wp.array(dtype=wp.int32), gradients: wp.array(dtype=real),
+        transmittance: wp.array(dtype=real), last_contributor: wp.array(dtype=wp.int32),
+        grad_image: wp.array(dtype=vec_image), grad_transmittance: wp.array(dtype=real),
+        rows: int, gradient_count: int, only_subtile: int,
+        emit_indices: wp.array(dtype=wp.int32), gradients: wp.array(dtype=real),
     ):
         thread = wp.tid()
         block = thread >> 5
         lane = thread & 31
         if wp.static(ordered):
             tile = block
-            corner = only_corner
+            subtile = only_subtile
         else:
             tile = block // wp.static(BLOCKS_PER_TILE)
-            corner = block - tile * wp.static(BLOCKS_PER_TILE)
+            subtile = block - tile * wp.static(BLOCKS_PER_TILE)
         tile_row = tile // columns
-        left = (tile - tile_row * columns) * wp.static(TILE_SIZE) + (corner % wp.static(blocks_across)) * 8
-        top = tile_row * wp.static(TILE_SIZE) + (corner // wp.static(blocks_across)) * 4
+        left = (tile - tile_row * columns) * wp.static(TILE_SIZE) + (subtile % wp.static(blocks_across)) * 8
+        top = tile_row * wp.static(TILE_SIZE) + (subtile // wp.static(blocks_across)) * 4
         px = left + (lane & 7)
         py = top + (lane >> 3)
         inside = px < width and py < height
         pixel = wp.min(py, height - 1) * width + wp.min(px, width - 1)
         x = real(px) + real(0.5)
         y = real(py) + real(0.5)
-        corner_x = real(left) + real(0.5)
-        corner_y = real(top) + real(0.5)
+        subtile_x = real(left) + real(0.5)
+        subtile_y = real(top) + real(0.5)
 
-        begin = ranges[tile][0]
+        begin = tile_ranges[tile][0]
         own_last = int(0)
         if inside:
-            own_last = last[pixel]
-        most_drawn = wp.tile_max(wp.tile(own_last))
-        count = most_drawn[0]
+            own_last = last_contributor[pixel]
+        furthest = wp.tile_max(wp.tile(own_last))
+        count = furthest[0]
         last_place = real(own_last)
         t = transmittance[pixel]
-        pixel_gradient = image_gradient[pixel]
-        behind = real(0.0)
-        if transmittance_gradient.shape[0] > 0:
-            behind = t * transmittance_gradient[pixel]
-        incoming = vec_padded()
+        grad_pixel = grad_image[pixel]
+        grad_from_behind = real(0.0)
+        if grad_transmittance.shape[0] > 0:
+            grad_from_behind = t * grad_transmittance[pixel]
+        grad_channels = vec_padded()
         for channel in range(wp.static(channels)):
-            incoming[channel] = pixel_gradient[channel]
-        block_incoming = wp.tile(incoming, preserve_type=True)
+            grad_channels[channel] = grad_pixel[channel]
+        block_grad_channels = wp.tile(grad_channels, preserve_type=True)
 
         lanes_below = (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
         queue = wp.tile_empty(shape=wp.static(QUEUE), dtype=wp.vec2i, storage="shared")
-        batch_shape = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
-        batch_ellipse = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
+        batch_means = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
+        batch_conics = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
         batch_features = wp.tile_empty(shape=wp.static(32 * quads), dtype=vec4, storage="shared")
         # (weight, slope) of two Gaussians for each of the 32 pixels; 33 columns keep lanes on different banks
         pixel_terms = wp.tile_empty(shape=wp.static(16 * 33), dtype=vec4, storage="shared")
@@ -143,7 +145,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
             for k in range(wp.static(ROUNDS)):
                 at = begin + wp.max(count - 1 - (k * 32 + lane), 0)
                 gaussians[k] = intersections[at]
-                touched[k] = int(corners[at])
+                touched[k] = int(subtile_masks[at])
         turns = (count + wp.static(32 * ROUNDS - 1)) // wp.static(32 * ROUNDS)
         turn = int(0)
         alive = int(1)
@@ -152,7 +154,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 start = count - 1 - (turn * wp.static(32 * ROUNDS) + lane)
                 for k in range(wp.static(ROUNDS)):
                     place = start - k * 32
-                    hit = place >= 0 and ((touched[k] >> corner) & 1) == 1
+                    hit = place >= 0 and ((touched[k] >> subtile) & 1) == 1
                     mask = votes(hit, lane)
                     slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
                     wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], place), hit)
@@ -161,15 +163,15 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 for k in range(wp.static(ROUNDS)):
                     at = begin + wp.max(start - wp.static(32 * ROUNDS) - k * 32, 0)
                     gaussians[k] = intersections[at]
-                    touched[k] = int(corners[at])
+                    touched[k] = int(subtile_masks[at])
             coming = wp.min(queued, 32)
             own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))
-            shape = vec4()
-            ellipse = vec4()
+            xy_opacity = vec4()
+            conic_cutoff = vec4()
             fetched = vec_padded()
             if lane < coming:
-                shape = row(shapes, own[0])
-                ellipse = row(ellipses, own[0])
+                xy_opacity = row(means_opacities, own[0])
+                conic_cutoff = row(conics_cutoffs, own[0])
                 for e in range(wp.static(quads)):
                     quad = row(features, own[0] * wp.static(quads) + e)
                     for h in range(wp.static(4)):
@@ -179,14 +181,14 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
 
             if ready > 0:
                 # A lane is a pixel: back to front, one that does not contribute with an alpha of 0.
-                for group in range((ready + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
+                for group in range((ready + wp.static(UNROLL - 1)) // wp.static(UNROLL)):
                     alphas = vec_many()
                     gains = vec_many()
-                    alongs = vec_many()
-                    for k in range(wp.static(TOGETHER)):
-                        j = group * wp.static(TOGETHER) + k
-                        s = wp.tile_extract(batch_shape, j)
-                        q = wp.tile_extract(batch_ellipse, j)
+                    feature_dots = vec_many()
+                    for k in range(wp.static(UNROLL)):
+                        j = group * wp.static(UNROLL) + k
+                        s = wp.tile_extract(batch_means, j)
+                        q = wp.tile_extract(batch_conics, j)
                         dx = s[0] - x
                         dy = s[1] - y
                         unclamped = s[2] * wp.exp(wp.min(dx * (q[0] * dx + q[1] * dy) + q[2] * dy * dy, real(0.0)))
@@ -194,32 +196,32 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                         contributes = s[3] < last_place and a > alpha_threshold
                         alphas[k] = wp.where(contributes, a, real(0.0))
                         gains[k] = wp.where(contributes and unclamped < real(ALPHA_MAX), a, real(0.0))
-                        along = real(0.0)
+                        feature_dot = real(0.0)
                         for e in range(wp.static(quads)):
                             quad = wp.tile_extract(batch_features, j * wp.static(quads) + e)
                             for h in range(wp.static(4)):
-                                along += quad[h] * incoming[e * 4 + h]
-                        alongs[k] = along
+                                feature_dot += quad[h] * grad_channels[e * 4 + h]
+                        feature_dots[k] = feature_dot
                     own_terms = vec_terms()
-                    for k in range(wp.static(TOGETHER)):
+                    for k in range(wp.static(UNROLL)):
                         a = alphas[k]
                         inverse = real(1.0) / (real(1.0) - a)
                         # t * inverse would round each of many faint factors the same way.
                         t += t * (a * inverse)
                         weight = a * t
                         own_terms[2 * k] = weight
-                        own_terms[2 * k + 1] = gains[k] * (t * alongs[k] - behind * inverse)
-                        behind += weight * alongs[k]
-                    for k in range(wp.static(TOGETHER // 2)):
+                        own_terms[2 * k + 1] = gains[k] * (t * feature_dots[k] - grad_from_behind * inverse)
+                        grad_from_behind += weight * feature_dots[k]
+                    for k in range(wp.static(UNROLL // 2)):
                         wp.tile_scatter_masked(
-                            pixel_terms, (group * wp.static(TOGETHER // 2) + k) * 33 + lane,
+                            pixel_terms, (group * wp.static(UNROLL // 2) + k) * 33 + lane,
                             vec4(own_terms[4 * k], own_terms[4 * k + 1], own_terms[4 * k + 2], own_terms[4 * k + 3]),
                             True,
                         )
 
                 # A lane is a Gaussian: moments of the slope over the 32 pixels.
-                s = wp.tile_extract(batch_shape, lane)
-                q = wp.tile_extract(batch_ellipse, lane)
+                s = wp.tile_extract(batch_means, lane)
+                q = wp.tile_extract(batch_conics, lane)
                 is_second = (lane & 1) == 1
                 base = (lane >> 1) * 33
                 feature_sum = vec_padded()
@@ -230,7 +232,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 sum_xy = real(0.0)
                 sum_yy = real(0.0)
                 for line in range(rows):
-                    dy = s[1] - (corner_y + real(line))
+                    dy = s[1] - (subtile_y + real(line))
                     row_0 = real(0.0)
                     row_x = real(0.0)
                     row_xx = real(0.0)
@@ -239,8 +241,8 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                         terms = wp.tile_extract(pixel_terms, base + at)
                         pixel_weight = wp.where(is_second, terms[2], terms[0])
                         pixel_slope = wp.where(is_second, terms[3], terms[1])
-                        from_pixel = wp.tile_extract(block_incoming, at)
-                        dx = s[0] - (corner_x + real(at - line * 8))
+                        from_pixel = wp.tile_extract(block_grad_channels, at)
+                        dx = s[0] - (subtile_x + real(at - line * 8))
                         slope_dx = pixel_slope * dx
                         row_0 += pixel_slope
                         row_x += slope_dx
@@ -282,7 +284,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                         value = wp.tile_extract(staging, owner, part)
                         if owner < ready:
                             if wp.static(ordered):
-                                place_of = rows_of[begin + entry[1]] * wp.static(gradient_columns) + part
+                                place_of = emit_indices[begin + entry[1]] * wp.static(gradient_columns) + part
                                 gradients[place_of] = gradients[place_of] + value
                             else:
                                 wp.atomic_add(gradients, entry[0] * wp.static(gradient_columns) + part, value)
@@ -291,10 +293,13 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 alive = 0
             ready = coming
             ready_one = own
-            wp.tile_scatter_masked(batch_shape, lane, vec4(shape[0], shape[1], shape[2], real(own[1])), True)
             wp.tile_scatter_masked(
-                batch_ellipse, lane, vec4(real(-0.5) * ellipse[0], -ellipse[1], real(-0.5) * ellipse[2], real(0.0)),
-                True,
+                batch_means, lane, vec4(xy_opacity[0], xy_opacity[1], xy_opacity[2], real(own[1])), True,
+            )
+            # Staged as -a / 2, -b, -c / 2, so that the exponent is dx (q0 dx + q1 dy) + q2 dy dy.
+            wp.tile_scatter_masked(
+                batch_conics, lane,
+                vec4(real(-0.5) * conic_cutoff[0], -conic_cutoff[1], real(-0.5) * conic_cutoff[2], real(0.0)), True,
             )
             for e in range(wp.static(quads)):
                 wp.tile_scatter_masked(
