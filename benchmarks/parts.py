@@ -25,15 +25,22 @@ OTHER = "torch's own"
 
 KERNELS = {
     "projection": ("project_*_forward",),
-    "harmonics": ("evaluate_*", "turns_adjoint_*"),
+    "harmonics": ("evaluate_*", "jacobian_backward_*"),
     "activations": ("activate_*",),
     "lists": ("pack_splats_*", "key_by_*", "emit_*", "find_tile_ranges_*", "*radix_sort*", "*DeviceScan*"),
     "blend": ("blend_forward_*", "pad_rows_*"),
-    "response and fusion": ("encode_*", "interpolate_*", "perceptrons_*", "mix_*", "point_adjoint_*", "unit_adjoint_*"),
+    "response and fusion": (
+        "encode_*",
+        "interpolate_*",
+        "perceptrons_*",
+        "mix_*",
+        "point_backward_*",
+        "unit_backward_*",
+    ),
     "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*"),
-    "blend, adjoint": ("blend_backward_*",),
-    "projection, adjoint": ("project_*_backward",),
-    "optimizer": ("update_*", "find_nonfinite_*", "judge_step_*"),
+    "blend, backward": ("blend_backward_*",),
+    "projection, backward": ("project_*_backward",),
+    "optimizer": ("update_*", "find_nonfinite_*", "check_finite_*"),
     "densification": ("add_position_noise_*", "add_gradient_statistics_*"),
     OTHER: ("*",),
 }
@@ -62,20 +69,20 @@ class Work:
 
 
 FLOAT = 4
-GEOMETRY, PROJECTED, RECORD = 11, 9, 8  # Numbers of a Gaussian, of its projection, of what the blend reads of it
+GEOMETRY, PROJECTED, PACKED = 11, 9, 8  # Numbers of a Gaussian, of its projection, of what the blend reads of it
 
 BYTES: dict[str, Callable[[Work], float]] = {
     "projection": lambda w: FLOAT * w.gaussians * (GEOMETRY + PROJECTED),
     "harmonics": lambda w: FLOAT * w.gaussians * (w.harmonics + 3 + 3),
-    # Records, running counts; keys of 8 bytes and values of 4, written, read by one sort, and written by it.
-    "lists": lambda w: w.gaussians * (FLOAT * (PROJECTED + RECORD) + 16) + 36 * w.pairs,
-    "blend": lambda w: FLOAT * (w.pairs + w.gaussians * (RECORD + w.channels) + w.pixels * (w.channels + 2)),
+    # Packed Gaussians, prefix sums; keys of 8 bytes and values of 4, written, read by one sort, and written by it.
+    "lists": lambda w: w.gaussians * (FLOAT * (PROJECTED + PACKED) + 16) + 36 * w.pairs,
+    "blend": lambda w: FLOAT * (w.pairs + w.gaussians * (PACKED + w.channels) + w.pixels * (w.channels + 2)),
     # A code, an image and its gradient.
     "losses": lambda w: 3 * w.pixels * (1 + 2 * FLOAT),
-    "blend, adjoint": lambda w: (
-        FLOAT * (w.pairs + w.gaussians * (RECORD + 2 * w.channels + 6) + w.pixels * (w.channels + 2))
+    "blend, backward": lambda w: (
+        FLOAT * (w.pairs + w.gaussians * (PACKED + 2 * w.channels + 6) + w.pixels * (w.channels + 2))
     ),
-    "projection, adjoint": lambda w: FLOAT * w.gaussians * (2 * GEOMETRY + 6),
+    "projection, backward": lambda w: FLOAT * w.gaussians * (2 * GEOMETRY + 6),
     # Parameters and both moments, read and written; the harmonics' gradients are made of three numbers.
     "optimizer": lambda w: FLOAT * w.gaussians * (6 * (GEOMETRY + w.harmonics) + GEOMETRY + 3),
 }
@@ -83,10 +90,10 @@ BYTES: dict[str, Callable[[Work], float]] = {
 
 INSTRUCTIONS: dict[str, Callable[[Work], float]] = {
     "blend": lambda w: w.drawn * (28 + 1.25 * (w.channels - 3)),
-    "blend, adjoint": lambda w: w.drawn * (49 + 2.25 * (w.channels - 3)),
+    "blend, backward": lambda w: w.drawn * (49 + 2.25 * (w.channels - 3)),
 }
 """That warps issue, at least: what sm_90's code of three channels has for a Gaussian in a warp, and one multiply-add
-and a fourth of a load for each more; the adjoint sums once more."""
+and a fourth of a load for each more; the backward pass sums once more."""
 
 
 def part_of(kernel: str) -> str:

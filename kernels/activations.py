@@ -27,23 +27,23 @@ def exposures_kernel(dtype):
 
 
 @cache
-def exposures_adjoint_kernel(dtype):
-    """Write value_gradients [N C], flat, from exposure_gradients [N, C] of any strides; 0 from the bounds on."""
+def exposures_backward_kernel(dtype):
+    """Write grad_values [N C], flat, from exposure_gradients [N, C] of any strides; 0 from the bounds on."""
     real = dtype
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def activate_exposures_adjoint(
+    def activate_exposures_backward(
         first: int,
         values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
-        exposure_gradients: wp.array2d(dtype=real), value_gradients: wp.array(dtype=real),
+        exposure_gradients: wp.array2d(dtype=real), grad_values: wp.array(dtype=real),
     ):
         place = first + wp.tid()
         i = place // exposure_gradients.shape[1]
         gradient = exposure_gradients[i, place - i * exposure_gradients.shape[1]] * exposures[place]
         value = values[place]
-        value_gradients[place] = wp.where(value >= bound or value <= -bound, real(0.0), gradient)
+        grad_values[place] = wp.where(value >= bound or value <= -bound, real(0.0), gradient)
 
-    return activate_exposures_adjoint
+    return activate_exposures_backward
 
 
 @cache
@@ -76,8 +76,8 @@ def opacities_kernel(dtype):
 
 
 @cache
-def opacities_adjoint_kernel(dtype):
-    """Return the adjoint of opacities_kernel(), launched over N threads.
+def opacities_backward_kernel(dtype):
+    """Return the backward pass of opacities_kernel(), launched over N threads.
 
     logit_gradients: [N] from opacity_gradients [N] and mean_gradient [1], either of which may be None. live: as of
     opacities_kernel().
@@ -85,7 +85,7 @@ def opacities_adjoint_kernel(dtype):
     real = dtype
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def activate_opacities_adjoint(
+    def activate_opacities_backward(
         first: int,
         opacities: wp.array(dtype=real), weight: real, live: wp.array(dtype=wp.int32),
         opacity_gradients: wp.array(dtype=real), mean_gradient: wp.array(dtype=real),
@@ -103,4 +103,4 @@ def opacities_adjoint_kernel(dtype):
         opacity = opacities[i]
         logit_gradients[i] = gradient * opacity * (real(1.0) - opacity)
 
-    return activate_opacities_adjoint
+    return activate_opacities_backward

@@ -29,10 +29,10 @@ def _terms_function(dtype):
         away = v - total / clipped
         off = precision * (v - expected)
         energy = real(0.5) * (smoothness * away * away + hold * off * off)
-        by_v = hold * precision * off
+        grad_v = hold * precision * off
         if v > real(0.0):
-            by_v += smoothness * away
-        return energy, by_v
+            grad_v += smoothness * away
+        return energy, grad_v
 
     return terms_of
 
@@ -122,10 +122,10 @@ def clipped_light_kernel(dtype):
             expected, precision = estimate_of(
                 estimates, rows, columns, row, column, i - 3 * (i // 3), height, width
             )
-            energy, by_v = terms_of(v, total, clipped, smoothness, expected, precision, hold)
+            energy, grad_v = terms_of(v, total, clipped, smoothness, expected, precision, hold)
             terms[i] = terms[i] + energy
             if slopes:
-                slopes[i] = slopes[i] + by_v / wp.max(image[i], white)
+                slopes[i] = slopes[i] + grad_v / wp.max(image[i], white)
 
     return clipped_light
 
@@ -190,10 +190,10 @@ def clipped_light_patch_kernel(dtype, code):
                     for k in range(wp.static(2 * REACH + 1)):
                         figures += wp.tile_extract(sums, row, at + wp.static(CHANNELS) * k)
                     expected, precision = estimate_of(estimates, rows, columns, y, x, channel, height, width)
-                    term, by_v = terms_of(v, figures[0], figures[1], smoothness, expected, precision, hold)
+                    term, grad_v = terms_of(v, figures[0], figures[1], smoothness, expected, precision, hold)
                     energy += term
                     if slopes:
-                        slopes[i] = slopes[i] + by_v / wp.max(image[i], white)
+                        slopes[i] = slopes[i] + grad_v / wp.max(image[i], white)
         of_patch = wp.tile_extract(wp.tile_sum(wp.tile(energy)), 0)
         if thread == 0:
             terms[block] = terms[block] + of_patch

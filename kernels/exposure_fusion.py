@@ -1,4 +1,4 @@
-"""Neural exposure fusion (SeHDR, section 3.3) at given encoded brackets, and its adjoint by what it learns.
+"""Neural exposure fusion (SeHDR, section 3.3) at given encoded brackets, and its backward pass.
 
 P brackets of M colours, Q = P M points of each of the three channels, in the order [3, P, M]. The perceptron of a
 channel has H hidden units: its terms of a point are read by all threads of a warp at once, or a warp's threads are its
@@ -17,7 +17,7 @@ POINTS_PER_THREAD = 64  # Of one hidden unit's gradients, summed before the atom
 
 @cache
 def fusion_kernels(dtype) -> SimpleNamespace:
-    """Return perceptrons, mix, mix_adjoint, unit_adjoint and point_adjoint for one scalar type.
+    """Return perceptrons, mix, mix_backward, unit_backward and point_backward for one scalar type.
 
     encoded, exposedness, outputs and what is made of them: [3, Q]; inner [3, 2, H], inner_bias, outer [3, H],
     outer_bias [3]: the perceptrons' weights; log_sigma: [3]; results: [M, 3].
@@ -78,12 +78,12 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         results[place, channel] = scale * weighted / total
 
     @wp.kernel(module="unique", module_options=options)
-    def mix_adjoint(
+    def mix_backward(
         encoded: reals2d, exposedness: reals2d, outputs: reals2d,
         brackets: int, scale: real,
-        results: reals2d, result_gradients: reals2d, by_exposedness: reals2d, by_output: reals2d,
+        results: reals2d, grad_results: reals2d, grad_exposedness: reals2d, grad_output: reals2d,
     ):
-        """Write the gradients; by_exposedness is that through the logits alone."""
+        """Write the gradients; grad_exposedness is that through the logits alone."""
         place, channel = wp.tid()
         count = results.shape[0]
         largest = largest_logit(outputs, exposedness, channel, place, count, brackets)
@@ -91,19 +91,19 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         for p in range(brackets):
             q = p * count + place
             total += wp.exp(outputs[channel, q] * exposedness[channel, q] - largest)
-        gradient = result_gradients[place, channel]
+        gradient = grad_results[place, channel]
         for p in range(brackets):
             q = p * count + place
             weight = wp.exp(outputs[channel, q] * exposedness[channel, q] - largest) / total
-            by_logit = gradient * weight * (scale * encoded[channel, q] - results[place, channel])
-            by_exposedness[channel, q] = by_logit * outputs[channel, q]
-            by_output[channel, q] = by_logit * exposedness[channel, q]
+            grad_logit = gradient * weight * (scale * encoded[channel, q] - results[place, channel])
+            grad_exposedness[channel, q] = grad_logit * outputs[channel, q]
+            grad_output[channel, q] = grad_logit * exposedness[channel, q]
 
     @wp.kernel(module="unique", module_options=options)
-    def unit_adjoint(
-        encoded: reals2d, exposedness: reals2d, by_output: reals2d,
+    def unit_backward(
+        encoded: reals2d, exposedness: reals2d, grad_output: reals2d,
         inner: reals3d, inner_bias: reals2d, outer: reals2d, points: int,
-        by_inner: reals3d, by_inner_bias: reals2d, by_outer: reals2d, by_outer_bias: reals,
+        grad_inner: reals3d, grad_inner_bias: reals2d, grad_outer: reals2d, grad_outer_bias: reals,
     ):
         """Add the gradients by the perceptrons' weights, of `points` points for each thread."""
         channel, chunk, unit = wp.tid()
@@ -111,37 +111,37 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         second_weight = inner[channel, 1, unit]
         bias = inner_bias[channel, unit]
         outer_weight = outer[channel, unit]
-        by_first = real(0.0)
-        by_second = real(0.0)
-        by_bias = real(0.0)
-        by_out = real(0.0)
+        grad_first_weight = real(0.0)
+        grad_second_weight = real(0.0)
+        grad_bias = real(0.0)
+        grad_outer_weight = real(0.0)
         output_sum = real(0.0)
         for q in range(chunk * points, wp.min((chunk + 1) * points, encoded.shape[1])):
             near = exposedness[channel, q]
             x = encoded[channel, q]
-            gradient = by_output[channel, q]
+            gradient = grad_output[channel, q]
             value = first_weight * near + second_weight * x + bias
             output_sum += gradient
             if value > real(0.0):
-                by_out += gradient * value
+                grad_outer_weight += gradient * value
                 through = gradient * outer_weight
-                by_bias += through
-                by_first += through * near
-                by_second += through * x
-        wp.atomic_add(by_inner, channel, 0, unit, by_first)
-        wp.atomic_add(by_inner, channel, 1, unit, by_second)
-        wp.atomic_add(by_inner_bias, channel, unit, by_bias)
-        wp.atomic_add(by_outer, channel, unit, by_out)
+                grad_bias += through
+                grad_first_weight += through * near
+                grad_second_weight += through * x
+        wp.atomic_add(grad_inner, channel, 0, unit, grad_first_weight)
+        wp.atomic_add(grad_inner, channel, 1, unit, grad_second_weight)
+        wp.atomic_add(grad_inner_bias, channel, unit, grad_bias)
+        wp.atomic_add(grad_outer, channel, unit, grad_outer_weight)
         if unit == 0:
-            wp.atomic_add(by_outer_bias, channel, output_sum)
+            wp.atomic_add(grad_outer_bias, channel, output_sum)
 
     @wp.kernel(module="unique", module_options=options)
-    def point_adjoint(
-        encoded: reals2d, exposedness: reals2d, by_exposedness: reals2d, by_output: reals2d, log_sigma: reals,
+    def point_backward(
+        encoded: reals2d, exposedness: reals2d, grad_exposedness: reals2d, grad_output: reals2d, log_sigma: reals,
         most_log: real, most: real,
-        inner: reals3d, inner_bias: reals2d, outer: reals2d, by_log_sigma: reals2d,
+        inner: reals3d, inner_bias: reals2d, outer: reals2d, grad_log_sigma: reals2d,
     ):
-        """Write by_log_sigma [3, Q], to be summed over Q."""
+        """Write grad_log_sigma [3, Q], to be summed over Q."""
         channel, point = wp.tid()
         x = encoded[channel, point]
         near = exposedness[channel, point]
@@ -150,15 +150,15 @@ def fusion_kernels(dtype) -> SimpleNamespace:
             weight = inner[channel, 0, unit]
             if weight * near + inner[channel, 1, unit] * x + inner_bias[channel, unit] > real(0.0):
                 through += outer[channel, unit] * weight
-        gradient = by_exposedness[channel, point] + by_output[channel, point] * through
+        gradient = grad_exposedness[channel, point] + grad_output[channel, point] * through
         log = log_sigma[channel]
         deviation = deviation_of(x, log, most_log)
         result = real(0.0)
         if wp.abs(log) <= most_log and wp.abs(deviation) <= most:
             result = gradient * near * deviation * deviation
-        by_log_sigma[channel, point] = result
+        grad_log_sigma[channel, point] = result
 
     return SimpleNamespace(
-        perceptrons=perceptrons, mix=mix, mix_adjoint=mix_adjoint, unit_adjoint=unit_adjoint,
-        point_adjoint=point_adjoint,
+        perceptrons=perceptrons, mix=mix, mix_backward=mix_backward, unit_backward=unit_backward,
+        point_backward=point_backward,
     )

@@ -75,25 +75,25 @@ def harmonic_functions(dtype):
 
 
 @cache
-def turn_function(dtype, degree: int):
-    """Return turn() and the vector type of its weights.
+def mean_gradient_function(dtype, degree: int):
+    """Return mean_gradient() and the vector type of its weights.
 
-    turn() is the gradient, with respect to a mean, of the sum of weights times harmonics; weights[0] belongs to
-    harmonic number 1. Its `direction` is direction_of() the mean.
+    mean_gradient() is the gradient, with respect to a mean, of the sum of weights times harmonics; weights[0] belongs
+    to harmonic number 1. Its `direction` is direction_of() the mean.
     """
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
     weight_vector = vector(max((degree + 1) * (degree + 1) - 1, 1), dtype)
 
     @wp.func
-    def turn(weights: weight_vector, direction: vec4) -> vec3:
+    def mean_gradient(weights: weight_vector, direction: vec4) -> vec3:
         x = direction[0]
         y = direction[1]
         z = direction[2]
-        by_direction = vec3()
+        grad_direction = vec3()
         if wp.static(degree > 0):
             c1 = real(0.4886025119029199)
-            by_direction = c1 * vec3(-weights[2], -weights[0], weights[1])
+            grad_direction = c1 * vec3(-weights[2], -weights[0], weights[1])
         xx = x * x
         yy = y * y
         zz = z * z
@@ -101,11 +101,11 @@ def turn_function(dtype, degree: int):
             a = real(1.0925484305920792)
             b = real(0.31539156525252005)
             c = real(0.5462742152960396)
-            by_direction += (a * weights[3]) * vec3(y, x, real(0.0))
-            by_direction += (-a * weights[4]) * vec3(real(0.0), z, y)
-            by_direction += (real(2.0) * b * weights[5]) * vec3(-x, -y, real(2.0) * z)
-            by_direction += (-a * weights[6]) * vec3(z, real(0.0), x)
-            by_direction += (real(2.0) * c * weights[7]) * vec3(x, -y, real(0.0))
+            grad_direction += (a * weights[3]) * vec3(y, x, real(0.0))
+            grad_direction += (-a * weights[4]) * vec3(real(0.0), z, y)
+            grad_direction += (real(2.0) * b * weights[5]) * vec3(-x, -y, real(2.0) * z)
+            grad_direction += (-a * weights[6]) * vec3(z, real(0.0), x)
+            grad_direction += (real(2.0) * c * weights[7]) * vec3(x, -y, real(0.0))
         if wp.static(degree > 2):
             e = real(-0.5900435899266435)
             f = real(2.890611442640554)
@@ -116,26 +116,26 @@ def turn_function(dtype, degree: int):
             xy = x * y
             xz = x * z
             yz = y * z
-            by_direction += (three * e * weights[8]) * vec3(real(2.0) * xy, xx - yy, real(0.0))
-            by_direction += (f * weights[9]) * vec3(yz, xz, xy)
-            by_direction += (h * weights[10]) * vec3(
+            grad_direction += (three * e * weights[8]) * vec3(real(2.0) * xy, xx - yy, real(0.0))
+            grad_direction += (f * weights[9]) * vec3(yz, xz, xy)
+            grad_direction += (h * weights[10]) * vec3(
                 real(-2.0) * xy, real(4.0) * zz - xx - three * yy, real(8.0) * yz
             )
-            by_direction += (three * m * weights[11]) * vec3(
+            grad_direction += (three * m * weights[11]) * vec3(
                 real(-2.0) * xz, real(-2.0) * yz, real(2.0) * zz - xx - yy
             )
-            by_direction += (h * weights[12]) * vec3(
+            grad_direction += (h * weights[12]) * vec3(
                 real(4.0) * zz - three * xx - yy, real(-2.0) * xy, real(8.0) * xz
             )
-            by_direction += (n * weights[13]) * vec3(real(2.0) * xz, real(-2.0) * yz, xx - yy)
-            by_direction += (three * e * weights[14]) * vec3(xx - yy, real(-2.0) * xy, real(0.0))
+            grad_direction += (n * weights[13]) * vec3(real(2.0) * xz, real(-2.0) * yz, xx - yy)
+            grad_direction += (three * e * weights[14]) * vec3(xx - yy, real(-2.0) * xy, real(0.0))
         if wp.static(degree > 0):
-            # Only what turns the direction counts: along it the harmonics do not change.
+            # Only the part across the direction counts: along it the harmonics do not change.
             d = vec3(x, y, z)
-            by_direction = (by_direction - d * wp.dot(d, by_direction)) * direction[3]
-        return by_direction
+            grad_direction = (grad_direction - d * wp.dot(d, grad_direction)) * direction[3]
+        return grad_direction
 
-    return turn, weight_vector
+    return mean_gradient, weight_vector
 
 
 @cache
@@ -165,21 +165,21 @@ def harmonics_kernel(dtype, degree: int):
 
 
 @cache
-def channels_kernel(dtype, degree: int, turning: bool):
+def channels_kernel(dtype, degree: int, with_jacobian: bool):
     """Return harmonics_kernel() with one thread for each channel, so that reads coalesce on a GPU.
 
-    constant, rest: [N, ..., 3], values: [N, 3]. turns, if `turning`: [N, 3] vec3, the gradient of each channel's value
-    with respect to the mean. Launched over 3 N threads.
+    constant, rest: [N, ..., 3], values: [N, 3]. mean_jacobian, if `with_jacobian`: [N, 3] vec3, the
+    gradient of each channel's value with respect to the mean. Launched over 3 N threads.
     """
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
-    turn, weight_vector = turn_function(dtype, degree)
+    mean_gradient, weight_vector = mean_gradient_function(dtype, degree)
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def evaluate_channels(
         first: int,
         constant: wp.array3d(dtype=dtype), rest: wp.array3d(dtype=dtype), means: wp.array(dtype=vec3),
-        camera_position: wp.array(dtype=vec3), values: wp.array2d(dtype=dtype), turns: wp.array2d(dtype=vec3),
+        camera_position: wp.array(dtype=vec3), values: wp.array2d(dtype=dtype), mean_jacobian: wp.array2d(dtype=vec3),
     ):
         place = first + wp.tid()
         i = place // 3
@@ -190,8 +190,8 @@ def channels_kernel(dtype, degree: int, turning: bool):
         for k in range(wp.static((degree + 1) * (degree + 1) - 1)):
             weights[k] = rest[i, k, channel]
             value += harmonic(k + 1, d[0], d[1], d[2]) * weights[k]
-        if wp.static(turning):
-            turns[i, channel] = turn(weights, d)
+        if wp.static(with_jacobian):
+            mean_jacobian[i, channel] = mean_gradient(weights, d)
         values[i, channel] = value
 
     return evaluate_channels
@@ -207,10 +207,10 @@ def zero_if_unused(dtype):
     real, vec3 = g.real, g.vec3
 
     @wp.func
-    def without_nan(by_mean: vec3, gradient: vec3) -> vec3:
-        result = by_mean
+    def without_nan(grad_mean: vec3, gradient: vec3) -> vec3:
+        result = grad_mean
         if gradient[0] == real(0.0) and gradient[1] == real(0.0) and gradient[2] == real(0.0):
-            if not wp.isfinite(by_mean):
+            if not wp.isfinite(grad_mean):
                 result = vec3()
         return result
 
@@ -218,63 +218,63 @@ def zero_if_unused(dtype):
 
 
 @cache
-def turns_adjoint_kernel(dtype):
-    """Return the kernel of mean_gradients[i] = sum over c of value_gradients[i, c] * turns[i, c], over N threads."""
+def jacobian_backward_kernel(dtype):
+    """Return the kernel of grad_means[i] = sum over c of grad_colors[i, c] * jacobian[i, c], over N threads."""
     vec3 = geometry(dtype).vec3
     without_nan = zero_if_unused(dtype)
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def turns_adjoint(
+    def jacobian_backward(
         first: int,
-        turns: wp.array2d(dtype=vec3), value_gradients: wp.array(dtype=vec3), mean_gradients: wp.array(dtype=vec3),
+        jacobian: wp.array2d(dtype=vec3), grad_colors: wp.array(dtype=vec3), grad_means: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
-        gradient = value_gradients[i]
-        by_mean = gradient[0] * turns[i, 0] + gradient[1] * turns[i, 1] + gradient[2] * turns[i, 2]
-        mean_gradients[i] = without_nan(by_mean, gradient)
+        gradient = grad_colors[i]
+        grad_mean = gradient[0] * jacobian[i, 0] + gradient[1] * jacobian[i, 1] + gradient[2] * jacobian[i, 2]
+        grad_means[i] = without_nan(grad_mean, gradient)
 
-    return turns_adjoint
+    return jacobian_backward
 
 
 @cache
-def harmonics_adjoint_kernel(dtype, degree: int, coefficients: bool):
-    """Return the adjoint of harmonics_kernel() with respect to means and, if `coefficients`, to those.
+def harmonics_backward_kernel(dtype, degree: int, coefficients: bool):
+    """Return the backward pass of harmonics_kernel() with respect to means and, if `coefficients`, to those.
 
-    Gradients are written, not accumulated. value_gradients, mean_gradients: [N] vec3; constant_gradients,
-    rest_gradients: as the coefficients; those of higher degrees are set to 0. The gradient with respect to the camera's
-    position is the negative sum of mean_gradients.
+    Gradients are written, not accumulated. grad_colors, grad_means: [N] vec3; grad_constant,
+    grad_rest: as the coefficients; those of higher degrees are set to 0. The gradient with respect to the camera's
+    position is the negative sum of grad_means.
     """
     without_nan = zero_if_unused(dtype)
     vec3 = geometry(dtype).vec3
     direction_of, harmonic = harmonic_functions(dtype)
-    turn, weight_vector = turn_function(dtype, degree)
+    mean_gradient, weight_vector = mean_gradient_function(dtype, degree)
     columns = (degree + 1) * (degree + 1) - 1
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def harmonics_adjoint(
+    def harmonics_backward(
         first: int,
         rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3), camera_position: wp.array(dtype=vec3),
-        value_gradients: wp.array(dtype=vec3), mean_gradients: wp.array(dtype=vec3),
-        constant_gradients: wp.array2d(dtype=vec3), rest_gradients: wp.array2d(dtype=vec3),
+        grad_colors: wp.array(dtype=vec3), grad_means: wp.array(dtype=vec3),
+        grad_constant: wp.array2d(dtype=vec3), grad_rest: wp.array2d(dtype=vec3),
     ):
         i = first + wp.tid()
-        gradient = value_gradients[i]
+        gradient = grad_colors[i]
         direction = direction_of(means[i], camera_position[0])
         x = direction[0]
         y = direction[1]
         z = direction[2]
         if wp.static(coefficients):
-            constant_gradients[i, 0] = harmonic(0, x, y, z) * gradient
+            grad_constant[i, 0] = harmonic(0, x, y, z) * gradient
             for k in range(wp.static(columns)):
-                rest_gradients[i, k] = harmonic(k + 1, x, y, z) * gradient
-            for column in range(wp.static(columns), rest_gradients.shape[1]):
-                rest_gradients[i, column] = vec3()
+                grad_rest[i, k] = harmonic(k + 1, x, y, z) * gradient
+            for column in range(wp.static(columns), grad_rest.shape[1]):
+                grad_rest[i, column] = vec3()
         weights = weight_vector()
         for k in range(wp.static(columns)):
             weights[k] = wp.dot(rest[i, k], gradient)
-        mean_gradients[i] = without_nan(turn(weights, direction), gradient)
+        grad_means[i] = without_nan(mean_gradient(weights, direction), gradient)
 
-    return harmonics_adjoint
+    return harmonics_backward
 
 
 @cache
@@ -303,13 +303,13 @@ def coefficient_gradient(dtype, count: int):
     """Return the function that computes one number of the gradient with respect to coefficients [N, count, 3].
 
     place: index of the number in the flat gradient. start: index of the first coefficient; those beyond the basis
-    [V, K, N] have gradient 0. value_gradients: [V, N, 3].
+    [V, K, N] have gradient 0. grad_colors: [V, N, 3].
     """
     real = dtype
 
     @wp.func
     def gradient_of(
-        place: int, start: int, basis: wp.array3d(dtype=real), value_gradients: wp.array3d(dtype=real)
+        place: int, start: int, basis: wp.array3d(dtype=real), grad_colors: wp.array3d(dtype=real)
     ) -> real:
         i = place // wp.static(3 * count)
         rest = place - i * wp.static(3 * count)
@@ -317,15 +317,15 @@ def coefficient_gradient(dtype, count: int):
         gradient = real(0.0)
         if k < basis.shape[1]:
             for view in range(basis.shape[0]):
-                gradient += basis[view, k, i] * value_gradients[view, i, rest % 3]
+                gradient += basis[view, k, i] * grad_colors[view, i, rest % 3]
         return gradient
 
     return gradient_of
 
 
 @cache
-def coefficient_adjoint_kernel(dtype, count: int):
-    """Return the adjoint with respect to coefficients, with one thread for each number so that writes coalesce.
+def coefficient_backward_kernel(dtype, count: int):
+    """Return the backward pass with respect to coefficients, with one thread for each number so that writes coalesce.
 
     A GPU takes several times as long if one thread writes all coefficients of a Gaussian. gradients: [3 N count], which
     is also the number of threads; otherwise as coefficient_gradient() takes them.
@@ -333,12 +333,12 @@ def coefficient_adjoint_kernel(dtype, count: int):
     gradient_of = coefficient_gradient(dtype, count)
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def coefficient_adjoint(
+    def coefficient_backward(
         first: int,
-        basis: wp.array3d(dtype=dtype), value_gradients: wp.array3d(dtype=dtype), start: int,
+        basis: wp.array3d(dtype=dtype), grad_colors: wp.array3d(dtype=dtype), start: int,
         gradients: wp.array(dtype=dtype),
     ):
         place = first + wp.tid()
-        gradients[place] = gradient_of(place, start, basis, value_gradients)
+        gradients[place] = gradient_of(place, start, basis, grad_colors)
 
-    return coefficient_adjoint
+    return coefficient_backward

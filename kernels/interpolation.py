@@ -1,4 +1,4 @@
-"""Catmull-Rom interpolation of tables of one variable, and its adjoint.
+"""Catmull-Rom interpolation of tables of one variable, and its backward pass.
 
 A column of the table holds one function at equal steps, with one node more at either end. Below the first cell a
 function is constant, above the last one a straight line.
@@ -10,8 +10,8 @@ from .compile_options import NO_AUTODIFF
 from .geometry import vector
 
 COPIES = 128
-"""The adjoint adds to this many tables in turn, summed afterwards: on a GPU thousands of threads would otherwise wait
-for the few nodes that most values fall between."""
+"""The backward pass adds to this many tables in turn, summed afterwards: on a GPU thousands of threads would otherwise
+wait for the few nodes that most values fall between."""
 
 _weights4 = vector(4, wp.float32)
 
@@ -68,10 +68,10 @@ def interpolate(
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-def interpolate_adjoint(
+def interpolate_backward(
     table: wp.array2d(dtype=wp.float32),
     low: float, inverse_step: float,
-    positions: wp.array2d(dtype=wp.float32), value_gradients: wp.array2d(dtype=wp.float32),
+    positions: wp.array2d(dtype=wp.float32), grad_values: wp.array2d(dtype=wp.float32),
     position_gradients: wp.array2d(dtype=wp.float32), table_gradients: wp.array3d(dtype=wp.float32),
 ):
     """Add to table_gradients [copies, nodes + 2, C], and write the other gradients [N, C]."""
@@ -82,7 +82,7 @@ def interpolate_adjoint(
     part = position - float(cell)
     weights = node_weights(part)
     slopes = weight_slopes(part)
-    gradient = value_gradients[i, column]
+    gradient = grad_values[i, column]
     slope = float(0.0)
     copy = i % table_gradients.shape[0]
     for node in range(4):

@@ -1,4 +1,4 @@
-"""Structural similarity (Wang et al. 2004) and its adjoint: separable Gaussian windows over two images.
+"""Structural similarity (Wang et al. 2004) and its gradient: separable Gaussian windows over two images.
 
 Written in the sum s = a + b and the difference d = a - b, whose windowed moments give
 
@@ -60,12 +60,12 @@ def comparison(dtype, lanes: int):
         qb = wp.cw_mul(vd, rb)
         luminance = one - qa
         structure = one - qb
-        by_ss = wp.cw_mul(wp.cw_mul(luminance, qb), rb) * half
-        by_dd = by_ss - wp.cw_mul(luminance, rb)
+        grad_ss = wp.cw_mul(wp.cw_mul(luminance, qb), rb) * half
+        grad_dd = grad_ss - wp.cw_mul(luminance, rb)
         # d/dE[s] + d/dE[d], since both s and d follow `a` with slope one.
-        by_sd = wp.cw_mul(wp.cw_mul(structure, ra), wp.cw_mul(qa, ms + md) - md * real(2.0))
-        by_sd -= (wp.cw_mul(by_ss, ms) + wp.cw_mul(by_dd, md)) * real(2.0)
-        return wp.cw_mul(luminance, structure), by_sd, by_ss, by_dd
+        grad_sd = wp.cw_mul(wp.cw_mul(structure, ra), wp.cw_mul(qa, ms + md) - md * real(2.0))
+        grad_sd -= (wp.cw_mul(grad_ss, ms) + wp.cw_mul(grad_dd, md)) * real(2.0)
+        return wp.cw_mul(luminance, structure), grad_sd, grad_ss, grad_dd
 
     return similarity_of
 
@@ -145,15 +145,15 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
             md += moments[1, y, i + k * channels] * weight
             ss += moments[2, y, i + k * channels] * weight
             dd += moments[3, y, i + k * channels] * weight
-        similarity_value, by_sd, by_ss, by_dd = similarity_of(ms, md, ss, dd)
+        similarity_value, grad_sd, grad_ss, grad_dd = similarity_of(ms, md, ss, dd)
         if wp.static(distance):
             apart = wp.abs(a[y, i] - b[y, i])
             similarity[y, i] = apart * distance_weight + (run(real(1.0)) - similarity_value) * dissimilarity_weight
         else:
             similarity[y, i] = similarity_value
-        derivatives[0, y, i] = by_sd
-        derivatives[1, y, i] = by_ss
-        derivatives[2, y, i] = by_dd
+        derivatives[0, y, i] = grad_sd
+        derivatives[1, y, i] = grad_ss
+        derivatives[2, y, i] = grad_dd
 
     @wp.kernel(module="unique", module_options=options)
     def blur_derivatives(
@@ -185,7 +185,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         length: int, channels: int,
         scale: wp.array(dtype=real), slopes: wp.array2d(dtype=run),
         distance_weight: real, dissimilarity_weight: real,
-        adjoint_a: wp.array2d(dtype=run),
+        grad_a_rows: wp.array2d(dtype=run),
     ):
         y, i = place_of(first + wp.tid(), length)
         sd = run(real(0.0))
@@ -204,12 +204,12 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
             side = run(real(0.0))
             for k in range(wp.static(lanes)):
                 side[k] = wp.where(d[k] > real(0.0), real(1.0), wp.where(d[k] < real(0.0), real(-1.0), real(0.0)))
-            by_a = (side * distance_weight - (sd + moments) * dissimilarity_weight) * scale[0]
+            grad_a = (side * distance_weight - (sd + moments) * dissimilarity_weight) * scale[0]
             if slopes:
-                by_a = wp.cw_mul(by_a, slopes[y, i])
-            adjoint_a[y, i] = by_a
+                grad_a = wp.cw_mul(grad_a, slopes[y, i])
+            grad_a_rows[y, i] = grad_a
         else:
-            adjoint_a[y, i] = (sd + moments) * scale[0]
+            grad_a_rows[y, i] = (sd + moments) * scale[0]
 
     return SimpleNamespace(
         run=run, blur_columns=blur_columns, compare=compare, blur_derivatives=blur_derivatives, gradient=gradient

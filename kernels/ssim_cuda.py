@@ -1,4 +1,4 @@
-"""Structural similarity and its adjoint for CUDA, one launch each: the maths of ssim.py in the patches of patches.py.
+"""Structural similarity and its gradient for CUDA, one launch each: the maths of ssim.py in the patches of patches.py.
 
 These kernels also run on the CPU where wp.config.enable_cpu_blocks is set: slow, but the same logic, for tests.
 """
@@ -90,15 +90,15 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
                 m = vec4()
                 for k in range(wp.static(2 * RADIUS + 1)):
                     m += wp.tile_extract(moments, row, at + wp.static(CHANNELS) * k) * taps[k]
-                alike, by_sd, by_ss, by_dd = similarity_of(vec1(m[0]), vec1(m[1]), vec1(m[2]), vec1(m[3]))
+                alike, grad_sd, grad_ss, grad_dd = similarity_of(vec1(m[0]), vec1(m[1]), vec1(m[2]), vec1(m[3]))
                 if wp.static(distance):
                     apart = wp.abs(a[y, i] - b[y, i])
                     total += apart * distance_weight + (real(1.0) - alike[0]) * dissimilarity_weight
                 else:
                     similarity[y, i] = alike[0]
-                derivatives[0, y, i] = by_sd[0]
-                derivatives[1, y, i] = by_ss[0]
-                derivatives[2, y, i] = by_dd[0]
+                derivatives[0, y, i] = grad_sd[0]
+                derivatives[1, y, i] = grad_ss[0]
+                derivatives[2, y, i] = grad_dd[0]
         if wp.static(distance):
             of_patch = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
             if thread == 0:
@@ -110,7 +110,7 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
         derivatives: wp.array3d(dtype=real), a: wp.array2d(dtype=real), b: wp.array2d(dtype=real),
         scale: wp.array(dtype=real), slopes: wp.array2d(dtype=real),
         distance_weight: real, dissimilarity_weight: real,
-        adjoint_a: wp.array2d(dtype=real),
+        grad_a_rows: wp.array2d(dtype=real),
     ):
         _, thread, top, left, channel = patch_of(wp.tid(), width, channels)
         taps = window_of(weights)
@@ -131,12 +131,12 @@ def ssim_patch_kernels(dtype, distance: bool = False) -> SimpleNamespace:
                     by += wp.tile_extract(blurs, row, at + wp.static(CHANNELS) * k) * taps[k]
                 x = a[y, i]
                 z = b[y, i]
-                by_a = by[0] + ((x + z) * by[1] + (x - z) * by[2]) * real(2.0)
+                grad_a = by[0] + ((x + z) * by[1] + (x - z) * by[2]) * real(2.0)
                 if wp.static(distance):
                     side = wp.where(x > z, real(1.0), wp.where(x < z, real(-1.0), real(0.0)))
-                    by_a = side * distance_weight - by_a * dissimilarity_weight
+                    grad_a = side * distance_weight - grad_a * dissimilarity_weight
                     if slopes:
-                        by_a *= slopes[y, i]
-                adjoint_a[y, i] = by_a * scale[0]
+                        grad_a *= slopes[y, i]
+                grad_a_rows[y, i] = grad_a * scale[0]
 
     return SimpleNamespace(compare=compare_patches, gradient=gradient_in_patches)

@@ -24,15 +24,15 @@ _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-def judge_step(
+def check_finite(
     loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), incomplete: wp.array(dtype=wp.bool),
-    tally: wp.array(dtype=wp.int64), pairs: wp.array(dtype=wp.int64), verdict: wp.array(dtype=wp.float32),
+    tally: wp.array(dtype=wp.int64), pairs: wp.array(dtype=wp.int64), step_flags: wp.array(dtype=wp.float32),
 ):
     """Decide whether a step is skipped because its loss or a gradient is not finite; one thread.
 
-    verdict: [2], 1 or 0: skipped, not skipped. norms: [K] of the gradients. incomplete: [1], or [0] if no step can be.
-    tally: [3] or [0], counts steps that are not finite and, with pairs ([1] or [0]), holds the most intersections and
-    counts the incomplete steps.
+    step_flags: [2], 1 or 0: skipped, not skipped. norms: [K] of the gradients. incomplete: [1], or [0] if no step can
+    be. tally: [3] or [0], counts steps that are not finite and, with pairs ([1] or [0]), holds the most intersections
+    and counts the incomplete steps.
     """
     finite = wp.isfinite(loss[0])
     for i in range(norms.shape[0]):
@@ -47,8 +47,8 @@ def judge_step(
             tally[1] = wp.max(tally[1], pairs[0])
             if not whole:
                 tally[2] = tally[2] + wp.int64(1)
-    verdict[0] = wp.where(finite and whole, 0.0, 1.0)
-    verdict[1] = 1.0 - verdict[0]
+    step_flags[0] = wp.where(finite and whole, 0.0, 1.0)
+    step_flags[1] = 1.0 - step_flags[0]
 
 
 @wp.func
@@ -177,7 +177,7 @@ def place_in_turn(k: int, turn: int, turns: int) -> int:
 def harmonics_adam_kernel(count: int):
     """Return update_by_adam() for coefficients of harmonics [3 N count] whose gradients are not stored.
 
-    They are computed as harmonics.coefficient_adjoint_kernel() does. Blocks of TURN coefficients are updated in `turns`
+    They are computed as by harmonics.coefficient_backward_kernel(). Blocks of TURN coefficients are updated in `turns`
     turns. Launched over `stride` threads: a thread takes NUMBERS coefficients, `stride` apart, and requests the memory
     of all before it waits for any.
     """
@@ -186,7 +186,7 @@ def harmonics_adam_kernel(count: int):
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def update_harmonics_by_adam(
         first: int,
-        basis: wp.array3d(dtype=wp.float32), value_gradients: wp.array3d(dtype=wp.float32), start: int, stride: int,
+        basis: wp.array3d(dtype=wp.float32), grad_colors: wp.array3d(dtype=wp.float32), start: int, stride: int,
         turns: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
         live: wp.array(dtype=wp.int32),
@@ -218,8 +218,8 @@ def harmonics_adam_kernel(count: int):
             for view in range(basis.shape[0]):
                 for k in range(wp.static(NUMBERS)):
                     basis_value = basis[view, wp.min(rows[k], degrees - 1), owners[k]]
-                    by_value = value_gradients[view, owners[k], channels[k]]
-                    gradients[k] += wp.where(rows[k] < degrees, basis_value, 0.0) * by_value
+                    grad_color = grad_colors[view, owners[k], channels[k]]
+                    gradients[k] += wp.where(rows[k] < degrees, basis_value, 0.0) * grad_color
             turn_count = wp.ceil(step[0] / float(turns))
             length = rate[0] / bias_correction(first_decay_log, turn_count)
             enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, turn_count))

@@ -91,12 +91,12 @@ assert_type(runner.run("key", lambda: image), torch.Tensor)
 
 @sw.differentiable
 def attenuate(program: Program, radiance: torch.Tensor, *, density: float) -> torch.Tensor:
-    return program.write(radiance.shape)
+    return program.empty_output(radiance.shape)
 
 
 @sw.differentiable
 def split(program: Program, radiance: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return program.write(radiance.shape), program.write(radiance.shape)
+    return program.empty_output(radiance.shape), program.empty_output(radiance.shape)
 
 
 assert_type(attenuate(image, density=0.5), torch.Tensor)

@@ -47,7 +47,7 @@ class _Watch(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, by_image, by_transmittance):
+    def backward(ctx, grad_image, grad_transmittance):
         features, means_opacities, conics_cutoffs = ctx.saved_tensors
         lists, channels = ctx.lists, features.shape[1]
         emit_order = lists.emit_order
@@ -68,10 +68,10 @@ class _Watch(torch.autograd.Function):
             lists.width,
             lists.height,
             ctx.alpha_threshold,
-            by_image.contiguous().view(-1, channels),
-            by_transmittance.contiguous().view(-1),
+            grad_image.contiguous().view(-1, channels),
+            grad_transmittance.contiguous().view(-1),
             rows,
             ranges=even_ranges(tiles, 1) * _PIXELS,
         )
         ctx.store(rows if emit_order is None else gather_by_gaussian(emit_order, rows))
-        return by_image, by_transmittance, None, None, None, None, None
+        return grad_image, grad_transmittance, None, None, None, None, None

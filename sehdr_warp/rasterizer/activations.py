@@ -5,9 +5,9 @@ from torch import Tensor
 from torch.nn.functional import hardtanh
 
 from ..kernels.activations import (
-    exposures_adjoint_kernel,
+    exposures_backward_kernel,
     exposures_kernel,
-    opacities_adjoint_kernel,
+    opacities_backward_kernel,
     opacities_kernel,
 )
 from .warp_launch.launching import launch, warp_scalar
@@ -44,7 +44,7 @@ class _BoundedExponential(torch.autograd.Function):
         values, exponentials = ctx.saved_tensors
         result = torch.empty_like(values)
         kernel, inputs = (
-            exposures_adjoint_kernel(warp_scalar(values.dtype)),
+            exposures_backward_kernel(warp_scalar(values.dtype)),
             (values.view(-1), ctx.bound, exponentials.view(-1)),
         )
         launch(kernel, values.numel(), *inputs, upstream, result.view(-1))
@@ -75,9 +75,9 @@ class _Opacities(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, by_opacities, by_mean):
+    def backward(ctx, grad_opacities, grad_mean):
         (opacities,) = ctx.saved_tensors
         result = torch.empty_like(opacities)
-        kernel, inputs = opacities_adjoint_kernel(warp_scalar(opacities.dtype)), (opacities, ctx.weight, ctx.live)
-        launch(kernel, len(opacities), *inputs, by_opacities, by_mean, result)
+        kernel, inputs = opacities_backward_kernel(warp_scalar(opacities.dtype)), (opacities, ctx.weight, ctx.live)
+        launch(kernel, len(opacities), *inputs, grad_opacities, grad_mean, result)
         return result, None, None

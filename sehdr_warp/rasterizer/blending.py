@@ -17,23 +17,23 @@ from .torch_contract import direct_apply, keeps_graph, once_differentiable
 from .warp_launch.launching import fixed_launch, launch, warp_scalar, warp_stream
 
 PIECES_PER_THREAD = 16  # Of the image, on the CPU: their work differs by more than their intersections.
-Adjoint = Callable[[Tensor, Tensor | None], Tensor]
+Backward = Callable[[Tensor, Tensor | None], Tensor]
 """Maps the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6 or more]: features, conic
 a b c, x, y, opacity, and columns that pad a row."""
 
 
 class BlendResult(NamedTuple):
-    """A blended image and its adjoint, with no graph behind them.
+    """A blended image and its backward pass, with no graph behind them.
 
     Attributes:
         image: [H, W, C].
         transmittance: [H, W].
-        adjoint: their backward pass.
+        backward: their backward pass.
     """
 
     image: Tensor
     transmittance: Tensor
-    adjoint: Adjoint
+    backward: Backward
 
 
 def blend(
@@ -66,9 +66,9 @@ def blend(
     image = rows.new_empty(lists.height, lists.width, rows.shape[1])
     transmittance = rows.new_empty(image.shape[:2])
     backend = blend_on_cuda if rows.device.type == "cuda" else blend_on_cpu
-    # The adjoint keeps some of these. It must not keep the results of the node that keeps it: detached are others.
-    adjoint = backend(rows, lists, packed, image.detach(), transmittance.detach(), alpha_threshold, deterministic)
-    return with_gradient(means2d, conics, opacities, features, BlendResult(image, transmittance, adjoint))
+    # The backward pass keeps some of these, but it must not keep the results of the node that keeps it: so detach them.
+    backward = backend(rows, lists, packed, image.detach(), transmittance.detach(), alpha_threshold, deterministic)
+    return with_gradient(means2d, conics, opacities, features, BlendResult(image, transmittance, backward))
 
 
 def with_gradient(means2d, conics, opacities, features, result: BlendResult) -> tuple[Tensor, Tensor]:
@@ -81,30 +81,32 @@ def with_gradient(means2d, conics, opacities, features, result: BlendResult) -> 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, opacities, features, result: BlendResult):
-        ctx.sizes, ctx.adjoint = result.image.shape, result.adjoint
-        # The adjoint reads them: torch then raises its own error if one is changed in place before.
+        ctx.sizes, ctx.gradients_of = result.image.shape, result.backward
+        # The backward pass reads them: torch then raises its own error if one is changed in place before.
         ctx.save_for_backward(features, result.transmittance)
         ctx.set_materialize_grads(False)
         return result.image, result.transmittance
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, by_image, by_transmittance):
+    def backward(ctx, grad_image, grad_transmittance):
         _ = ctx.saved_tensors  # Raises torch's errors for a freed graph and for changes in place.
-        adjoint = ctx.adjoint
+        gradients_of = ctx.gradients_of
         if not keeps_graph():
-            ctx.adjoint = None
-        if by_image is None and by_transmittance is None:
+            ctx.gradients_of = None
+        if grad_image is None and grad_transmittance is None:
             return (None,) * 5
         _, width, channels = ctx.sizes
-        by_image = by_transmittance.new_zeros(ctx.sizes) if by_image is None else by_image.contiguous()
+        grad_image = grad_transmittance.new_zeros(ctx.sizes) if grad_image is None else grad_image.contiguous()
         # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
-        if by_image.stride() != (width * channels, channels, 1):
-            by_image = by_image.as_strided(ctx.sizes, (width * channels, channels, 1))
-        gathered = adjoint(by_image, None if by_transmittance is None else by_transmittance.contiguous())
+        if grad_image.stride() != (width * channels, channels, 1):
+            grad_image = grad_image.as_strided(ctx.sizes, (width * channels, channels, 1))
+        gathered = gradients_of(grad_image, None if grad_transmittance is None else grad_transmittance.contiguous())
         rest = gathered.shape[1] - channels - 6
-        by_features, by_conics, by_means2d, by_opacities, _ = gathered.split_with_sizes((channels, 3, 2, 1, rest), 1)
-        gradients = by_means2d, by_conics, by_opacities[:, 0], by_features
+        grad_features, grad_conics, grad_means2d, grad_opacities, _ = gathered.split_with_sizes(
+            (channels, 3, 2, 1, rest), 1
+        )
+        gradients = grad_means2d, grad_conics, grad_opacities[:, 0], grad_features
         return *(part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False)), None
 
 
@@ -119,7 +121,7 @@ def blend_on_cpu(
     transmittance: Tensor,
     alpha_threshold: float,
     deterministic: bool,
-) -> Adjoint:
+) -> Backward:
     """Fill image [H, W, C] and transmittance [H, W]: balanced pieces of tiles, a thread each."""
     scalar, emit_order = warp_scalar(features.dtype), lists.emit_order
     assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
@@ -130,10 +132,10 @@ def blend_on_cpu(
     def rows(*shape):
         return features.new_empty(tile_count, *shape, blend_cpu.LANES)
 
-    iota, count = torch.arange(blend_cpu.LANES, dtype=features.dtype), blend_cpu.HALVES * TILE_SIZE
+    lane_offsets, count = torch.arange(blend_cpu.LANES, dtype=features.dtype), blend_cpu.HALVES * TILE_SIZE
     means_opacities, conics_cutoffs = packed.means_opacities, packed.conics_cutoffs
-    frame = features, lists.columns, width, height, alpha_threshold, iota
-    tile_transmittance, last = rows(count), rows(count)
+    frame = features, lists.columns, width, height, alpha_threshold, lane_offsets
+    tile_transmittance, last_contributor = rows(count), rows(count)
     launch(
         blend_cpu.forward_kernel(*kind),
         tile_count,
@@ -144,18 +146,18 @@ def blend_on_cpu(
         *frame,
         tile_transmittance,
         rows(channels, count),
-        last,
+        last_contributor,
         image.view(-1, channels),
         transmittance,
         ranges=pieces,
     )
 
-    def backward(by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
-        if by_transmittance is None:
-            by_transmittance = torch.zeros_like(transmittance)
+    def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
+        if grad_transmittance is None:
+            grad_transmittance = torch.zeros_like(transmittance)
         # The kernel takes the transmittance back to the front, in place.
         tile_state = tile_transmittance.clone() if keeps_graph() else tile_transmittance
-        by_intersection = features.new_empty(lists.intersection_count, channels + 6)
+        grad_intersections = features.new_empty(lists.intersection_count, channels + 6)
         launch(
             blend_cpu.backward_kernel(*kind),
             tile_count,
@@ -165,25 +167,25 @@ def blend_on_cpu(
             means_opacities,
             conics_cutoffs,
             *frame,
-            last,
-            by_image.view(-1, channels),
-            by_transmittance,
+            last_contributor,
+            grad_image.view(-1, channels),
+            grad_transmittance,
             tile_state,
             rows(count),
             rows(channels, count),
             rows(TILE_SIZE),
             rows(TILE_SIZE),
             rows(channels + 6),
-            by_intersection,
+            grad_intersections,
             ranges=pieces,
         )
-        return gather_by_gaussian(emit_order, by_intersection)
+        return gather_by_gaussian(emit_order, grad_intersections)
 
     return backward
 
 
 def exp_squarings(alpha_threshold: float) -> int:
-    """Return how often the CPU's polynomial exponential halves its argument to reach down to log(alpha_threshold)."""
+    """Return how often the CPU's polynomial exponential is squared to reach down to log(alpha_threshold)."""
     return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
 
 
@@ -208,18 +210,20 @@ def blend_on_cuda(
     transmittance: Tensor,
     alpha_threshold: float,
     deterministic: bool,
-) -> "BlockAdjoint":
-    """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also on fibers of the CPU)."""
+) -> "BlockBackward":
+    """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also in Warp's CPU block emulation)."""
     rows = pad_features(features)
-    last = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
+    last_contributor = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
     # Padded features take more memory; few Gaussians keep them, so that they need not be padded again.
     saved = rows if len(features) <= MAX_SINGLE_SORT else features
-    return BlockAdjoint(saved, image.shape[-1], lists, packed, transmittance, last, alpha_threshold, deterministic)
+    return BlockBackward(
+        saved, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
+    )
 
 
 @dataclass(frozen=True)
-class BlockAdjoint:
-    """The adjoint of blend_on_cuda(); see Adjoint.
+class BlockBackward:
+    """The backward pass of blend_on_cuda(); see Backward.
 
     Attributes:
         features: [N, C] or, padded, [N, more].
@@ -227,7 +231,7 @@ class BlockAdjoint:
         lists: that were blended.
         packed: Gaussians that were blended.
         transmittance: [H, W], the result.
-        last: of blend_blocks().
+        last_contributor: of blend_blocks().
         alpha_threshold: contributions with a smaller alpha were left out.
         deterministic: sum in a fixed order.
     """
@@ -237,50 +241,50 @@ class BlockAdjoint:
     lists: TileLists
     packed: PackedSplats
     transmittance: Tensor
-    last: Tensor
+    last_contributor: Tensor
     alpha_threshold: float
     deterministic: bool
 
-    def __call__(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
+    def __call__(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
         """Return the gradients by Gaussian."""
-        if by_transmittance is None:
-            by_transmittance = self.transmittance.view(-1)[:0]
+        if grad_transmittance is None:
+            grad_transmittance = self.transmittance.view(-1)[:0]
         lists = self.lists
         if not self.deterministic:
             gathered = self._zeros()
-            arguments = *self._arguments(by_image, by_transmittance), 0, lists.gaussians, gathered
+            arguments = *self._arguments(grad_image, grad_transmittance), 0, lists.gaussians, gathered
             launch_blocks(self._kernel(), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
             return gathered
-        by_intersection = self.transmittance.new_zeros(lists.intersection_count, self.channels + 6)
-        emit_order, arguments = lists.emit_order, self._arguments(by_image, by_transmittance)
+        grad_intersections = self.transmittance.new_zeros(lists.intersection_count, self.channels + 6)
+        emit_order, arguments = lists.emit_order, self._arguments(grad_image, grad_transmittance)
         assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
         for subtile in range(blend_cuda.BLOCKS_PER_TILE):
-            launch_blocks(self._kernel(), lists, 1, *arguments, subtile, emit_order.emit_indices, by_intersection)
-        return gather_by_gaussian(emit_order, by_intersection)
+            launch_blocks(self._kernel(), lists, 1, *arguments, subtile, emit_order.emit_indices, grad_intersections)
+        return gather_by_gaussian(emit_order, grad_intersections)
 
-    def on_fixed_memory(self) -> Adjoint:
-        """Return the adjoint for less host time; for use while all tensors stay where they are."""
+    def on_fixed_memory(self) -> Backward:
+        """Return the backward pass for less host time; for use while all tensors stay where they are."""
         assert not self.deterministic, "sums in a fixed order are several launches"
-        by_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
-        by_transmittance, gathered = torch.empty_like(self.transmittance), self._zeros()
+        grad_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
+        grad_transmittance, gathered = torch.empty_like(self.transmittance), self._zeros()
         fixed = fixed_launch(
             self._kernel(),
             block_threads(self.lists, blend_cuda.BLOCKS_PER_TILE),
-            *self._arguments(by_image, by_transmittance),
+            *self._arguments(grad_image, grad_transmittance),
             0,
             self.lists.gaussians,
             gathered,
-            whole=(by_image, by_transmittance, gathered),
+            whole=(grad_image, grad_transmittance, gathered),
             block_dim=blend_cuda.BLOCK_DIM,
         )
         device, shape = gathered.device, gathered.shape
 
-        def adjoint(by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
-            gathered = by_image.new_zeros(shape)
-            fixed.launch((), (by_image, by_transmittance, gathered), warp_stream(device))
+        def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
+            gathered = grad_image.new_zeros(shape)
+            fixed.launch((), (grad_image, grad_transmittance, gathered), warp_stream(device))
             return gathered
 
-        return adjoint
+        return backward
 
     def _zeros(self) -> Tensor:
         columns = self.channels + 6
@@ -296,14 +300,14 @@ class BlockAdjoint:
         scalar = warp_scalar(self.features.dtype)
         return blend_cuda_backward.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
 
-    def _arguments(self, by_image: Tensor, by_transmittance: Tensor) -> tuple:
+    def _arguments(self, grad_image: Tensor, grad_transmittance: Tensor) -> tuple:
         lists, packed = self.lists, self.packed
         height, width = self.transmittance.shape
         return (
             *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
             pad_features(self.features).reshape(-1, 4),
-            *(lists.columns, width, height, self.alpha_threshold, self.transmittance, self.last),
-            *(by_image, by_transmittance, blend_cuda_backward.ROWS, self.channels + 6),
+            *(lists.columns, width, height, self.alpha_threshold, self.transmittance, self.last_contributor),
+            *(grad_image, grad_transmittance, blend_cuda_backward.ROWS, self.channels + 6),
         )
 
 
@@ -316,7 +320,7 @@ def blend_blocks(
     """
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     height, width, channels = image.shape
-    last = torch.empty(height * width, dtype=torch.int32, device=rows.device)
+    last_contributor = torch.empty(height * width, dtype=torch.int32, device=rows.device)
     kernel = blend_cuda.forward_kernel(warp_scalar(rows.dtype), channels, rows.device.type == "cuda")
     launch_blocks(
         kernel,
@@ -334,9 +338,9 @@ def blend_blocks(
         alpha_threshold,
         image,
         transmittance,
-        last,
+        last_contributor,
     )
-    return last
+    return last_contributor
 
 
 def launch_blocks(kernel: Any, lists: TileLists, blocks_per_tile: int, *arguments: Any) -> None:
@@ -359,16 +363,16 @@ def pad_features(features: Tensor) -> Tensor:
     return features.clone() if features.data_ptr() % 16 else features
 
 
-def gather_by_gaussian(emit_order: EmitOrder, by_intersection: Tensor) -> Tensor:
-    """Return [N, columns]: for each Gaussian the sum of its rows of by_intersection [M, columns], first tile to last.
+def gather_by_gaussian(emit_order: EmitOrder, grad_intersections: Tensor) -> Tensor:
+    """Return [N, columns]: for each Gaussian the sum of its rows of grad_intersections, first tile to last_contributor.
 
-    by_intersection: rows in the order of intersections before the sort by tile.
+    grad_intersections: rows in the order of intersections before the sort by tile.
     """
-    length, columns = by_intersection.shape
+    length, columns = grad_intersections.shape
     count = emit_order.order.shape[0]
-    gathered = by_intersection.new_zeros(count, columns)
+    gathered = grad_intersections.new_zeros(count, columns)
     if length:
         cumulative_counts = emit_order.cumulative_counts.clamp(0, length)  # Beyond max_intersections there are no rows.
-        kernel = tile_kernels(warp_scalar(by_intersection.dtype)).gather_intersections
-        launch(kernel, count, emit_order.order, cumulative_counts, by_intersection, columns, gathered)
+        kernel = tile_kernels(warp_scalar(grad_intersections.dtype)).gather_intersections
+        launch(kernel, count, emit_order.order, cumulative_counts, grad_intersections, columns, gathered)
     return gathered

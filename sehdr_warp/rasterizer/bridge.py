@@ -6,7 +6,7 @@ adjoints of the kernels run when torch asks for gradients.
 
     @differentiable
     def scaled(program, values, *, gain):
-        result = program.write(values.shape)
+        result = program.empty_output(values.shape)
         program.launch(scale, len(values), [values, gain], [result])
         return result
 
@@ -60,8 +60,10 @@ class Program:
         for tensor in tensors:
             self._place(tensor)
 
-    def write(self, shape: Sequence[int], dtype: torch.dtype = torch.float32, *, differentiable: bool = True) -> Tensor:
-        """Return a new tensor for one launch to write to. A vector type's components are its last dimension."""
+    def empty_output(
+        self, shape: Sequence[int], dtype: torch.dtype = torch.float32, *, differentiable: bool = True
+    ) -> Tensor:
+        """Allocate a tensor for one launch to write to. A vector type's components are its last dimension."""
         tensor = torch.empty(tuple(shape), dtype=dtype, device=self.device)
         if self._differentiable:
             place = self._place(tensor)
@@ -115,7 +117,7 @@ class _ProgramFunction(torch.autograd.Function):
         launches, tensors_of_program = program._launches, program._tensors
         places = [program._places.get(id(tensor), -1) for tensor in outputs]
         if not program._written.issuperset(places):
-            raise TypeError(f"{body.__name__}() returns a tensor that program.write() did not make")
+            raise TypeError(f"{body.__name__}() returns a tensor that program.empty_output() did not make")
         # Torch makes this node the origin of what it returns; saved as well, neither would ever be freed.
         returned = tuple(tensor.detach() for tensor in outputs)
         ctx.mark_non_differentiable(
@@ -155,14 +157,14 @@ class _ProgramFunction(torch.autograd.Function):
 def _launch_adjoint(forward: _Launch, saved: Sequence[Tensor | None], gradients: dict[int, Any]) -> None:
     kernel, dim, inputs, outputs = forward
     values: list[Any] = [saved[value] if isinstance(value, _Place) else value for value in inputs]
-    by_value = [gradients.get(v) if isinstance(v, _Place) else None for v in (*inputs, *outputs)]
-    if all(gradient is None for gradient in by_value):
+    grad_values = [gradients.get(v) if isinstance(v, _Place) else None for v in (*inputs, *outputs)]
+    if all(gradient is None for gradient in grad_values):
         return
-    pairs = zip(values, by_value, strict=False)
+    pairs = zip(values, grad_values, strict=False)
     shared = any(gradient is not None and tensor is not None and len(tensor) != dim for tensor, gradient in pairs)
     ranges = single_range(dim) if shared and isinstance(dim, int) else None
     arguments = values + [None] * len(outputs)
-    launch(kernel, dim, *arguments, gradients=by_value, ranges=ranges)
+    launch(kernel, dim, *arguments, gradients=grad_values, ranges=ranges)
 
 
 @overload
@@ -181,7 +183,7 @@ def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
     a retained graph; a tensor that is changed in place before that raises torch's own error.
 
     Args:
-        body: body(program, *tensors, **options) -> tensors made by program.write().
+        body: body(program, *tensors, **options) -> tensors made by program.empty_output().
     """
 
     @torch_operation

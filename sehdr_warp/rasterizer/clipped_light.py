@@ -97,6 +97,6 @@ class _ClippedLight(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, by_energy):
+    def backward(ctx, grad_energy):
         (slopes,) = ctx.saved_tensors
-        return scale_gradient(slopes, by_energy), None, None, None, None, None, None
+        return scale_gradient(slopes, grad_energy), None, None, None, None, None, None

@@ -77,20 +77,29 @@ class _Fusion(torch.autograd.Function):
     def backward(ctx, gradients):
         encoded, log_sigma, *weights, exposedness, outputs, results = ctx.saved_tensors
         brackets, scale = ctx.numbers
-        by_exposedness, by_output, by_log_sigma = (torch.empty_like(encoded) for _ in range(3))
+        grad_exposedness, grad_output, grad_log_sigma = (torch.empty_like(encoded) for _ in range(3))
         sizes = [weight.numel() for weight in weights]
         zeros = encoded.new_zeros(sum(sizes)).split(sizes)
-        by_weights = [part.view(weight.shape) for part, weight in zip(zeros, weights, strict=True)]
+        grad_weights = [part.view(weight.shape) for part, weight in zip(zeros, weights, strict=True)]
         learned = _flat(weights)[:3]
         kernels = fusion_kernels(warp_scalar(encoded.dtype))
         mixed = encoded, exposedness, outputs, brackets, scale, results, gradients.contiguous()
-        launch(kernels.mix_adjoint, results.shape, *mixed, by_exposedness, by_output)
+        launch(kernels.mix_backward, results.shape, *mixed, grad_exposedness, grad_output)
         units = 3, -(-encoded.shape[1] // POINTS_PER_THREAD), weights[0].shape[2]
-        by_unit = encoded, exposedness, by_output, *learned, POINTS_PER_THREAD, *_flat(by_weights)
-        launch(kernels.unit_adjoint, units, *by_unit)
-        by_point = encoded, exposedness, by_exposedness, by_output, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION, *learned
-        launch(kernels.point_adjoint, encoded.shape, *by_point, by_log_sigma)
-        return None, by_log_sigma.sum(1), *by_weights, None
+        by_unit = encoded, exposedness, grad_output, *learned, POINTS_PER_THREAD, *_flat(grad_weights)
+        launch(kernels.unit_backward, units, *by_unit)
+        by_point = (
+            encoded,
+            exposedness,
+            grad_exposedness,
+            grad_output,
+            log_sigma,
+            MAX_LOG_SIGMA,
+            MAX_DEVIATION,
+            *learned,
+        )
+        launch(kernels.point_backward, encoded.shape, *by_point, grad_log_sigma)
+        return None, grad_log_sigma.sum(1), *grad_weights, None
 
 
 def _flat(weights):

@@ -3,6 +3,9 @@
 Rendering 2D Gaussians takes some ten launches; called from Python one by one, they take longer than a small image does.
 After a few calls with the same sizes the next one is captured as CUDA graphs on memory of its own: inputs are copied
 in, outputs are copied out.
+
+This applies to calls of rasterize() and of gsplat's rasterization(). A training captures its whole step as one CUDA
+graph (training/step_graphs.py); within it, and with max_intersections, calls are launched.
 """
 
 import atexit
@@ -19,7 +22,7 @@ import torch
 from torch import Tensor
 
 from ..kernels.project import projection_kernel
-from .blending import Adjoint, BlendResult, BlockAdjoint, blend_on_cuda
+from .blending import Backward, BlendResult, BlockBackward, blend_on_cuda
 from .cuda_graphs import CudaGraphRunner, is_capturing
 from .projection import ProjectedGaussians, ProjectionAdjoint, project_to_camera
 from .render_options import RenderOptions
@@ -38,16 +41,16 @@ from .warp_launch.launching import fixed_launch, stream_handle, warp_scalar, war
 LOG = logging.getLogger(__name__)
 
 WARMUP_CALLS = 4  # Launched calls of a size before one is captured: a capture takes the time of some twenty of them.
-MAX_SIZES = 3  # Sizes of calls with graphs, the most recent ones.
-MAX_GRAPHS = 4  # Graphs of a size: each holds a render until its backward pass.
-MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without graphs.
+MAX_SIZES = 3  # Sizes of calls with CUDA graphs, the most recent ones.
+MAX_GRAPHS = 4  # CUDA graphs of a size: each holds a render until its backward pass.
+MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
 MAX_GAUSSIANS = 1 << 21  # Without a backward pass; with one the host is the bottleneck only up to MAX_SINGLE_SORT.
 HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
 MIN_INTERSECTIONS = 1 << 12
 
 
 class _Signature(NamedTuple):
-    """Properties that the calls of one graph share."""
+    """Properties that the calls of one CUDA graph share."""
 
     options: RenderOptions
     stream: int
@@ -55,8 +58,8 @@ class _Signature(NamedTuple):
     tensors: tuple  # Shape, dtype and device of each.
 
 
-def find_graphs(tensors: Sequence[Any], options: RenderOptions) -> "_CallGraphs | None":
-    """Return the graphs of calls like this one; None if there was none yet, or it is not for a graph.
+def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
+    """Return the CUDA graphs of calls like this one; None if there are none yet, or the call cannot be captured.
 
     tensors, options: as their user passed them. If calls like this one are known, they fit.
     """
@@ -73,11 +76,11 @@ def find_graphs(tensors: Sequence[Any], options: RenderOptions) -> "_CallGraphs 
     return None if graphs is None or is_capturing(tensors[0].device) else graphs
 
 
-def add_graphs(tensors: Sequence[Tensor], options: RenderOptions) -> "_CallGraphs | None":
-    """Return the graphs of calls like this one, which need not be known; None if it is not for a graph.
+def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "GraphPool | None":
+    """Return the CUDA graphs of calls like this one, an empty pool at first; None if the call cannot be captured.
 
     Args:
-        tensors: as _CallGraphs.replay() takes them, of one device.
+        tensors: as GraphPool.replay() takes them, of one device.
         options: of the image.
     """
     first, features = tensors[0], tensors.features if isinstance(tensors, Splats) else tensors[FEATURES]
@@ -89,7 +92,7 @@ def add_graphs(tensors: Sequence[Tensor], options: RenderOptions) -> "_CallGraph
     small = 0 < len(features) <= (MAX_SINGLE_SORT if signature.differentiable else MAX_GAUSSIANS)
     if not small or options.width * options.height > MAX_PIXELS or is_capturing(first.device):
         return None
-    return _graphs_of(signature)
+    return _pool_of(signature)
 
 
 def on_gpu(tensor: Tensor) -> bool:
@@ -107,20 +110,23 @@ FEATURES = 4
 """Place of features among a call's tensors: means, log_scales, quaternions, opacities, features, pose, lens."""
 
 
-class GraphRender:
-    """A render by a CUDA graph, which no other call uses until the adjoints are freed.
+class ReplayedRender:
+    """A render by a CUDA graph, which no other call uses for as long as the backward passes of this render exist.
+
+    They hold a lease of the graph. It ends with the last reference to `result` or `projection_adjoint`: when the
+    autograd graph of the render is freed, or at once for a render without gradients.
 
     Attributes:
-        projected: 2D Gaussians; None if the graph began with them. Their conics and opacities are the graph's memory.
+        projected: 2D Gaussians; None if the CUDA graph began with them. Their conics and opacities are its memory.
         result: of the blend.
     """
 
-    def __init__(self, graphs: "_CallGraphs", graph: "_RenderGraph", result: Sequence[Tensor]) -> None:
-        """Lease the graph."""
+    def __init__(self, graphs: "GraphPool", graph: "CapturedRender", result: Sequence[Tensor]) -> None:
+        """Lease the CUDA graph."""
         self._graphs, self._graph = graphs, graph
         lease = _Lease(graphs.idle, graph)
         image, transmittance, *others = result
-        self.result = BlendResult(image, transmittance, lease.adjoint)
+        self.result = BlendResult(image, transmittance, lease.backward)
         self.projected: ProjectedGaussians | None = None
         if graph.projection_adjoint is not None:
             means2d, depths, extents = others
@@ -141,14 +147,14 @@ class GraphRender:
         return False
 
 
-class _RenderGraph:
-    """One render on fixed memory, in two graphs, between which the number of intersections is copied to the host.
+class CapturedRender:
+    """One render on fixed memory, in two CUDA graphs, between which the number of intersections is copied to the host.
 
     Args:
         tensors: the seven tensors of a call, or Splats.
         options: of the image.
         intersections: the least number to allocate memory for.
-        differentiable: whether adjoints may be called.
+        differentiable: whether its backward passes may be called.
     """
 
     def __init__(
@@ -173,7 +179,7 @@ class _RenderGraph:
             counter.copy_(offsets.cumulative_counts[-1:], non_blocking=True)
             return splats, packed, offsets
 
-        def blend(splats: Splats, packed: PackedSplats, offsets: IntersectionOffsets, limit: int) -> BlockAdjoint:
+        def blend(splats: Splats, packed: PackedSplats, offsets: IntersectionOffsets, limit: int) -> BlockBackward:
             depths, extents = splats.depths, splats.extents
             lists = build_tile_lists(packed, offsets, depths, extents, width, height, limit, keep_emit_order=False)
             return blend_on_cuda(splats.features, lists, packed, image, transmittance, threshold, False)
@@ -187,9 +193,9 @@ class _RenderGraph:
             del splats, packed, offsets
         self.splats, packed, offsets = self._counting.capture(None, count)
         limit = self.max_intersections
-        adjoint = self._blending.capture(None, lambda: blend(self.splats, packed, offsets, limit))
-        self.adjoint: Adjoint = adjoint.on_fixed_memory() if differentiable else adjoint
-        """Adjoint of the last render; one launch, which needs no graph."""
+        backward = self._blending.capture(None, lambda: blend(self.splats, packed, offsets, limit))
+        self.backward: Backward = backward.on_fixed_memory() if differentiable else backward
+        """Backward pass of the last render; one launch, which needs no CUDA graph."""
         self.projection_adjoint = _projection_adjoint(inputs, options, self.splats) if projects else None
         outputs = self.splats.means2d, self.splats.depths, self.splats.extents
         self._inputs = inputs
@@ -247,25 +253,25 @@ def _projection_adjoint(inputs: Sequence[Tensor], options: RenderOptions, splats
 
 
 @dataclass
-class _CallGraphs:
-    """The graphs of calls of one kind.
+class GraphPool:
+    """The CUDA graphs of calls with one signature.
 
     Attributes:
-        differentiable: whether the calls need adjoints.
+        differentiable: whether the calls need backward passes.
         launched: calls that were launched.
-        captured: graphs that were captured since the memory last grew.
-        intersections: the least number that the next graph allocates memory for.
-        idle: graphs that no call holds.
+        captured: CUDA graphs that were captured since the memory last grew.
+        intersections: the least number that the next CUDA graph allocates memory for.
+        idle: CUDA graphs that no call holds.
     """
 
     differentiable: bool = False
     launched: int = 0
     captured: int = 0
     intersections: int = 0
-    idle: list[_RenderGraph] = field(default_factory=list)
+    idle: list[CapturedRender] = field(default_factory=list)
 
-    def take(self, capture: Callable[[int], _RenderGraph]) -> _RenderGraph | None:
-        """Return a graph that is the caller's until it is idle again; None for a call that is to be launched."""
+    def take(self, capture: Callable[[int], CapturedRender]) -> CapturedRender | None:
+        """Return a CUDA graph that is the caller's until it is idle again; None for a call that is to be launched."""
         if self.idle:
             with suppress(IndexError):
                 return self.idle.pop()
@@ -282,7 +288,7 @@ class _CallGraphs:
 
     def replay(
         self, tensors: Sequence[Tensor], options: RenderOptions, outputs: Sequence[Tensor] = ()
-    ) -> GraphRender | None:
+    ) -> ReplayedRender | None:
         """Render by a CUDA graph, or return None if the call is to be launched instead.
 
         Args:
@@ -291,31 +297,31 @@ class _CallGraphs:
             outputs: for Splats (extents,), to be written to.
         """
 
-        def capture(intersections: int) -> _RenderGraph:
+        def capture(intersections: int) -> CapturedRender:
             with torch.inference_mode(False), torch.no_grad():
-                return _RenderGraph(tensors, options, intersections, self.differentiable)
+                return CapturedRender(tensors, options, intersections, self.differentiable)
 
         with torch.no_grad():
             graph = self.take(capture)
-            return None if graph is None else GraphRender(self, graph, graph.replay(tensors, outputs))
+            return None if graph is None else ReplayedRender(self, graph, graph.replay(tensors, outputs))
 
     def grow(self, intersections: int) -> None:
-        """Let new graphs be captured, because one had too little memory for this many intersections."""
+        """Let new CUDA graphs be captured, because one had too little memory for this many intersections."""
         self.intersections, self.captured, self.idle = max(intersections, self.intersections), 0, []
 
 
 class _Lease:
-    """Keeps a graph from other calls for as long as it lives."""
+    """Keeps a CUDA graph from other calls, and returns it to the idle ones when it is deleted."""
 
-    def __init__(self, idle: list[_RenderGraph], graph: _RenderGraph) -> None:
+    def __init__(self, idle: list[CapturedRender], graph: CapturedRender) -> None:
         self._idle, self._graph = idle, graph
 
-    def adjoint(self, by_image: Tensor, by_transmittance: Tensor | None) -> Tensor:
-        return self._graph.adjoint(by_image, by_transmittance)
+    def backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
+        return self._graph.backward(grad_image, grad_transmittance)
 
     def projection_adjoint(self, *arguments: Any) -> None:
         adjoint = self._graph.projection_adjoint
-        assert adjoint is not None, "the graph begins with 2D Gaussians"
+        assert adjoint is not None, "the CUDA graph begins with 2D Gaussians"
         adjoint(*arguments)
 
     def __del__(self) -> None:
@@ -323,20 +329,20 @@ class _Lease:
 
 
 _lock = threading.Lock()
-_graphs: OrderedDict[_Signature, _CallGraphs] = OrderedDict()
+_graphs: OrderedDict[_Signature, GraphPool] = OrderedDict()
 
 
 def clear_graphs() -> None:
-    """Free all graphs and their memory."""
+    """Free all CUDA graphs and their memory."""
     _graphs.clear()
 
 
-atexit.register(clear_graphs)  # Graphs must be freed before CUDA is.
+atexit.register(clear_graphs)  # CUDA graphs must be freed before CUDA is.
 
 
-def _graphs_of(signature: _Signature) -> _CallGraphs:
+def _pool_of(signature: _Signature) -> GraphPool:
     with _lock:
-        graphs = _graphs.setdefault(signature, _CallGraphs(signature.differentiable))
+        graphs = _graphs.setdefault(signature, GraphPool(signature.differentiable))
         _graphs.move_to_end(signature)
         while len(_graphs) > MAX_SIZES:
             _graphs.popitem(last=False)

@@ -10,10 +10,10 @@ from torch import Tensor
 from ..kernels.harmonics import (
     basis_kernel,
     channels_kernel,
-    coefficient_adjoint_kernel,
-    harmonics_adjoint_kernel,
+    coefficient_backward_kernel,
+    harmonics_backward_kernel,
     harmonics_kernel,
-    turns_adjoint_kernel,
+    jacobian_backward_kernel,
 )
 from .checks import check_tensors, integer
 from .torch_contract import torch_operation
@@ -80,13 +80,13 @@ class HarmonicsGradients:
     The gradients are sums over the views.
 
     Attributes:
-        by_values: [V, N, 3] gradients by the values of each view.
+        grad_colors: [V, N, 3] gradients by the values of each view.
         positions: [V, 3] of the views' cameras, world coordinates.
         means: [N, 3] of the Gaussians when the views were rendered.
         degree: of the evaluation.
     """
 
-    by_values: Tensor
+    grad_colors: Tensor
     positions: Tensor
     means: Tensor
     degree: int
@@ -100,17 +100,17 @@ class HarmonicsGradients:
         launch(kernel, len(self.positions) * len(means), means, self.positions, basis)
         return basis
 
-    def by_coefficients(self, like: Tensor, start: int) -> Tensor:
+    def coefficient_gradients(self, like: Tensor, start: int) -> Tensor:
         """Return the gradients [N, K, 3], like a tensor of that shape, by the coefficients from number `start` on."""
         gradients = torch.empty_like(like)
         if gradients.numel():
-            kernel = coefficient_adjoint_kernel(warp_scalar(gradients.dtype), gradients.shape[1])
-            launch(kernel, gradients.numel(), self.basis, self.by_values, start, gradients.view(-1))
+            kernel = coefficient_backward_kernel(warp_scalar(gradients.dtype), gradients.shape[1])
+            launch(kernel, gradients.numel(), self.basis, self.grad_colors, start, gradients.view(-1))
         return gradients
 
 
 class _Evaluation(torch.autograd.Function):
-    """Harmonics with an adjoint written by hand.
+    """Harmonics with a backward pass written by hand.
 
     The generated adjoint adds to zeros, number by number, which for 48 numbers a Gaussian takes several times as long
     as writing them.
@@ -124,39 +124,39 @@ class _Evaluation(torch.autograd.Function):
             torch.empty_like(means),
         )
         # A GPU waits for memory: what the backward pass needs of 48 numbers a Gaussian are 9, made while they are here.
-        turning = writes_turns(means.device) and any(ctx.needs_input_grad[3:])
-        turns = means.new_empty(len(means) if turning else 0, 3, 3)
-        if writes_turns(means.device):
-            launch(channels_kernel(scalar, degree, turning), 3 * len(means), *inputs, values, turns)
+        with_jacobian = writes_jacobian(means.device) and any(ctx.needs_input_grad[3:])
+        mean_jacobian = means.new_empty(len(means) if with_jacobian else 0, 3, 3)
+        if writes_jacobian(means.device):
+            launch(channels_kernel(scalar, degree, with_jacobian), 3 * len(means), *inputs, values, mean_jacobian)
         else:
             launch(harmonics_kernel(scalar, degree), len(means), *inputs, values)
-        ctx.degree, ctx.turning = degree, turning
-        ctx.save_for_backward(constant, rest, means, camera_position, turns)
+        ctx.degree, ctx.with_jacobian = degree, with_jacobian
+        ctx.save_for_backward(constant, rest, means, camera_position, mean_jacobian)
         return values
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        constant, rest, means, position, turns = ctx.saved_tensors
+        constant, rest, means, position, mean_jacobian = ctx.saved_tensors
         scalar, degree, gradient = warp_scalar(gradient.dtype), ctx.degree, gradient.contiguous()
-        by_constant, by_rest, by_means, by_camera = ctx.needs_input_grad[1:]
+        need_constant, need_rest, need_means, need_camera = ctx.needs_input_grad[1:]
         # On the CPU a thread takes a Gaussian with all of its coefficients.
-        together = not writes_turns(gradient.device) and (by_constant or by_rest)
-        by_parts = [torch.empty_like(part) if together else None for part in (constant, rest)]
-        mean_gradients = torch.empty_like(means)
-        if ctx.turning:
-            launch(turns_adjoint_kernel(scalar), len(means), turns, gradient, mean_gradients)
-        elif by_means or by_camera or together:
-            kernel = harmonics_adjoint_kernel(scalar, degree, together)
-            launch(kernel, len(means), rest, means, position, gradient, mean_gradients, *by_parts)
-        if not together and (by_constant or by_rest):
+        together = not writes_jacobian(gradient.device) and (need_constant or need_rest)
+        grad_parts = [torch.empty_like(part) if together else None for part in (constant, rest)]
+        grad_means = torch.empty_like(means)
+        if ctx.with_jacobian:
+            launch(jacobian_backward_kernel(scalar), len(means), mean_jacobian, gradient, grad_means)
+        elif need_means or need_camera or together:
+            kernel = harmonics_backward_kernel(scalar, degree, together)
+            launch(kernel, len(means), rest, means, position, gradient, grad_means, *grad_parts)
+        if not together and (need_constant or need_rest):
             factors = HarmonicsGradients(gradient[None], position[None], means, degree)
-            by_parts = [factors.by_coefficients(part, start) for start, part in enumerate((constant, rest))]
-        by_position = -mean_gradients.sum(0) if by_camera else None
-        return None, *by_parts, mean_gradients if by_means else None, by_position
+            grad_parts = [factors.coefficient_gradients(part, start) for start, part in enumerate((constant, rest))]
+        grad_position = -grad_means.sum(0) if need_camera else None
+        return None, *grad_parts, grad_means if need_means else None, grad_position
 
 
-def writes_turns(device: torch.device) -> bool:
+def writes_jacobian(device: torch.device) -> bool:
     """Return whether the forward pass on a device has one thread for each channel.
 
     That pass also writes what the gradient by the means needs.

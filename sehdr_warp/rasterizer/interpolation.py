@@ -55,7 +55,7 @@ class _Interpolation(torch.autograd.Function):
     def backward(ctx, gradients):
         table, positions = ctx.saved_tensors
         copies = 1 if table.device.type == "cpu" else interpolation.COPIES
-        by_position, by_node = torch.empty_like(positions), table.new_zeros(copies, *table.shape)
+        grad_positions, grad_table = torch.empty_like(positions), table.new_zeros(copies, *table.shape)
         inputs = table, ctx.low, 1.0 / ctx.step, positions, gradients.contiguous()
-        launch(interpolation.interpolate_adjoint, positions.shape, *inputs, by_position, by_node)
-        return by_node.sum(0), None, None, by_position
+        launch(interpolation.interpolate_backward, positions.shape, *inputs, grad_positions, grad_table)
+        return grad_table.sum(0), None, None, grad_positions

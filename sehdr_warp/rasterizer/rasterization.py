@@ -11,7 +11,7 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .blending import blend, with_gradient
 from .checks import check_cameras, check_opacities, check_tensors
-from .graph_cache import FEATURES, GraphRender, add_graphs, find_graphs
+from .graph_cache import FEATURES, ReplayedRender, find_pool, get_or_create_pool
 from .memory import oom_context
 from .projection import ProjectedGaussians, project_to_camera, with_projection_gradient
 from .render_options import RenderOptions
@@ -145,7 +145,7 @@ def rasterize(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
     tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
-    graphs = find_graphs(tensors, options) if background is None else None
+    graphs = find_pool(tensors, options) if background is None else None
     if graphs is None:
         check_shapes(*tensors, background)
         check_opacities(opacities)
@@ -153,7 +153,7 @@ def rasterize(
         options = options.checked(means.device)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
         if world_to_camera.ndim == 2:
-            view = _project(tensors, options, graphs or add_graphs(tensors, options))
+            view = _project(tensors, options, graphs or get_or_create_pool(tensors, options))
             rendering = _render(view, view.projected.means2d, features, options)
         else:
             rendering = _render_cameras(tensors, options)
@@ -203,7 +203,7 @@ class _View(NamedTuple):
     """Gaussians projected to a camera, and their render if a CUDA graph made it."""
 
     projected: ProjectedGaussians
-    graph_render: GraphRender | None
+    replayed: ReplayedRender | None
 
 
 def _project(tensors: Sequence[Tensor], options: RenderOptions, graphs: Any) -> _View:
@@ -213,24 +213,24 @@ def _project(tensors: Sequence[Tensor], options: RenderOptions, graphs: Any) -> 
     """
     means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
     gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
-    graph_render = None if graphs is None else graphs.replay(tensors, options)
-    if graph_render is not None and graph_render.projected is not None:
-        outputs = with_projection_gradient(gaussians, graph_render.projected, graph_render.projection_adjoint)
-        if graph_render.fits():
-            return _View(ProjectedGaussians(*outputs), graph_render)
+    replayed = None if graphs is None else graphs.replay(tensors, options)
+    if replayed is not None and replayed.projected is not None:
+        outputs = with_projection_gradient(gaussians, replayed.projected, replayed.projection_adjoint)
+        if replayed.fits():
+            return _View(ProjectedGaussians(*outputs), replayed)
     dense = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
     return _View(project_to_camera(*dense, opacities, world_to_camera, intrinsics, options), None)
 
 
 def _render(view: _View, means2d: Tensor, features: Tensor, options: RenderOptions) -> Rendering:
     """Render a view with features [N, C], as a function of means2d [N, 2]."""
-    projected, graph_render = view
-    if graph_render is None:
+    projected, replayed = view
+    if replayed is None:
         return render_projected(projected._replace(means2d=means2d), features, options, replays=False)
     if options.depth:
         features = torch.cat([features, projected.depths[:, None]], 1)
-    image, transmittance = with_gradient(means2d, projected.conics, projected.opacities, features, graph_render.result)
-    count = graph_render.intersections
+    image, transmittance = with_gradient(means2d, projected.conics, projected.opacities, features, replayed.result)
+    count = replayed.intersections
     return _rendering(image, transmittance, projected._replace(means2d=means2d), count, None, None, options)
 
 
@@ -246,7 +246,7 @@ def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Render
         strict=True,
     )
     calls = [(means, log_scales, quaternions, *own) for own in each]
-    views = [_project(call, options, add_graphs(call, options)) for call in calls]
+    views = [_project(call, options, get_or_create_pool(call, options)) for call in calls]
     # One tensor that every image is rendered from, so that its gradient holds every camera's.
     means2d = torch.stack([view.projected.means2d for view in views])
     renderings = [
@@ -269,11 +269,11 @@ def render_projected(
     features = features.contiguous()
     # In place on memory that the projection's graph has saved: as data, so that it is no change of a saved tensor.
     splats = Splats(means2d, conics, opacities, features, depths, extents.data)
-    graphs = add_graphs(splats, options) if replays else None
-    graph_render = None if graphs is None else graphs.replay(splats, options, (splats.extents,))
-    if graph_render is not None and graph_render.fits():
-        image, transmittance = with_gradient(means2d, conics, opacities, features, graph_render.result)
-        return _rendering(image, transmittance, projected, graph_render.intersections, None, None, options)
+    graphs = get_or_create_pool(splats, options) if replays else None
+    replayed = None if graphs is None else graphs.replay(splats, options, (splats.extents,))
+    if replayed is not None and replayed.fits():
+        image, transmittance = with_gradient(means2d, conics, opacities, features, replayed.result)
+        return _rendering(image, transmittance, projected, replayed.intersections, None, None, options)
     lists, packed = list_splats(splats._replace(features=features.detach()), options)
     image, transmittance = blend(
         means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic

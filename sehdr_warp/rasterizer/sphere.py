@@ -175,21 +175,21 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, by_image, by_transmittance):
+    def backward(ctx, grad_image, grad_transmittance):
         *splats, transmittance, ends = ctx.saved_tensors
         lists, emit_order, (count, channels) = ctx.lists, ctx.lists.emit_order, splats[-1].shape
         # On the CPU each entry has a row, and whole tiles go to a thread: sums keep one order.
         emit_indices = lists.gaussians if emit_order is None else emit_order.emit_indices
-        rows = by_image.new_zeros(count if emit_order is None else len(emit_indices), channels + 10)
-        gradients = by_image.contiguous().view(-1, channels), by_transmittance.contiguous()
+        rows = grad_image.new_zeros(count if emit_order is None else len(emit_indices), channels + 10)
+        gradients = grad_image.contiguous().view(-1, channels), grad_transmittance.contiguous()
         arguments = *ctx.inputs, *splats, *ctx.frame, transmittance, ends, emit_indices, *gradients, rows
         ranges = even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS
         launch(ctx.kernels.blend_backward, ctx.pixels, *arguments, ranges=ranges)
         if emit_order is not None:
             rows = gather_by_gaussian(emit_order, rows)
-        by_axis, by_across, by_along, by_opacity, by_features = rows.split((3, 3, 3, 1, channels), dim=1)
-        by_caps = torch.nn.functional.pad(by_axis, (0, 1))
-        return by_caps, by_across, by_along, by_opacity[:, 0], by_features, None, None
+        grad_axis, grad_across, grad_along, grad_opacity, grad_features = rows.split((3, 3, 3, 1, channels), dim=1)
+        grad_caps = torch.nn.functional.pad(grad_axis, (0, 1))
+        return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None
 
 
 def caps_of(directions: Tensor, side: int) -> Tensor:

@@ -15,7 +15,7 @@ from .warp_launch.threads import torch_threads
 
 
 @torch.no_grad()
-def judge_step(
+def check_finite(
     loss: Tensor,
     norms: Tensor,
     incomplete: Tensor | None = None,
@@ -30,13 +30,13 @@ def judge_step(
     tally: [3] int64, counts steps that are not finite; with pairs, an int64 scalar, it also holds the most
     intersections and counts the incomplete steps.
     """
-    verdict = norms.new_empty(2)
+    step_flags = norms.new_empty(2)
     if incomplete is None:
         incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
     none = torch.empty(0, dtype=torch.int64, device=norms.device) if tally is None or pairs is None else None
     counters = (none if tally is None else tally), (none if pairs is None else pairs)
-    launch(kernels.judge_step, 1, loss.detach(), norms, incomplete, *counters, verdict)
-    return verdict[0], verdict[1]
+    launch(kernels.check_finite, 1, loss.detach(), norms, incomplete, *counters, step_flags)
+    return step_flags[0], step_flags[1]
 
 
 @torch.no_grad()
@@ -179,7 +179,7 @@ def harmonics_adam_step(
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
     in_turn = parameter.numel() if turns == 1 else -(-parameter.numel() // (kernels.TURN * turns)) * kernels.TURN
     stride = -(-in_turn // kernels.NUMBERS)
-    arguments = gradients.basis, gradients.by_values, start, stride, turns, *options, *values
+    arguments = gradients.basis, gradients.grad_colors, start, stride, turns, *options, *values
     launch(kernel, stride, *arguments)
 
 

@@ -17,7 +17,7 @@ class GraphCapacity:
     """Chooses the intersection capacity of the next capture from counts that steps keep on the device.
 
     Attributes:
-        step_counters: [3] int64, added up by training_step.judge_step(): steps that were not finite; largest number
+        step_counters: [3] int64, added up by training_step.check_finite(): steps that were not finite; largest number
             of intersections, set to 0 by rescale(); steps with more intersections than the capacity.
     """
 

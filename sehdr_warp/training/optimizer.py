@@ -15,7 +15,7 @@ from ..model.adam import BETAS, FIRST_HARMONIC, Adam
 from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients
-from ..rasterizer.training_step import judge_step, norms
+from ..rasterizer.training_step import check_finite, norms
 from ..runs.checkpoint import under
 from ..runs.config import Config
 
@@ -87,16 +87,16 @@ def guarded_step(
         loss: Scalar loss.
         incomplete: Scalar bool, whether the rendering lacked intersections.
         harmonics: Gradients of the harmonics in factored form.
-        step_counters: As in judge_step().
-        pairs: As in judge_step().
+        step_counters: As in check_finite().
+        pairs: As in check_finite().
         live: As in Adam.step().
 
     Returns:
         A scalar float tensor: 1 if the step was applied, else 0.
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-    gradients += [] if harmonics is None else [harmonics.by_values]
-    skipped, applied = judge_step(loss, norms(gradients), incomplete, step_counters, pairs)
+    gradients += [] if harmonics is None else [harmonics.grad_colors]
+    skipped, applied = check_finite(loss, norms(gradients), incomplete, step_counters, pairs)
     optimizer.step(skipped, applied, harmonics, live)
     return applied
 
@@ -150,8 +150,8 @@ class FlatGradients:
         self._degree = None
         if harmonics is not None:
             # The slots of other ranks are zero, so that the sum over the ranks gathers all.
-            by_values, positions = (part.zero_() for part in self._views[-2:])
-            by_values[self._place], positions[self._place] = harmonics.by_values[0], harmonics.positions[0]
+            grad_colors, positions = (part.zero_() for part in self._views[-2:])
+            grad_colors[self._place], positions[self._place] = harmonics.grad_colors[0], harmonics.positions[0]
             self._degree = harmonics.degree
         self.numbers[0] = loss.detach()
         self.numbers[1] = torch.zeros_like(loss) if incomplete is None else incomplete.to(loss.dtype)
@@ -168,8 +168,8 @@ class FlatGradients:
             self.parameters[k].grad = self._views[k]
         harmonics = None
         if self._degree is not None:
-            by_values, positions = self._views[-2:]
-            harmonics = HarmonicsGradients(by_values, positions * self._count, self._means, self._degree)
+            grad_colors, positions = self._views[-2:]
+            harmonics = HarmonicsGradients(grad_colors, positions * self._count, self._means, self._degree)
         return self.numbers[0], self.numbers[1] > 0, harmonics
 
 

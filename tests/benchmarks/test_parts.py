@@ -12,8 +12,11 @@ from benchmarks.step import bench_step
     "kernel, part",
     [
         ("project_d287a562_cuda_kernel_forward", "projection"),
-        ("project_d287a562_cuda_kernel_backward", "projection, adjoint"),
-        ("backward_kernel__locals__blend_backward_64b9232b_cuda_kernel_forward", "blend, adjoint"),
+        ("project_d287a562_cuda_kernel_backward", "projection, backward"),
+        ("backward_kernel__locals__blend_backward_64b9232b_cuda_kernel_forward", "blend, backward"),
+        ("tile_kernels__locals__pack_splats_64b9232b_cuda_kernel_forward", "lists"),
+        ("tile_ranges_kernel__locals__find_tile_ranges_64b9232b_cuda_kernel_forward", "lists"),
+        ("jacobian_backward_kernel__locals__jacobian_backward_64b9232b_cuda_kernel_forward", "harmonics"),
         ("void cub::_V_3::detail::radix_sort::DeviceRadixSortOnesweepKernel<int>", "lists"),
         ("opacities_kernel__locals__activate_opacities_3c9e86f4_cuda_kernel_forward", "activations"),
         ("update_harmonics_by_adam_973af1cd_cuda_kernel_forward", "optimizer"),

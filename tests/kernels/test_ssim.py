@@ -45,7 +45,7 @@ def relative_error(value, truth):
 
 @pytest.fixture(params=["runs", "single", "patches"])
 def kernels(request, monkeypatch, device):
-    """All kernels on the CPU: runs of 16, those of narrow images, and those of a GPU, on fibers."""
+    """All kernels on the CPU: runs of 16, those of narrow images, and those of a GPU, emulated."""
     module = import_module("sehdr_warp.rasterizer.ssim")
     if request.param == "single":
         monkeypatch.setattr(module, "CPU_LANES", 1)

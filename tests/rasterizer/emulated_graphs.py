@@ -50,7 +50,7 @@ def tensors_of(value) -> Iterator[torch.Tensor]:
 
 
 def emulate(monkeypatch) -> None:
-    """Let calls on the CPU be replayed, with block kernels on fibers; ordinary kernels must not run in blocks."""
+    """Let calls on the CPU be replayed, with block kernels emulated; ordinary kernels must not run in blocks."""
     empty = torch.empty
     monkeypatch.setattr(graph_cache, "CudaGraphRunner", Runner)
     monkeypatch.setattr(graph_cache, "on_gpu", lambda tensor: True)

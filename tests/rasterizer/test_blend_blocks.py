@@ -1,4 +1,4 @@
-"""The CUDA block kernels run on CPU fibers, so that a machine without a GPU tests their logic."""
+"""The CUDA block kernels run in Warp's CPU block emulation, so that a machine without a GPU tests their logic."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ BOUNDS = {torch.float64: 1e-12, torch.float32: 1e-5}
 
 
 @pytest.fixture
-def fibers(monkeypatch):
+def blocks(monkeypatch):
     """Switches block kernels on the CPU on; off again, because ordinary kernels must not run in blocks."""
     monkeypatch.setattr(blending, "blend_on_cpu", blend_on_cuda)
     monkeypatch.setattr(tile_lists, "lists_by_tile", tile_lists._sort_by_tile)
@@ -45,13 +45,13 @@ def leaves_and_lists(scene):
 
 @pytest.mark.parametrize("dtype", BOUNDS, ids=["float64", "float32"])
 @pytest.mark.parametrize("channels, deterministic", [(1, False), (3, False), (3, True), (9, False)])
-def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministic):
+def test_block_kernels_match_the_reference(blocks, dtype, channels, deterministic):
     # Enough overlap that queues spill over 32 and pixels finish early; a cut tile at the right and the bottom.
     scene = random_scene(count=600, channels=channels, width=44, height=26, spread=1.6, seed=2)
     leaves, given, _ = leaves_and_lists(scene.to(dtype))
-    ranges = given[0].ranges
+    ranges = given[0].tile_ranges
     assert int((ranges[:, 1] - ranges[:, 0]).max()) > 64
-    image, transmittance = fibers(lambda: blend(*leaves, *given, THRESHOLD, deterministic))
+    image, transmittance = blocks(lambda: blend(*leaves, *given, THRESHOLD, deterministic))
     truth = scene.to(torch.float64)
     true_leaves, _, true_extents = leaves_and_lists(truth)
     sizes = truth.width, truth.height, THRESHOLD
@@ -61,28 +61,28 @@ def test_block_kernels_match_the_reference(fibers, dtype, channels, deterministi
     assert relative_error(transmittance, true_transmittance) < BOUNDS[dtype]
     assert relative_error(1 - transmittance, 1 - true_transmittance) < BOUNDS[dtype]
     loss = (image * random_like(image, 1)).sum() + (transmittance * random_like(transmittance, 2)).sum()
-    fibers(loss.backward)
+    blocks(loss.backward)
     true_loss = (true_transmittance * random_like(true_transmittance, 2)).sum()
     (true_loss + (true_image * random_like(true_image, 1)).sum()).backward()
     for ours, true in zip(leaves, true_leaves):
         assert relative_error(ours.grad, true.grad) < BOUNDS[dtype]
 
 
-def test_a_single_pixels_gradient_may_have_any_strides(fibers):
+def test_a_single_pixels_gradient_may_have_any_strides(blocks):
     scene = random_scene(count=600, channels=1, width=1, height=1, spread=1.6, seed=2).to(torch.float32, "cpu")
     leaves, given, _ = leaves_and_lists(scene)
-    image = fibers(lambda: blend(*leaves, *given, THRESHOLD))[0]
-    fibers(image.sum().backward)
+    image = blocks(lambda: blend(*leaves, *given, THRESHOLD))[0]
+    blocks(image.sum().backward)
     assert float(leaves[3].grad.sum()) > 0
 
 
-def test_nothing_more_by_gaussian_is_kept_for_the_backward_pass(fibers, monkeypatch):
+def test_nothing_more_by_gaussian_is_kept_for_the_backward_pass(blocks, monkeypatch):
     monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
     monkeypatch.setattr(blending, "MAX_SINGLE_SORT", 0)  # few are kept padded
     scene = random_scene(count=600, channels=3, width=44, height=26, seed=2).to(torch.float32, "cpu")
     leaves, given, _ = leaves_and_lists(scene)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
-        image = fibers(lambda: blend(*leaves, *given, THRESHOLD))[0]
+        image = blocks(lambda: blend(*leaves, *given, THRESHOLD))[0]
     kept = sum(event.nbytes() for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]")
     by_pixel = 3 + 1 + 1  # image, transmittance and the last Gaussian drawn
     assert image.requires_grad and kept == 4 * by_pixel * 44 * 26

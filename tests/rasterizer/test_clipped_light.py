@@ -17,7 +17,7 @@ WHITE, WEIGHTS = 1.3, ClippedWeights(smoothness=0.7, hold=0.4)
 
 @pytest.fixture(params=["values", "patches"])
 def kernels(request, monkeypatch, device):
-    """The kernels of the device; on the CPU those of a GPU too, on fibers."""
+    """The kernels of the device; on the CPU those of a GPU too, in Warp's block emulation."""
     if request.param == "patches" and device == "cpu":
         monkeypatch.setattr(patches, "in_patches", lambda device: True)
         monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)

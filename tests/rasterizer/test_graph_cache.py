@@ -130,7 +130,7 @@ def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
 
 
 def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
-    kind, made = graph_cache._CallGraphs(), iter("abcdefgh")
+    kind, made = graph_cache.GraphPool(), iter("abcdefgh")
     assert [kind.take(lambda pairs: next(made)) for _ in range(graph_cache.WARMUP_CALLS)] == [
         None
     ] * graph_cache.WARMUP_CALLS
@@ -146,7 +146,7 @@ def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
 
 
 def test_what_cannot_be_recorded_is_launched():
-    kind, asked = graph_cache._CallGraphs(), []
+    kind, asked = graph_cache.GraphPool(), []
 
     def record(pairs):
         asked.append(pairs)
@@ -160,11 +160,11 @@ def test_only_the_latest_kinds_are_remembered():
     tensors = scene.tensors
 
     def graphs(width):
-        return graph_cache.add_graphs(tensors, RenderOptions(width, 8))
+        return graph_cache.get_or_create_pool(tensors, RenderOptions(width, 8))
 
-    assert graph_cache.find_graphs(tensors, RenderOptions(1, 8)) is None
+    assert graph_cache.find_pool(tensors, RenderOptions(1, 8)) is None
     kinds = [graphs(1 + n) for n in range(graph_cache.MAX_SIZES)]
-    assert graphs(1) is kinds[0] and graph_cache.find_graphs(tensors, RenderOptions(1, 8)) is kinds[0]
+    assert graphs(1) is kinds[0] and graph_cache.find_pool(tensors, RenderOptions(1, 8)) is kinds[0]
     graphs(99)
     assert graphs(1) is kinds[0] and graphs(2) is not kinds[1]
 

@@ -50,9 +50,9 @@ def test_basis_is_the_real_spherical_harmonics(device, degree):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("which", range(3), ids=["coefficients", "means", "camera_position"])
-@pytest.mark.parametrize("turning", [False, True])
-def test_gradients_match_finite_differences(device, degree, which, turning, monkeypatch):
-    monkeypatch.setattr(harmonics, "writes_turns", lambda device: turning)
+@pytest.mark.parametrize("with_jacobian", [False, True])
+def test_gradients_match_finite_differences(device, degree, which, with_jacobian, monkeypatch):
+    monkeypatch.setattr(harmonics, "writes_jacobian", lambda device: with_jacobian)
     tensors = inputs(count=6)
     weights = torch.randn(6, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
@@ -99,7 +99,7 @@ def test_a_thread_for_each_coefficient_gives_the_same(device, degree, dtype):
     spherical_harmonics(degree, *leaves).backward(weights)
     means, position = (leaf.detach() for leaf in leaves[1:])
     factors = HarmonicsGradients(weights[None], position[None], means, degree)
-    found = factors.by_coefficients(leaves[0].detach()[:, 1:].contiguous(), 1)
+    found = factors.coefficient_gradients(leaves[0].detach()[:, 1:].contiguous(), 1)
     assert torch.allclose(found, leaves[0].grad[:, 1:], rtol=1e-5, atol=1e-6)
     assert not found[:, (degree + 1) ** 2 - 1 :].any()
 

@@ -28,7 +28,7 @@ def cube_kernel(first: int, values: wp.array(dtype=wp.float64), cubes: wp.array(
 
 @differentiable
 def cube(program, values):
-    cubes = program.write(values.shape, values.dtype)
+    cubes = program.empty_output(values.shape, values.dtype)
     program.launch(cube_kernel, len(values), [values], [cubes])
     return cubes
 

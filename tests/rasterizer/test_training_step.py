@@ -13,9 +13,9 @@ from sehdr_warp.rasterizer.training_step import (
     adam_steps,
     add_gradient_statistics,
     add_position_noise,
+    check_finite,
     differentiate,
     harmonics_adam_step,
-    judge_step,
     norms,
 )
 
@@ -140,7 +140,7 @@ def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
         skipped = nonfinite or bool(incomplete)
         tally, pairs = (torch.tensor(values, device=device) for values in ([4, 7, 2], 9))
         for counted in (None, pairs):
-            found = judge_step(torch.tensor(loss, device=device), given, told, tally, counted)
+            found = check_finite(torch.tensor(loss, device=device), given, told, tally, counted)
             assert [float(value) for value in found] == [skipped, not skipped]
         assert tally.tolist() == [4 + 2 * nonfinite, 9, 2 + bool(incomplete)]
 

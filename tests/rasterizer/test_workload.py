@@ -17,8 +17,8 @@ def test_what_warps_draw_is_counted(device, monkeypatch):
     def counted(opacities, grown=0.0):
         """What is counted, and the warps that have a pixel which a Gaussian colors, were it alone."""
         given = means, log_scales + grown, quaternions, opacities, features
-        with monkeypatch.context() as fibers:
-            fibers.setattr(wp.config, "enable_cpu_blocks", device == "cpu")
+        with monkeypatch.context() as blocks:
+            blocks.setattr(wp.config, "enable_cpu_blocks", device == "cpu")
             pairs, drawn = count_blended_pairs((*given, *camera), 40, 24)
         each = [rasterize(*(tensor[i : i + 1] for tensor in given), *camera, 40, 24).alpha for i in range(400)]
         colored = torch.stack(each) >= ALPHA_THRESHOLD

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.training_step import judge_step
+from sehdr_warp.rasterizer.training_step import check_finite
 from sehdr_warp.training.graph_capacity import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
 
 MANY = 10 * MIN_CAPACITY
@@ -14,7 +14,7 @@ def replay(capacity, pairs):
     loss = torch.zeros((), device=capacity.step_counters.device)
     for needed in pairs:
         given, needed = capacity.capacity(), torch.tensor(needed, device=loss.device)
-        judge_step(loss, loss[None], needed > given, capacity.step_counters, needed)
+        check_finite(loss, loss[None], needed > given, capacity.step_counters, needed)
     return given
 
 
@@ -60,7 +60,7 @@ def test_looks_that_do_not_wait_tell_what_the_one_before_asked_for(device):
     capacity, nan = GraphCapacity(device), torch.full((1,), float("nan"), device=device)
     capacity.observe(MANY)
     pairs = torch.tensor(5 * MANY, device=device)
-    judge_step(nan[0], nan, pairs > capacity.capacity(), capacity.step_counters, pairs)
+    check_finite(nan[0], nan, pairs > capacity.capacity(), capacity.step_counters, pairs)
     late = [capacity.poll(wait=False) for _ in range(2)]
     assert late[-1 if capacity.step_counters.is_cuda else 0] == (1, True)
     assert capacity.overflows == 1

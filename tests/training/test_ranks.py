@@ -162,7 +162,7 @@ def test_harmonics_go_as_their_factors():
     ranks[1].buffer.copy_(torch.stack([flat.buffer for flat in ranks]).mean(0))
     _, _, harmonics = ranks[1].distribute()
     assert harmonics.degree == 1 and ranks[1].buffer.numel() < 4 * count * means.numel() + 11 * len(means)
-    assert torch.allclose(harmonics.by_values, torch.cat([one.by_values for one in seen]) / count)
+    assert torch.allclose(harmonics.grad_colors, torch.cat([one.grad_colors for one in seen]) / count)
     assert torch.allclose(harmonics.positions, torch.cat([one.positions for one in seen]))
 
 

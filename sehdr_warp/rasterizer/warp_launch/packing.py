@@ -44,7 +44,7 @@ class PackedLaunch:
         options = {"adj_inputs": initial[count:], "adjoint": adjoint, "block_dim": block_dim}
         self.command = launch_object(kernel, dim, initial[:count], wp.device_from_torch(device), **options)
         self.dim: int | Sequence[int] | None = None
-        # Blocks, on fibers where there is no GPU, are left to Warp.
+        # Block kernels are left to Warp, which emulates them where there is no GPU.
         self.structures = self._structures() if device.type == "cpu" and block_dim is None else []
         # Arrays are packed where the kernel reads them.
         self.arrays = [getattr(part, name) for part in self.structures for name, *_ in part._fields_]

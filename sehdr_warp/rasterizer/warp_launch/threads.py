@@ -58,18 +58,18 @@ def run_ranges(function: Any, bounds: ctypes.Structure, structures: Sequence[cty
     work = shared_ranges.Work(kernel, ctypes.addressof(bounds), parameters, gradients, size, ranges.data_ptr(), count)
     once = _share_ranges()
 
-    def take_part(fork: int = 0) -> None:
-        arguments = shared_ranges.Arguments(ctypes.addressof(work), fork, threads)
+    def run_worker(gomp_parallel: int = 0) -> None:
+        arguments = shared_ranges.Arguments(ctypes.addressof(work), gomp_parallel, threads)
         once.hooks.forward(ctypes.byref(once.params[0]), ctypes.byref(arguments))
 
     if min(count, threads) < 2:
-        take_part()
-    elif fork := _openmp_fork():
-        take_part(fork)
+        run_worker()
+    elif gomp_parallel := _openmp_parallel():
+        run_worker(gomp_parallel)
     else:
-        helpers = [_helpers(threads - 1).submit(take_part) for _ in range(threads - 1)]
+        helpers = [_helpers(threads - 1).submit(run_worker) for _ in range(threads - 1)]
         try:
-            take_part()
+            run_worker()
         finally:
             # No thread may still be at work when the caller goes on; one that has not begun finds nothing left to do.
             wait([helper for helper in helpers if not helper.cancel()])
@@ -82,7 +82,7 @@ def _share_ranges() -> Any:
 
 
 @cache
-def _openmp_fork() -> int:
+def _openmp_parallel() -> int:
     """Return the address of GOMP_parallel() in torch's OpenMP library, or 0 if it has none, as on Windows.
 
     OpenMP libraries other than GNU's export it too.
