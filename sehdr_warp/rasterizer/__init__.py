@@ -1,6 +1,6 @@
 """torch <-> Warp: differentiable splatting and the bridge that makes torch operations of Warp programs."""
 
-from . import compiled as compiled
+from . import custom_ops as custom_ops  # Registers what torch.compile calls in place of the operations.
 from .bridge import Program, differentiable
 from .cuda_graphs import CudaGraphRunner
 from .harmonics import HarmonicsGradients, spherical_harmonics

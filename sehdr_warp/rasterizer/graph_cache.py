@@ -160,6 +160,7 @@ class CapturedRender:
     def __init__(
         self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
     ) -> None:
+        """Launch the render once, then capture it."""
         width, height, threshold = options.width, options.height, options.alpha_threshold
         inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
         device = inputs[0].device

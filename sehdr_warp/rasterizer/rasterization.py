@@ -102,8 +102,8 @@ def rasterize(
     """Rasterize Gaussians with any number of feature channels to images of cameras (3DGS, Kerbl et al. 2023).
 
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable once with respect to
-    every tensor, camera included; the graph can be retained. On the CPU results repeat bit for bit, whatever the number
-    of threads.
+    every tensor, camera included; the graph can be retained. The factor that antialiased=True multiplies opacities by
+    is constant in these gradients. On the CPU results repeat bit for bit, whatever the number of threads.
 
     A Gaussian with a parameter or feature that is not finite is culled: it contributes nothing, and its gradients are
     0. On a GPU a camera that is not finite culls all; on the CPU it is refused.
@@ -124,7 +124,8 @@ def rasterize(
         near_plane: least depth of a Gaussian's centre, in scene units; > 0.
         eps2d: variance in square pixels added to each 2D Gaussian; >= 0.
         alpha_threshold: contributions with a smaller alpha are left out; in (0, 1).
-        antialiased: lower opacities so that the variance of eps2d keeps a Gaussian's energy.
+        antialiased: lower opacities so that the variance of eps2d keeps a Gaussian's energy (Mip-Splatting).
+            rasterize_directions() and compat.gsplat differentiate this factor, rasterize() does not.
         background: [C] color behind the Gaussians, or with B cameras [B, C].
         depth: also blend depths, see Rendering.depth.
         max_intersections: allocate memory for this many (Gaussian, tile) intersections of a camera, from 1. On a GPU
@@ -301,7 +302,8 @@ def _rendering(
 def list_splats(splats: Splats, options: RenderOptions, *, blocks: bool = False) -> tuple[TileLists, PackedSplats]:
     """Return the tile lists of 2D Gaussians and their packed form, as blend() takes them.
 
-    blocks: make the lists of block kernels, which a GPU gets anyway unless options.deterministic.
+    blocks: make lists without an order of emission, as block kernels whose gradients are atomic sums need them. A GPU
+    gets them unless options.deterministic, whose block kernels sum in the order of emission.
     """
     width, height, threshold = options.width, options.height, options.alpha_threshold
     keep_emit_order = not blocks and (splats.features.device.type == "cpu" or options.deterministic)

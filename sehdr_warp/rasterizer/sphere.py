@@ -55,7 +55,7 @@ def rasterize_directions(
             what a Gaussian looks like.
         pixel_angle: of the picture's pixels, radians; where they are larger, Gaussians are smoothed to them and keep
             their energy.
-        antialiased: as of rasterize().
+        antialiased: as of rasterize(), but its factor is differentiated.
         near_plane: as of rasterize().
         alpha_threshold: as of rasterize().
 

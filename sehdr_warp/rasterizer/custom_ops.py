@@ -1,7 +1,7 @@
-"""Public operations within torch.compile and torch.export: opaque nodes of one graph, with the shapes of their results.
+"""Public operations within torch.compile and torch.export: custom operators of torch, with the shapes of their results.
 
-Nothing here runs outside of a compiler. The backward pass of a node renders once more, because a node's results are
-tensors alone.
+Nothing here runs outside of a compiler. The backward pass of an operator renders once more, because an operator's
+results are tensors alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,19 +10,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
+from ..kernels.constants import ALPHA_THRESHOLD, NEAR_PLANE
 from .harmonics import check_harmonics, spherical_harmonics
 from .rasterization import Rendering, check_shapes, rasterize
+from .render_options import RenderOptions
 from .sphere import rasterize_directions
 from .ssim import ssim, ssim_map
 from .torch_contract import HALF, register_compiled
 
-Run = Callable[..., list[Tensor]]
+Operation = Callable[..., list[Tensor]]
 _KEYS = torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
 """Dispatch keys of torch outside of an operator: within one it records no gradients."""
 
 
-def define_node(name: str, options: str, run: Run, fake: Run) -> Callable[..., list[Tensor]]:
+def register_custom_op(name: str, options: str, run: Operation, fake: Operation) -> Callable[..., list[Tensor]]:
     """Register an operator of torch, with its gradient, and return it.
 
     Args:
@@ -75,29 +76,20 @@ def _as_float(*tensors: Tensor) -> list[Tensor]:
     return [tensor.float() if half else tensor for tensor, half in zip(tensors, halves, strict=True)]
 
 
-def _run_rasterize(tensors: Sequence[Tensor], width: int, height: int, *options: Any) -> list[Tensor]:
-    near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic = options
-    arguments: Any = (*tensors[:7], width, height)
-    rendering = rasterize(
-        *arguments,
-        near_plane=near_plane,
-        eps2d=eps2d,
-        alpha_threshold=alpha_threshold,
-        antialiased=antialiased,
-        background=tensors[7] if len(tensors) > 7 else None,
-        depth=depth,
-        max_intersections=max_intersections,
-        deterministic=deterministic,
-    )
+def _run_rasterize(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
+    arguments: Any = tensors[:7]
+    background = tensors[7] if len(tensors) > 7 else None
+    rendering = rasterize(*arguments, background=background, **RenderOptions(*options)._asdict())
     results = [rendering.image, rendering.transmittance, rendering.means2d, rendering.depths, rendering.extents]
     optional = rendering.depth, rendering.overflow, rendering.needed_intersections
     return results + [result for result in optional if result is not None]
 
 
-def _fake_rasterize(tensors: Sequence[Tensor], width: int, height: int, *options: Any) -> list[Tensor]:
+def _fake_rasterize(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
     arguments: Any = (*tensors[:7], tensors[7] if len(tensors) > 7 else None)
     check_shapes(*arguments)
-    *_, depth, max_intersections, _ = options
+    options = RenderOptions(*values)
+    height, width = options.height, options.width
     means, features, pose = tensors[0], tensors[4], tensors[5]
     cameras, count = pose.shape[:-2], means.shape[0]
     results = [
@@ -107,14 +99,14 @@ def _fake_rasterize(tensors: Sequence[Tensor], width: int, height: int, *options
         means.new_empty(*cameras, count),
         means.new_empty(*cameras, count, 2),
     ]
-    results += [means.new_empty(*cameras, height, width)] if depth else []
-    if max_intersections is not None:
+    results += [means.new_empty(*cameras, height, width)] if options.depth else []
+    if options.max_intersections is not None:
         results += [means.new_empty((), dtype=torch.bool), means.new_empty((), dtype=torch.int64)]
     return results
 
 
-_rasterize_node = define_node(
-    "rasterize",
+_rasterize_op = register_custom_op(
+    "rasterize",  # The fields of RenderOptions, in their order.
     ", SymInt width, SymInt height, float near_plane, float eps2d, float alpha_threshold, bool antialiased, "
     "bool depth, SymInt? max_intersections, bool deterministic",
     _run_rasterize,
@@ -133,25 +125,18 @@ def compiled_rasterize(
     width: int,
     height: int,
     *,
-    near_plane: float = NEAR_PLANE,
-    eps2d: float = EPS2D,
-    alpha_threshold: float = ALPHA_THRESHOLD,
-    antialiased: bool = False,
     background: Tensor | None = None,
-    depth: bool = False,
-    max_intersections: int | None = None,
-    deterministic: bool = False,
+    **others: Any,
 ) -> Rendering:
-    """Do what rasterize() does, as a node. The number of intersections is 0 without max_intersections."""
+    """Do what rasterize() does, as a custom operator. The number of intersections is 0 without max_intersections."""
     tensors = [means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics]
     if background is not None:
         tensors.append(background)
-    tensors = _as_float(*tensors)
-    options = near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
-    results = list(_rasterize_node(tensors, width, height, *options))
+    options = RenderOptions(width, height, **others)
+    results = list(_rasterize_op(_as_float(*tensors), *options))
     image, transmittance, means2d, depths, extents = results[:5]
     overflow = needed = None
-    if max_intersections is not None:
+    if options.max_intersections is not None:
         overflow, needed = results[-2:]
     return Rendering(
         image=image,
@@ -159,29 +144,22 @@ def compiled_rasterize(
         means2d=means2d,
         depths=depths,
         extents=extents,
-        intersection_count=0 if max_intersections is None else max_intersections,
+        intersection_count=options.max_intersections or 0,
         overflow=overflow,
         needed_intersections=needed,
-        depth=results[5] if depth else None,
+        depth=results[5] if options.depth else None,
     )
 
 
-def _run_directions(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
-    focal_length, pixel_angle, antialiased, near_plane, alpha_threshold = options
-    arguments: Any = tensors
-    return list(
-        rasterize_directions(
-            *arguments,
-            focal_length=focal_length,
-            pixel_angle=pixel_angle,
-            antialiased=antialiased,
-            near_plane=near_plane,
-            alpha_threshold=alpha_threshold,
-        )
-    )
+_DIRECTION_OPTIONS = "focal_length", "pixel_angle", "antialiased", "near_plane", "alpha_threshold"
 
 
-_directions_node = define_node(
+def _run_directions(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
+    arguments, options = tensors, dict(zip(_DIRECTION_OPTIONS, values, strict=True))
+    return list(rasterize_directions(*arguments, **options))
+
+
+_directions_op = register_custom_op(
     "rasterize_directions",
     ", float focal_length, float pixel_angle, bool antialiased, float near_plane, float alpha_threshold",
     _run_directions,
@@ -207,9 +185,9 @@ def compiled_directions(
     near_plane: float = NEAR_PLANE,
     alpha_threshold: float = ALPHA_THRESHOLD,
 ) -> tuple[Tensor, Tensor]:
-    """Do what rasterize_directions() does, as a node."""
+    """Do what rasterize_directions() does, as a custom operator."""
     tensors = _as_float(means, log_scales, quaternions, opacities, features, position, directions)
-    results = _directions_node(tensors, focal_length, pixel_angle, antialiased, near_plane, alpha_threshold)
+    results = _directions_op(tensors, focal_length, pixel_angle, antialiased, near_plane, alpha_threshold)
     return results[0], results[1]
 
 
@@ -219,7 +197,7 @@ def _fake_harmonics(tensors: Sequence[Tensor], degree: int) -> list[Tensor]:
     return [torch.empty_like(means)]
 
 
-_harmonics_node = define_node(
+_harmonics_op = register_custom_op(
     "spherical_harmonics",
     ", SymInt degree",
     lambda tensors, degree: [spherical_harmonics(degree, (tensors[0], tensors[1]), tensors[2], tensors[3])],
@@ -230,26 +208,26 @@ _harmonics_node = define_node(
 def compiled_harmonics(
     degree: int, coefficients: Tensor | tuple[Tensor, Tensor], means: Tensor, camera_position: Tensor
 ) -> Tensor:
-    """Do what spherical_harmonics() does, as a node."""
+    """Do what spherical_harmonics() does, as a custom operator."""
     whole = isinstance(coefficients, Tensor)
     constant, rest = (coefficients[:, :1], coefficients[:, 1:]) if whole else coefficients
-    return _harmonics_node(_as_float(constant, rest, means, camera_position), degree)[0]
+    return _harmonics_op(_as_float(constant, rest, means, camera_position), degree)[0]
 
 
-_ssim_node = define_node("ssim", "", lambda tensors: [ssim(*tensors)], lambda tensors: [tensors[0].new_empty(())])
-_ssim_map_node = define_node(
+_ssim_op = register_custom_op("ssim", "", lambda tensors: [ssim(*tensors)], lambda tensors: [tensors[0].new_empty(())])
+_ssim_map_op = register_custom_op(
     "ssim_map", "", lambda tensors: [ssim_map(*tensors)], lambda tensors: [torch.empty_like(tensors[0])]
 )
 
 
 def compiled_ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Do what ssim() does, as a node."""
-    return _ssim_node(_as_float(a, b))[0]
+    """Do what ssim() does, as a custom operator."""
+    return _ssim_op(_as_float(a, b))[0]
 
 
 def compiled_ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """Do what ssim_map() does, as a node."""
-    return _ssim_map_node(_as_float(a, b))[0]
+    """Do what ssim_map() does, as a custom operator."""
+    return _ssim_map_op(_as_float(a, b))[0]
 
 
 register_compiled(

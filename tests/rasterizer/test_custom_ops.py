@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import compiled, rasterize
+from sehdr_warp.rasterizer import custom_ops, rasterize
 
 from .scenes import random_scene
 from .test_torch_contract import SIZE, directions, splats
@@ -74,7 +74,7 @@ def test_several_cameras_and_room_have_the_shapes_that_the_compiler_expects(devi
     cameras = [torch.stack([tensor.detach()] * 2) for tensor in scene.tensors[5:]]
     arguments = *scene.tensors[:5], *cameras, *SIZE
     truth = rasterize(*arguments, max_intersections=500, depth=True)
-    rendering = compiled.compiled_rasterize(*arguments, max_intersections=500, depth=True)
+    rendering = custom_ops.compiled_rasterize(*arguments, max_intersections=500, depth=True)
     for name in ("image", "transmittance", "means2d", "depths", "extents", "overflow", "needed_intersections", "depth"):
         mine, true = getattr(rendering, name), getattr(truth, name)
         assert mine.shape == true.shape and torch.equal(mine, true)
