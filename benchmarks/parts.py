@@ -10,9 +10,9 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from sehdr_warp.quiet import silent_stderr
-from sehdr_warp.rasterizer.workload import count_blended_pairs
 
 from .timing import Variant
+from .workload import count_blended_pairs
 
 STEPS = 20
 """Steps that are looked at."""

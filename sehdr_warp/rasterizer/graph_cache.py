@@ -24,14 +24,19 @@ from torch import Tensor
 from ..kernels.project import projection_kernel
 from .blending import Backward, BlendResult, BlockBackward, blend_on_cuda
 from .cuda_graphs import CudaGraphRunner, is_capturing
-from .projection import ProjectedGaussians, ProjectionAdjoint, project_to_camera
-from .render_options import RenderOptions
+from .projection import (
+    ProjectedGaussians,
+    ProjectionAdjoint,
+    RasterInputs,
+    adjoint_arguments,
+    project_to_camera,
+    projection_parameters,
+)
+from .render_options import MAX_INTERSECTIONS, RenderOptions
 from .tile_lists import (
-    MAX_INTERSECTIONS,
     MAX_SINGLE_SORT,
     IntersectionOffsets,
     PackedSplats,
-    Splats,
     build_tile_lists,
     order_intersections,
     pack_splats,
@@ -83,13 +88,13 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
         tensors: as GraphPool.replay() takes them, of one device.
         options: of the image.
     """
-    first, features = tensors[0], tensors.features if isinstance(tensors, Splats) else tensors[FEATURES]
+    first = tensors[0]
     if not on_gpu(first) or first.dtype != torch.float32:
         return None
     if options.max_intersections is not None or options.deterministic:
         return None
     signature = _signature(tensors, options)
-    small = 0 < len(features) <= (MAX_SINGLE_SORT if signature.differentiable else MAX_GAUSSIANS)
+    small = 0 < len(first) <= (MAX_SINGLE_SORT if signature.differentiable else MAX_GAUSSIANS)
     if not small or options.width * options.height > MAX_PIXELS or is_capturing(first.device):
         return None
     return _pool_of(signature)
@@ -107,7 +112,7 @@ def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> _Signature:
 
 
 FEATURES = 4
-"""Place of features among a call's tensors: means, log_scales, quaternions, opacities, features, pose, lens."""
+"""Index of features among a call's seven tensors, those that rasterize() takes first."""
 
 
 class ReplayedRender:
@@ -130,7 +135,8 @@ class ReplayedRender:
         self.projected: ProjectedGaussians | None = None
         if graph.projection_adjoint is not None:
             means2d, depths, extents = others
-            conics, opacities = graph.splats.conics.detach(), graph.splats.opacities.detach()
+            fixed = graph.splats.projected
+            conics, opacities = fixed.conics.detach(), fixed.opacities.detach()
             self.projected = ProjectedGaussians(means2d, conics, depths, opacities, extents)
         self.projection_adjoint: ProjectionAdjoint = lease.projection_adjoint
         self.intersections = 0
@@ -151,7 +157,7 @@ class CapturedRender:
     """One render on fixed memory, in two CUDA graphs, between which the number of intersections is copied to the host.
 
     Args:
-        tensors: the seven tensors of a call, or Splats.
+        tensors: the seven tensors of a call, or flatten() of RasterInputs.
         options: of the image.
         intersections: the least number to allocate memory for.
         differentiable: whether its backward passes may be called.
@@ -164,8 +170,8 @@ class CapturedRender:
         width, height, threshold = options.width, options.height, options.alpha_threshold
         inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
         device = inputs[0].device
-        projects = not isinstance(tensors, Splats)
-        channels = inputs[FEATURES].shape[1] + options.depth if projects else Splats(*inputs).features.shape[1]
+        projects = len(inputs) == 7
+        channels = inputs[FEATURES].shape[1] + options.depth if projects else inputs[-1].shape[1]
         image, transmittance = inputs[0].new_empty(height, width, channels), inputs[0].new_empty(height, width)
         counter = torch.empty(1, dtype=torch.int64, pin_memory=True)
         self._counter, self._count = counter, ctypes.c_int64.from_address(counter.data_ptr())
@@ -173,15 +179,18 @@ class CapturedRender:
         self._counting = CudaGraphRunner(device)
         self._blending = CudaGraphRunner(device, self._counting.stream)
 
-        def count() -> tuple[Splats, PackedSplats, IntersectionOffsets]:
-            splats = _project(inputs, options) if projects else Splats(*inputs)
+        def count() -> tuple[RasterInputs, PackedSplats, IntersectionOffsets]:
+            splats = _project(inputs, options) if projects else unflatten(inputs)
             packed = pack_splats(splats, threshold, width, height)
-            offsets = order_intersections(packed.counts, splats.depths, splats.extents, keep_emit_order=False)
+            depths, extents = splats.projected.depths, splats.projected.extents
+            offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
             counter.copy_(offsets.cumulative_counts[-1:], non_blocking=True)
             return splats, packed, offsets
 
-        def blend(splats: Splats, packed: PackedSplats, offsets: IntersectionOffsets, limit: int) -> BlockBackward:
-            depths, extents = splats.depths, splats.extents
+        def blend(
+            splats: RasterInputs, packed: PackedSplats, offsets: IntersectionOffsets, limit: int
+        ) -> BlockBackward:
+            depths, extents = splats.projected.depths, splats.projected.extents
             lists = build_tile_lists(packed, offsets, depths, extents, width, height, limit, keep_emit_order=False)
             return blend_on_cuda(splats.features, lists, packed, image, transmittance, threshold, False)
 
@@ -197,8 +206,9 @@ class CapturedRender:
         backward = self._blending.capture(None, lambda: blend(self.splats, packed, offsets, limit))
         self.backward: Backward = backward.on_fixed_memory() if differentiable else backward
         """Backward pass of the last render; one launch, which needs no CUDA graph."""
-        self.projection_adjoint = _projection_adjoint(inputs, options, self.splats) if projects else None
-        outputs = self.splats.means2d, self.splats.depths, self.splats.extents
+        projected = self.splats.projected
+        self.projection_adjoint = _projection_adjoint(inputs, options, projected) if projects else None
+        outputs = projected.means2d, projected.depths, projected.extents
         self._inputs = inputs
         self._outputs = [image, transmittance, *(outputs if projects else outputs[2:])]
 
@@ -222,28 +232,37 @@ class CapturedRender:
         return self._count.value
 
 
-def _project(inputs: Sequence[Tensor], options: RenderOptions) -> Splats:
-    means, log_scales, quaternions, opacities, features, pose, lens = inputs
-    projected = project_to_camera(means, log_scales, quaternions, opacities, pose, lens, options)
+def _project(inputs: Sequence[Tensor], options: RenderOptions) -> RasterInputs:
+    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = inputs
+    projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
     if options.depth:
         features = torch.cat([features, projected.depths[:, None]], 1)
-    return Splats(
-        projected.means2d, projected.conics, projected.opacities, features, projected.depths, projected.extents
-    )
+    return RasterInputs(projected, features)
 
 
-def _projection_adjoint(inputs: Sequence[Tensor], options: RenderOptions, splats: Splats) -> ProjectionAdjoint:
+def flatten(inputs: RasterInputs) -> tuple[Tensor, ...]:
+    """Return the six tensors of RasterInputs."""
+    return *inputs.projected, inputs.features
+
+
+def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
+    """Return the RasterInputs of flatten()."""
+    return RasterInputs(ProjectedGaussians(*tensors[:-1]), tensors[-1])
+
+
+def _projection_adjoint(
+    inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians
+) -> ProjectionAdjoint:
     """Return the adjoint of _project() on fixed memory; it reads the copies of its first and second argument there."""
     copies = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
-    forward = splats.means2d, splats.conics, splats.depths, splats.opacities
-    rows, whole = [torch.empty_like(tensor) for tensor in forward], [torch.empty_like(tensor) for tensor in copies]
-    kernel = projection_kernel(warp_scalar(splats.depths.dtype), options.antialiased)
-    parameters = options.width, options.height, options.near_plane, options.eps2d, options.alpha_threshold
-    gradients = *whole, *(None,) * (len(parameters) + 1), *rows, None
-    unread = (None,) * (len(rows) + 1)
-    arguments = *copies, *parameters, splats.extents, *unread
-    fixed = fixed_launch(kernel, len(splats.depths), *arguments, gradients=gradients, rows=rows, whole=whole)
-    device = splats.depths.device
+    rows = [torch.empty_like(tensor) for tensor in projected[:-1]]
+    whole = [torch.empty_like(tensor) for tensor in copies]
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
+    parameters = projection_parameters(options)
+    arguments, gradients = adjoint_arguments(copies, parameters, projected.extents, (*rows, None), whole)
+    count = len(projected.depths)
+    fixed = fixed_launch(kernel, count, *arguments, gradients=gradients, rows=rows, whole=whole)
+    device = projected.depths.device
 
     def adjoint(
         inputs: Sequence[Tensor], culling: Tensor, upstream: Sequence[Tensor | None], results: Sequence[Tensor | None]
@@ -293,9 +312,9 @@ class GraphPool:
         """Render by a CUDA graph, or return None if the call is to be launched instead.
 
         Args:
-            tensors: the seven tensors of a call, or Splats.
+            tensors: the seven tensors of a call, or flatten() of RasterInputs.
             options: of the image.
-            outputs: for Splats (extents,), to be written to.
+            outputs: for RasterInputs (extents,), to be written to.
         """
 
         def capture(intersections: int) -> CapturedRender:

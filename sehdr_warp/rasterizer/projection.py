@@ -32,51 +32,11 @@ class ProjectedGaussians(NamedTuple):
     extents: Tensor
 
 
-def project(
-    means: Tensor,
-    log_scales: Tensor,
-    quaternions: Tensor,
-    opacities: Tensor,
-    world_to_camera: Tensor,
-    intrinsics: Tensor,
-    *,
-    width: int,
-    height: int,
-    near_plane: float,
-    eps2d: float,
-    alpha_threshold: float,
-    antialiased: bool,
-    exact: bool = False,
-) -> ProjectedGaussians:
-    """Project Gaussians to the image plane of one camera; all but the extents are differentiable.
+class RasterInputs(NamedTuple):
+    """2D Gaussians with features [N, C], as the stages after projection read them: contiguous, without a graph."""
 
-    Args:
-        means: [N, 3]; this and all other tensors contiguous.
-        log_scales: [N, 3].
-        quaternions: [N, 4] (w, x, y, z), of any length.
-        opacities: [N].
-        world_to_camera: [4, 4].
-        intrinsics: [4] fx, fy, cx, cy in pixels.
-        width: of the image, pixels.
-        height: of the image, pixels.
-        near_plane: least depth, in scene units.
-        eps2d: variance in square pixels added to each 2D Gaussian.
-        alpha_threshold: alpha at which extents end.
-        antialiased: whether opacities are lowered so that the added variance keeps a Gaussian's energy.
-        exact: whether that factor is differentiated with respect to the covariance, and not constant.
-    """
-    count = means.shape[0]
-    outputs = ProjectedGaussians(
-        means.new_empty(count, 2),
-        means.new_empty(count, 3),
-        means.new_empty(count),
-        means.new_empty(count),
-        means.new_empty(count, 2),
-    )
-    kernel = projection_kernel(warp_scalar(means.dtype), antialiased, exact and antialiased)
-    parameters = width, height, near_plane, eps2d, alpha_threshold
-    inputs = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
-    return ProjectedGaussians(*launch_projection(kernel, inputs, parameters, outputs))
+    projected: ProjectedGaussians
+    features: Tensor
 
 
 def project_to_camera(
@@ -88,24 +48,38 @@ def project_to_camera(
     intrinsics: Tensor,
     options: RenderOptions,
     *,
-    exact: bool = False,
+    differentiate_compensation: bool = False,
 ) -> ProjectedGaussians:
-    """Project Gaussians, whose means, log_scales and quaternions are contiguous, to one camera; see project()."""
-    return project(
-        means,
-        log_scales,
-        quaternions,
-        opacities.contiguous(),
-        world_to_camera.contiguous(),
-        intrinsics.contiguous(),
-        width=options.width,
-        height=options.height,
-        near_plane=options.near_plane,
-        eps2d=options.eps2d,
-        alpha_threshold=options.alpha_threshold,
-        antialiased=options.antialiased,
-        exact=exact,
+    """Project Gaussians to the image plane of one camera; all but the extents are differentiable.
+
+    Args:
+        means: [N, 3]; this and the next two contiguous.
+        log_scales: [N, 3].
+        quaternions: [N, 4] (w, x, y, z), of any length.
+        opacities: [N].
+        world_to_camera: [4, 4].
+        intrinsics: [4] fx, fy, cx, cy in pixels.
+        options: of the image; extents end where alpha falls to options.alpha_threshold.
+        differentiate_compensation: differentiate the factor of antialiased opacities with respect to the covariance.
+    """
+    count = means.shape[0]
+    outputs = ProjectedGaussians(
+        means.new_empty(count, 2),
+        means.new_empty(count, 3),
+        means.new_empty(count),
+        means.new_empty(count),
+        means.new_empty(count, 2),
     )
+    antialiased = options.antialiased
+    kernel = projection_kernel(warp_scalar(means.dtype), antialiased, differentiate_compensation and antialiased)
+    camera = opacities.contiguous(), world_to_camera.contiguous(), intrinsics.contiguous()
+    inputs = means, log_scales, quaternions, *camera
+    return ProjectedGaussians(*launch_projection(kernel, inputs, projection_parameters(options), outputs))
+
+
+def projection_parameters(options: RenderOptions) -> tuple:
+    """Return the parameters of the projection kernel that are not tensors, in its order."""
+    return options.width, options.height, options.near_plane, options.eps2d, options.alpha_threshold
 
 
 ProjectionAdjoint = Callable[[Sequence[Tensor], Tensor, Sequence[Tensor | None], Sequence[Tensor | None]], None]
@@ -133,13 +107,27 @@ def launch_projection(
     def adjoint(
         inputs: Sequence[Tensor], culling: Tensor, upstream: Sequence[Tensor | None], results: Sequence[Tensor | None]
     ) -> None:
-        gradients = *results, *(None,) * (len(parameters) + 1), *upstream
+        arguments, gradients = adjoint_arguments(inputs, parameters, culling, upstream, results)
         # All Gaussians add to the camera's gradients: on the CPU one thread must.
         ranges = None if all(result is None for result in results[4:]) else single_range(count)
-        arguments = *inputs, *parameters, culling, *(None,) * len(upstream)
         launch(kernel, count, *arguments, gradients=gradients, ranges=ranges)
 
     return with_projection_gradient(inputs, outputs, adjoint)
+
+
+def adjoint_arguments(
+    inputs: Sequence[Tensor],
+    parameters: tuple,
+    culling: Tensor,
+    upstream: Sequence[Tensor | None],
+    results: Sequence[Tensor | None],
+) -> tuple[tuple, tuple]:
+    """Return arguments of a projection kernel and, for each, its gradient or None, as launch() takes them.
+
+    See ProjectionAdjoint; the adjoint does not read the outputs except the last one, culling.
+    """
+    arguments = *inputs, *parameters, culling, *(None,) * len(upstream)
+    return arguments, (*results, *(None,) * (len(parameters) + 1), *upstream)
 
 
 def with_projection_gradient(

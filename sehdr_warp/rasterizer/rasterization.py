@@ -1,6 +1,6 @@
 """Differentiable rasterization of 3D Gaussians: project, order, list by tile, blend."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
+from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
 from .checks import check_cameras, check_opacities, check_tensors
-from .graph_cache import FEATURES, ReplayedRender, find_pool, get_or_create_pool
+from .graph_cache import FEATURES, ReplayedRender, find_pool, flatten, get_or_create_pool
 from .memory import oom_context
-from .projection import ProjectedGaussians, project_to_camera, with_projection_gradient
+from .projection import ProjectedGaussians, RasterInputs, project_to_camera, with_projection_gradient
 from .render_options import RenderOptions
 from .tile_lists import (
     PackedSplats,
-    Splats,
     TileLists,
     build_tile_lists,
     order_intersections,
@@ -146,15 +146,15 @@ def rasterize(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
     tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
-    graphs = find_pool(tensors, options) if background is None else None
-    if graphs is None:
+    pool = find_pool(tensors, options) if background is None else None
+    if pool is None:
         check_shapes(*tensors, background)
         check_opacities(opacities)
         check_cameras(world_to_camera, intrinsics)
         options = options.checked(means.device)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
         if world_to_camera.ndim == 2:
-            view = _project(tensors, options, graphs or get_or_create_pool(tensors, options))
+            view = _project(tensors, options, pool or get_or_create_pool(tensors, options))
             rendering = _render(view, view.projected.means2d, features, options)
         else:
             rendering = _render_cameras(tensors, options)
@@ -207,14 +207,14 @@ class _View(NamedTuple):
     replayed: ReplayedRender | None
 
 
-def _project(tensors: Sequence[Tensor], options: RenderOptions, graphs: Any) -> _View:
+def _project(tensors: Sequence[Tensor], options: RenderOptions, pool: Any) -> _View:
     """Project to one camera. On a GPU, calls that repeat are replayed as CUDA graphs (graph_cache.py).
 
-    graphs: of calls like this one; None if it is to be launched.
+    pool: CUDA graphs of calls like this one; None if it is to be launched.
     """
     means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
     gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
-    replayed = None if graphs is None else graphs.replay(tensors, options)
+    replayed = None if pool is None else pool.replay(tensors, options)
     if replayed is not None and replayed.projected is not None:
         outputs = with_projection_gradient(gaussians, replayed.projected, replayed.projection_adjoint)
         if replayed.fits():
@@ -257,28 +257,44 @@ def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Render
 
 
 def render_projected(
-    projected: ProjectedGaussians, features: Tensor, options: RenderOptions, *, replays: bool = True
+    projected: ProjectedGaussians,
+    features: Tensor,
+    options: RenderOptions,
+    *,
+    replays: bool = True,
+    store_absolute: Callable[[Tensor], None] | None = None,
 ) -> Rendering:
     """Render 2D Gaussians of one camera with features [N, C].
 
-    Sets the extents of Gaussians whose features are not finite to 0, in place. replays: on a GPU, replay calls that
-    repeat as CUDA graphs.
+    Sets the extents of Gaussians whose features are not finite to 0, in place.
+
+    Args:
+        projected: the Gaussians.
+        features: [N, C].
+        options: of the image.
+        replays: on a GPU, replay calls that repeat as CUDA graphs.
+        store_absolute: called in the backward pass with the absolute gradients of the 2D means, [N, 2]; see
+            watch_absolute_gradients(). Such calls are always launched.
     """
     means2d, conics, depths, opacities, extents = projected
     if options.depth:
         features = torch.cat([features, depths[:, None]], 1)
     features = features.contiguous()
     # In place on memory that the projection's graph has saved: as data, so that it is no change of a saved tensor.
-    splats = Splats(means2d, conics, opacities, features, depths, extents.data)
-    graphs = get_or_create_pool(splats, options) if replays else None
-    replayed = None if graphs is None else graphs.replay(splats, options, (splats.extents,))
+    inputs = RasterInputs(projected._replace(extents=extents.data), features)
+    pool = get_or_create_pool(flatten(inputs), options) if replays and store_absolute is None else None
+    replayed = None if pool is None else pool.replay(flatten(inputs), options, (extents.data,))
     if replayed is not None and replayed.fits():
         image, transmittance = with_gradient(means2d, conics, opacities, features, replayed.result)
         return _rendering(image, transmittance, projected, replayed.intersections, None, None, options)
-    lists, packed = list_splats(splats._replace(features=features.detach()), options)
+    lists, packed = list_splats(inputs._replace(features=features.detach()), options)
     image, transmittance = blend(
         means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic
     )
+    if store_absolute is not None:
+        image, transmittance = watch_absolute_gradients(
+            image, transmittance, features, lists, packed, options.alpha_threshold, store_absolute
+        )
     needed = None if options.max_intersections is None else lists.total
     return _rendering(image, transmittance, projected, lists.intersection_count, lists.overflow, needed, options)
 
@@ -299,21 +315,24 @@ def _rendering(
     return Rendering(image, transmittance, means2d, depths, extents, count, overflow, needed, depth)
 
 
-def list_splats(splats: Splats, options: RenderOptions, *, blocks: bool = False) -> tuple[TileLists, PackedSplats]:
+def list_splats(
+    inputs: RasterInputs, options: RenderOptions, *, blocks: bool = False
+) -> tuple[TileLists, PackedSplats]:
     """Return the tile lists of 2D Gaussians and their packed form, as blend() takes them.
 
     blocks: make lists without an order of emission, as block kernels whose gradients are atomic sums need them. A GPU
     gets them unless options.deterministic, whose block kernels sum in the order of emission.
     """
     width, height, threshold = options.width, options.height, options.alpha_threshold
-    keep_emit_order = not blocks and (splats.features.device.type == "cpu" or options.deterministic)
-    packed = pack_splats(splats, threshold, width, height)
-    offsets = order_intersections(packed.counts, splats.depths, splats.extents, keep_emit_order=keep_emit_order)
+    keep_emit_order = not blocks and (inputs.features.device.type == "cpu" or options.deterministic)
+    packed = pack_splats(inputs, threshold, width, height)
+    depths, extents = inputs.projected.depths, inputs.projected.extents
+    offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=keep_emit_order)
     lists = build_tile_lists(
         packed,
         offsets,
-        splats.depths,
-        splats.extents,
+        depths,
+        extents,
         width,
         height,
         options.max_intersections,

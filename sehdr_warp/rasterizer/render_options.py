@@ -8,8 +8,8 @@ import torch
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .checks import integer
 from .cuda_graphs import is_capturing
-from .tile_lists import MAX_INTERSECTIONS
 
+MAX_INTERSECTIONS = 2**31 - 1  # They are counted in int32.
 MAX_SIDE = 1 << 20  # Of an image, in pixels.
 
 

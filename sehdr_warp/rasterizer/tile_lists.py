@@ -12,34 +12,15 @@ from ..kernels import tiles as kernels
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
+from .projection import RasterInputs
+from .render_options import MAX_INTERSECTIONS
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.sorting import sort_pairs
 from .warp_launch.threads import torch_threads
 
-MAX_INTERSECTIONS = 2**31 - 1  # They are counted in int32.
 MAX_SINGLE_SORT = 1 << 18
 """Up to this many Gaussians a GPU makes the lists by one sort: the host is then the bottleneck, not memory."""
 MIN_CHUNK = 1 << 14  # Intersections that are worth a thread's time.
-
-
-class Splats(NamedTuple):
-    """2D Gaussians and their features as kernels read them, contiguous and without a graph.
-
-    Attributes:
-        means2d: [N, 2] centres in pixels.
-        conics: [N, 3] a, b, c of the inverse covariance.
-        opacities: [N].
-        features: [N, C].
-        depths: [N].
-        extents: [N, 2] half-width and half-height in pixels; 0 if culled.
-    """
-
-    means2d: Tensor
-    conics: Tensor
-    opacities: Tensor
-    features: Tensor
-    depths: Tensor
-    extents: Tensor
 
 
 class PackedSplats(NamedTuple):
@@ -124,12 +105,12 @@ class TileLists:
         return self.gaussians.shape[0]
 
 
-def pack_splats(splats: Splats, alpha_threshold: float, width: int, height: int) -> PackedSplats:
+def pack_splats(inputs: RasterInputs, alpha_threshold: float, width: int, height: int) -> PackedSplats:
     """Pack 2D Gaussians for an image, and count the tiles that each one's ellipse touches.
 
-    Culls Gaussians whose features are not finite: sets their rows of splats.extents to 0 in place.
+    Culls Gaussians whose features are not finite: sets their rows of inputs.projected.extents to 0 in place.
     """
-    means2d, features = splats.means2d, splats.features
+    (means2d, conics, _, opacities, extents), features = inputs
     count = len(means2d)
     packed = PackedSplats(
         means2d.new_empty(count, 4),
@@ -140,14 +121,14 @@ def pack_splats(splats: Splats, alpha_threshold: float, width: int, height: int)
         tile_kernels(warp_scalar(means2d.dtype)).pack_splats,
         count,
         means2d,
-        splats.conics,
-        splats.opacities,
+        conics,
+        opacities,
         features,
         features.shape[1],
         alpha_threshold,
         -(-width // TILE_SIZE),
         -(-height // TILE_SIZE),
-        splats.extents,
+        extents,
         *packed,
     )
     return packed

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import torch
 
-from sehdr_warp.rasterizer.projection import project
-from sehdr_warp.rasterizer.tile_lists import PackedSplats, Splats, pack_splats
+from sehdr_warp.rasterizer.projection import ProjectedGaussians, RasterInputs, project_to_camera
+from sehdr_warp.rasterizer.render_options import RenderOptions
+from sehdr_warp.rasterizer.tile_lists import PackedSplats, pack_splats
 
 WIDTH, HEIGHT = 70, 50
 
@@ -55,12 +56,12 @@ def random_scene(count=150, channels=3, seed=0, width=WIDTH, height=HEIGHT, spre
     return SplatInputs([means, log_scales, quaternions, opacities, features, pose, intrinsics], width, height)
 
 
-def projected(scene: SplatInputs, threshold: float = 1 / 255) -> tuple[torch.Tensor, ...]:
-    """means2d, conics, depths, opacities and extents of a scene, with no graph behind them."""
-    options = {"near_plane": 0.01, "eps2d": 0.3, "alpha_threshold": threshold, "antialiased": False}
+def projected(scene: SplatInputs, threshold: float = 1 / 255) -> ProjectedGaussians:
+    """The 2D Gaussians of a scene, with no graph behind them."""
+    options = RenderOptions(scene.width, scene.height, 0.01, 0.3, threshold)
     tensors = *scene.tensors[:4], *scene.tensors[5:]
     with torch.no_grad():
-        return project(*tensors, width=scene.width, height=scene.height, **options)
+        return project_to_camera(*tensors, options)
 
 
 class PackedScene(NamedTuple):
@@ -72,9 +73,10 @@ class PackedScene(NamedTuple):
 
 
 def packed(scene: SplatInputs, threshold: float = 1 / 255) -> PackedScene:
-    means2d, conics, depths, opacities, extents = projected(scene, threshold)
-    splats = Splats(means2d, conics, opacities, means2d.new_empty(len(means2d), 0), depths, extents)
-    return PackedScene(pack_splats(splats, threshold, scene.width, scene.height), depths, extents)
+    gaussians = projected(scene, threshold)
+    inputs = RasterInputs(gaussians, gaussians.means2d.new_empty(len(gaussians.means2d), 0))
+    packed = pack_splats(inputs, threshold, scene.width, scene.height)
+    return PackedScene(packed, gaussians.depths, gaussians.extents)
 
 
 def relative_error(value: torch.Tensor, truth: torch.Tensor) -> float:

@@ -6,18 +6,19 @@ import weakref
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.projection import project
+from sehdr_warp.rasterizer.projection import project_to_camera
+from sehdr_warp.rasterizer.render_options import RenderOptions
 
 from .scenes import random_scene
 
-OPTIONS = {"near_plane": 0.01, "eps2d": 0.3, "alpha_threshold": 1 / 255, "antialiased": False}
+OPTIONS = 0.01, 0.3, 1 / 255  # near_plane, eps2d, alpha_threshold
 
 
 def seen(device="cpu", **sizes):
     """The tensors that a projection takes, and what it returns."""
     scene = random_scene(**sizes).to(device=device)
     given = *scene.tensors[:4], *scene.tensors[5:]
-    return given, project(*given, width=scene.width, height=scene.height, **OPTIONS)
+    return given, project_to_camera(*given, RenderOptions(scene.width, scene.height, *OPTIONS))
 
 
 def test_gradients_of_any_strides_are_read(device):

@@ -64,12 +64,12 @@ def project_gaussians(
         camera_model: "pinhole", "ortho" or "fisheye".
     """
     if camera_model == "pinhole" and quats is not None and scales is not None:
-        lens = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+        intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
         near = max(culling.near_plane, 1e-30)
         options = RenderOptions(width, height, near, eps2d, ALPHA_THRESHOLD, antialiased)
         log_scales = scales.abs().clamp_min(SMALLEST_SIZE).log()
         shapes = means.contiguous(), log_scales, quats.contiguous()
-        projected = project_to_camera(*shapes, opacities, viewmat, lens, options, exact=True)
+        projected = project_to_camera(*shapes, opacities, viewmat, intrinsics, options, differentiate_compensation=True)
     else:
         if covars is None:
             assert quats is not None and scales is not None

@@ -6,17 +6,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from ...rasterizer.absolute_gradient import watch_absolute_gradients
-from ...rasterizer.blending import blend
 from ...rasterizer.checks import integer
 from ...rasterizer.memory import oom_context
-from ...rasterizer.projection import ProjectedGaussians
-from ...rasterizer.rasterization import list_splats, render_projected
+from ...rasterizer.rasterization import render_projected
 from ...rasterizer.render_options import MAX_SIDE, RenderOptions
-from ...rasterizer.tile_lists import Splats
 from ...rasterizer.torch_contract import torch_operation
 from .inputs import UNSUPPORTED, Inputs, check_supported
-from .projection import ALPHA_THRESHOLD, CAMERA_MODELS, CameraModel, Culling, project_gaussians
+from .projection import CAMERA_MODELS, CameraModel, Culling, project_gaussians
 from .splats import JoinedSplats, make_meta
 
 RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
@@ -143,7 +139,8 @@ def rasterization(
             if has_depth:
                 features = torch.cat([features, mine.projected.depths[:, None]], 1)
             store = _store(splats, mine.rows) if absgrad and means2d.requires_grad else None
-            image, transmittance = _render(mine.projected, features, *size, store)
+            rendering = render_projected(mine.projected, features, RenderOptions(*size), store_absolute=store)
+            image, transmittance = rendering.image, rendering.transmittance
             if view.background is not None and has_color:
                 behind = view.background
                 behind = torch.cat([behind, behind.new_zeros(1)]) if has_depth else behind
@@ -167,25 +164,3 @@ def _store(splats: JoinedSplats, rows: Any) -> Callable[[Tensor], None]:
         absgrad[rows] = absolute
 
     return store
-
-
-def _render(
-    projected: ProjectedGaussians,
-    features: Tensor,
-    width: int,
-    height: int,
-    store: Callable[[Tensor], None] | None,
-) -> tuple[Tensor, Tensor]:
-    """Return image and transmittance; store: where to leave absolute gradients."""
-    options = RenderOptions(width, height)
-    if store is None:
-        rendering = render_projected(projected, features, options)
-        return rendering.image, rendering.transmittance
-    means2d, conics, depths, opacities, extents = projected
-    features = features.contiguous()
-    splats = Splats(
-        *(tensor.detach().contiguous() for tensor in (means2d, conics, opacities, features, depths, extents))
-    )
-    lists, packed = list_splats(splats, options)
-    image, transmittance = blend(means2d, conics, opacities, features, lists, packed, ALPHA_THRESHOLD)
-    return watch_absolute_gradients(image, transmittance, features, lists, packed, ALPHA_THRESHOLD, store)

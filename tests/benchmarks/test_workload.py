@@ -4,9 +4,9 @@ import torch
 import warp as wp
 
 from benchmarks.splats import Size, make_splat_scene
+from benchmarks.workload import count_blended_pairs
 from sehdr_warp.kernels.constants import ALPHA_THRESHOLD
 from sehdr_warp.rasterizer import rasterize
-from sehdr_warp.rasterizer.workload import count_blended_pairs
 
 
 def test_what_warps_draw_is_counted(device, monkeypatch):

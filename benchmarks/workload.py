@@ -1,0 +1,64 @@
+"""Count what the block kernels of a GPU blend."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from sehdr_warp.kernels.blend_cuda import BLOCKS_PER_TILE
+from sehdr_warp.kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
+from sehdr_warp.rasterizer.blending import blend_blocks, pad_features
+from sehdr_warp.rasterizer.projection import RasterInputs, project_to_camera
+from sehdr_warp.rasterizer.rasterization import list_splats
+from sehdr_warp.rasterizer.render_options import RenderOptions
+
+
+class Workload(NamedTuple):
+    """Work of one image.
+
+    Attributes:
+        intersections: (Gaussian, tile) pairs.
+        blended: (Gaussian, warp) pairs that are blended: the Gaussian touches the 8 x 4 pixels of the warp and is not
+            behind the last one that any of these shows.
+    """
+
+    intersections: int
+    blended: int
+
+
+@torch.no_grad()
+def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) -> Workload:
+    """Return the work of an image.
+
+    Args:
+        arguments: the seven tensors that rasterize() takes first, for one camera, on a GPU (or where the CPU runs
+            blocks of threads).
+        width: of the image, pixels.
+        height: of the image, pixels.
+    """
+    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = (
+        tensor.detach().contiguous() for tensor in arguments
+    )
+    options = RenderOptions(width, height)
+    projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
+    lists, packed = list_splats(RasterInputs(projected, features), options, blocks=True)
+    assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
+    image, left = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
+    last_contributor = blend_blocks(pad_features(features), lists, packed, image, left, ALPHA_THRESHOLD)
+    beyond = 0, lists.columns * TILE_SIZE - width, 0, lists.rows * TILE_SIZE - height
+    last_contributor = torch.nn.functional.pad(last_contributor.view(height, width), beyond)
+    # Rows of tiles, of their subtile_masks, of pixels; then columns of each.
+    last_contributor = last_contributor.view(lists.rows, TILE_SIZE // 4, 4, lists.columns, TILE_SIZE // 8, 8).amax(
+        (2, 5)
+    )
+    last_contributor = last_contributor.permute(0, 2, 1, 3).reshape(len(lists.tile_ranges), BLOCKS_PER_TILE)
+    lengths = (lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]).long()
+    tiles = torch.repeat_interleave(torch.arange(len(lengths), device=last_contributor.device), lengths)
+    places = torch.arange(len(tiles), device=last_contributor.device) - (lengths.cumsum(0) - lengths)[tiles]
+    intersections = lists.tile_ranges[:, 0].long()[tiles] + places
+    touched = (
+        lists.subtile_masks[intersections, None].int() >> torch.arange(BLOCKS_PER_TILE, device=last_contributor.device)
+    ) & 1
+    blended = touched.bool() & (places[:, None] < last_contributor[tiles])
+    return Workload(lists.intersection_count, int(blended.sum()))
