@@ -1,0 +1,79 @@
+"""Compile kernels for CUDA, without a GPU: machines of continuous integration have none.
+
+Warp comes with NVIDIA's compiler. What the kernels compute on a GPU is tested by tests/rasterizer where there is one.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import warp as wp
+
+from sehdr_warp.kernels import (
+    absolute_gradient,
+    blend_cuda,
+    blend_cuda_adjoint,
+    clipped_light,
+    code_residual,
+    exposure_fusion,
+    harmonics,
+    interpolation,
+    plane_sweep,
+    project,
+    relocation,
+    residual_sampling,
+    response_curves,
+    sphere,
+    ssim_cuda,
+    tiles,
+    training_step,
+)
+
+ARCHITECTURES = wp.get_cuda_supported_archs()
+REAL = wp.float32
+KERNELS: dict[str, Callable[[], Any]] = {
+    "absolute gradient": lambda: absolute_gradient.absolute_gradient_kernel(REAL),
+    "blend, 3 channels": lambda: blend_cuda.forward_kernel(REAL, 3, True),
+    "blend, 9 channels": lambda: blend_cuda.forward_kernel(REAL, 9, True),
+    "blend backward, 3 channels": lambda: blend_cuda_adjoint.backward_kernel(REAL, 3, False, True),
+    "blend backward, 3 channels, deterministic": lambda: blend_cuda_adjoint.backward_kernel(REAL, 3, True, True),
+    "blend backward, 9 channels": lambda: blend_cuda_adjoint.backward_kernel(REAL, 9, False, True),
+    "pad rows": lambda: blend_cuda.pad_rows_kernel(REAL, 3),
+    "clipped light": lambda: clipped_light.clipped_light_patch_kernel(REAL, wp.uint8),
+    "clipped logarithms": lambda: clipped_light.clipped_logarithms_kernel(REAL, wp.uint16),
+    "code residual": lambda: code_residual.code_residual_kernel(REAL, wp.uint8, True),
+    "encode": lambda: response_curves.encode_kernel(REAL, 0),
+    "fusion": lambda: exposure_fusion.fusion_kernels(REAL),
+    "harmonics": lambda: harmonics.harmonics_kernel(REAL, 3),
+    "harmonics backward": lambda: harmonics.harmonics_adjoint_kernel(REAL, 3, True),
+    "harmonics, Adam": lambda: training_step.harmonics_adam_kernel(4),
+    "interpolation": lambda: interpolation,
+    "plane sweep": lambda: plane_sweep,
+    "projection": lambda: project.projection_kernel(REAL, False),
+    "projection, antialiased": lambda: project.projection_kernel(REAL, True),
+    "projection, sphere": lambda: sphere.projection_kernel(REAL, False),
+    "relocation": lambda: relocation,
+    "sampled errors": lambda: residual_sampling.error_weights_kernel(wp.uint8),
+    "sphere": lambda: sphere.sphere_kernels(REAL, 3),
+    "SSIM": lambda: ssim_cuda.ssim_patch_kernels(REAL, True),
+    "tile lists": lambda: tiles.lists_kernel(REAL, wp.int64, 32),
+    "tiles": lambda: tiles.tile_kernels(REAL),
+    "tiles, module": lambda: tiles,
+    "training step": lambda: training_step,
+}
+
+
+def warp_modules(made: Any) -> list[Any]:
+    """Return the modules of a kernel, of a namespace of kernels or of a Python module."""
+    kernels = [made] if isinstance(made, wp.Kernel) else [k for k in vars(made).values() if isinstance(k, wp.Kernel)]
+    assert kernels
+    return list({id(kernel.module): kernel.module for kernel in kernels}.values())
+
+
+@pytest.mark.skipif(not ARCHITECTURES, reason="this build of Warp has no compiler for CUDA")
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernels_compile_for_cuda(tmp_path, name):
+    for number, module in enumerate(warp_modules(KERNELS[name]())):
+        folder = tmp_path / str(number)
+        [path] = wp.compile_aot_module(module, arch=min(ARCHITECTURES), module_dir=folder, use_ptx=True)
+        assert ".entry" in path.read_text()
