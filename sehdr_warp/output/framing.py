@@ -17,6 +17,7 @@ log = logging.getLogger(__name__)
 FILM_SIZES = ((640, 360), (1280, 720), (1920, 1080))
 """Sizes of a path that states none, 16:9: the first that is as high as the photos' short side."""
 _WIDEST = math.radians(75)  # Vertical field of view to which a path opens for its subject
+_MOST_ZOOM = 2.0  # Times that it then shows more than the photos do: photos show most of a subject, fog looks larger
 _MARGIN = 1.25  # Of the picture around the subject, whose surface is thick
 _VIEWS, _SIZE = 12, 96  # Renders that the subject is found on; longest side of these and of the checks for obstacles
 _REACH = 0.7  # Surfaces within this part of the cameras' distance from the focus are the subject
@@ -54,8 +55,9 @@ def film_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:
 def frame_subject(run: Any, path: Sequence[Camera], photos: Sequence[Camera]) -> list[Camera]:
     """Return a path around the photos' focus whose pictures hold the whole subject and are not blocked.
 
-    If photos surround the focus, the lens opens, up to 75 degrees, until the sphere of subject_radius fits; otherwise
-    it would show what no photo does. Cameras behind a wall or in a floater come forward, smoothly along the path.
+    The lens opens until the sphere of subject_radius fits, to at most 75 degrees: up to twice the picture if photos
+    surround the focus, else up to their height, because wider pictures would show what no photo does. Cameras behind
+    a wall or in a floater come forward, smoothly along the path.
 
     Args:
         run: The scene.
@@ -67,14 +69,13 @@ def frame_subject(run: Any, path: Sequence[Camera], photos: Sequence[Camera]) ->
     if focus is None or radius is None:
         return list(path)
     cleared = _in_front_of_obstacles(run, path, focus, radius)
-    if not surround(photos, focus):
-        return cleared
     distance = min(float(np.linalg.norm(camera.position - focus)) for camera in cleared)
-    needed = 2 * math.asin(min(_MARGIN * radius / distance, 1.0))
-    first = path[0]
-    present = 2 * math.atan(first.height / 2 / first.fy)
-    view = max(present, min(needed, _WIDEST))
-    zoom = math.tan(present / 2) / math.tan(view / 2)
+    # Tangents of half the vertical fields of view
+    present = path[0].height / 2 / path[0].fy
+    needed = math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
+    photo = float(np.median([camera.height / 2 / camera.fy for camera in photos]))
+    most = _MOST_ZOOM * present if surround(photos, focus) else max(photo, present)
+    zoom = present / min(max(present, needed), most)
     return [replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom) for camera in cleared]
 
 
