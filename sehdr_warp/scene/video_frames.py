@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import os
 import shutil
 import tempfile
@@ -23,7 +24,7 @@ from .names import list_images
 from .png16 import png16
 from .read_folders import find_photos
 from .sfm import file_digest
-from .video import Clip, codes, decode, grey, open_clip, sharpness, shift
+from .video import Clip, codes, decode, grey, open_clip
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -90,6 +91,43 @@ def choose_frames(clip: Clip) -> FrameChoice:
     intervals = np.minimum(np.array(moved) / movement * count, count - 1e-6).astype(int)
     best = {int(i): max(np.flatnonzero(intervals == i), key=lambda k: sharp[k]) for i in np.unique(intervals)}
     return FrameChoice(tuple(numbers[k] for k in sorted(best.values())), total, movement)
+
+
+def sharpness(picture: np.ndarray) -> float:
+    """Return the mean size of the Laplacian of a grey picture [h, w], relative to its brightness."""
+    inner = picture[1:-1, 1:-1]
+    around = picture[:-2, 1:-1] + picture[2:, 1:-1] + picture[1:-1, :-2] + picture[1:-1, 2:]
+    return float(np.abs(around - 4 * inner).mean() / (inner.mean() + 1e-3))
+
+
+def shift(first: np.ndarray, second: np.ndarray, block: int = 64) -> float:
+    """Return how far two grey pictures [h, w] are moved, in parts of the width: the median over blocks.
+
+    Phase correlation (Kuglin and Hines 1975). 0 if blocks agree on no movement.
+    """
+    height, width = first.shape
+    side = min(block, height, width)
+    window = np.outer(np.hanning(side), np.hanning(side))
+    lengths = []
+    for top in np.linspace(0, height - side, max(1, round(height / side))).astype(int):
+        for left in np.linspace(0, width - side, max(1, round(width / side))).astype(int):
+            parts = [image[top : top + side, left : left + side] for image in (first, second)]
+            spectra = [np.fft.rfft2((part - part.mean()) * window) for part in parts]
+            cross = spectra[0] * spectra[1].conj()
+            peak = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-9), s=(side, side))
+            place = np.array(np.unravel_index(int(peak.argmax()), peak.shape))
+            fine = place + [_between(peak, place, axis) for axis in (0, 1)]
+            place = np.where(fine > side / 2, fine - side, fine)
+            lengths.append(math.hypot(*place))
+    return float(np.median(lengths)) / width
+
+
+def _between(peak: np.ndarray, place: np.ndarray, axis: int) -> float:
+    """Return how far a maximum lies beside its pixel along an axis: that of a parabola, -0.5 to 0.5."""
+    line = np.roll(np.take(peak, place[1 - axis], axis=1 - axis), 1 - place[axis])
+    before, center, after = line[:3]
+    bend = 2 * center - before - after
+    return float(np.clip((after - before) / (2 * bend), -0.5, 0.5)) if bend > 0 else 0.0
 
 
 def _without_hidden(frames: Iterable[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
