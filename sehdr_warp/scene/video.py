@@ -244,17 +244,17 @@ def _luma_and_chroma(frame: Any, color: VideoColor) -> tuple[np.ndarray, np.ndar
     """Return luma [H, W] from 0 to 1 and chroma [H, W, 2] from -0.5 to 0.5, as float32."""
     component = frame.format.components[min(1, len(frame.format.components) - 1)]  # Grey has luma alone
     sizes = (frame.height, component.height), (frame.width, component.width)
-    halved = tuple(2 * small - size in (0, 1) and small < size for size, small in sizes)
+    rows, columns = (bool(2 * small - size in (0, 1) and small < size) for size, small in sizes)  # Whether halved
     # FFmpeg interpolates chroma of other sizes, such as a quarter of the width.
-    layout = {(False, True): "yuv422p16le", (True, True): "yuv420p16le"}.get(halved, "yuv444p16le")
+    layout = {(False, True): "yuv422p16le", (True, True): "yuv420p16le"}.get((rows, columns), "yuv444p16le")
     y, u, v = _planes(_reformatted(frame, layout, color))
     top = np.float32((2**color.bits - 1) << (16 - color.bits))  # The largest code, as it stands in 16 bits
     low, luma, chroma = (0, top, top) if color.full_range else (16 * 256, 219 * 256, 224 * 256)
     y, uv = (y - np.float32(low)) / np.float32(luma), (np.stack([u, v], axis=2) - 32768) / np.float32(chroma)
     if uv.shape[:2] == y.shape:
         return y, uv
-    places = _chroma_places(frame, layout)
-    return y, upsample_chroma(y, uv, tuple(p if half else None for p, half in zip(places, halved, strict=True)))
+    down, right = _chroma_places(frame, layout)
+    return y, upsample_chroma(y, uv, (down if rows else None, right if columns else None))
 
 
 def _reformatted(frame: Any, layout: str, color: VideoColor | None = None) -> Any:
