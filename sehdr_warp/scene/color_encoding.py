@@ -9,7 +9,7 @@ light, PQ, HLG and logarithmic curves are light themselves, and leave nothing to
 import re
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -101,9 +101,7 @@ class ColorEncoding:
         if self.is_srgb:
             return image
         alpha, above, deviation = image.alpha, image.above_white, image.above_white_deviation
-        # Light of a gain map is in sRGB's curve already.
-        curves = () if above is not None else self.curves
-        codes, brighter = encoded_in_bands(image.pixels, above, replace(self, curves=curves).to_linear)
+        codes, brighter = encoded_in_bands(image.pixels, above, self.to_linear)
         if brighter is None:
             return EncodedImage(codes, alpha)
         return EncodedImage(codes, alpha, brighter, max(_DEVIATION, deviation))

@@ -38,7 +38,8 @@ class ImageRecord:
         linear: the user says that the photo's codes are proportional to light; they are re-encoded by sRGB's curve.
         gain_map: the photo's light is taken from its gain map and re-encoded by sRGB's curve.
         encoding: what the photo's file states of its colors; None if it states nothing.
-        light_scale: factor from the values of a float photo to the light of the set, by the times that files state.
+        light_scale: factor from the values of a float photo to the light of the set, by the times that files state; of
+            a photo whose gain map gives its light, the factor by which its codes and its exposure_time are smaller.
         time_known: False if exposure_time is only a guess, to be replaced by comparing light with other photos.
         oriented: the lens refers to the pixels after EXIF orientation; None decides by the sizes.
     """

@@ -26,6 +26,7 @@ from .primaries import srgb_to_linear
 
 _log = logging.getLogger("sehdr_warp.scene")
 
+MOST_STOPS_IN_CODES = 4.0  # Above white; of more, 16 bits would keep less of the dark than 8 bits of a photo
 DEVIATION = 0.05
 """Standard deviation of the logarithm of decoded light: 8 bits of map and photo, and a map of fewer pixels."""
 _HEAD_BYTES = 1 << 18  # In which a file names a second picture: behind EXIF and a profile
@@ -72,15 +73,16 @@ class GainMap:
         return np.maximum(result, 0)
 
 
-def light_of(photo: EncodedImage, gain_map: GainMap | None) -> EncodedImage:
+def light_of(photo: EncodedImage, gain_map: GainMap | None, scale: float = 1.0) -> EncodedImage:
     """Return the light of a photo encoded by sRGB's curve as 16-bit sRGB codes, and what is above white beside it.
 
     Args:
         photo: as decoded.
         gain_map: of the photo; None for one without, whose light ends at white.
+        scale: light that code 65535 stands for is white's divided by it.
     """
     light = _decoded(photo)
-    light = light if gain_map is None else gain_map.light(light)
+    light = light if gain_map is None else gain_map.light(light) * np.float32(scale)
     codes = linear_codes(np.minimum(light, 1))
     above = None if gain_map is None else _above_white(light, codes == 65535)
     return replace(photo, pixels=codes, above_white=above, above_white_deviation=DEVIATION)

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..subsets import every_nth
 from .dataparser import DataparserOutputs
 from .exposure import are_camera_jpegs
-from .gain_map import has_gain_map, read_gain_map
+from .gain_map import MOST_STOPS_IN_CODES, has_gain_map, read_gain_map
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix
 from .names import unique_names
@@ -37,6 +37,7 @@ __all__ = [
 _log = logging.getLogger("sehdr_warp.scene")
 _MOST_SAMPLED = 24  # Photos that a response is chosen from: they have more edges than are looked at
 _UNSURE = 0.4  # Uncertainty of a chosen response, in stops, from which a line says that it is a guess
+_BELOW_WHITE = 0.97  # Code of the largest light of a gain map, in light: from 0.99 on codes count as clipped
 
 
 def load_scene(
@@ -149,15 +150,21 @@ def as_linear(dataset: DataparserOutputs) -> DataparserOutputs:
 
 def as_gain_mapped(dataset: DataparserOutputs) -> DataparserOutputs:
     """Take the light of photos from their gain maps if most photos of a dataset have one."""
-    maps = [
-        read_gain_map(record.image) for record in dataset.records if not record.derived and has_gain_map(record.image)
-    ]
-    headrooms = [gain_map.headroom for gain_map in maps if gain_map is not None]
+    images = [record.image for record in dataset.records if not record.derived]
+    maps = {image: read_gain_map(image) for image in images if has_gain_map(image)}
+    headrooms = {image: gain_map.headroom for image, gain_map in maps.items() if gain_map is not None}
     if 2 * len(headrooms) <= len(dataset.records):
         return dataset
+    most = max(headrooms.values())
     note = f"{len(headrooms)} of {len(dataset.records)} photos have a gain map: light is taken from it, up to "
-    note += f"{max(headrooms):.1f} stops above white; --response NAME takes the codes and a curve instead"
-    records = tuple(replace(record, gain_map=True) for record in dataset.records)
+    note += f"{most:.1f} stops above white; --response NAME takes the codes and a curve instead"
+    # Codes hold the light above white, too, as those of a photo that was exposed shorter.
+    scale = _BELOW_WHITE * 2.0 ** -min(max(most, 0.0), MOST_STOPS_IN_CODES)
+    scales = [scale if record.image in headrooms else 1.0 for record in dataset.records]
+    records = tuple(
+        replace(record, gain_map=True, light_scale=scale, exposure_time=record.seconds * scale)
+        for record, scale in zip(dataset.records, scales, strict=True)
+    )
     return replace(dataset, kind="gain-map", records=records, notes=(*dataset.notes, note))
 
 

@@ -126,7 +126,8 @@ def read_codes(record: ImageRecord, *, oriented: bool = False) -> EncodedImage:
         if record.gain_map or (kind_of(record.image) == "encoded" and not record.linear and has_gain_map(record.image)):
             gain_map = read_gain_map(record.image, oriented=oriented)
             if record.gain_map:
-                photo = light_of(photo, gain_map)
+                photo = light_of(photo, gain_map, record.light_scale)
+                encoding = replace(encoding, curves=(), table=None)  # The light is in sRGB's curve already
             elif gain_map is not None:
                 photo = with_light_above_white(photo, gain_map)
         elif record.linear and encoding.light is None:

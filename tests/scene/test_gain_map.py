@@ -196,10 +196,9 @@ def test_a_set_with_gain_maps_has_their_light(tmp_path):
     assert scene.light_known and scene.response.name == "srgb"
     assert any("4 of 4 photos have a gain map: light is taken from it, up to 2.5 stops" in note for note in scene.notes)
     view = scene.views[0]
-    white = view.codes == 65535
-    found = np.where(white, view.light_above_white, linear(view.codes))
-    assert (view.light_above_white[~white] == 0).all() and white.mean() > 0.2
-    assert_light(found, light)
+    # As if exposed 2.5 stops shorter: nothing is clipped.
+    assert view.exposure_time == pytest.approx(0.97 * 2**-2.5) and view.codes.max() < 65535
+    assert_light(linear(view.codes) / view.exposure_time, light)
     again = load_scene(tmp_path, response=scene.response.name)  # As a run does that goes on.
     np.testing.assert_array_equal(again.views[0].codes, view.codes)
 
@@ -237,8 +236,32 @@ def test_light_of_a_display_p3_photo_ends_in_rec709(tmp_path):
     view = load_scene(tmp_path).views[0]
     spaces = colour.RGB_COLOURSPACES
     matrix = colour.matrix_RGB_to_RGB(spaces["Display P3"], spaces["sRGB"])
-    found = np.where(view.codes == 65535, view.light_above_white, linear(view.codes))
-    assert_light(found, light @ matrix.T, channels=3)
+    assert_light(linear(view.codes) / view.exposure_time, light @ matrix.T, channels=3)
+
+
+def test_a_photo_without_a_map_in_such_a_set_is_clipped_at_white(tmp_path):
+    write_set(tmp_path)
+    _, base, _ = pair()
+    Image.fromarray(base).save(tmp_path / "3.jpg", quality=100, subsampling=0)
+    with_map, without = (load_scene(tmp_path, holdout=0).views[i] for i in (0, 3))
+    assert (with_map.exposure_time, without.exposure_time) == (pytest.approx(0.97 * 2**-2.5), 1)
+    clipped = without.codes == 65535
+    assert clipped.mean() > 0.2
+    dark = linear(with_map.codes)[~clipped] / with_map.exposure_time
+    np.testing.assert_allclose(linear(without.codes)[~clipped].mean(), dark.mean(), rtol=0.03)
+
+
+@pytest.mark.parametrize("stops", [0.0, 9.0])
+def test_maps_of_no_and_of_many_stops(tmp_path, stops):
+    """Beyond four stops light lies beside codes, so that 16 bits keep the dark."""
+    frames = [{"file_path": f"{i}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
+    _, base, gain = pair()
+    for i in range(3):
+        body = hdrgm()[1].replace(b'GainMapMax="2.5"', f'GainMapMax="{stops}"'.encode())
+        write_jpeg_pair(tmp_path / f"{i}.jpg", base, gain, [(0xFFE1, body)])
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
+    scene = load_scene(tmp_path)
+    assert scene.views[0].exposure_time == pytest.approx(0.97 * 2 ** -min(stops, 4))
 
 
 @pytest.mark.parametrize(
