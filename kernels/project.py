@@ -73,11 +73,9 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
             if forward_extents[i][0] <= real(0.0):
                 return
         pose = world_to_camera[0]
-        focal_principal = intrinsics[0]
-        fx = focal_principal[0]
-        fy = focal_principal[1]
-        cx = focal_principal[2]
-        cy = focal_principal[3]
+        pinhole = intrinsics[0]
+        fx = pinhole[0]
+        fy = pinhole[1]
         rotation = g.mat33(
             pose[0, 0], pose[0, 1], pose[0, 2],
             pose[1, 0], pose[1, 1], pose[1, 2],
@@ -90,14 +88,18 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
         inverse_z = real(1.0) / z
         x_ratio = wp.where(in_front, centre[0], real(0.0)) * inverse_z
         y_ratio = wp.where(in_front, centre[1], real(0.0)) * inverse_z
-        pixel = vec2(fx * x_ratio + cx, fy * y_ratio + cy)
+        pixel = vec2(fx * x_ratio + pinhole[2], fy * y_ratio + pinhole[3])
 
         # Far off the axis the linearisation explodes: hold its ray near the frustum.
         w = real(width)
         h = real(height)
         margin = real(FRUSTUM_MARGIN)
-        jx = wp.clamp(x_ratio, -(cx + margin * w * real(0.5)) / fx, (w - cx + margin * w * real(0.5)) / fx)
-        jy = wp.clamp(y_ratio, -(cy + margin * h * real(0.5)) / fy, (h - cy + margin * h * real(0.5)) / fy)
+        jx = wp.clamp(
+            x_ratio, -(pinhole[2] + margin * w * real(0.5)) / fx, (w - pinhole[2] + margin * w * real(0.5)) / fx
+        )
+        jy = wp.clamp(
+            y_ratio, -(pinhole[3] + margin * h * real(0.5)) / fy, (h - pinhole[3] + margin * h * real(0.5)) / fy
+        )
         jacobian = mat23(
             fx * inverse_z, real(0.0), -fx * jx * inverse_z,
             real(0.0), fy * inverse_z, -fy * jy * inverse_z,

@@ -9,6 +9,7 @@ from ..kernels.absolute_gradient import absolute_gradient_kernel
 from ..kernels.constants import TILE_SIZE
 from .blending import gather_by_gaussian
 from .tile_lists import PackedSplats, TileLists
+from .torch_contract import once_differentiable
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import even_ranges
 
@@ -46,7 +47,7 @@ class _Watch(torch.autograd.Function):
         return image.view_as(image), transmittance.view_as(transmittance)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, grad_image, grad_transmittance):
         features, means_opacities, conics_cutoffs = ctx.saved_tensors
         lists, channels = ctx.lists, features.shape[1]

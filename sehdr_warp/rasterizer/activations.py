@@ -10,6 +10,7 @@ from ..kernels.activations import (
     opacities_backward_kernel,
     opacities_kernel,
 )
+from .torch_contract import once_differentiable
 from .warp_launch.launching import launch, warp_scalar
 
 MEAN_THREADS = 1 << 14
@@ -39,7 +40,7 @@ class _BoundedExponential(torch.autograd.Function):
         return exponentials
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, upstream):
         values, exponentials = ctx.saved_tensors
         result = torch.empty_like(values)
@@ -74,7 +75,7 @@ class _Opacities(torch.autograd.Function):
         return opacities, shares.sum()
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, grad_opacities, grad_mean):
         (opacities,) = ctx.saved_tensors
         result = torch.empty_like(opacities)

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from .gradients import kernel_layout
-from .torch_contract import torch_operation
+from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch
 from .warp_launch.packing import check_dimensions
 from .warp_launch.threads import single_range
@@ -132,7 +132,7 @@ class _ProgramFunction(torch.autograd.Function):
         return returned if isinstance(result, tuple) else returned[0]
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, *upstream):
         saved, needed = ctx.saved_tensors, ctx.needs_input_grad[2:]
         device = next((gradient.device for gradient in upstream if gradient is not None), None)

@@ -5,7 +5,6 @@ Nothing here waits for a GPU: values are looked at on the CPU alone.
 
 import math
 import operator
-from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -25,20 +24,19 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
         **arguments: by name, the value and its shape, in which a letter stands for the size of the first tensor that
             has it.
     """
-    if _fit(arguments.values()):
-        return
     sizes: dict[str, int] = {}
     first_name, (first, _) = next(iter(arguments.items()))
     for name, (value, shape) in arguments.items():
-        expected = f"[{', '.join(map(str, shape))}]"
         if not isinstance(value, Tensor):
             kind = f"{type(value).__module__.split('.')[0]}.{type(value).__name__}"
-            raise TypeError(f"{name} is a {kind}, expected a torch tensor {expected}")
-        if value.ndim == len(shape):
-            for size, letter in zip(value.shape, shape, strict=True):
-                if isinstance(letter, str):
-                    sizes.setdefault(letter, size)
-        if tuple(value.shape) != tuple(sizes.get(n, -1) if isinstance(n, str) else n for n in shape):
+            raise TypeError(f"{name} is a {kind}, expected a torch tensor [{', '.join(map(str, shape))}]")
+        fits = value.ndim == len(shape)
+        if fits:
+            for size, expected in zip(value.shape, shape, strict=True):
+                if size != expected and (isinstance(expected, int) or sizes.setdefault(expected, size) != size):
+                    fits = False
+        if not fits:
+            expected = f"[{', '.join(map(str, shape))}]"
             sizes_text = ", ".join(f"{n} = {sizes[n]}" for n in shape if isinstance(n, str) and n in sizes)
             expected += f" with {sizes_text}" if sizes_text else ""
             raise ValueError(f"{name} has shape {list(value.shape)}, expected {expected}")
@@ -51,30 +49,6 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
             raise ValueError(f"{name} is {value.dtype} on {value.device}, but {other}")
     if first.device.type not in DEVICES:
         raise ValueError(f"{first_name} is on {first.device}, expected the CPU or a CUDA device")
-
-
-def _fit(arguments: Iterable[tuple[Any, tuple[int | str, ...]]]) -> bool:
-    """Return whether check_tensors() has no objection; as fast as possible, because every call asks."""
-    sizes: dict[str, int] = {}
-    dtype = device = None
-    for value, shape in arguments:
-        if not isinstance(value, Tensor):
-            return False
-        if dtype is None:
-            dtype, device = value.dtype, value.device
-            if device.type not in DEVICES:
-                return False
-        elif value.dtype != dtype or value.device != device:
-            return False
-        if value.layout != torch.strided:
-            return False
-        actual = value.shape
-        if len(actual) != len(shape):
-            return False
-        for size, expected in zip(actual, shape, strict=True):
-            if size != expected and (isinstance(expected, int) or sizes.setdefault(expected, size) != size):
-                return False
-    return dtype in (torch.float32, torch.float64)
 
 
 def integer(name: str, value: Any, least: int, most: int) -> int:

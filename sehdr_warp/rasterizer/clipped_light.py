@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ..kernels.clipped_light import clipped_light_kernel, clipped_light_patch_kernel, clipped_logarithms_kernel
 from . import patches
-from .code_residual import CODES, WHITE
+from .code_residual import CODES, WHITE, photo_stack
 from .gradients import scale_gradient
+from .torch_contract import once_differentiable
 from .warp_launch.launching import launch, warp_scalar
 
 
@@ -66,9 +67,8 @@ def add_clipped_light(image, codes, white, weights, index, mask, estimates, term
 
     slopes: [H, W, 3], contiguous; may be None.
     """
-    if index is None:
-        codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
-    photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
+    photos, index = photo_stack(codes, index)
+    mask = None if mask is None else mask.contiguous().view(-1)
     photo = image, photos, index, mask, WHITE[codes.dtype], white
     rows, columns = (0, 0) if estimates is None else estimates.shape[:2]
     estimates = None if estimates is None else estimates.contiguous().view(-1)
@@ -96,7 +96,7 @@ class _ClippedLight(torch.autograd.Function):
         return patches.total(terms)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, grad_energy):
         (slopes,) = ctx.saved_tensors
         return scale_gradient(slopes, grad_energy), None, None, None, None, None, None

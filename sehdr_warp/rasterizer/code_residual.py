@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from ..kernels.code_residual import code_residual_kernel
+from .torch_contract import once_differentiable
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import torch_threads
 
@@ -31,6 +32,13 @@ def code_values(codes: Tensor) -> Tensor:
     integers = codes.int() & 0xFFFF if codes.dtype == torch.int16 else codes
     # By a tensor: torch's division by a number on a GPU is a product with its reciprocal, which rounds differently.
     return integers / torch.full((), float(WHITE[codes.dtype]), device=codes.device)
+
+
+def photo_stack(codes: Tensor, index: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the codes of a photo, or with an index of several, as [V, 3 H W], and the index [1] int64 of the photo."""
+    if index is None:
+        codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
+    return codes.contiguous().view(len(codes), -1), index
 
 
 @dataclass(frozen=True)
@@ -90,11 +98,9 @@ def check_codes(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | 
 def residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """code_residual()'s two of a contiguous image, and the derivatives of the first by it, [H, W, 3], with no graph."""
     prediction, slopes, target = (torch.empty_like(image) for _ in range(3))
-    if index is None:
-        codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
+    photos, index = photo_stack(codes, index)
     law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.mu else (0.0, 0.0)
     kernel = code_residual_kernel(warp_scalar(image.dtype), CODES[codes.dtype], scale.mu > 0)
-    photos = codes.contiguous().view(len(codes), -1)
     launch(kernel, image.numel(), image, photos, index, scale.table, *law, prediction, slopes, target)
     return prediction, target, slopes
 
@@ -109,10 +115,10 @@ class _CodeResidual(torch.autograd.Function):
         return prediction, target
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, by_seen, _):
+    @once_differentiable
+    def backward(ctx, grad_prediction, _):
         (slopes,) = ctx.saved_tensors
-        if by_seen is None:
+        if grad_prediction is None:
             return None, None, None, None
         with torch_threads(slopes.device):
-            return by_seen * slopes, None, None, None
+            return grad_prediction * slopes, None, None, None

@@ -6,6 +6,7 @@ from torch import Tensor
 from ..kernels.exposure_fusion import POINTS_PER_THREAD, fusion_kernels
 from .checks import check_tensors
 from .gradients import requires_ordered_sums
+from .torch_contract import once_differentiable
 from .warp_launch.launching import launch, warp_scalar
 
 MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0  # Inside these exp(-d^2 / 2) and its gradient are finite in float32
@@ -73,7 +74,7 @@ class _Fusion(torch.autograd.Function):
         return results
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, gradients):
         encoded, log_sigma, *weights, exposedness, outputs, results = ctx.saved_tensors
         brackets, scale = ctx.numbers

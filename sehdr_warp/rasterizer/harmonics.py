@@ -16,7 +16,7 @@ from ..kernels.harmonics import (
     jacobian_backward_kernel,
 )
 from .checks import check_tensors, integer
-from .torch_contract import torch_operation
+from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch, warp_scalar
 
 MAX_DEGREE = 3
@@ -135,7 +135,7 @@ class _Evaluation(torch.autograd.Function):
         return values
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, gradient):
         constant, rest, means, position, mean_jacobian = ctx.saved_tensors
         scalar, degree, gradient = warp_scalar(gradient.dtype), ctx.degree, gradient.contiguous()

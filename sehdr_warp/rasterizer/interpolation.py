@@ -6,6 +6,7 @@ from torch import Tensor
 from ..kernels import interpolation
 from .checks import check_tensors
 from .gradients import requires_ordered_sums
+from .torch_contract import once_differentiable
 from .warp_launch.launching import launch
 
 
@@ -51,7 +52,7 @@ class _Interpolation(torch.autograd.Function):
         return values
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, gradients):
         table, positions = ctx.saved_tensors
         copies = 1 if table.device.type == "cpu" else interpolation.COPIES

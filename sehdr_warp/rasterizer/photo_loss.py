@@ -12,6 +12,7 @@ from .code_residual import CodeScale, check_codes, residual
 from .gradients import scale_gradient
 from .patches import total
 from .ssim import distance_terms
+from .torch_contract import once_differentiable
 
 
 def photo_loss(
@@ -53,6 +54,6 @@ class _PhotoLoss(torch.autograd.Function):
         return total(terms)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, upstream):
         return scale_gradient(ctx.saved_tensors[0], upstream), None, None, None, None, None, None

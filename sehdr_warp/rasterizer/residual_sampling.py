@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import residual_sampling as kernels
-from .code_residual import CODES, WHITE
+from .code_residual import CODES, WHITE, photo_stack
 from .plane_sweep import BORDER
 from .warp_launch.launching import launch
 
@@ -30,10 +30,9 @@ def sample_residual_pixels(
     float32, by which errors are multiplied. uniform: [K] float64 in [0, 1), random numbers of the draws.
     """
     height, width, _ = rendered.shape
-    if index is None:
-        codes, index = codes[None], torch.zeros(1, dtype=torch.int64, device=codes.device)
+    photos, index = photo_stack(codes, index)
+    mask = None if mask is None else mask.contiguous().view(-1)
     weights = torch.empty(height * width, dtype=torch.float64, device=rendered.device)
-    photos, mask = codes.contiguous().view(len(codes), -1), None if mask is None else mask.contiguous().view(-1)
     inputs = rendered.contiguous().view(-1, 3), photos, index, float(WHITE[codes.dtype]), mask, least
     launch(kernels.error_weights_kernel(CODES[codes.dtype]), len(weights), *inputs, weights)
     steps = weights.cumsum(0)

@@ -14,7 +14,7 @@ from .checks import check_opacities, check_tensors
 from .memory import oom_context
 from .projection import launch_projection
 from .tile_lists import EmitOrder, check_intersection_count, depth_order, lists_by_tile
-from .torch_contract import torch_operation
+from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import even_ranges
 
@@ -174,7 +174,7 @@ class _Blend(torch.autograd.Function):
         return image, transmittance
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, grad_image, grad_transmittance):
         *splats, transmittance, ends = ctx.saved_tensors
         lists, emit_order, (count, channels) = ctx.lists, ctx.lists.emit_order, splats[-1].shape

@@ -10,7 +10,7 @@ from ..kernels.ssim_cuda import ssim_patch_kernels
 from . import patches
 from .checks import check_tensors
 from .gradients import constant, scale_gradient, unit_gradient
-from .torch_contract import torch_operation
+from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch, warp_scalar
 
 CPU_LANES = 16  # Numbers that one step of the CPU kernels takes: one AVX-512 register of float32
@@ -62,7 +62,7 @@ class _Distance(torch.autograd.Function):
         return patches.total(terms)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, upstream):
         return scale_gradient(ctx.saved_tensors[0], upstream), None, None, None
 
@@ -97,7 +97,7 @@ class _Similarity(torch.autograd.Function):
         return similarity.flatten(1).sum(1).sum() / similarity.numel() if mean else similarity
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, upstream):
         a, b, derivatives = ctx.saved_tensors
 

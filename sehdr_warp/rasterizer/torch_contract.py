@@ -7,12 +7,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch._C._dynamo.eval_frame import _FrameAction, _FrameExecStrategy, set_code_exec_strategy
 from torch.autograd import forward_ad
-
-try:
-    from torch._C._dynamo.eval_frame import _FrameAction, _FrameExecStrategy, set_code_exec_strategy
-except ImportError:  # torch 2.6
-    _FrameAction = _FrameExecStrategy = set_code_exec_strategy = None
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -22,13 +18,8 @@ HALF = torch.float16, torch.bfloat16
 _transforms_are_active = torch._C._are_functorch_transforms_active
 
 
-def _autocast_of_a_device() -> bool:
-    return torch.is_autocast_enabled("cuda") or torch.is_autocast_enabled("cpu")
-
-
+_some_autocast = torch._C._is_any_autocast_enabled
 is_compiling = torch.compiler.is_compiling
-_some_autocast = getattr(torch._C, "_is_any_autocast_enabled", _autocast_of_a_device)
-
 
 _compiled: dict[str, Callable[..., Any]] = {}
 
@@ -54,7 +45,7 @@ def torch_operation(function: Callable[P, T], *, compiles: bool = False) -> Call
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         if compiles and is_compiling():
-            return _compiled[name](*args, **kwargs)
+            return _compiled[name](*args, **kwargs)  # Registered by custom_ops.py, which the package imports.
         if _transforms_are_active():
             raise NotImplementedError(f"{name}() does not support torch.func; use torch.autograd")
         if forward_ad._current_level >= 0 and any(map(_has_tangent, (*args, *kwargs.values()))):
@@ -66,9 +57,6 @@ def torch_operation(function: Callable[P, T], *, compiles: bool = False) -> Call
     operation: Any = call
     if compiles:
         return operation
-    if set_code_exec_strategy is None or _FrameExecStrategy is None or _FrameAction is None:
-        disabled: Any = torch.compiler.disable(operation)
-        return disabled
     # What torch.compiler.disable() does, without its import of Dynamo, which takes two seconds.
     operation._torchdynamo_disable = True
     operation._torchdynamo_disable_msg = "it launches Warp kernels"
@@ -102,9 +90,7 @@ def keeps_graph() -> bool:
 
     If not, what a node holds beside its saved tensors can be freed: a further backward pass is refused by torch.
     """
-    autograd: Any = getattr(torch._C, "_autograd", None)
-    ask = getattr(autograd, "_get_current_graph_task_keep_graph", None)
-    return True if ask is None else ask()
+    return torch._C._autograd._get_current_graph_task_keep_graph()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:

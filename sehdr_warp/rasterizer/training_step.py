@@ -10,6 +10,7 @@ from torch import Tensor
 from ..kernels import training_step as kernels
 from .gradients import unit_gradient
 from .harmonics import HarmonicsGradients
+from .torch_contract import once_differentiable
 from .warp_launch.launching import launch
 from .warp_launch.threads import torch_threads
 
@@ -71,7 +72,7 @@ class _ByOne(torch.autograd.Function):
         return loss.detach()
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, upstream):
         return unit_gradient(upstream)
 

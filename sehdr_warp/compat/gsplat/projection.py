@@ -6,13 +6,12 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from ...kernels.constants import ALPHA_THRESHOLD, FRUSTUM_MARGIN
 from ...rasterizer.projection import ProjectedGaussians, project_to_camera
 from ...rasterizer.render_options import RenderOptions
 
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS = "pinhole", "ortho", "fisheye"
-ALPHA_THRESHOLD = 1 / 255
-FRUSTUM_MARGIN = 0.3  # Rays of the linearised pinhole projection end at this fraction of the image beyond its border.
 SMALLEST_SIZE = 1e-30  # A size of 0 has no logarithm; its gradient is 0 as the covariance's is.
 
 
