@@ -45,8 +45,8 @@ def register_custom_op(name: str, options: str, run: Operation, fake: Operation)
             places = [place for place in places if results[place].requires_grad]
             gradients: Sequence[Tensor | None] = [None] * len(leaves)
             if places:
-                outputs, by_outputs = [results[place] for place in places], [upstream[place] for place in places]
-                gradients = torch.autograd.grad(outputs, leaves, by_outputs, allow_unused=True)
+                outputs, grad_outputs = [results[place] for place in places], [upstream[place] for place in places]
+                gradients = torch.autograd.grad(outputs, leaves, grad_outputs, allow_unused=True)
         # Each with memory of its own, as a compiler may assume.
         pairs = zip(leaves, gradients, strict=True)
         return [torch.zeros_like(leaf) if gradient is None else gradient.clone() for leaf, gradient in pairs]

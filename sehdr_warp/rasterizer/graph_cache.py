@@ -73,12 +73,12 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
             return None
         signature = _signature(tensors, options)
         with _lock:
-            graphs = _graphs.get(signature)
-            if graphs is not None:
-                _graphs.move_to_end(signature)
+            pool = _pools.get(signature)
+            if pool is not None:
+                _pools.move_to_end(signature)
     except (AttributeError, TypeError, RuntimeError):
         return None
-    return None if graphs is None or is_capturing(tensors[0].device) else graphs
+    return None if pool is None or is_capturing(tensors[0].device) else pool
 
 
 def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "GraphPool | None":
@@ -126,10 +126,10 @@ class ReplayedRender:
         result: of the blend.
     """
 
-    def __init__(self, graphs: "GraphPool", graph: "CapturedRender", result: Sequence[Tensor]) -> None:
+    def __init__(self, pool: "GraphPool", graph: "CapturedRender", result: Sequence[Tensor]) -> None:
         """Lease the CUDA graph."""
-        self._graphs, self._graph = graphs, graph
-        lease = _Lease(graphs.idle, graph)
+        self._pool, self._graph = pool, graph
+        lease = _Lease(pool.idle, graph)
         image, transmittance, *others = result
         self.result = BlendResult(image, transmittance, lease.backward)
         self.projected: ProjectedGaussians | None = None
@@ -149,7 +149,7 @@ class ReplayedRender:
         self.intersections = self._graph.count_intersections()
         if self.intersections <= self._graph.max_intersections:
             return True
-        self._graphs.grow(self.intersections)
+        self._pool.grow(self.intersections)
         return False
 
 
@@ -349,12 +349,12 @@ class _Lease:
 
 
 _lock = threading.Lock()
-_graphs: OrderedDict[_Signature, GraphPool] = OrderedDict()
+_pools: OrderedDict[_Signature, GraphPool] = OrderedDict()
 
 
 def clear_graphs() -> None:
     """Free all CUDA graphs and their memory."""
-    _graphs.clear()
+    _pools.clear()
 
 
 atexit.register(clear_graphs)  # CUDA graphs must be freed before CUDA is.
@@ -362,8 +362,8 @@ atexit.register(clear_graphs)  # CUDA graphs must be freed before CUDA is.
 
 def _pool_of(signature: _Signature) -> GraphPool:
     with _lock:
-        graphs = _graphs.setdefault(signature, GraphPool(signature.differentiable))
-        _graphs.move_to_end(signature)
-        while len(_graphs) > MAX_SIZES:
-            _graphs.popitem(last=False)
-    return graphs
+        pool = _pools.setdefault(signature, GraphPool(signature.differentiable))
+        _pools.move_to_end(signature)
+        while len(_pools) > MAX_SIZES:
+            _pools.popitem(last=False)
+    return pool

@@ -78,7 +78,7 @@ def blend_reference(
     order = order[: int((extents[:, 0] > 0).sum())]
     low, high = means2d[order] - extents[order], means2d[order] + extents[order]
     pixels = torch.arange(height * width, device=means2d.device).reshape(height, width)
-    places, images, left_over = [], [], []
+    places, images, final_transmittance = [], [], []
     for corner in product(range(0, width, TILE_SIZE), range(0, height, TILE_SIZE)):
         left, top = means2d.new_tensor(corner)
         here = order[(high[:, 0] > left) & (low[:, 0] < left + TILE_SIZE)
@@ -95,9 +95,10 @@ def blend_reference(
         # What each Gaussian finds left, and what all leave.
         transmittance = torch.cumprod(torch.cat([value.new_ones(1, value.shape[1]), 1 - value]), 0)
         images.append(torch.einsum("gp,gc->pc", value * transmittance[:-1], features[here]))
-        left_over.append(transmittance[-1])
+        final_transmittance.append(transmittance[-1])
     place = torch.cat(places).argsort()
-    return torch.cat(images)[place].reshape(height, width, -1), torch.cat(left_over)[place].reshape(height, width)
+    image = torch.cat(images)[place].reshape(height, width, -1)
+    return image, torch.cat(final_transmittance)[place].reshape(height, width)
 
 
 def rasterize_reference(

@@ -72,7 +72,8 @@ class TileLists:
     Attributes:
         tile_ranges: [tiles, 2] first intersection of each tile and one past its last.
         gaussians: [M] the Gaussian of each intersection.
-        subtile_masks: [M] uint8, bit k set if the ellipse touches subtile k of its tile; None on the CPU.
+        subtile_masks: [M] uint8, bit k set if the ellipse touches subtile k of its tile; None from the CPU's sort by
+            counting, because only block kernels read them.
         emit_order: of the intersections before the sort; None unless requested.
         width: of the image in pixels.
         height: of the image in pixels.

@@ -32,7 +32,7 @@ def scene_of(count=80, channels=3):
 
 
 def recordings():
-    return sum(size.captured for size in graph_cache._graphs.values())
+    return sum(size.captured for size in graph_cache._pools.values())
 
 
 def values_and_gradients(splat, scene, *, by_alpha=True, **options):
