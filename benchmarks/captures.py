@@ -27,7 +27,7 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import Run
 from sehdr_warp.scene import Scene, View, load_scene
 from sehdr_warp.scene.normalization import normalization_of
-from sehdr_warp.training.initialization import choose_response
+from sehdr_warp.training.initialization import response_for_training
 from sehdr_warp.training.train import train
 
 from .gsplat_trainer import STEPS, STRATEGIES, GsplatScene, Snapshot, train_gsplat
@@ -91,7 +91,7 @@ def compare(
     figures_of_run["best"] = max(line["psnr_ldr"] for line in run.metrics())
     add("sehdr-warp", run.response, lambda view: photographed(run, view), **figures_of_run)
     shutil.rmtree(scratch)
-    response, normalized = choose_response(scene, load_config("default")), normalization_of(scene)
+    response, normalized = response_for_training(scene, load_config("default")), normalization_of(scene)
     for strategy in strategies:
         forget_peaks(torch.device(device))
 

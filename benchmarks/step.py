@@ -13,7 +13,7 @@ from sehdr_warp.rasterizer.reference import rasterize_reference
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.scene import Scene
-from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.machine import torch_settings
 from sehdr_warp.training.ranks import Ranks
 from sehdr_warp.training.trainer import Trainer
@@ -83,7 +83,7 @@ def make_trainer(
 
     rasterizer: in place of ours. ranks: that train together, each of which makes the same trainer.
     """
-    field = make_field(scene, config, choose_response(scene, config), device)
+    field = make_field(scene, config, response_for_training(scene, config), device)
     field.rasterizer = rasterizer or field.rasterizer
     generator = torch.Generator().manual_seed(config.seed)
     opacities = 0.05 + 0.9 * torch.rand(field.gaussians.count, generator=generator) ** 1.5

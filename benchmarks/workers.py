@@ -17,7 +17,7 @@ from sehdr_warp.parallel import thread_count
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.machine import torch_settings
-from sehdr_warp.training.rank_place import Place, device_of_rank
+from sehdr_warp.training.rank_info import RankInfo, device_of_rank
 from sehdr_warp.training.ranks import GO, Ranks, join_ranks
 
 from .results import check, new_result
@@ -90,7 +90,7 @@ def time_ranks(size: Size, count: int, device_type: str, repetitions: int) -> di
 def _rank(rank: int, count: int, folder: Path, size: Size, device_type: str, repetitions: int) -> None:
     os.environ |= {"WORLD_SIZE": str(count), "SEHDR_RANKS": str(folder / "meeting")}
     device = device_of_rank(rank, device_type)
-    with join_ranks(Place.on_one_node(rank, count), device) if count > 1 else nullcontext() as ranks:
+    with join_ranks(RankInfo.on_one_node(rank, count), device) if count > 1 else nullcontext() as ranks:
         timing = _time_steps(ranks, size, device, repetitions)
         if not rank:
             write_json(folder / "timing.json", timing)

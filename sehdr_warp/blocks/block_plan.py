@@ -27,7 +27,7 @@ from ..scene import Scene
 from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.normalization import Normalization, normalization_of
 from ..training.compensation import SharedDecisions, estimate_compensation, estimates_compensation
-from ..training.initialization import base_time, check_views, choose_response, match_points
+from ..training.initialization import base_time, check_views, match_points, response_for_training
 from ..training.matching import LARGEST_SIDE
 from ..training.plan import STEPS_PER_PHOTO
 from .division import Cell, Division, divide, largest_count, weights_of
@@ -202,7 +202,7 @@ def make_block_plan(
     size = min(data.get("max_size") or LARGEST_SIDE, LARGEST_SIDE)
     scene = load_photos(data | {"max_size": size}, response=config.response.name, **selection)
     check_views(scene)
-    response = choose_response(scene, config)
+    response = response_for_training(scene, config)
     times = {view.name: view.exposure_time for view in scene.views}
     normalization = normalization_of(scene)
     gains = None

@@ -59,7 +59,7 @@ def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
         InputError: If a block is damaged or was trained with other options, or if no Gaussian is in any core.
     """
     blocks = [_trained_block(out, plan, index) for index in range(len(plan.blocks))]
-    empty = [plan.blocks[index].name for index, block in enumerate(blocks) if not len(block.evidence.seen)]
+    empty = [plan.blocks[index].name for index, block in enumerate(blocks) if not len(block.evidence.weight_sum)]
     if empty:
         log.warning("%s: no Gaussian is in its core; the merged run has nothing there", ", ".join(empty))
     tensors = {name: torch.cat([block.gaussians[name] for block in blocks]) for name in PARAMETER_NAMES}
@@ -133,7 +133,7 @@ def _summary(blocks: list[TrainedBlock], iterations: int, seconds: float, gaussi
         "skipped_steps": sum(block.summary.get("skipped_steps", 0) for block in blocks),
         "device": blocks[0].summary.get("device", ""),
         "blocks": [
-            {"gaussians": len(block.evidence.seen)}
+            {"gaussians": len(block.evidence.weight_sum)}
             | {
                 name: block.summary.get(name)
                 for name in ("train_seconds", "peak_memory_bytes", "peak_gpu_memory_bytes")

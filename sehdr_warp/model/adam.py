@@ -24,13 +24,13 @@ class Adam:
     Attributes:
         param_groups: Dictionaries with "params", "lr", "betas" and "eps".
         state: For each parameter "step", "exp_avg" and "exp_avg_sq".
-        turns: Number of parts of the harmonics above degree 0 of which one is updated per step, if their gradients come
-            in factored form.
+        sh_update_interval: The harmonics above degree 0 are divided into this many parts, of which each step updates
+            one, if their gradients come in factored form.
     """
 
-    def __init__(self, groups: list[dict], betas: tuple[float, float] = BETAS, turns: int = 1):
+    def __init__(self, groups: list[dict], betas: tuple[float, float] = BETAS, sh_update_interval: int = 1):
         """Create an optimizer without state."""
-        self.turns = turns
+        self.sh_update_interval = sh_update_interval
         self.param_groups = [{"betas": betas, "eps": EPSILON} | group for group in groups]
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
 
@@ -51,7 +51,7 @@ class Adam:
         skipped: Tensor | None = None,
         applied: Tensor | None = None,
         harmonics: HarmonicsGradients | None = None,
-        live: Tensor | None = None,
+        active_count: Tensor | None = None,
     ) -> None:
         """Update all parameters that have a gradient.
 
@@ -60,7 +60,7 @@ class Adam:
             applied: Scalar 1 - skipped.
             harmonics: Gradients of the harmonics in factored form, for groups whose parameters have no gradient of
                 their own.
-            live: [1] int32, number of Gaussians, if parameters have more rows than that; the gradients of the others
+            active_count: [1] int32, number of Gaussians, if parameters have more rows; the gradients of the other rows
                 are 0.
         """
         factored = FIRST_HARMONIC if harmonics is not None else ()
@@ -95,6 +95,8 @@ class Adam:
             elif harmonics is not None:
                 state, rate = (first, second, step, skipped), {"rate": group["lr"]}
                 start = FIRST_HARMONIC[group["name"]]
-                turns = self.turns if start else 1
-                harmonics_adam_step(values, start, harmonics, *state, **rate, **options, live=live, turns=turns)
-        adam_steps(steps_with_gradient, skipped, **options, live=live)
+                interval = self.sh_update_interval if start else 1
+                harmonics_adam_step(
+                    values, start, harmonics, *state, **rate, **options, live=active_count, turns=interval
+                )
+        adam_steps(steps_with_gradient, skipped, **options, live=active_count)

@@ -53,7 +53,7 @@ def field_of(gaussians: GaussianArrays) -> RadianceField:
         for values in (gaussians.means - center, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
     )
     model = Gaussians(means, log_scales, quaternions, logits, harmonics[:, :1], harmonics[:, 1:])
-    options = {"base_time": gaussians.base_time, "radiance": gaussians.color_model}
+    options = {"base_time": gaussians.base_time, "color_model": gaussians.color_model}
     options["normalization"] = Normalization(center)
     return RadianceField(model, response_by_name("srgb"), **options).requires_grad_(False)
 

@@ -78,7 +78,7 @@ class DisplayModel(ColorModel):
         return value.add(0.5).clamp_min(0)
 
 
-def color_model(name: str) -> ColorModel:
+def make_color_model(name: str) -> ColorModel:
     """Return the model that config.model.radiance names."""
     return {kind.name: kind for kind in (ColorModel, LinearModel, DisplayModel)}[name]()
 

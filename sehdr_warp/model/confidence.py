@@ -35,13 +35,13 @@ class Evidence:
     """Evidence of the training photos for N Gaussians; tensors [N].
 
     Attributes:
-        seen: Sum of blending weights over pixels, RESIDUAL_WEIGHT times in regions that the scene does not reproduce.
+        weight_sum: Sum of blending weights over pixels, RESIDUAL_WEIGHT times in regions that the scene does not reproduce.
         stops: Mean uncertainty in stops.
         clipped: Fraction of clipped values.
-        peak: Sum of blending weights, as in seen, in the photo in which it is largest.
+        peak: Sum of blending weights, as in weight_sum, in the photo in which it is largest.
     """
 
-    seen: Tensor
+    weight_sum: Tensor
     stops: Tensor
     clipped: Tensor
     peak: Tensor
@@ -53,11 +53,11 @@ class Evidence:
 
     def rows(self, index: Tensor) -> "Evidence":
         """Return the evidence of the Gaussians at an index or mask [N]."""
-        return Evidence(self.seen[index], self.stops[index], self.clipped[index], self.peak[index])
+        return Evidence(self.weight_sum[index], self.stops[index], self.clipped[index], self.peak[index])
 
     def confidence(self) -> Tensor:
         """Return [N] in [0, 1]: 1 observed unclipped and reproduced, 1/2 known to a factor of two, 0 never seen."""
-        return torch.exp2(-self.stops) * self.seen / (self.seen + HALF_CONFIDENCE_PIXELS)
+        return torch.exp2(-self.stops) * self.weight_sum / (self.weight_sum + HALF_CONFIDENCE_PIXELS)
 
 
 def pixel_uncertainty(

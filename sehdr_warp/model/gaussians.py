@@ -34,7 +34,7 @@ class Gaussians(nn.Module):
         opacity_logits: [N]; the opacity is their sigmoid.
         harmonics_dc: [N, 1, 3] real spherical harmonics of degree 0; the color model says what their sum means.
         harmonics_rest: [N, K - 1, 3] harmonics of higher degrees, K = (degree + 1)^2.
-        live: [1] int32, number of rows that are Gaussians while a step runs on reserved rows; else None.
+        active_count: [1] int32, number of rows that are Gaussians while a step runs on reserved rows; else None.
         reallocations: How often the parameters moved to other memory; CUDA graphs captured before are then invalid.
     """
 
@@ -58,7 +58,7 @@ class Gaussians(nn.Module):
         if math.isqrt(harmonics) ** 2 != harmonics:
             raise ValueError(f"{harmonics} harmonics are not a whole number of degrees")
         self._reserved: ReservedRows | None = None
-        self.live: Tensor | None = None
+        self.active_count: Tensor | None = None
         self.reallocations = 0
 
     @classmethod
@@ -125,7 +125,7 @@ class Gaussians(nn.Module):
                 reserved.clear(name, len(index), count)
                 new = reserved.first(name, len(index))
             self._put(name, *new, optimizer)
-        self._update_live_count()
+        self._update_active_count()
 
     def append(self, rows: dict[str, Tensor], optimizer: Optimizer | None = None) -> None:
         """Append M Gaussians with tensors as returned by rows(); their optimizer state starts at zero."""
@@ -143,7 +143,7 @@ class Gaussians(nn.Module):
                 self._reserved.all_rows[name].detach()[count:total] = added
                 new = self._reserved.first(name, total)
             self._put(name, *new, optimizer)
-        self._update_live_count()
+        self._update_active_count()
 
     def reserve(self, rows: int, optimizer: Optimizer | None = None) -> None:
         """Move the parameters to memory with `rows` rows, at least the count.
@@ -157,7 +157,7 @@ class Gaussians(nn.Module):
             self._put(name, *reserved.first(name, self.count), optimizer)
         self._reserved = reserved
         self.reallocations += 1
-        self._update_live_count()
+        self._update_active_count()
 
     def release(self) -> None:
         """Return to parameters without reserved rows, from the next change of the count on."""
@@ -181,11 +181,11 @@ class Gaussians(nn.Module):
         parameters = {name: getattr(self, name) for name in PARAMETER_NAMES}
         for name in PARAMETER_NAMES:
             self._put(name, reserved.all_rows[name], reserved.moments[name], optimizer)
-        self.live = reserved.live_count
+        self.active_count = reserved.active_count
         try:
             yield
         finally:
-            self.live = None
+            self.active_count = None
             for name, parameter in parameters.items():
                 reserved.moments[name] = moments_of(optimizer, reserved.all_rows[name])
                 self._put(name, parameter, first_rows(reserved.moments[name], len(parameter)), optimizer)
@@ -226,10 +226,10 @@ class Gaussians(nn.Module):
         if old in optimizer.state:
             optimizer.state[new] = optimizer.state.pop(old) | moments
 
-    def _update_live_count(self) -> None:
+    def _update_active_count(self) -> None:
         """Copy the count to the device, where captured CUDA graphs read it."""
         if self._reserved is not None:
-            self._reserved.live_count.fill_(self.count)
+            self._reserved.active_count.fill_(self.count)
 
 
 def neighbour_distances(points: Tensor) -> Tensor:

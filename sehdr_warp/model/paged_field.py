@@ -39,14 +39,8 @@ class PagedField(RadianceField):
         super().__init__(
             field.gaussians,
             field.response.to(device) if isinstance(field.response, torch.nn.Module) else field.response,
-            base_time=field.base_time,
-            rasterizer=field.rasterizer,
-            radiance=field.color_model.name,
-            tone_map=field.tone_map,
             fusion=None if field.fusion is None else field.fusion.to(device),
-            antialiased=field.antialiased,
-            deterministic=field.deterministic,
-            normalization=field.normalization,
+            **field.options(),
         )
         self.confidence = field.confidence
         self._device, self.budget = device, budget
@@ -139,18 +133,8 @@ class PagedField(RadianceField):
             pages = [self._empty()]
         joined = {name: torch.cat([page[name] for page in pages]) for name in pages[0]}
         confidence = joined.pop("confidence", None)
-        part = RadianceField(
-            Gaussians(**joined),
-            self.response,
-            base_time=self.base_time,
-            rasterizer=self.rasterizer,
-            radiance=self.color_model.name,
-            tone_map=self.tone_map,
-            fusion=self.fusion,
-            antialiased=self.antialiased,
-            deterministic=self.deterministic,
-            normalization=self.normalization,
-        ).requires_grad_(False)
+        part = RadianceField(Gaussians(**joined), self.response, fusion=self.fusion, **self.options())
+        part.requires_grad_(False)
         part.confidence = confidence
         return part
 

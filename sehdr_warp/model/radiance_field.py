@@ -4,8 +4,9 @@ Every color set that a step needs is a group of three channels of one rasterisat
 sorted and blended once.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from ..response import Response
 from ..scene import Camera
 from ..scene.normalization import Normalization
 from .camera_tensors import CameraTensors
-from .color_models import color_model
+from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
 
@@ -34,7 +35,7 @@ class TrainRender:
         exposure: Exposure of the HDR color at the base time (I^h dt_1 in the paper); None for encoded color models.
         base: Exposure of the base color at the base time (I^b); the same tensor as `exposure` without fusion.
         rendering: Result of the rasterizer: alpha, projected means, radii.
-        light: Exposure of this photo, the input of the response; None if colors are encoded before they are composited.
+        photo_exposure: Exposure of this photo, the input of the response; None if colors are encoded before they are composited.
         harmonics_gradients: If gradients are factored, holds after a backward pass the gradient [N, 3] by the color
             that each Gaussian's harmonics have in this direction.
         opacity_penalty: opacity_weight times the mean opacity, a scalar; None without a weight.
@@ -44,7 +45,7 @@ class TrainRender:
     exposure: Tensor | None
     base: Tensor | None
     rendering: Rendering
-    light: Tensor | None = None
+    photo_exposure: Tensor | None = None
     harmonics_gradients: tuple[Tensor, ...] | list[Tensor] = ()
     opacity_penalty: Tensor | None = None
 
@@ -99,8 +100,7 @@ class RadianceField(nn.Module):
         response: Response,
         *,
         base_time: float,
-        rasterizer: Callable[..., Rendering] = rasterize,
-        radiance: str = "log",
+        color_model: str = "log",
         tone_map: str = "pixel",
         fusion: NeuralExposureFusion | None = None,
         antialiased: bool = False,
@@ -113,8 +113,7 @@ class RadianceField(nn.Module):
             gaussians: The Gaussians.
             response: Camera response from exposure to encoded values.
             base_time: Exposure time dt_1, seconds.
-            rasterizer: rasterize(), or a function with the same arguments.
-            radiance: Name of the color model.
+            color_model: Name of the color model: log, linear or display.
             tone_map: "pixel" for f(sum of weighted x); "gaussian" for the sum of weighted f(x), as the paper
                 composites.
             fusion: Fusion at the same base time; without it, the HDR color is the base color.
@@ -125,11 +124,22 @@ class RadianceField(nn.Module):
         """
         super().__init__()
         self.normalization = normalization or Normalization()
-        self.gaussians, self.fusion, self.rasterizer = gaussians, fusion, rasterizer
+        self.gaussians, self.fusion = gaussians, fusion
         self.response, self.base_time = response, base_time
-        self.color_model, self.tone_map = color_model(radiance), tone_map
+        self.color_model, self.tone_map = make_color_model(color_model), tone_map
         self.antialiased, self.deterministic = antialiased, deterministic
         self.register_buffer("confidence", None, persistent=False)
+
+    def options(self) -> dict[str, Any]:
+        """Return the keyword arguments of a field that differs in Gaussians, response and fusion alone."""
+        return {
+            "base_time": self.base_time,
+            "color_model": self.color_model.name,
+            "tone_map": self.tone_map,
+            "antialiased": self.antialiased,
+            "deterministic": self.deterministic,
+            "normalization": self.normalization,
+        }
 
     @property
     def render_device(self) -> torch.device:
@@ -160,13 +170,15 @@ class RadianceField(nn.Module):
             degree: Highest SH degree, by default all.
             also: Further images to render: any of "exposure" and "base".
             max_intersections: As in rasterize().
-            encode: If False, `encoded` stays None if `light` is available.
+            encode: If False, `encoded` stays None if `photo_exposure` is available.
             factored: Give the harmonics no gradient; the gradient by their sum is in harmonics_gradients.
             opacity_weight: Weight of the mean opacity in opacity_penalty.
         """
         gaussians, opacities, penalty = self.gaussians, None, None
         if opacity_weight:
-            opacities, penalty = opacities_with_penalty(gaussians.opacity_logits, opacity_weight, gaussians.live)
+            opacities, penalty = opacities_with_penalty(
+                gaussians.opacity_logits, opacity_weight, gaussians.active_count
+            )
         ratio = exposure_time / self.base_time
         values = self._values(camera.position, degree, factored)
         gradients: list[Tensor] = []
@@ -194,12 +206,14 @@ class RadianceField(nn.Module):
         # A single image is not split, because the derivative of a split is a copy.
         parts = rendering.image.split(3, dim=2) if len(color_sets) > 1 else (rendering.image,)
         images = dict(zip(color_sets, parts, strict=True))
-        encoded, exposure, light = images.get("encoded"), images.get("fused"), None
+        encoded, exposure, photo_exposure = images.get("encoded"), images.get("fused"), None
         if self.tone_map == "pixel":
             # Usually the ratio is 1.
-            light = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
-            encoded = self.response.encode_extended(light) if encode else None
-        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, light, gradients, penalty)
+            photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
+            encoded = self.response.encode_extended(photo_exposure) if encode else None
+        return TrainRender(
+            encoded, exposure, images.get("base", exposure), rendering, photo_exposure, gradients, penalty
+        )
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
@@ -351,7 +365,7 @@ class RadianceField(nn.Module):
         opacities = gaussians.opacities() if opacities is None else opacities
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, features, opacities)
-        return self.rasterizer(
+        return rasterize(
             gaussians.means,
             gaussians.log_scales,
             gaussians.quaternions,

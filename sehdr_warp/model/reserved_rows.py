@@ -20,7 +20,7 @@ class ReservedRows:
         rows: Number of rows.
         all_rows: For each parameter name the parameter with all rows, [rows, ...].
         moments: For each parameter name the optimizer's tensors with all rows.
-        live_count: [1] int32 on the device, the number of rows that are Gaussians.
+        active_count: [1] int32 on the device, the number of rows that are Gaussians.
     """
 
     def __init__(self, rows: int, device: torch.device):
@@ -28,7 +28,7 @@ class ReservedRows:
         self.rows = rows
         self.all_rows: dict[str, nn.Parameter] = {}
         self.moments: dict[str, dict[str, Tensor]] = {}
-        self.live_count = torch.zeros(1, dtype=torch.int32, device=device)
+        self.active_count = torch.zeros(1, dtype=torch.int32, device=device)
 
     def store(self, name: str, values: Tensor, moments: dict[str, Tensor]) -> None:
         """Copy a parameter [count, ...] and its moments into new memory with all rows."""

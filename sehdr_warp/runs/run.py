@@ -349,7 +349,7 @@ def assemble_field(
         gaussians,
         response,
         base_time=base_time,
-        radiance=config.model.radiance,
+        color_model=config.model.radiance,
         tone_map=config.model.tone_map,
         fusion=fusion,
         antialiased=config.model.antialiased,

@@ -19,7 +19,7 @@ import json
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -52,6 +52,8 @@ NEW, READY = ".new", ".ready"
 _GIVE_RUN = "give the folder that `sehdr-warp train --out` wrote"
 _REMOVE_FILE = "remove this file, which a run does not need, or train again"
 _MAKE_AGAIN = "remove this file; `sehdr-warp report` makes it again from the photos"
+EVIDENCE_TENSORS = {"weight_sum": "seen", "stops": "stops", "clipped": "clipped", "peak": "peak"}
+"""Name in confidence.safetensors of each field of Evidence."""
 _Value = TypeVar("_Value")
 
 
@@ -255,12 +257,12 @@ class RunFolder:
         Raises:
             InputError: If it was not measured for this checkpoint, or is damaged.
         """
-        names = tuple(field.name for field in fields(Evidence))
+        names = tuple(EVIDENCE_TENSORS.values())
         tensors = self._confidence_tensors(checkpoint.values["sha256"], names)
         count = checkpoint.tensors["gaussians.means"].shape[:1]
         if tensors is None or any(tensors[name].shape != count for name in names):
             raise InputError(self.confidence, "is not of the newest checkpoint", "continue with --resume")
-        return Evidence(**tensors)
+        return Evidence(**{field: tensors[name] for field, name in EVIDENCE_TENSORS.items()})
 
     def _confidence_tensors(
         self, checkpoint_hash: str | None, names: tuple[str, ...] = ("confidence", "clipped")

@@ -25,7 +25,7 @@ from ..scene import Scene
 from ..scene.exposure_compensation import ExposureCompensation
 from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
 from .config import Config
-from .run_folder import NEW, READY, RunFolder, confidence_metadata, describe_scene
+from .run_folder import EVIDENCE_TENSORS, NEW, READY, RunFolder, confidence_metadata, describe_scene
 from .values import FORMAT, read_object, require_readable
 
 _LOCK = ".lock"
@@ -258,7 +258,8 @@ def write_confidence(folder: RunFolder, evidence: Evidence, checkpoint_hash: str
     from safetensors.torch import save
 
     folder.refuse_links()
-    tensors = {**vars(evidence), "confidence": evidence.confidence()}
+    tensors = {name: getattr(evidence, field) for field, name in EVIDENCE_TENSORS.items()}
+    tensors["confidence"] = evidence.confidence()
     # One key: safetensors writes several in any order, and the same run is to give the same file.
     metadata = {"sehdr_warp": json.dumps(confidence_metadata(checkpoint_hash), sort_keys=True)}
     data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, metadata)

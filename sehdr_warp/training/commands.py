@@ -112,29 +112,29 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         args: the options.
         argv: the words of the command line, with which --gpus starts the other ranks.
     """
-    from .rank_place import device_of_rank, launched_as
+    from .rank_info import device_of_rank, launched_as
 
-    gpus, place = args.machine.gpus, launched_as()
+    gpus, info = args.machine.gpus, launched_as()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
     _refuse_run(args)
     if _in_blocks(args):
-        if place is not None:
+        if info is not None:
             raise UsageError("--blocks starts its own processes; leave torchrun out")
         _train_blocks(args)
-    elif place is None and gpus > 1 and not args.training.plan_only:
+    elif info is None and gpus > 1 and not args.training.plan_only:
         from .launch import launch
 
         device_of_rank(gpus - 1, args.machine.device)
         launch(gpus, _run_as_rank, list(argv))
-    elif place is None or args.training.plan_only:
+    elif info is None or args.training.plan_only:
         _train(args)
-    elif gpus not in (1, place.local_count):
-        raise UsageError(f"--gpus {gpus}, but {place.local_count} ranks were started; leave it out")
+    elif gpus not in (1, info.local_count):
+        raise UsageError(f"--gpus {gpus}, but {info.local_count} ranks were started; leave it out")
     else:
         from .ranks import join_ranks
 
-        with join_ranks(place, device_of_rank(place.local_rank, args.machine.device)) as ranks:
+        with join_ranks(info, device_of_rank(info.local_rank, args.machine.device)) as ranks:
             if ranks.leads:
                 _train(args, ranks)
             else:
@@ -176,7 +176,7 @@ def _train(args: Train, ranks=None) -> None:
     if out is not None:
         check_dataset_truth(data, config)
     with nullcontext() if out is None or device.type != "cpu" else _precompiling(config):
-        if ranks is not None and ranks.place.several_nodes:
+        if ranks is not None and ranks.info.several_nodes:
             from .following import PhotoRequest
 
             ranks.request_photos(PhotoRequest(data, {"response": options.name, **selection}))
@@ -253,7 +253,7 @@ def _train_blocks(args: Train) -> None:
     from ..blocks.block_plan import BlockPlan
     from ..blocks.train import is_in_blocks, train_in_blocks
     from ..runs.device import pick_device
-    from .rank_place import device_of_rank
+    from .rank_info import device_of_rank
 
     output, machine = args.output, args.machine
     if output.out is None:

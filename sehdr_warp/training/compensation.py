@@ -248,4 +248,6 @@ def _decision(gains: ExposureCompensation, parts: Parts, times_stated: bool) -> 
         figures.append(f"{gains.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
     choice = f"taken out of the photos{over if times_stated else ''}"
-    return Decision("exposure-compensation", {}, choice, f"matched points differ by {', '.join(figures)}", told=True)
+    return Decision(
+        "exposure-compensation", {}, choice, f"matched points differ by {', '.join(figures)}", always_log=True
+    )

@@ -58,7 +58,7 @@ class SharedTraining:
 
 def send_training(ranks: Ranks, trainer: Trainer, gains: ExposureCompensation | None) -> None:
     """Send a training from rank 0 to the others, in the form of a checkpoint; gains: already taken from its photos."""
-    if ranks.place.several_nodes and not ranks.photos_are_requested:
+    if ranks.info.several_nodes and not ranks.photos_are_requested:
         raise SehdrError("ranks on several nodes read their own photos: train by the command line")
     tensors, values = trainer.state()
     tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
@@ -69,7 +69,7 @@ def send_training(ranks: Ranks, trainer: Trainer, gains: ExposureCompensation | 
         info["exposure_compensation"] = gains.to_dict()
     layout = {name: (tensor.shape, tensor.dtype) for name, tensor in tensors.items()}
     scene = _training_part(trainer.scene)
-    description = describe_scene(scene) if ranks.place.several_nodes else None
+    description = describe_scene(scene) if ranks.info.several_nodes else None
     ranks.broadcast_object(SharedTraining(trainer.config, info, layout, values, description))
     ranks.broadcast_arrays(list(tensors.values()))
     ranks.share_photos(scene, _bytes_of(scene))
@@ -92,7 +92,7 @@ def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
         ranks: The ranks.
         path: Where the photos are on this node; None for where they are on that of rank 0.
     """
-    reads = ranks.place.node > 0 and ranks.place.leads_node
+    reads = ranks.info.node > 0 and ranks.info.leads_node
     scene = None
     if reads:
         request: PhotoRequest = ranks.requested_photos()
@@ -153,5 +153,5 @@ def _check_same_photos(ranks: Ranks, shared: SharedTraining, scene: Scene) -> No
     name = shared.scene["name"]
     difference = scene_difference(shared.scene, describe_scene(replace(scene, name=name)))
     if difference is not None:
-        problem = f"{ranks.place} reads other photos than rank 0: {difference} differ"
+        problem = f"{ranks.info} reads other photos than rank 0: {difference} differ"
         raise InputError(scene.name, problem, "copy the same set to all nodes, or use a shared file system")

@@ -11,7 +11,7 @@ import torch
 
 from ..errors import InputError, SehdrError
 from ..model.baking import field_of, gaussians_of, to_normalized
-from ..model.color_models import color_model
+from ..model.color_models import make_color_model
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name
@@ -47,7 +47,7 @@ def scene_extent(scene: Scene) -> float:
     return normalization_of(scene).unit
 
 
-def choose_response(scene: Scene, config: Config) -> Response:
+def response_for_training(scene: Scene, config: Config) -> Response:
     """Return the response that the config names.
 
     "learned" is a new ToneMapper. "auto" is the response of the scene, if it was selected as the config asks, else the
@@ -103,7 +103,7 @@ def make_field(
     if len(points) > most:
         subset = np.sort(rng.choice(len(points), most, replace=False))
         points, colors = points[subset], colors[subset]
-    dc = color_model(config.model.radiance).start(colors, response)
+    dc = make_color_model(config.model.radiance).start(colors, response)
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
     gaussians = Gaussians.from_points(points, dc, config.model.sh_degree)
     return assemble_field(gaussians, config, response, time, normalization).to(device)

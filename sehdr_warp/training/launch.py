@@ -13,7 +13,7 @@ import torch.distributed as dist
 import torch.multiprocessing as processes
 
 from ..errors import SehdrError
-from .rank_place import FILE_STORE
+from .rank_info import FILE_STORE
 
 GRACE = 5.0  # Seconds that other ranks have to end after one has ended, and again after SIGTERM
 

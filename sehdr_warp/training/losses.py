@@ -147,7 +147,7 @@ def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
 
 def compared_image(photo: TrainRender, target: Target) -> Tensor:
     """Return the image that is compared with the photo: exposures if the target has them, else encoded values."""
-    image = photo.light if target.scale.mu else photo.encoded
+    image = photo.photo_exposure if target.scale.mu else photo.encoded
     assert image is not None
     return image
 

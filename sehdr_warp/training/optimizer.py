@@ -21,8 +21,8 @@ from ..runs.config import Config
 
 # Higher harmonics are 3/4 of all parameters and the Adam step is bandwidth-bound, so on a GPU only every second part of
 # them is updated per step.
-TURNS = 2
-IN_TURN_FROM = 4000  # Steps of the shortest training to which TURNS applies; shorter ones lose quality
+SH_UPDATE_INTERVAL = 2
+SH_INTERVAL_FROM = 4000  # Steps of the shortest training to which SH_UPDATE_INTERVAL applies; shorter ones lose quality
 
 
 def make_optimizer(field: RadianceField, config: Config, extent: float, batch: int = 1) -> Adam:
@@ -48,8 +48,8 @@ def make_optimizer(field: RadianceField, config: Config, extent: float, batch: i
     for group in groups:
         rate = group["lr"] * math.sqrt(batch)
         group["lr"] = torch.tensor(rate, device=device) if device.type == "cuda" else rate
-    turns = TURNS if config.schedule.iterations >= IN_TURN_FROM * batch else 1
-    return Adam(groups, betas=(BETAS[0] ** batch, BETAS[1] ** batch), turns=turns)
+    interval = SH_UPDATE_INTERVAL if config.schedule.iterations >= SH_INTERVAL_FROM * batch else 1
+    return Adam(groups, betas=(BETAS[0] ** batch, BETAS[1] ** batch), sh_update_interval=interval)
 
 
 def means_rate(config: Config, extent: float, iteration: int, batch: int = 1) -> float:
@@ -75,8 +75,8 @@ def guarded_step(
     harmonics: HarmonicsGradients | None = None,
     *,
     step_counters: Tensor | None = None,
-    pairs: Tensor | None = None,
-    live: Tensor | None = None,
+    intersections: Tensor | None = None,
+    active_count: Tensor | None = None,
 ) -> Tensor:
     """Run one step of Adam, unless the loss or a gradient is not finite or the rendering was incomplete.
 
@@ -88,16 +88,16 @@ def guarded_step(
         incomplete: Scalar bool, whether the rendering lacked intersections.
         harmonics: Gradients of the harmonics in factored form.
         step_counters: As in check_finite().
-        pairs: As in check_finite().
-        live: As in Adam.step().
+        intersections: As in check_finite().
+        active_count: As in Adam.step().
 
     Returns:
         A scalar float tensor: 1 if the step was applied, else 0.
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.grad_colors]
-    skipped, applied = check_finite(loss, norms(gradients), incomplete, step_counters, pairs)
-    optimizer.step(skipped, applied, harmonics, live)
+    skipped, applied = check_finite(loss, norms(gradients), incomplete, step_counters, intersections)
+    optimizer.step(skipped, applied, harmonics, active_count)
     return applied
 
 
@@ -110,12 +110,12 @@ class FlatGradients:
         buffer: The buffer.
     """
 
-    def __init__(self, optimizer: Adam, place: int, count: int, *, factored: bool):
+    def __init__(self, optimizer: Adam, rank: int, count: int, *, factored: bool):
         """Allocate the buffer.
 
         Args:
             optimizer: The optimizer.
-            place: Number of this rank.
+            rank: Number of this rank.
             count: Number of ranks.
             factored: Whether gradients of the harmonics are exchanged in factored form.
         """
@@ -127,7 +127,7 @@ class FlatGradients:
             for parameter in parameters
             if not (factored and name in FIRST_HARMONIC)
         ]
-        self._means, self._place, self._count = groups["means"][0], place, count
+        self._means, self._rank, self._count = groups["means"][0], rank, count
         shapes = [parameter.shape for parameter in self.parameters]
         shapes += [(count, *self._means.shape), (count, 3)] if factored else []
         sizes = [math.prod(shape) for shape in shapes]
@@ -151,7 +151,7 @@ class FlatGradients:
         if harmonics is not None:
             # The slots of other ranks are zero, so that the sum over the ranks gathers all.
             grad_colors, positions = (part.zero_() for part in self._views[-2:])
-            grad_colors[self._place], positions[self._place] = harmonics.grad_colors[0], harmonics.positions[0]
+            grad_colors[self._rank], positions[self._rank] = harmonics.grad_colors[0], harmonics.positions[0]
             self._degree = harmonics.degree
         self.numbers[0] = loss.detach()
         self.numbers[1] = torch.zeros_like(loss) if incomplete is None else incomplete.to(loss.dtype)

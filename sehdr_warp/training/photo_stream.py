@@ -30,24 +30,24 @@ def fits_device(source: PhotoSource, device: torch.device) -> bool:
 
 
 def make_view_source(
-    source: PhotoSource, where: str, recorded: bool
+    source: PhotoSource, where: str, use_cuda_graph: bool
 ) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
     """Return the views of a source in the form that steps take.
 
     Args:
         source: The photos.
         where: Value of schedule.photo_cache.
-        recorded: Whether steps are captured as CUDA graphs.
+        use_cuda_graph: Whether steps are captured as CUDA graphs.
     """
     device = torch.device(source.device)
     if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
         return source
     if where in ("memory", "disk") or (where == "auto" and not fits_device(source, device)):
         log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, device)
-        return _stream_or_source(source) if recorded else source
+        return _stream_or_source(source) if use_cuda_graph else source
     views = list(source)
     # Only captured steps need all photos in one tensor.
-    return (ViewStack.of(views) if recorded else None) or views
+    return (ViewStack.of(views) if use_cuda_graph else None) or views
 
 
 def _stream_or_source(source: PhotoSource) -> "PhotoStream | PhotoSource":

@@ -32,9 +32,9 @@ CPU_FEWEST = 1000
 WIDEST = 0.12  # mcmc.prune_near_angle if cameras look all around
 CPU_BUDGET = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
 RATES_FOR = 30_000  # Length of the trainings that 3DGS's learning rates are for
-HASTE, MOST_HASTE = 0.22, 2.5  # Learning rates of shorter trainings grow with this power, up to this factor
-HASTY_PHOTOS = 40  # Largest number of photos for that: scenes with 10 to 21 photos gain, with 52 and 84 lose
-HASTY = "means", "means_final", "log_scales", "opacity_logits", "harmonics_rest"
+RATE_POWER, MAX_RATE_SCALE = 0.22, 2.5  # Rates of shorter trainings grow with this power, up to this factor
+SCALED_RATE_PHOTOS = 40  # Largest number of photos for that: scenes with 10 to 21 photos gain, with 52 and 84 lose
+SCALED_RATES = "means", "means_final", "log_scales", "opacity_logits", "harmonics_rest"
 REACH = 2.0**16  # Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
@@ -46,12 +46,12 @@ class Choice(NamedTuple):
 
     Attributes:
         fields: Fields of the config, with their values.
-        words: The choice in words.
+        summary: The choice in words.
         reason: The figures it rests on.
     """
 
     fields: dict[str, object]
-    words: str
+    summary: str
     reason: str
 
 
@@ -64,14 +64,14 @@ class Decision:
         fields: Fields of the config that change, with their values.
         choice: The choice in words.
         reason: The figures it rests on.
-        told: Whether it is logged although it changes no field.
+        always_log: Whether it is logged although it changes no field.
     """
 
     name: str
     fields: dict[str, object]
     choice: str
     reason: str
-    told: bool = False
+    always_log: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,10 @@ class Plan:
 
     def lines(self) -> list[str]:
         """Return a line for each decision that changes something, and for each field that the user set."""
-        lines = [f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.told]
-        compensated = any(row.name == "exposure-compensation" and row.told for row in self.decisions)
+        lines = [
+            f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.always_log
+        ]
+        compensated = any(row.name == "exposure-compensation" and row.always_log for row in self.decisions)
         if self.facts.drift >= DRIFT and not compensated:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             lines.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
@@ -151,7 +153,7 @@ def make_plan(scene: Scene, config: Config, device: str | torch.device | None = 
             for path, new in choice.fields.items()
             if path not in overridden and new != attrgetter(path)(planned)
         }
-        decisions.append(Decision(name, changes, choice.words, choice.reason))
+        decisions.append(Decision(name, changes, choice.summary, choice.reason))
         planned = override_config(planned, changes, f"{scene.name}: plan of {name}")
     planned = override_config(planned, {"plan.enabled": False}, scene.name)
     return Plan(planned, facts, tuple(decisions), overridden)
@@ -333,23 +335,23 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choi
 def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     # Adam moves a parameter by its rate at most: of fewer steps each is to go farther.
     steps = config.schedule.iterations
-    if facts.photos > HASTY_PHOTOS:
-        return Choice({}, "as they are", f"more than {HASTY_PHOTOS} photos")
-    haste = round(min(MOST_HASTE, max(1.0, (RATES_FOR / steps) ** HASTE)), 2)
+    if facts.photos > SCALED_RATE_PHOTOS:
+        return Choice({}, "as they are", f"more than {SCALED_RATE_PHOTOS} photos")
+    scale = round(min(MAX_RATE_SCALE, max(1.0, (RATES_FOR / steps) ** RATE_POWER)), 2)
     usual = OptimizerConfig()
-    as_usual = [name for name in HASTY if getattr(config.optimizer, name) == getattr(usual, name)]
-    if haste == 1 or not as_usual:
+    as_usual = [name for name in SCALED_RATES if getattr(config.optimizer, name) == getattr(usual, name)]
+    if scale == 1 or not as_usual:
         return Choice({}, "as they are", f"{steps} steps")
-    fields: dict[str, object] = {f"optimizer.{name}": float(f"{getattr(usual, name) * haste:.3g}") for name in as_usual}
+    fields: dict[str, object] = {f"optimizer.{name}": float(f"{getattr(usual, name) * scale:.3g}") for name in as_usual}
     return Choice(
-        fields, f"{haste:g} times", f"learning rates are tuned for {RATES_FOR} steps; this training has {steps}"
+        fields, f"{scale:g} times", f"learning rates are tuned for {RATES_FOR} steps; this training has {steps}"
     )
 
 
 def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
     unsure = facts.clipped + facts.black
-    reason = f"{unsure:.1%} of the pixels are clipped or black, and a point is visible in {facts.seen:.1f} photos"
-    return Choice({}, "low in places" if unsure >= 0.001 or facts.seen < 4 else "high throughout", reason)
+    reason = f"{unsure:.1%} of the pixels are clipped or black, and a point is visible in {facts.visibility:.1f} photos"
+    return Choice({}, "low in places" if unsure >= 0.001 or facts.visibility < 4 else "high throughout", reason)
 
 
 RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {

@@ -29,7 +29,7 @@ from ..model.adam import Adam
 from ..model.gaussians import Gaussians
 from ..parallel import WAITING_NOTICE, run_interruptibly, thread_count
 from ..scene.photo_file import PhotoFile, can_share, open_shared
-from .rank_place import Place, open_store
+from .rank_info import RankInfo, open_store
 from .strategies import Strategy
 
 log = logging.getLogger(__name__)
@@ -53,18 +53,18 @@ class Ranks:
 
     Attributes:
         store: Key-value store of the ranks.
-        place: Place of this process.
+        info: Rank and node of this process.
         rank: Number of this process.
         count: Number of processes.
         device: Device that this process trains on.
         leads: True for rank 0.
     """
 
-    def __init__(self, store: dist.Store, place: Place, device: torch.device):
+    def __init__(self, store: dist.Store, info: RankInfo, device: torch.device):
         """Create a rank; init() connects it."""
-        self.store, self.place, self.device = store, place, device
-        self.rank, self.count = place.rank, place.count
-        self.leads = place.rank == 0
+        self.store, self.info, self.device = store, info, device
+        self.rank, self.count = info.rank, info.count
+        self.leads = info.rank == 0
         self._cuda = device.type == "cuda"
         self._deadline: float | None = None
         self._over = threading.Event()
@@ -88,7 +88,7 @@ class Ranks:
 
     def _log_wait(self) -> None:
         """Log that this rank waits for the others."""
-        log.info("%s waits for the others", self.place)
+        log.info("%s waits for the others", self.info)
 
     def _await_all(self) -> None:
         """Wait until all ranks are there; raise SehdrError that names the nodes of those that do not come."""
@@ -102,11 +102,11 @@ class Ranks:
                 logged_once = True
             if waited > self._patience:
                 absent = [rank for rank, key in enumerate(keys) if not self.store.check([key])]
-                nodes = ", ".join(str(node) for node in sorted({self.place.node_of(rank) for rank in absent}))
-                problem = f"{self.place} waited {self._patience:.0f} s ({TIMEOUT}) for rank {absent[0]}"
+                nodes = ", ".join(str(node) for node in sorted({self.info.node_of(rank) for rank in absent}))
+                problem = f"{self.info} waited {self._patience:.0f} s ({TIMEOUT}) for rank {absent[0]}"
                 problem += f" and {len(absent) - 1} more" if len(absent) > 1 else ""
                 raise SehdrError(
-                    f"{problem}: node {nodes} of {self.place.nodes} did not come; start it, or use fewer nodes"
+                    f"{problem}: node {nodes} of {self.info.nodes} did not come; start it, or use fewer nodes"
                 )
             time.sleep(_POLL)
 
@@ -222,17 +222,17 @@ class Ranks:
         Rank 0 waits until those of other nodes have done the same.
         """
         handle = None
-        if self.place.local_count > 1:
+        if self.info.local_count > 1:
             self._photos = PhotoFile(size + (1 << 30))
             handle = self._photos.share(value)
         # The store takes bytes, although its stub says str.
-        self.store.set(f"photos/{self.place.node}", pickle.dumps(handle))  # pyright: ignore[reportArgumentType]
+        self.store.set(f"photos/{self.info.node}", pickle.dumps(handle))  # pyright: ignore[reportArgumentType]
         if self.leads:
-            self._await_keys([f"photos/{node}" for node in range(self.place.nodes)])
+            self._await_keys([f"photos/{node}" for node in range(self.info.nodes)])
 
     def receive_photos(self) -> Any:
         """Return what the rank that reads the photos of this node shares; wait for it."""
-        key = f"photos/{self.place.node}"
+        key = f"photos/{self.info.node}"
         self._await_keys([key])
         return open_shared(pickle.loads(self.store.get(key)))
 
@@ -253,7 +253,7 @@ class Ranks:
 
     def notes(self) -> Iterator[str]:
         """Yield notes about this machine's GPUs."""
-        others = range(1, self.place.local_count) if self._cuda else ()
+        others = range(1, self.info.local_count) if self._cuda else ()
         apart = [k for k in others if not torch.cuda.can_device_access_peer(0, k)]
         if apart:
             yield f"GPU {apart[0]} has no access to the memory of GPU 0: gradients go through the host, which is slower"
@@ -278,7 +278,7 @@ class Ranks:
         except RuntimeError as error:
             time.sleep(_GRACE)
             log.debug("%s", error)
-            raise RanksLost(f"{self.place} lost another, which has ended: {ENDING}") from error
+            raise RanksLost(f"{self.info} lost another, which has ended: {ENDING}") from error
 
     def _check_versions(self) -> None:
         """Raise SehdrError if a rank runs other versions of packages."""
@@ -292,7 +292,7 @@ class Ranks:
         other = next((k for k, text in enumerate(versions) if text != versions[0]), None)
         if other is not None:
             who = f"rank {other}"
-            who += f" on node {self.place.node_of(other)}" if self.place.several_nodes else ""
+            who += f" on node {self.info.node_of(other)}" if self.info.several_nodes else ""
             raise SehdrError(f"{who} runs {versions[other]}, rank 0 {versions[0]}: install the same on all")
 
     def _watch(self) -> None:
@@ -313,7 +313,7 @@ class Ranks:
             if (deadline is not None and now > deadline) or (heard and now - since > self._patience):
                 if self.ends_first():
                     message = "another rank did not answer %s for %.0f s (%s): %s"
-                    log.error(message, self.place, self._patience, TIMEOUT, ENDING)
+                    log.error(message, self.info, self._patience, TIMEOUT, ENDING)
                 os._exit(1)
 
 
@@ -332,20 +332,20 @@ def patience() -> float:
 
 
 @contextmanager
-def join_ranks(place: Place, device: torch.device) -> Iterator[Ranks]:
+def join_ranks(info: RankInfo, device: torch.device) -> Iterator[Ranks]:
     """Connect this process to the ranks within this block; an error of any rank ends all, and one reports it."""
-    if place.local_count > 1 and not can_share():
+    if info.local_count > 1 and not can_share():
         raise SehdrError("several ranks of one machine need Linux, where processes can read one nameless file")
-    os.environ.setdefault("SEHDR_THREADS", str(max(1, thread_count() // place.local_count)))
-    if not place.several_nodes:  # All are on this machine, whatever its network.
+    os.environ.setdefault("SEHDR_THREADS", str(max(1, thread_count() // info.local_count)))
+    if not info.several_nodes:  # All are on this machine, whatever its network.
         for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
             os.environ.setdefault(name, "lo")
     if device.type == "cuda":
         torch.cuda.set_device(device)
-    if place.rank:
+    if info.rank:
         logging.getLogger("sehdr_warp").setLevel(logging.ERROR)
-    waits = partial(log.info, "%s waits for the others", place)
-    ranks = Ranks(run_interruptibly(partial(open_store, place, patience()), waits), place, device)
+    waits = partial(log.info, "%s waits for the others", info)
+    ranks = Ranks(run_interruptibly(partial(open_store, info, patience()), waits), info, device)
     try:
         ranks.init()
         yield ranks
@@ -356,7 +356,7 @@ def join_ranks(place: Place, device: torch.device) -> Iterator[Ranks]:
         first, message = ranks.ends_first(), isinstance(error, Exception) and as_user_error(error)
         if message and not first:
             raise SystemExit(1) from None
-        if place.rank and isinstance(error, KeyboardInterrupt):
+        if info.rank and isinstance(error, KeyboardInterrupt):
             raise SystemExit(130) from None
         raise
 

@@ -48,7 +48,7 @@ class RunOutput:
     def after_step(self, trainer: TrainingState) -> None:
         """Evaluate held-out views, write a checkpoint and log, each if it is due."""
         iteration = trainer.iteration
-        evaluate = not self._evaluate_at.isdisjoint(range(iteration - trainer.photos + 1, iteration + 1))
+        evaluate = not self._evaluate_at.isdisjoint(range(iteration - trainer.step_batch + 1, iteration + 1))
         save = trainer.came_to(self._checkpoint_every)
         if evaluate or save:
             trainer.synchronize()

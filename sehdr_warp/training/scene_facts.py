@@ -20,7 +20,7 @@ MOST_VIEWS = 64  # Largest number of photos whose codes are read; cameras are re
 LOWEST_PLATEAU, PLATEAU_CODES, PLATEAU_SHARE, PLATEAU_EXCESS = 200, 3, 1e-3, 3.0
 """Photos clip below white if the brightest code is at least the first; if so many codes, the brightest that occur, hold
 the third share of the pixels, and the fourth times what as many codes below them hold. JPEG spreads a plateau."""
-MOST_GAZE, MOST_AHEAD = 0.3, 0.75
+MAX_ALIGNMENT, MOST_AHEAD = 0.3, 0.75
 """Cameras look all around if both figures are below these. Eight captures of objects, rooms and grounds have 0.5 to 1
 of the first, maps from within a place 0.1; objects have nearly 1 of the second."""
 
@@ -35,14 +35,14 @@ class SceneFacts:
         from_camera: Whether a camera wrote the files.
         truths: Number of photos with HDR truth.
         points: Number of sparse points.
-        seen: Mean number of photos whose field of view contains a probe.
+        visibility: Mean number of photos whose field of view contains a probe.
         overlap: Fraction of the probes, or of places along the cameras' rays if that is more, that two photos contain.
         clipped: Fraction of pixels with a channel at white.
         black: Fraction of pixels with all channels at 0.
         contrast: Standard deviation of all encoded values.
         drift: Approximate stops between the darkest and the brightest photo's median if no exposure times are known;
             else 0.
-        gaze: Length of the mean viewing direction: 1 if all cameras look the same way.
+        view_alignment: Length of the mean viewing direction: 1 if all cameras look the same way.
         ahead: Fraction of the cameras that look towards the middle of all.
         light_known: Whether the photos hold light itself: RAW, linear, float.
         unclipped: Whether they are float pictures without clipping.
@@ -54,13 +54,13 @@ class SceneFacts:
     from_camera: bool
     truths: int
     points: int
-    seen: float
+    visibility: float
     overlap: float
     clipped: float
     black: float
     contrast: float
     drift: float
-    gaze: float = 1.0
+    view_alignment: float = 1.0
     ahead: float = 1.0
     light_known: bool = False
     unclipped: bool = False
@@ -69,7 +69,7 @@ class SceneFacts:
     @property
     def around(self) -> bool:
         """True if cameras look all around from within, as in a room, and not at an object from its sides."""
-        return self.gaze < MOST_GAZE and self.ahead < MOST_AHEAD
+        return self.view_alignment < MAX_ALIGNMENT and self.ahead < MOST_AHEAD
 
 
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
@@ -86,20 +86,20 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     read_views = every_nth(views, MOST_VIEWS)
     figures = np.array([_codes(view) for view in read_views])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
-    gaze, ahead = _gaze(np.stack([view.camera.world_to_camera for view in views]))
+    view_alignment, ahead = _viewing_directions(np.stack([view.camera.world_to_camera for view in views]))
     return SceneFacts(
         photos=len(photos),
         pixels=sum(view.camera.width * view.camera.height for view in photos),
         from_camera=are_camera_jpegs([view.source for view in photos]),
         truths=sum(view.hdr is not None for view in photos),
         points=len(scene.points),
-        seen=float(visible[visible > 0].mean()) if visible.any() else 0.0,
+        visibility=float(visible[visible > 0].mean()) if visible.any() else 0.0,
         overlap=max(float((count >= 2).mean()) for count in (visible, on_rays)),
         clipped=clipped,
         black=black,
         contrast=float(np.sqrt(max(square - mean**2, 0.0))),
         drift=0.0 if scene.exposure_times_known else float(np.ptp(figures[:, -1])),
-        gaze=gaze,
+        view_alignment=view_alignment,
         ahead=ahead,
         light_known=scene.light_known,
         unclipped=scene.light_known and all(view.source and kind_of(view.source) == "float" for view in views),
@@ -132,8 +132,8 @@ def _plateau(views: Sequence[View]) -> int:
     return largest if is_plateau and LOWEST_PLATEAU <= largest < 255 else 0
 
 
-def _gaze(poses: np.ndarray) -> tuple[float, float]:
-    """Return SceneFacts.gaze and .ahead of cameras [V, 4, 4]."""
+def _viewing_directions(poses: np.ndarray) -> tuple[float, float]:
+    """Return SceneFacts.view_alignment and .ahead of cameras [V, 4, 4]."""
     forward = poses[:, 2, :3]
     places = -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
     inwards = np.einsum("vi,vi->v", places.mean(axis=0) - places, forward)

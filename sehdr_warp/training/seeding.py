@@ -14,7 +14,7 @@ from ..rasterizer.residual_sampling import sample_residual_pixels
 from ..response import Response
 from ..splats.arrays import HARMONIC_0
 from .matching import Matcher
-from .strategies import Seeds
+from .strategies import Proposals
 from .strategies.mcmc import MAX_DISTANCE
 from .targets import TrainingView
 
@@ -33,7 +33,7 @@ def seed_gaussians(
     number: Tensor,
     bound: int,
     random_seed: int,
-) -> Seeds:
+) -> Proposals:
     """Return new Gaussians at pixels sampled by their squared error. Does not wait for the device.
 
     Args:
@@ -70,7 +70,7 @@ def seed_gaussians(
         "harmonics_rest": rest.new_zeros(bound, *rest.shape[1:]),
     }
     order = valid.byte().argsort(descending=True, stable=True)
-    return Seeds({name: values[order] for name, values in rows.items()}, valid.sum())
+    return Proposals({name: values[order] for name, values in rows.items()}, valid.sum())
 
 
 @lru_cache(maxsize=1)

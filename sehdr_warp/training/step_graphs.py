@@ -35,21 +35,21 @@ class StepGraphs:
 
     @property
     def captured(self) -> Any:
-        """The CUDA graph that the next step of the same kind replays; None if there is none."""
+        """The CUDA graph that the next step with the same key replays; None if there is none."""
         return None if self._first is None else self._first._graph
 
-    def can_capture(self, views: Any, kind: Hashable, *, has_counts: bool) -> TypeGuard[ViewStack | PhotoStream]:
-        """Return whether a step can be captured: photos of one size, after a step of its kind was launched.
+    def can_capture(self, views: Any, graph_key: Hashable, *, has_counts: bool) -> TypeGuard[ViewStack | PhotoStream]:
+        """Return whether a step can be captured: photos of one size, after a step with this key was launched.
 
         Args:
             views: The training views, which a captured step selects by an index on the device.
-            kind: Everything that changes which kernels a step launches.
+            graph_key: Everything that changes which kernels a step launches; steps of one key share a graph.
             has_counts: Whether the number of intersections of a step is known.
         """
         if self._first is None or not isinstance(views, ViewStack | PhotoStream):
             return False
-        ready = kind in self._launched and has_counts
-        self._launched.add(kind)
+        ready = graph_key in self._launched and has_counts
+        self._launched.add(graph_key)
         return ready
 
     def on_capture_stream(self) -> AbstractContextManager[None]:
@@ -58,21 +58,21 @@ class StepGraphs:
 
     def run(
         self,
-        kind: Hashable,
+        graph_key: Hashable,
         optimize: Callable[[Compute, Apply], Any],
         compute_gradients: Compute,
         apply_gradients: Apply,
         iteration: int,
     ) -> Any:
-        """Replay optimize(compute_gradients, apply_gradients), after capturing it if there is no graph of its kind."""
+        """Replay optimize(compute_gradients, apply_gradients), after capturing it if this key has no graph."""
         first, second = self._first, self._second
         assert first is not None
         try:
             if second is None:
-                return first.run(kind, lambda: optimize(compute_gradients, apply_gradients))
+                return first.run(graph_key, lambda: optimize(compute_gradients, apply_gradients))
             return optimize(
-                lambda: first.run(kind, compute_gradients),
-                lambda gradients: second.run(kind, lambda: apply_gradients(gradients)),
+                lambda: first.run(graph_key, compute_gradients),
+                lambda gradients: second.run(graph_key, lambda: apply_gradients(gradients)),
             )
         except RuntimeError as error:
             if failed_allocation(error):

@@ -16,14 +16,14 @@ class Gradients:
         loss: Scalar loss of this rank's photo.
         image: [H, W, 3] rendered image that was compared with the photo.
         rendering: Result of the rasterizer, without tensors that nothing reads any more.
-        watched: Whether the strategy accumulates the gradients of the projected means.
+        needs_means2d_grad: Whether the strategy accumulates the gradients of the projected means.
         harmonics: Gradients of the harmonics in factored form; None if the parameters hold them.
     """
 
     loss: Tensor
     image: Tensor
     rendering: Rendering
-    watched: bool
+    needs_means2d_grad: bool
     harmonics: HarmonicsGradients | None
 
 

@@ -21,7 +21,7 @@ from ..scene.normalization import normalization_of
 from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from .following import send_training, several_ranks_notes
 from .hdr_truth import check_scene_truth
-from .initialization import choose_response, make_field, make_matcher, sizes_of
+from .initialization import make_field, make_matcher, response_for_training, sizes_of
 from .machine import Stopwatch, summary_writer
 from .plan import apply_plan
 from .ranks import Ranks
@@ -128,7 +128,7 @@ def _begin(
     normalized = normalization_of(scene).scene(scene)
     config, plan = apply_plan(normalized, config, device)
     check_scene_truth(scene, config.loss)
-    response = choose_response(scene, config)
+    response = response_for_training(scene, config)
     matcher, gains = cache(partial(make_matcher, normalized, response, device)), None
     compensated = scene
     if shared is not None:

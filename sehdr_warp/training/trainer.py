@@ -34,7 +34,7 @@ from .run_output import RunOutput
 from .seeding import seed_gaussians
 from .step import Step
 from .step_values import Gradients, StepResult
-from .strategies import SEED_STRIDE, Seeds
+from .strategies import SEED_STRIDE, Proposals
 from .targets import TrainingView, ViewStack
 from .training_state import TrainingState
 
@@ -148,10 +148,10 @@ class Trainer(TrainingState):
 
     def _step(self, started: float) -> Step:
         """Return the values of the last step, with the time left."""
-        step, steps_before = Step(self), self.iteration - self.first_iteration - self.photos
+        step, steps_before = Step(self), self.iteration - self.first_iteration - self.step_batch
         if steps_before == 0:  # The first step compiles kernels and says nothing of the pace.
             return step
-        self._pace += ((self.seconds - started) / self.photos - self._pace) / min(steps_before, 100)
+        self._pace += ((self.seconds - started) / self.step_batch - self._pace) / min(steps_before, 100)
         # With the largest number of Gaussians, a step takes about twice as long as at the start.
         growing = self.field.gaussians.count < self.strategy.cap_max
         ahead = max(0.0, 1 - self.iteration / self.strategy.schedule.stop) if growing else 0.0
@@ -167,34 +167,34 @@ class Trainer(TrainingState):
             SehdrError: If more than MAX_SKIPPED steps were not finite, or ranks differ.
         """
         # The last step may have more photos than iterations are left.
-        self.photos = self.strategy.photos = min(self.batch, max(1, self.total - self.iteration))
-        self.iteration += self.photos
+        self.step_batch = self.strategy.step_batch = min(self.batch, max(1, self.total - self.iteration))
+        self.iteration += self.step_batch
         views, gaussians = self._training_views(), self.field.gaussians
         index = self._view_index = self.order.next()
         means_lr = adam.means_rate(self.config, self.extent, self.iteration, self.batch)
         adam.set_means_rate(self.optimizer, means_lr)
         if self.reserves_rows and not self._rows:
             self._reserve_rows()
-        watched = self.strategy.needs_gradients(self.iteration)
-        if watched:
+        needs_means2d_grad = self.strategy.needs_gradients(self.iteration)
+        if needs_means2d_grad:
             self.strategy.prepare(gaussians.reserved, self.device)
 
-        # Forward, loss, backward, optimizer step; as a CUDA graph if a step of this kind has been launched before.
+        # Forward, loss, backward, optimizer step; as a CUDA graph if a step with this key has been launched before.
         # Small counts use other kernels: a sort in a single pass, and an exact learned response.
         small = gaussians.reserved < EXACT_BELOW, gaussians.reserved <= MAX_SINGLE_SORT
-        kind = (self.degree, watched, self.opacity_weight > 0, *small)
+        graph_key = (self.degree, needs_means2d_grad, self.opacity_weight > 0, *small)
         fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
-        if fixed_time and self.graphs.can_capture(views, kind, has_counts=self.capacity.has_counts):
+        if fixed_time and self.graphs.can_capture(views, graph_key, has_counts=self.capacity.has_counts):
             self._index.fill_(index)
             if isinstance(views, PhotoStream):
                 views.bring(index)
             capacity = self.capacity.capacity()
-            compute = partial(self._compute_at_index, views, watched, capacity)
-            self._result = self.graphs.run(kind, self._optimize, compute, self.apply_gradients, self.iteration)
+            compute = partial(self._compute_at_index, views, needs_means2d_grad, capacity)
+            self._result = self.graphs.run(graph_key, self._optimize, compute, self.apply_gradients, self.iteration)
             if isinstance(views, PhotoStream):
                 views.release(self.order.peek())
         else:
-            compute = partial(self.compute_gradients, views[index], watched)
+            compute = partial(self.compute_gradients, views[index], needs_means2d_grad)
             with self.graphs.on_capture_stream():
                 self._result = self._optimize(compute, self.apply_gradients)
 
@@ -202,7 +202,7 @@ class Trainer(TrainingState):
         self.strategy.inject_noise(self.iteration, gaussians, means_lr)
         self._densify()
         # Moving average.
-        self.average.update(self.iteration, self.photos, gaussians)
+        self.average.update(self.iteration, self.step_batch, gaussians)
         if self.came_to(CHECK_EVERY):
             self.check(wait=False)
         if self.came_to(COMPARE_EVERY):
@@ -218,16 +218,18 @@ class Trainer(TrainingState):
                 self.ranks.all_reduce_mean(self._flat.buffer)
             return StepResult(apply(gradients), gradients.image)
 
-    def _compute_at_index(self, views: ViewStack | PhotoStream, watched: bool, capacity: int) -> Gradients:
+    def _compute_at_index(self, views: ViewStack | PhotoStream, needs_means2d_grad: bool, capacity: int) -> Gradients:
         """Compute gradients of the view whose index is on the device, with a fixed intersection capacity."""
-        return self.compute_gradients(views.at(self._index), watched, capacity)
+        return self.compute_gradients(views.at(self._index), needs_means2d_grad, capacity)
 
-    def compute_gradients(self, view: TrainingView, watched: bool, max_intersections: int | None = None) -> Gradients:
+    def compute_gradients(
+        self, view: TrainingView, needs_means2d_grad: bool, max_intersections: int | None = None
+    ) -> Gradients:
         """Render a view, compute the loss and differentiate it.
 
         Args:
             view: The training view.
-            watched: Whether the strategy needs the gradients of the projected means.
+            needs_means2d_grad: Whether the strategy needs the gradients of the projected means.
             max_intersections: Fixed capacity, with which nothing waits for the device.
         """
         target, camera, field, config = view.target, view.camera, self.field, self.config.loss
@@ -242,12 +244,15 @@ class Trainer(TrainingState):
             opacity_weight=self.opacity_weight,
         )
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in the step.
-        dropped = {"image", "transmittance", "depths"} | (set() if watched else {"means2d", "extents"})
+        dropped = {"image", "transmittance", "depths"} | (set() if needs_means2d_grad else {"means2d", "extents"})
         rendering = replace(render.rendering, **dict.fromkeys(dropped))
-        if watched:
+        if needs_means2d_grad:
             rendering.means2d.retain_grad()
         loss = with_opacity_penalty(data_loss(field, render, target, config, self._largest_truth), render)
-        image, harmonics_gradients = (render.encoded if self._encoded else render.light), render.harmonics_gradients
+        image, harmonics_gradients = (
+            (render.encoded if self._encoded else render.photo_exposure),
+            render.harmonics_gradients,
+        )
         assert image is not None
         del render, target, view
         differentiate(loss)
@@ -257,7 +262,7 @@ class Trainer(TrainingState):
             harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, self.degree)
         if self.ranks is not None:
             self._flat_gradients().collect(loss, rendering.overflow, harmonics)
-        return Gradients(loss.detach(), image.detach(), rendering, watched, harmonics)
+        return Gradients(loss.detach(), image.detach(), rendering, needs_means2d_grad, harmonics)
 
     def apply_gradients(self, gradients: Gradients) -> Tensor:
         """Update the parameters, unless the step is not finite; return its loss. Does not wait for the device."""
@@ -271,10 +276,10 @@ class Trainer(TrainingState):
             incomplete,
             harmonics,
             step_counters=self.capacity.step_counters,
-            pairs=rendering.needed_intersections,
-            live=self.field.gaussians.live,
+            intersections=rendering.needed_intersections,
+            active_count=self.field.gaussians.active_count,
         )
-        if gradients.watched:
+        if gradients.needs_means2d_grad:
             height, width, _ = gradients.image.shape
             self.strategy.accumulate(rendering, width, height, applied)
         self.optimizer.zero_grad()
@@ -288,8 +293,8 @@ class Trainer(TrainingState):
         if not strategy.is_due(self.iteration):
             return
         count, reallocations = gaussians.count, gaussians.reallocations
-        seed = self._seed if self.seeds else None
-        refine = partial(strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, seed)
+        propose = self._propose_gaussians if self.can_seed else None
+        refine = partial(strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, propose)
         changed = refine() if ranks is None else ranks.refine_on_leader(refine, strategy, gaussians, self.optimizer)
         if changed and self.reserves_rows:
             self._reserve_rows()
@@ -300,8 +305,8 @@ class Trainer(TrainingState):
             if not valid:
                 self.graphs.invalidate()
 
-    def _seed(self, number: Tensor, bound: int) -> Seeds:
-        """Return new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
+    def _propose_gaussians(self, number: Tensor, bound: int) -> Proposals:
+        """Propose new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
         random_seed = self.config.seed * SEED_STRIDE + self.iteration
         view, result = self._training_views()[self._view_index], self._result
         assert result is not None

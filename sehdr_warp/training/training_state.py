@@ -53,7 +53,7 @@ class TrainingState:
         iteration: Iterations done; a step on several ranks counts one for each photo.
         first_iteration: Iterations done before this process.
         total: Iterations in all.
-        photos: Photos of the last step, one per rank.
+        step_batch: Photos of the last step, one for each rank; each counts as an iteration.
         seconds: Duration so far, without evaluation and checkpoints.
     """
 
@@ -70,7 +70,7 @@ class TrainingState:
         self.rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)
         self.device = field.gaussians.means.device
         self.total = config.schedule.iterations
-        self.iteration, self.first_iteration, self.photos, self.seconds = 0, 0, 1, 0.0
+        self.iteration, self.first_iteration, self.step_batch, self.seconds = 0, 0, 1, 0.0
 
         normalized = field.normalization.scene(scene)
         views = self._views = normalized.train_views
@@ -82,7 +82,7 @@ class TrainingState:
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.order = PhotoOrder(len(views), config.seed, self.rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
-        self.seeds = not has_wide_views(normalized, config)  # Seeding samples pixels of pinhole photos.
+        self.can_seed = not has_wide_views(normalized, config)  # Seeding samples pixels of pinhole photos.
         self._matcher = matcher or cache(partial(make_matcher, normalized, field.response, self.device))
 
         # If exposures are compared, the loss does not need the encoded photo.
@@ -148,7 +148,7 @@ class TrainingState:
 
     def came_to(self, every: int) -> bool:
         """Return whether the last step came to a multiple of a number of iterations, or past it."""
-        return self.iteration % every < self.photos
+        return self.iteration % every < self.step_batch
 
     def gather(self) -> None:
         """Gather statistics on rank 0 for a checkpoint; raise SehdrError if the ranks' Gaussians differ."""

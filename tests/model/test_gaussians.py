@@ -81,7 +81,7 @@ def test_reserved_rows_keep_gaussians_where_they_are_and_change_nothing_else():
     moves = roomy.reallocations
     with roomy.all_rows(optimizers[1]):
         held = {name: getattr(roomy, name).data_ptr() for name in PARAMETER_NAMES}
-        assert roomy.means.shape == (11, 3) and roomy.live.tolist() == [8]
+        assert roomy.means.shape == (11, 3) and roomy.active_count.tolist() == [8]
     for change in (
         lambda g, o: g.keep(torch.tensor([5, 1, 2, 7, 0, 3]), o),
         lambda g, o: g.append(g.rows(torch.tensor([0, 4, 4])), o),
@@ -95,7 +95,7 @@ def test_reserved_rows_keep_gaussians_where_they_are_and_change_nothing_else():
                 optimizer.state[getattr(gaussians, name)]["exp_avg"].add_(1)
         with roomy.all_rows(optimizers[1]):
             assert {name: getattr(roomy, name).data_ptr() for name in PARAMETER_NAMES} == held
-            assert roomy.live.tolist() == [plain.count] and not roomy.opacities()[plain.count :].any()
+            assert roomy.active_count.tolist() == [plain.count] and not roomy.opacities()[plain.count :].any()
             torch.testing.assert_close(roomy.quaternions[plain.count :].norm(dim=1), torch.ones(11 - plain.count))
             for group in optimizers[1].param_groups:
                 (whole,) = group["params"]

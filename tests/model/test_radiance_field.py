@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.model import radiance_field
 from sehdr_warp.model.camera_tensors import CameraTensors
 from sehdr_warp.model.exposure import exposure_times
 from sehdr_warp.model.fusion import NeuralExposureFusion
@@ -25,7 +26,7 @@ def wall(exposure, radiance="log", depth=3.0, **options):
     value = math.log(exposure) if radiance == "log" else exposure
     gaussians = Gaussians.from_points(torch.tensor([[0.0, 0.0, depth]]), torch.full((1, 3), value), 0, opacity=0.99)
     gaussians.overwrite({"log_scales": torch.full((1, 3), 4.0), "opacity_logits": torch.full((1,), 12.0)})
-    return RadianceField(gaussians, SRGB, base_time=TIME, radiance=radiance, **options)
+    return RadianceField(gaussians, SRGB, base_time=TIME, color_model=radiance, **options)
 
 
 def photograph(field, time=TIME, **options):
@@ -81,14 +82,15 @@ def fusion_of():
 
 
 @pytest.mark.parametrize("tone_map,channels", [("pixel", 6), ("gaussian", 9)])
-def test_brackets_share_one_rasterisation(tone_map, channels):
+def test_brackets_share_one_rasterisation(monkeypatch, tone_map, channels):
     calls = []
 
     def counted(*arguments, **options):
         calls.append(arguments[4].shape[1])
         return rasterize(*arguments, **options)
 
-    field = wall(0.2, tone_map=tone_map, fusion=fusion_of(), rasterizer=counted)
+    monkeypatch.setattr(radiance_field, "rasterize", counted)
+    field = wall(0.2, tone_map=tone_map, fusion=fusion_of())
     photo = photograph(field, also=frozenset({"base", "exposure"}))
     assert calls == [channels]
     assert photo.encoded.shape == photo.exposure.shape == photo.base.shape == (24, 32, 3)

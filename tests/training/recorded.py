@@ -2,14 +2,14 @@
 
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.training.held_out import evaluate_views
-from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.trainer import Trainer
 
 
 def train_on_gpu(scene, config, *, recorded: bool = True, iterations: int | None = None) -> tuple[Trainer, int]:
     """The trainer after its iterations, and how many of them were replayed."""
     config = override_config(config, {"schedule.use_cuda_graph": recorded})
-    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cuda:0"))
+    trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cuda:0"))
     replays = 0
     for _ in range(iterations or config.schedule.iterations):
         trainer.step()

@@ -18,11 +18,11 @@ def run_team(work, folder: Path, *arguments) -> None:
 
 
 def _rank(rank: int, work, folder: Path, arguments: tuple) -> None:
-    from sehdr_warp.training.rank_place import Place
+    from sehdr_warp.training.rank_info import RankInfo
     from sehdr_warp.training.ranks import join_ranks
 
     os.environ |= {"WORLD_SIZE": str(RANKS), "SEHDR_RANKS": str(folder / "meeting"), "SEHDR_RANK_TIMEOUT": "60"}
-    with join_ranks(Place.on_one_node(rank, RANKS), torch.device("cpu")) as ranks:
+    with join_ranks(RankInfo.on_one_node(rank, RANKS), torch.device("cpu")) as ranks:
         work(ranks, folder, *arguments)
 
 

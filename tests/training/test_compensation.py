@@ -48,7 +48,7 @@ def test_drift_is_found_where_there_is_some(device):
 def test_stated_times_are_doubted_where_photos_contradict_them(device):
     scene, _ = drifting()
     gains, _, decision = found_in(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
-    assert gains.stops > 0.4 and "over the times they state" in decision.choice and decision.told
+    assert gains.stops > 0.4 and "over the times they state" in decision.choice and decision.always_log
     right = wall_and_lamp(TIMES)
     # A curve that is not the photos' makes right times look wrong, and evened photos would not agree.
     for curve in (LINEAR, response_by_name("gamma")):

@@ -53,10 +53,10 @@ def test_while_the_loss_is_not_finite_the_last_checkpoint_stays(scene, tmp_path,
 
 def test_huge_gradients_leave_finite_parameters(scene):
     """A gradient too large to be squared in float32 would freeze Adam's second moment at infinity."""
-    from sehdr_warp.training.initialization import choose_response, make_field
+    from sehdr_warp.training.initialization import make_field, response_for_training
 
     options = config()
-    field = make_field(scene, options, choose_response(scene, options), "cpu")
+    field = make_field(scene, options, response_for_training(scene, options), "cpu")
     trainer = Trainer(scene, options, field)
     factor = [1e36]
     field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * factor[0])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.machine import torch_settings
 from sehdr_warp.training.trainer import Trainer
 
@@ -48,7 +48,7 @@ def end(scene):
     def train(strategy, *changed):
         config = override_config(BASE[strategy], dict([changed] if changed else []))
         with torch_settings(deterministic=False):
-            trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+            trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
             for _ in range(config.schedule.iterations):
                 trainer.step()
         return torch.cat([tensor.flatten() for tensor in trainer.field.gaussians.tensors().values()]).detach()

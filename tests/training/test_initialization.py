@@ -7,17 +7,17 @@ import pytest
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.model.color_models import color_model
+from sehdr_warp.model.color_models import make_color_model
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.splats import write_gaussians
 from sehdr_warp.training.initialization import (
     base_time,
-    choose_response,
     colors_in_views,
     focus_distance,
     make_field,
     random_points,
+    response_for_training,
     scene_extent,
 )
 
@@ -94,7 +94,7 @@ def test_cameras_back_to_back_share_nothing():
 @pytest.mark.parametrize("radiance", ["log", "linear", "display"])
 def test_start_colors_invert_the_colour_model(radiance):
     srgb, encoded = response_by_name("srgb"), np.array([[0.2, 0.5, 0.9]])
-    value = color_model(radiance).start(encoded, srgb)
+    value = make_color_model(radiance).start(encoded, srgb)
     shown = {
         "log": lambda: srgb.encode(np.exp(value)),
         "linear": lambda: srgb.encode(value),
@@ -103,7 +103,9 @@ def test_start_colors_invert_the_colour_model(radiance):
     np.testing.assert_allclose(shown[radiance](), encoded, atol=1e-6)
     # Black and white say a bound only; their start values are finite and inside it.
     for extreme in (0.0, 1.0):
-        assert np.isfinite(color_model(radiance).start(np.full((1, 3), extreme), response_by_name("hdr-nerf"))).all()
+        assert np.isfinite(
+            make_color_model(radiance).start(np.full((1, 3), extreme), response_by_name("hdr-nerf"))
+        ).all()
 
 
 def test_base_time_is_the_median_of_training(scene):
@@ -118,12 +120,12 @@ def test_auto_chooses_from_the_candidates(method, tmp_path):
     (tmp_path / "mine.csv").write_text("".join(f"{x / 20},{(x / 20) ** 0.4}\n" for x in range(21)))
     candidates = ["gamma-2.2", str(tmp_path / "mine.csv")]
     options = {"response.name": "auto", "response.method": method, "response.candidates": candidates}
-    assert choose_response(scene, load_config("default", options)).name in (
+    assert response_for_training(scene, load_config("default", options)).name in (
         "gamma-2.2",
         "mine",
         str(tmp_path / "mine.csv"),
     )
-    assert choose_response(scene, load_config("default", {"response.name": "rec709"})).name == "rec709"
+    assert response_for_training(scene, load_config("default", {"response.name": "rec709"})).name == "rec709"
 
 
 def test_posterior_takes_a_cameras_curve_for_a_cameras_files(tmp_path):
@@ -135,4 +137,4 @@ def test_posterior_takes_a_cameras_curve_for_a_cameras_files(tmp_path):
     toy = toy_scene()
     config = load_config("default", {"response.name": "auto", "response.method": "posterior"})
     views = tuple(dataclasses.replace(view, source=tmp_path / "photo.jpg") for view in toy.views)
-    assert choose_response(dataclasses.replace(toy, views=views), config).name == "camera"
+    assert response_for_training(dataclasses.replace(toy, views=views), config).name == "camera"

@@ -17,7 +17,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder, describe_scene
 from sehdr_warp.training.following import _check_same_photos
-from sehdr_warp.training.rank_place import Place, launched_as
+from sehdr_warp.training.rank_info import RankInfo, launched_as
 
 from ..refusals import call
 from .toy import toy_scene
@@ -129,7 +129,7 @@ def test_a_node_that_does_not_come_is_named(tmp_path):
 
 
 def test_nodes_must_have_the_same_photos():
-    ranks, scene = SimpleNamespace(place=Place(1, 2, 0, 1, 1, 2)), toy_scene()
+    ranks, scene = SimpleNamespace(info=RankInfo(1, 2, 0, 1, 1, 2)), toy_scene()
     shared = SimpleNamespace(scene=describe_scene(scene) | {"name": "town"})
     _check_same_photos(ranks, shared, scene)
     first = replace(scene.views[0], codes=scene.views[0].codes // 2)
@@ -145,4 +145,4 @@ def test_nodes_start_as_many_processes_each(monkeypatch):
     with pytest.raises(SehdrError, match="3 ranks on 2 nodes, and 1 on this one"):
         launched_as()
     monkeypatch.setenv("GROUP_WORLD_SIZE", "3")
-    assert launched_as() == Place(2, 3, 0, 1, 2, 3)
+    assert launched_as() == RankInfo(2, 3, 0, 1, 2, 3)

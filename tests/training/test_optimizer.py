@@ -29,7 +29,7 @@ def test_a_guarded_step_is_made_or_left_out_whole(device, incomplete, bad):
     assert float(optimizer.state[means]["step"]) == float(made)
 
 
-@pytest.mark.parametrize(("iterations", "batch", "turns"), [(4000, 1, 2), (3999, 1, 1), (8000, 2, 2), (7999, 2, 1)])
-def test_harmonics_step_in_turn_where_there_are_steps_enough(iterations, batch, turns):
+@pytest.mark.parametrize(("iterations", "batch", "interval"), [(4000, 1, 2), (3999, 1, 1), (8000, 2, 2), (7999, 2, 1)])
+def test_harmonics_step_in_turn_where_there_are_steps_enough(iterations, batch, interval):
     config = load_config("default", {"schedule.iterations": iterations})
-    assert make_optimizer(toy_field(), config, 1.0, batch).turns == turns
+    assert make_optimizer(toy_field(), config, 1.0, batch).sh_update_interval == interval

@@ -9,7 +9,7 @@ import torch
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene.photo_file import PhotoKeeper
-from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.photo_stream import PhotoStream
 from sehdr_warp.training.targets import photo_source
 from sehdr_warp.training.train import train
@@ -60,7 +60,7 @@ def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
     config, states = override_config(VARIANTS["default"], {"deterministic": True}), []
     for photos in ("device", "memory"):
         chosen = override_config(config, {"schedule.photo_cache": photos})
-        trainer = Trainer(scene, chosen, make_field(scene, chosen, choose_response(scene, chosen), "cuda:0"))
+        trainer = Trainer(scene, chosen, make_field(scene, chosen, response_for_training(scene, chosen), "cuda:0"))
         for _ in range(60):
             trainer.step()
         assert isinstance(trainer._source, PhotoStream) == (photos == "memory") and trainer.graphs.captured is not None

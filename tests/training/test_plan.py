@@ -44,7 +44,7 @@ def test_facts_are_those_of_the_scene(scene, facts):
     assert (facts.photos, facts.truths) == (6, 6)
     assert facts.pixels == 6 * 32 * 32 and facts.points == len(scene.points) == 60
     # Cameras on a full circle see most of a cloud in its middle.
-    assert facts.overlap > 0.5 and facts.seen > 4
+    assert facts.overlap > 0.5 and facts.visibility > 4
     clipped = [(view.image >= 254.5 / 255).any(2).mean() for view in scene.train_views]
     assert facts.clipped == pytest.approx(float(np.mean(clipped)))
 
@@ -95,7 +95,7 @@ def test_a_plan_decides_everything_once_with_figures(scene):
     ],
 )
 def test_decisions_follow_their_figures(facts, name, change, field, few, many):
-    small = {"photos": 6, "seen": 3.0, "pixels": 6144}
+    small = {"photos": 6, "visibility": 3.0, "pixels": 6144}
     # Relocation has a budget of its own.
     config = config_of(**({"densification__strategy": "adc"} if name == "densification" else {}))
     assert RULES[name](replace(facts, **small), config, GPU).fields.get(field) == few
@@ -131,7 +131,9 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
     for known, told in ((False, 1), (True, 0)):
         plan = make_plan(replace(drifting, exposure_times_known=known), config_of())
-        found = plan.with_decision(Decision("exposure-compensation", {}, "taken out of the photos", "", told=True))
+        found = plan.with_decision(
+            Decision("exposure-compensation", {}, "taken out of the photos", "", always_log=True)
+        )
         for given, count in ((plan, told), (found, 0)):
             lines = [line for line in given.lines() if "no exposure times" in line and "exposures.json" in line]
             assert len(lines) == count

@@ -18,7 +18,7 @@ from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
 from sehdr_warp.training.plan import gain_of_ranks
-from sehdr_warp.training.rank_place import device_of_rank
+from sehdr_warp.training.rank_info import device_of_rank
 from sehdr_warp.training.strategies import make_strategy
 from sehdr_warp.training.train import train
 
@@ -169,7 +169,7 @@ def test_harmonics_go_as_their_factors():
 @pytest.mark.parametrize("photos", [1, 2, 3, 8])
 def test_each_change_happens_once_whatever_the_stride(photos):
     strategy = make_strategy(VARIANTS["default"], 1.0, 1000)
-    strategy.photos = photos
+    strategy.step_batch = photos
     due = [n for n in range(photos, 91, photos) if strategy.is_due(n)]
     assert [n // 25 for n in due] == [1, 2, 3] and (strategy.schedule.start, strategy.schedule.stop) == (20, 80)
 

@@ -5,7 +5,7 @@ import torch
 
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.training import graph_capacity, training_state
-from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.strategies import base
 from sehdr_warp.training.trainer import Trainer
 
@@ -14,7 +14,7 @@ from .toy import VARIANTS
 
 def trained_steps(scene, config, device, reserves):
     """A trainer after 60 steps, and how often its Gaussians moved in how many changes of their number."""
-    training = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), device))
+    training = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), device))
     training.reserves_rows, gaussians, moves = reserves, training.field.gaussians, []
     for _ in range(60):
         count, before = gaussians.count, gaussians.reallocations
@@ -45,7 +45,7 @@ def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch
     monkeypatch.setattr(training_state, "MAX_RESERVE", 8.0)
     monkeypatch.setattr(graph_capacity, "MIN_HEADROOM", 0.0)
     config = VARIANTS["default"]
-    training = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cuda:0"))
+    training = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cuda:0"))
     for _ in range(48):
         training.step()
     recorded, count = training.graphs.captured, training.field.gaussians.count

@@ -12,7 +12,7 @@ from sehdr_warp.runs.checkpoint import Checkpoint
 from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
-from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 
@@ -106,7 +106,7 @@ def test_a_trainer_continues_from_its_state(scene, variant):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        whole = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+        whole = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
         _steps(whole, 30)
         tensors, values = whole.state()
         tensors = {name: value.clone() for name, value in tensors.items()}

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.model.color_models import color_model
+from sehdr_warp.model.color_models import make_color_model
 from sehdr_warp.model.radiance_field import TrainRender
 from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.runs.config_files import load_config, override_config, preset_names
 from sehdr_warp.training.hdr_truth import largest_hdr_truth
-from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
@@ -25,7 +25,7 @@ from .toy import VARIANTS, quick, without_truth
 
 
 def trainer_of(scene, config):
-    return Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+    return Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
 
 
 def test_presets_are_what_their_methods_say():
@@ -88,7 +88,7 @@ def test_photos_of_no_weight_teach_nothing(scene):
 
 @pytest.mark.parametrize("preset", ["truth", "hdr-gs-truth", "paper-truth"])
 def test_a_scene_without_truth_is_refused_by_name_and_field(scene, tmp_path, preset, monkeypatch):
-    for work in ("choose_response", "estimate_compensation", "make_field"):
+    for work in ("response_for_training", "estimate_compensation", "make_field"):
         monkeypatch.setattr(f"sehdr_warp.training.train.{work}", lambda *_: pytest.fail("worked for nothing"))
     field = "loss.hdr_truth = true" if preset == "paper-truth" else "loss.hdr_weight = "
     with pytest.raises(InputError, match=f"^toy: no training view has the HDR truth that {field}"):
@@ -124,13 +124,13 @@ def test_the_largest_truth_is_that_of_training_views_where_they_count(scene):
 
 def test_a_learned_tone_mapper_starts_as_hdr_gs_does(scene):
     config = Config(response=ResponseConfig(name="learned"), seed=5)
-    mapper = choose_response(scene, config)
+    mapper = response_for_training(scene, config)
     assert isinstance(mapper, ToneMapper) and mapper.width == 128
     assert torch.equal(mapper.weights[0], ToneMapper(seed=5).weights[0])
     encoded = np.array([[0.2, 0.5, 0.9]])
-    assert np.allclose(color_model("log").start(encoded, mapper), encoded)
-    assert np.allclose(color_model("linear").start(encoded, mapper), np.exp(encoded))
-    assert not np.allclose(color_model("log").start(encoded, response_by_name("srgb")), encoded)
+    assert np.allclose(make_color_model("log").start(encoded, mapper), encoded)
+    assert np.allclose(make_color_model("linear").start(encoded, mapper), np.exp(encoded))
+    assert not np.allclose(make_color_model("log").start(encoded, response_by_name("srgb")), encoded)
 
 
 def test_the_anchor_holds_the_unit_exposure_of_a_learned_tone_mapper():

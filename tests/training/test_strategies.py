@@ -10,7 +10,7 @@ from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.rasterizer.relocation import relocation_sums
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.training.strategies import AdcStrategy, Seeds, make_strategy, mcmc
+from sehdr_warp.training.strategies import AdcStrategy, Proposals, make_strategy, mcmc
 from sehdr_warp.training.strategies.adc import rotate, sample_half
 from sehdr_warp.training.strategies.mcmc import sample_rows
 
@@ -236,15 +236,15 @@ def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
     assert (after - before).abs().mean() < 0.05 * before.abs().mean()
 
 
-def seeds(colors):
-    """A seed function that returns Gaussians of these colors at the origin."""
+def proposer(colors):
+    """A function that proposes Gaussians of these colors at the origin."""
 
     def propose(wanted, room):
         made = cloud(len(colors)).tensors()
         given = torch.tensor(colors)[:, None, None].expand(-1, 1, 3)
         made |= {"means": torch.zeros_like(made["means"]), "harmonics_dc": given}
         rows = {name: values[:room].contiguous() for name, values in made.items()}
-        return Seeds(rows, wanted.clamp_max(len(colors)))
+        return Proposals(rows, wanted.clamp_max(len(colors)))
 
     return propose
 
@@ -258,7 +258,7 @@ def test_the_born_come_first_and_take_the_places_of_the_dead(rooms, dead, colors
     gone, before = (logits < -5).nonzero()[:, 0].tolist(), gaussians.rows(torch.arange(10))
     strategy = mcmc_strategy(seed_fraction=0.5, growth_rate=0.3)
     strategy.refine(
-        600, gaussians, optimizer, torch.Generator().manual_seed(0), seeds([10.0 + k for k in range(colors)])
+        600, gaussians, optimizer, torch.Generator().manual_seed(0), proposer([10.0 + k for k in range(colors)])
     )
     assert gaussians.count == 13
     places = [*gone, 10, 11, 12][: min(colors, (dead + 3) // 2)]

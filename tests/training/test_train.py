@@ -14,7 +14,7 @@ from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
 from sehdr_warp.training.held_out import evaluate_views
-from sehdr_warp.training.initialization import choose_response, make_field
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 
@@ -104,7 +104,7 @@ def test_views_of_differing_exposure_agree(tmp_path):
 def test_clipped_highlights_are_not_pulled_down(scene, tmp_path):
     """Photos of more than the sensor holds: the render is white there, and not held to just white."""
     views = tuple(dataclasses.replace(view, codes=np.full_like(view.codes, 255)) for view in scene.views)
-    field = make_field(scene, quick(), choose_response(scene, quick()), "cpu")
+    field = make_field(scene, quick(), response_for_training(scene, quick()), "cpu")
     bound = {"loss.ssim_weight": 0.0, "loss.clipped_smoothness": 0.0, "loss.clipped_estimate": 0.0}
     config = quick(**bound)
     trainer = Trainer(dataclasses.replace(scene, views=views), config, field)
@@ -156,7 +156,7 @@ def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
 def test_steps_that_compare_light_do_not_encode_it_and_report_the_same(scene):
     config = quick()
     trainers = [
-        Trainer(scene, config, make_field(scene, config, choose_response(scene, config), torch.device("cpu")))
+        Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), torch.device("cpu")))
         for _ in range(2)
     ]
     assert not trainers[0]._encoded
@@ -170,7 +170,9 @@ def test_steps_that_compare_light_do_not_encode_it_and_report_the_same(scene):
 
 def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
     config = quick(length=20)
-    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), torch.device("cpu")))
+    trainer = Trainer(
+        scene, config, make_field(scene, config, response_for_training(scene, config), torch.device("cpu"))
+    )
     widths = []
     for _ in range(20):
         trainer.step()
@@ -181,7 +183,9 @@ def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
 
 def test_opacities_are_not_pulled_down_once_none_are_relocated(scene):
     config = quick(length=60, **{"densification.refine_stop_iter": 40, "loss.opacity_weight": 10.0})
-    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), torch.device("cpu")))
+    trainer = Trainer(
+        scene, config, make_field(scene, config, response_for_training(scene, config), torch.device("cpu"))
+    )
     means = []
     for _ in trainer:
         means.append(float(trainer.field.gaussians.opacities().detach().mean()))
@@ -193,7 +197,7 @@ def test_opacities_are_not_pulled_down_once_none_are_relocated(scene):
 @pytest.mark.parametrize("variant", ["default", "adc"])
 def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
     config = override_config(VARIANTS[variant], {"schedule.sh_degree_interval": 2})
-    fields = [make_field(scene, config, choose_response(scene, config), device) for _ in range(2)]
+    fields = [make_field(scene, config, response_for_training(scene, config), device) for _ in range(2)]
     for field, factored in zip(fields, (True, False), strict=True):
         with torch.no_grad():  # How a ball is turned shows in no photo: its gradient would be rounding.
             field.gaussians.log_scales += torch.tensor([-0.5, 0.0, 0.5], device=device)
@@ -209,7 +213,7 @@ def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, va
 
 def test_non_finite_steps_are_skipped_and_then_stop(scene):
     config = quick(**{"mcmc.noise_lr": 0.0})
-    field = make_field(scene, config, choose_response(scene, config), "cpu")
+    field = make_field(scene, config, response_for_training(scene, config), "cpu")
     trainer = Trainer(scene, config, field)
     trainer.step()
     before = field.gaussians.means.detach().clone()
@@ -260,7 +264,7 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
             raise RuntimeError("operation not permitted when stream is capturing\nmore")
 
     config = quick()
-    trainer = Trainer(scene, config, make_field(scene, config, choose_response(scene, config), "cpu"))
+    trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
     trainer.graphs._first = BrokenRunner()
     monkeypatch.setattr(trainer.graphs, "can_capture", lambda *_, **__: trainer.iteration > 1)
     trainer.step()

@@ -8,15 +8,15 @@ from torch import Tensor
 
 from ...runs.config import Config
 from .adc import AdcStrategy
-from .base import SEED_STRIDE, SeedFunction, Seeds, Strategy
+from .base import SEED_STRIDE, Proposals, Propose, Strategy
 from .mcmc import McmcStrategy, mcmc_cap
 
 __all__ = [
     "SEED_STRIDE",
     "AdcStrategy",
     "McmcStrategy",
-    "SeedFunction",
-    "Seeds",
+    "Proposals",
+    "Propose",
     "Strategy",
     "make_strategy",
     "mcmc_cap",

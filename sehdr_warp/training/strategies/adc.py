@@ -10,7 +10,7 @@ from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer
 from ...rasterizer import Rendering
 from ...rasterizer.training_step import add_gradient_statistics
 from ...runs.config import AdcConfig, Config
-from .base import Schedule, SeedFunction, Strategy
+from .base import Propose, Schedule, Strategy
 
 SPLIT_SHRINK = 1.6  # Factor by which the two halves of a split are smaller (3DGS: 0.8 times the number of halves)
 MIN_RESET_INTERVAL = 300
@@ -76,12 +76,12 @@ class AdcStrategy(Strategy):
         gaussians: Gaussians,
         optimizer: Optimizer | None,
         generator: torch.Generator,
-        seed: SeedFunction | None = None,
+        propose: Propose | None = None,
     ) -> bool:
         """Duplicate, split and remove Gaussians, and reset opacities, if this iteration is due."""
         changed = False
         total, count = self.gradient_sum, self.visible_count
-        if self.schedule.is_due(iteration, self.photos) and total is not None and count is not None:
+        if self.schedule.is_due(iteration, self.step_batch) and total is not None and count is not None:
             changed = True
             small, large = self._select(gaussians, (total / count.clamp_min(1))[: gaussians.count])
             added = [self.duplicate(gaussians, small), *self.split(gaussians, large, generator)]
@@ -96,13 +96,13 @@ class AdcStrategy(Strategy):
 
     def is_due(self, iteration: int) -> bool:
         """Return whether this iteration refines or resets opacities."""
-        return self.schedule.is_due(iteration, self.photos) or self._resets(iteration)
+        return self.schedule.is_due(iteration, self.step_batch) or self._resets(iteration)
 
     def _resets(self, iteration: int) -> bool:
         """Return whether opacities are reset at this iteration."""
         past = iteration % self.reset_every
         before_stop = iteration - past < self.schedule.stop
-        return past < self.photos and before_stop and self.reset_every >= MIN_RESET_INTERVAL
+        return past < self.step_batch and before_stop and self.reset_every >= MIN_RESET_INTERVAL
 
     def _select(self, gaussians: Gaussians, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Return masks [N] of the Gaussians to duplicate and of those to split, by their mean gradient [N].

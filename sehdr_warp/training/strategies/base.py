@@ -18,7 +18,7 @@ RESERVE_FACTOR = 1.17  # Reserved rows as a multiple of the count: room for thre
 SEED_STRIDE = 1_000_003  # Distance between the noise seeds of consecutive training seeds; one seed per iteration
 
 
-class Seeds(NamedTuple):
+class Proposals(NamedTuple):
     """New Gaussians to place.
 
     Attributes:
@@ -30,7 +30,7 @@ class Seeds(NamedTuple):
     count: Tensor
 
 
-SeedFunction = Callable[[Tensor, int], Seeds]
+Propose = Callable[[Tensor, int], Proposals]
 """Returns up to a number of new Gaussians, given as int64 [] on the device and as its upper bound on the host."""
 
 
@@ -74,13 +74,13 @@ class Strategy:
         schedule: When to refine.
         cap_max: Largest number of Gaussians.
         prune_opacity: Gaussians below this opacity are relocated or removed.
-        photos: Iterations of the current step: one for each rank.
+        step_batch: Photos of the current step, one for each rank; each counts as an iteration.
     """
 
     schedule: Schedule
     cap_max: int
     prune_opacity: float
-    photos: int = 1
+    step_batch: int = 1
 
     def needs_gradients(self, iteration: int) -> bool:
         """Return whether accumulate() needs the gradients of the projected means at this iteration."""
@@ -101,7 +101,7 @@ class Strategy:
 
     def is_due(self, iteration: int) -> bool:
         """Return whether refine() does anything at this iteration."""
-        return self.schedule.is_due(iteration, self.photos)
+        return self.schedule.is_due(iteration, self.step_batch)
 
     def refine(
         self,
@@ -109,7 +109,7 @@ class Strategy:
         gaussians: Gaussians,
         optimizer: Optimizer | None,
         generator: torch.Generator,
-        seed: SeedFunction | None = None,
+        propose: Propose | None = None,
     ) -> bool:
         """Change the Gaussians and their optimizer state if this iteration is due.
 
@@ -118,7 +118,7 @@ class Strategy:
             gaussians: The Gaussians.
             optimizer: Their optimizer.
             generator: Source of random numbers, on the Gaussians' device.
-            seed: Proposes new Gaussians where photos are reproduced worst.
+            propose: Returns new Gaussians where photos are reproduced worst.
 
         Returns:
             True if the number of Gaussians, or any parameter tensor, changed.

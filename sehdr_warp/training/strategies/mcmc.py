@@ -11,7 +11,7 @@ from ...model.reserved_rows import moments_of
 from ...rasterizer.relocation import SampledRows, clear_rows, copy_rows, count_copies, number_places, share_opacities
 from ...rasterizer.training_step import add_position_noise
 from ...runs.config import Config, McmcConfig
-from .base import SEED_STRIDE, Schedule, SeedFunction, Strategy
+from .base import SEED_STRIDE, Propose, Schedule, Strategy
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: each Gaussian then shares with one other on average
 DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
@@ -22,7 +22,7 @@ MAX_DISTANCE = 100.0
 
 
 @dataclass(frozen=True)
-class _Places:
+class RelocationSlots:
     """Rows to fill in a refinement: those of the dead Gaussians, then the new ones.
 
     Attributes:
@@ -73,7 +73,7 @@ class McmcStrategy(Strategy):
         gaussians: Gaussians,
         optimizer: Optimizer | None,
         generator: torch.Generator,
-        seed: SeedFunction | None = None,
+        propose: Propose | None = None,
     ) -> bool:
         """Relocate dead Gaussians and add new ones, if this iteration is due.
 
@@ -87,13 +87,13 @@ class McmcStrategy(Strategy):
         dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
         numbers, dead_count = number_places(dead, added)
         gaussians.resize(count + added, optimizer)
-        places = _Places(numbers, torch.zeros_like(numbers, dtype=torch.bool))
-        seeded = self.place_seeds(gaussians, places, dead_count, added, count, seed)
-        self.relocate(gaussians, places, opacities.masked_fill(dead, 0), seeded, dead_count, generator)
+        slots = RelocationSlots(numbers, torch.zeros_like(numbers, dtype=torch.bool))
+        seeded = self.place_proposals(gaussians, slots, dead_count, added, count, propose)
+        self.relocate(gaussians, slots, opacities.masked_fill(dead, 0), seeded, dead_count, generator)
         if added > 0:
-            self.sample_add(gaussians, places, torch.maximum(dead_count, seeded), dead_count + added, added, generator)
+            self.sample_add(gaussians, slots, torch.maximum(dead_count, seeded), dead_count + added, added, generator)
         moments = [m for p in gaussians.parameters() for m in moments_of(optimizer, p).values()]
-        clear_rows(moments, places.changed)
+        clear_rows(moments, slots.changed)
         return added > 0
 
     def next_count(self, iteration: int, count: int) -> int:
@@ -107,58 +107,58 @@ class McmcStrategy(Strategy):
             growth = max(growth, min((self.cap_max / count) ** (1 / remaining) - 1, MAX_GROWTH))
         return max(count, min(self.cap_max, math.ceil((1 + growth) * count)))
 
-    def place_seeds(
+    def place_proposals(
         self,
         gaussians: Gaussians,
-        places: _Places,
+        slots: RelocationSlots,
         dead_count: Tensor,
         added: int,
         count: int,
-        seed: SeedFunction | None,
+        propose: Propose | None,
     ) -> Tensor:
         """Fill the first places with seeded Gaussians; return their number, int64 []."""
         fraction, none = self.options.seed_fraction, torch.zeros_like(dead_count)
-        if seed is None or not fraction:
+        if propose is None or not fraction:
             return none
         number = (fraction * (dead_count + added).double()).long()
         bound = host_bound(number, int(fraction * (count + added)))
         if not bound:
             return none
-        rows, seeded = seed(number, bound)
+        rows, seeded = propose(number, bound)
         values = list(gaussians.tensors().values())
         rows = [rows[name] for name in PARAMETER_NAMES]
-        copy_rows(values, rows, places.numbers, none, seeded, changed=places.changed)
+        copy_rows(values, rows, slots.numbers, none, seeded, changed=slots.changed)
         return seeded
 
     def relocate(
         self,
         gaussians: Gaussians,
-        places: _Places,
+        slots: RelocationSlots,
         weights: Tensor,
         first: Tensor,
         last: Tensor,
         generator: torch.Generator,
     ) -> None:
         """Fill the places [first, last) of dead Gaussians with living ones, sampled by weights [N]."""
-        self._fill(gaussians, places, weights, first, last, len(weights), generator)
+        self._fill(gaussians, slots, weights, first, last, len(weights), generator)
 
     def sample_add(
         self,
         gaussians: Gaussians,
-        places: _Places,
+        slots: RelocationSlots,
         first: Tensor,
         last: Tensor,
         bound: int,
         generator: torch.Generator,
     ) -> None:
         """Fill the places [first, last) of new Gaussians, at most `bound`, with others sampled by opacity."""
-        weights = gaussians.opacities().masked_fill_(places.numbers >= first, 0)
-        self._fill(gaussians, places, weights, first, last, bound, generator)
+        weights = gaussians.opacities().masked_fill_(slots.numbers >= first, 0)
+        self._fill(gaussians, slots, weights, first, last, bound, generator)
 
     def _fill(
         self,
         gaussians: Gaussians,
-        places: _Places,
+        slots: RelocationSlots,
         weights: Tensor,
         first: Tensor,
         last: Tensor,
@@ -173,12 +173,12 @@ class McmcStrategy(Strategy):
         if not bound:
             return
         sampled = sample_rows(weights, bound, generator)
-        copies = count_copies(sampled, first, last, places.changed)
+        copies = count_copies(sampled, first, last, slots.changed)
         logits, log_scales = gaussians.opacity_logits.detach(), gaussians.log_scales.detach()
         share_opacities(logits, log_scales, copies, least=self.prune_opacity)
         values = list(gaussians.tensors().values())
         # As in the authors' code, relocated Gaussians keep their Adam state, and only their sources lose it.
-        copy_rows(values, values, places.numbers, first, last, samples=sampled)
+        copy_rows(values, values, slots.numbers, first, last, samples=sampled)
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.

@@ -1,4 +1,4 @@
-"""The place of this process among those that train together, as a launcher (torchrun, or --gpus) states it."""
+"""Rank and node of this process among those that train together, as a launcher (torchrun, or --gpus) states them."""
 
 import os
 import platform
@@ -16,8 +16,8 @@ FILE_STORE = "SEHDR_RANKS"
 
 
 @dataclass(frozen=True)
-class Place:
-    """The place of a process.
+class RankInfo:
+    """Rank and node of a process.
 
     Attributes:
         rank: Number among all processes.
@@ -36,9 +36,9 @@ class Place:
     nodes: int = 1
 
     @staticmethod
-    def on_one_node(rank: int, count: int) -> "Place":
-        """Return the place of a rank if all are on this machine."""
-        return Place(rank, count, rank, count)
+    def on_one_node(rank: int, count: int) -> "RankInfo":
+        """Return the info of a rank if all are on this machine."""
+        return RankInfo(rank, count, rank, count)
 
     @property
     def several_nodes(self) -> bool:
@@ -60,8 +60,8 @@ class Place:
         return rank // self.local_count
 
 
-def launched_as() -> Place | None:
-    """Return the place that a launcher sets for this process; None if there is no launcher, or one process."""
+def launched_as() -> RankInfo | None:
+    """Return the info that a launcher sets for this process; None if there is no launcher, or one process."""
 
     def number(name: str, default: int) -> int:
         with suppress(KeyError, ValueError):
@@ -78,7 +78,7 @@ def launched_as() -> Place | None:
     if nodes * local_count != count:
         problem = f"{count} ranks on {nodes} nodes, and {local_count} on this one"
         raise SehdrError(f"{problem}: start as many on each, with --nproc-per-node")
-    return Place(rank, count, local_rank, local_count, node, nodes) if count > 1 else None
+    return RankInfo(rank, count, local_rank, local_count, node, nodes) if count > 1 else None
 
 
 def device_of_rank(rank: int, device: str | None) -> torch.device:
@@ -94,28 +94,28 @@ def device_of_rank(rank: int, device: str | None) -> torch.device:
     return torch.device("cuda", rank)
 
 
-def open_store(place: Place, patience: float) -> dist.Store:
+def open_store(info: RankInfo, patience: float) -> dist.Store:
     """Return the store of the ranks: a file of --gpus, or torchrun's server.
 
     Args:
-        place: Of this process.
+        info: Of this process.
         patience: Seconds to wait for the server.
 
     Raises:
         SehdrError: If there is no server, naming its address.
     """
     if path := os.environ.get(FILE_STORE):
-        return dist.FileStore(path, place.count + 1)
+        return dist.FileStore(path, info.count + 1)
     if missing := [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]:
         problem = f"RANK and WORLD_SIZE are set, and {' and '.join(missing)} not"
         raise SehdrError(f"{problem}: start with torchrun or --gpus, or unset RANK")
     host, port = os.environ["MASTER_ADDR"], os.environ["MASTER_PORT"]
     of_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-    serves = place.rank == 0 and not of_agent
+    serves = info.rank == 0 and not of_agent
     try:
         # Not torch's rendezvous(), which does not say who is missing.
         wait = timedelta(seconds=patience)
-        store = dist.TCPStore(host, int(port), place.count, serves, wait, wait_for_workers=False)
+        store = dist.TCPStore(host, int(port), info.count, serves, wait, wait_for_workers=False)
         # An agent's server outlives a restart of its processes.
         return dist.PrefixStore(f"attempt_{os.environ['TORCHELASTIC_RESTART_COUNT']}", store) if of_agent else store
     except (RuntimeError, ValueError) as error:
