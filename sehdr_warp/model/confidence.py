@@ -35,7 +35,7 @@ class Evidence:
     """Evidence of the training photos for N Gaussians; tensors [N].
 
     Attributes:
-        weight_sum: Sum of blending weights over pixels, RESIDUAL_WEIGHT times in regions that the scene does not reproduce.
+        weight_sum: Sum of blending weights over pixels, times RESIDUAL_WEIGHT where the scene does not reproduce them.
         stops: Mean uncertainty in stops.
         clipped: Fraction of clipped values.
         peak: Sum of blending weights, as in weight_sum, in the photo in which it is largest.

@@ -4,7 +4,7 @@ Every color set that a step needs is a group of three channels of one rasterisat
 sorted and blended once.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +35,8 @@ class TrainRender:
         exposure: Exposure of the HDR color at the base time (I^h dt_1 in the paper); None for encoded color models.
         base: Exposure of the base color at the base time (I^b); the same tensor as `exposure` without fusion.
         rendering: Result of the rasterizer: alpha, projected means, radii.
-        photo_exposure: Exposure of this photo, the input of the response; None if colors are encoded before they are composited.
+        photo_exposure: Exposure of this photo, the input of the response; None if colors are encoded before they are
+            composited.
         harmonics_gradients: If gradients are factored, holds after a backward pass the gradient [N, 3] by the color
             that each Gaussian's harmonics have in this direction.
         opacity_penalty: opacity_weight times the mean opacity, a scalar; None without a weight.
@@ -90,9 +91,11 @@ class RadianceField(nn.Module):
 
     Attributes:
         confidence: [N] in [0, 1], confidence in each Gaussian's light; None if it was not measured.
+        rasterizer: rasterize(); benchmarks set a function with the same arguments.
     """
 
     confidence: Tensor | None
+    rasterizer: Callable[..., Rendering] = staticmethod(rasterize)
 
     def __init__(
         self,
@@ -365,7 +368,7 @@ class RadianceField(nn.Module):
         opacities = gaussians.opacities() if opacities is None else opacities
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, features, opacities)
-        return rasterize(
+        return self.rasterizer(
             gaussians.means,
             gaussians.log_scales,
             gaussians.quaternions,

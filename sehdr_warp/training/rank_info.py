@@ -119,6 +119,6 @@ def open_store(info: RankInfo, patience: float) -> dist.Store:
         # An agent's server outlives a restart of its processes.
         return dist.PrefixStore(f"attempt_{os.environ['TORCHELASTIC_RESTART_COUNT']}", store) if of_agent else store
     except (RuntimeError, ValueError) as error:
-        problem = f"{place} cannot {'serve' if serves else 'reach'} {host}:{port} ({str(error).splitlines()[0]:.120})"
+        problem = f"{info} cannot {'serve' if serves else 'reach'} {host}:{port} ({str(error).splitlines()[0]:.120})"
         remedy = "check that node 0 runs and that this port is free and open, and start with torchrun"
         raise SehdrError(f"{problem}; {remedy}") from None

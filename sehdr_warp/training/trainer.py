@@ -249,10 +249,8 @@ class Trainer(TrainingState):
         if needs_means2d_grad:
             rendering.means2d.retain_grad()
         loss = with_opacity_penalty(data_loss(field, render, target, config, self._largest_truth), render)
-        image, harmonics_gradients = (
-            (render.encoded if self._encoded else render.photo_exposure),
-            render.harmonics_gradients,
-        )
+        image = render.encoded if self._encoded else render.photo_exposure
+        harmonics_gradients = render.harmonics_gradients
         assert image is not None
         del render, target, view
         differentiate(loss)

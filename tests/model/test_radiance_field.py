@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model import radiance_field
 from sehdr_warp.model.camera_tensors import CameraTensors
 from sehdr_warp.model.exposure import exposure_times
 from sehdr_warp.model.fusion import NeuralExposureFusion
@@ -82,15 +81,15 @@ def fusion_of():
 
 
 @pytest.mark.parametrize("tone_map,channels", [("pixel", 6), ("gaussian", 9)])
-def test_brackets_share_one_rasterisation(monkeypatch, tone_map, channels):
+def test_brackets_share_one_rasterisation(tone_map, channels):
     calls = []
 
     def counted(*arguments, **options):
         calls.append(arguments[4].shape[1])
         return rasterize(*arguments, **options)
 
-    monkeypatch.setattr(radiance_field, "rasterize", counted)
     field = wall(0.2, tone_map=tone_map, fusion=fusion_of())
+    field.rasterizer = counted
     photo = photograph(field, also=frozenset({"base", "exposure"}))
     assert calls == [channels]
     assert photo.encoded.shape == photo.exposure.shape == photo.base.shape == (24, 32, 3)
