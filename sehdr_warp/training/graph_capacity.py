@@ -32,7 +32,7 @@ class GraphCapacity:
 
     @property
     def has_counts(self) -> bool:
-        """Whether observe() has recorded a step."""
+        """True if observe() has recorded a step."""
         return self._intersections > 0
 
     def observe(self, intersections: int) -> None:

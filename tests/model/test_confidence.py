@@ -86,7 +86,7 @@ def test_clipped_and_unseen_gaussians_are_doubted(device):
     left, right, behind = evidence.confidence().tolist()
     assert left > 0.9 and 0.4 < right < 0.75 and behind == 0
     assert evidence.clipped[0] < 0.01 and evidence.clipped[1] > 0.5
-    assert evidence.seen[2] == 0 < evidence.seen[0]
+    assert evidence.weight_sum[2] == 0 < evidence.weight_sum[0]
     half = gather_evidence(model, [view(model, np.repeat(np.arange(20)[None] >= 10, 12, 0).astype(np.float32))])
     assert half.confidence()[0] == 0 and float(half.confidence()[1]) == pytest.approx(right, abs=0.02)
 
