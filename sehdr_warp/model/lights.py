@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ..scene import Camera
 from ..subsets import every_nth
-from .baking import sphere_directions
 from .radiance_field import RadianceField
 
 CLIPPED = 0.3  # Share of the photos' values that show a Gaussian, from which it can belong to a light
@@ -19,9 +18,9 @@ REACH = 3.0  # Gaussians join one light if they are nearer than this many median
 FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras
 MOST_LIGHTS, MOST_VIEWS = 64, 24
-DIRECTIONS, MOST_DIRECTIONS = 1 << 15, 1 << 20
-"""In which the light at a point is measured: as fine as the photos' pixels, within these bounds. In coarser pixels
-small Gaussians would no longer hide each other."""
+LEAST_ROWS, MOST_ROWS = 128, 724
+"""Rows of the map in which the light at a point is measured: as fine as the photos' pixels, within these bounds. In
+coarser pixels small Gaussians would no longer hide each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +130,16 @@ def find_lights(
 def _light_at(field: RadianceField, point: np.ndarray, cameras: Sequence[Camera], degree: int | None) -> float:
     """Return the light that reaches a point: the mean of the channels' radiance, integrated over all directions."""
     focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras]))
-    count = int(np.clip(4 * np.pi * focal**2, DIRECTIONS, MOST_DIRECTIONS)) // 256 * 256
-    directions = torch.tensor(sphere_directions(count), dtype=torch.float32).view(-1, 256, 3)
-    options = {"focal_length": focal, "pixel_angle": float(np.sqrt(4 * np.pi / count)), "degree": degree}
-    visible = field.render_directions(point, directions.to(field.gaussians.means.device), **options)
-    return 4 * np.pi * float(visible.hdr.mean())
+    # A latitude-longitude map, because its tiles are compact: those of evenly spread directions meet all Gaussians.
+    rows = int(np.clip(np.pi * focal, LEAST_ROWS, MOST_ROWS))
+    angle = np.pi / rows
+    latitude = angle * (np.arange(rows) + 0.5)[:, None] - np.pi / 2
+    longitude = angle * (np.arange(2 * rows) + 0.5)
+    up = np.broadcast_to(np.sin(latitude), (rows, 2 * rows))
+    directions = np.stack([np.cos(latitude) * np.sin(longitude), up, np.cos(latitude) * np.cos(longitude)], axis=2)
+    rays = torch.tensor(directions, dtype=torch.float32, device=field.gaussians.means.device)
+    visible = field.render_directions(point, rays, focal_length=focal, pixel_angle=angle, degree=degree)
+    return float(angle**2 * (visible.hdr.mean(2) * torch.tensor(np.cos(latitude)).to(visible.hdr)).sum())
 
 
 def _view_sums(field: RadianceField, camera: Camera, degree: int | None) -> tuple[Tensor, Tensor, Tensor]:
