@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..kernels.constants import FRUSTUM_MARGIN as FRUSTUM_MARGIN
 from ..kernels.project import projection_kernel
 from .gradients import kernel_layout, zero_gradients
 from .render_options import RenderOptions

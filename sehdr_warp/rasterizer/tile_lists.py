@@ -343,9 +343,8 @@ def find_tile_ranges(
         else:
             means_opacities, conics_cutoffs = packed.means_opacities, packed.conics_cutoffs
         kernel = kernels.tile_ranges_kernel(warp_scalar(means_opacities.dtype), *kind)
-        frame = columns, columns * rows
-        outputs = tile_ranges.view(-1), subtile_masks
-        launch(kernel, len(keys), keys, gaussians, means_opacities, conics_cutoffs, *frame, *outputs)
+        inputs = keys, gaussians, means_opacities, conics_cutoffs, columns, columns * rows
+        launch(kernel, len(keys), *inputs, tile_ranges.view(-1), subtile_masks)
     else:
         tile_ranges.zero_()
     return tile_ranges, None if packed is None else subtile_masks

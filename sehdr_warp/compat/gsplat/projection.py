@@ -6,9 +6,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ...kernels.constants import ALPHA_THRESHOLD, FRUSTUM_MARGIN
-from ...rasterizer.projection import ProjectedGaussians, project_to_camera
-from ...rasterizer.render_options import RenderOptions
+from ...rasterizer.projection import FRUSTUM_MARGIN, ProjectedGaussians, project_to_camera
+from ...rasterizer.render_options import ALPHA_THRESHOLD, RenderOptions
 
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS = "pinhole", "ortho", "fisheye"
