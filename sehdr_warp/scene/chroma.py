@@ -5,7 +5,7 @@ Where luma changes, chroma of the same surface usually changes in proportion, so
 model gets wrong by more than noise is added from the stored chroma, so that averages stay what the file states.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _NOISE = 3e-4  # Variance of luma codes in [0, 1] below which luma says little: 
 _TRUSTED = 2.0  # Median deviations from which a difference to the stored chroma is more than noise
 _REACH = 2  # Samples beside each one that cubic interpolation reads
 _BAND_ROWS = 256  # Chroma rows that are converted at a time, because floats take much memory
-_MARGIN = 12  # Chroma rows beside a band that its values depend on
+_MARGIN = _REACH + 1  # Chroma rows beside a band that its values depend on
 
 
 def upsample_chroma(luma: np.ndarray, chroma: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
@@ -32,33 +32,30 @@ def upsample_chroma(luma: np.ndarray, chroma: np.ndarray, offsets: Sequence[floa
     shape = luma.shape
     padding = [(0, 0 if offset is None else size % 2) for size, offset in zip(shape, offsets, strict=True)]
     luma = np.pad(luma, padding, mode="edge")
-    step = 1 if offsets[0] is None else 2
     small = _reduced(luma, offsets)
     center, center_small = _blurred(chroma), _blurred(small)
     variance = np.maximum(_blurred(small * small) - center_small**2, 0) + _NOISE
     slope = (_blurred(small[..., None] * chroma) - center_small[..., None] * center) / variance[..., None]
-    rest = chroma - slope * small[..., None]
-
-    def banded(convert: Callable[[slice, slice], np.ndarray], size: int) -> np.ndarray:
-        """Return [size, ...] joined of bands; `convert` takes rows of the chroma and those of them that count."""
-        parts = []
-        for top in range(0, len(chroma), _BAND_ROWS):
-            start, end = max(top - _MARGIN, 0), min(top + _BAND_ROWS + _MARGIN, len(chroma))
-            parts.append(convert(slice(start, end), slice(top - start, min(top + _BAND_ROWS, len(chroma)) - start)))
-        return np.concatenate(parts)[:size]
-
-    def model(rows: slice) -> np.ndarray:
-        wide = luma[rows.start * step : rows.stop * step, :, None]
-        return _enlarged(slope[rows], offsets) * wide + _enlarged(rest[rows], offsets)
-
-    difference = banded(lambda rows, inner: (chroma[rows] - _reduced(model(rows), offsets))[inner], len(chroma))
+    result = np.zeros((*luma.shape, chroma.shape[2]), np.float32)
+    _add_enlarged(result, slope, offsets, luma[..., None])
+    _add_enlarged(result, chroma - slope * small[..., None], offsets)
+    difference = chroma - _reduced(result, offsets)
     deviation = np.median(np.abs(difference), axis=(0, 1)) / np.float32(0.6745) * np.float32(_TRUSTED)
     difference *= np.maximum(0, 1 - (deviation / np.maximum(np.abs(difference), np.float32(1e-9))) ** 2)
+    _add_enlarged(result, difference, offsets)
+    return result[: shape[0], : shape[1]]
 
-    def corrected(rows: slice, inner: slice) -> np.ndarray:
-        return (model(rows) + _enlarged(difference[rows], offsets))[inner.start * step : inner.stop * step]
 
-    return banded(corrected, shape[0])[:, : shape[1]]
+def _add_enlarged(
+    result: np.ndarray, values: np.ndarray, offsets: Sequence[float | None], factor: np.ndarray | None = None
+) -> None:
+    """Add to result [H, W, C], in place, values [h, w, C] at its size, times factor [H, W, 1]."""
+    step = 1 if offsets[0] is None else 2
+    for top in range(0, len(values), _BAND_ROWS):
+        start, end = max(top - _MARGIN, 0), min(top + _BAND_ROWS, len(values))
+        band = _enlarged(values[start : end + _MARGIN], offsets)[(top - start) * step : (end - start) * step]
+        rows = slice(top * step, end * step)
+        result[rows] += band if factor is None else band * factor[rows]
 
 
 def _blurred(values: np.ndarray) -> np.ndarray:
