@@ -13,29 +13,33 @@ import torch
 from torch import Tensor
 
 from sehdr_warp.prior import load_prior
-from sehdr_warp.prior.network import LightNetwork, network_input
+from sehdr_warp.prior.network import STOPS, LightNetwork, network_input
 
 from .panoramas import Pack, read_pack
 from .photos import Camera, Photos
 
 PHOTOS, BATCH, SIZE = 384, 32, 96
 RIDGE = 10.0
+AREAS = (30, 300, 3000, 3 * SIZE**2)  # Most clipped values of a photo in a row of energies
 MU = 5000.0
 
 
 def judge(
     network: LightNetwork, scale: float, pack: Pack, unseen: np.ndarray, chosen: np.ndarray, *, seed: int, device: str
 ) -> dict:
-    """Return figures of each estimate on photos of unseen panoramas, plain (sRGB and other curves, 8 bits) and not.
+    """Return figures of each estimate on photos of unseen panoramas.
+
+    Photos are plain (sRGB, no noise), by cameras, and by cameras with lamps brighter than in the panoramas.
 
     For each estimate: rms (stops, all clipped values alike), level (spread of the mean error of photos, stops), light
     (median over photos of |log2| of total clipped light over the truth), psnr and worst (mu-law dB over whole photos,
-    mean and mean of the worst 5 %). For the network also calibration: the share within one deviation, and by deviation.
+    mean and mean of the worst 5 %). For the network also calibration: the share within one deviation, and by deviation;
+    energy: expected over true light of all photos together, by the number of values that a photo clips (AREAS).
     """
     learned = _collect(network, pack, chosen, seed + 100, device, plain=True)
     result = {}
-    for name, plain in (("plain", True), ("camera", False)):
-        photos = _collect(network, pack, unseen, seed, device, plain=plain)
+    for name, plain, stretch in (("plain", True, 0.0), ("camera", False, 0.0), ("bright lamps", False, 1.0)):
+        photos = _collect(network, pack, unseen, seed, device, plain=plain, stretch_share=stretch)
         constant = float(np.mean(list(learned["level"])))
         ridge = _ridge(learned["cues"], learned["level"])
         guesses = {
@@ -50,6 +54,7 @@ def judge(
         error = np.concatenate([m - t for m, t in zip(photos["mean"], photos["truth"], strict=True)])
         deviation = scale * np.concatenate(photos["deviation"])
         figures["network"]["within_one_deviation"] = float((np.abs(error) <= deviation).mean())
+        figures["network"]["energy"] = _energy(photos, scale)
         edges = np.quantile(deviation, [0, 0.25, 0.5, 0.75, 1])
         figures["network"]["by_deviation"] = [
             {
@@ -60,11 +65,12 @@ def judge(
             for low, high in itertools.pairwise(edges)
             if (part := (deviation >= low) & (deviation <= high)).any()
         ]
-        rng = np.random.default_rng(0)
-        sample = rng.choice(len(error), min(2000, len(error)), replace=False)
-        truth = np.concatenate(photos["truth"])
-        points = np.stack([truth[sample], truth[sample] + error[sample], deviation[sample]], 1)
-        figures["network"]["sample"] = np.round(points, 3).tolist()
+        if name == "camera":
+            rng = np.random.default_rng(0)
+            sample = rng.choice(len(error), min(2000, len(error)), replace=False)
+            truth = np.concatenate(photos["truth"])
+            points = np.stack([truth[sample], truth[sample] + error[sample], deviation[sample]], 1)
+            figures["network"]["sample"] = np.round(points.astype(float), 3).tolist()
         result[name] = figures
     return result
 
@@ -80,13 +86,22 @@ def main() -> None:
     pack, prior = read_pack(args.pack), load_prior(args.device, args.weights)
     unseen, chosen = np.flatnonzero(pack.held_out), np.flatnonzero(~pack.held_out)
     figures = judge(prior.network, prior.deviation_scale, pack, unseen, chosen, seed=2, device=args.device)
-    args.out.write_text(json.dumps(figures, indent=1))
+    args.out.write_text(json.dumps(figures))
 
 
 @torch.no_grad()
-def _collect(network: LightNetwork, pack: Pack, chosen: np.ndarray, seed: int, device: str, *, plain: bool) -> dict:
+def _collect(
+    network: LightNetwork,
+    pack: Pack,
+    chosen: np.ndarray,
+    seed: int,
+    device: str,
+    *,
+    plain: bool,
+    stretch_share: float = 0.0,
+) -> dict:
     """Return lists over photos: truth, mean and deviation of clipped values, cues, and what else figures need."""
-    camera = Camera(pack, device, chosen, rooms=False, seed=seed)
+    camera = Camera(pack, device, chosen, rooms=False, seed=seed, stretch_share=stretch_share)
     found: dict = {name: [] for name in ("truth", "mean", "deviation", "cues", "level", "clipped", "exposure")}
     for _ in range(PHOTOS // BATCH):
         photos = camera.take(BATCH, SIZE, plain=plain)
@@ -105,6 +120,24 @@ def _collect(network: LightNetwork, pack: Pack, chosen: np.ndarray, seed: int, d
             found["clipped"].append(clipped.cpu().numpy())
             found["exposure"].append(torch.where(clipped, 1.0, photos.exposure[k].clamp(0, 1)).cpu().numpy())
     return found
+
+
+def _energy(photos: dict, scale: float) -> dict[str, float]:
+    """Return expected over true light by the number of clipped values, as a training expects it.
+
+    The expected light is the mean of a log-normal value. Truth above STOPS counts as STOPS.
+    """
+    counts = np.array([len(truth) for truth in photos["truth"]])
+    true = np.array([np.exp2(np.minimum(truth, STOPS)).sum() for truth in photos["truth"]])
+    expected = np.array(
+        [
+            np.exp2(mean + (scale * deviation) ** 2 * np.log(2) / 2).sum()
+            for mean, deviation in zip(photos["mean"], photos["deviation"], strict=True)
+        ]
+    )
+    pairs = itertools.pairwise((0, *AREAS))
+    parts = {most: (counts > least) & (counts <= most) for least, most in pairs}
+    return {str(most): float(expected[part].sum() / max(true[part].sum(), 1e-9)) for most, part in parts.items()}
 
 
 def _cues(photos: Photos, k: int) -> np.ndarray:

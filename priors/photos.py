@@ -13,6 +13,9 @@ from .panoramas import Pack
 SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
 MOST_CLIPPED, LEAST_CLIPPED = 0.7, 5e-4  # Shares of a photo's pixels
 ROOM_SHARE = 0.35  # Of the photos of a training
+STRETCH_SHARE, MOST_STRETCH = 0.5, 2.2
+"""Of the photos, those whose light above white is raised to a random power up to this. Panoramas of 512 columns average
+small lamps with what surrounds them; photos resolve them."""
 PAGE_SHARE = 0.2  # Of the photos, those with a white surface that is no lamp
 PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
 LEVELS = 255
@@ -34,7 +37,16 @@ class Photos:
 class Camera:
     """Random photos of a pack's panoramas and rooms."""
 
-    def __init__(self, pack: Pack, device: torch.device | str, chosen: np.ndarray, *, rooms: bool, seed: int):
+    def __init__(
+        self,
+        pack: Pack,
+        device: torch.device | str,
+        chosen: np.ndarray,
+        *,
+        rooms: bool,
+        seed: int,
+        stretch_share: float = STRETCH_SHARE,
+    ):
         """Copy panoramas, rooms and curves to the device.
 
         Args:
@@ -43,7 +55,9 @@ class Camera:
             chosen: indices of the panoramas that are photographed.
             rooms: whether rooms are photographed too.
             seed: of every random number.
+            stretch_share: of the photos, unless they are plain.
         """
+        self.stretch_share = stretch_share
         self.device, self.random = torch.device(device), np.random.default_rng(seed)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         panoramas = torch.from_numpy(pack.panoramas[chosen]).permute(0, 3, 1, 2)
@@ -123,7 +137,7 @@ class Camera:
         white = torch.where(first, by_share, torch.minimum(by_middle, most)).clamp_min(1e-12)
         exposure = radiance / white[:, :, None, None]
         if not plain:
-            exposure = self._with_pages(exposure)
+            exposure = self._with_pages(self._stretch(exposure))
         truth = exposure.clamp_min(1).log2()
         seen = exposure
         if not plain:
@@ -141,6 +155,13 @@ class Camera:
         if not plain:
             decoded = decoded ** (2 ** self._uniform(count, -0.2, 0.2))
         return Photos(decoded, clipped, truth * clipped)
+
+    def _stretch(self, exposure: Tensor) -> Tensor:
+        """Return exposures [B, 3, S, S], some with brighter light above white, of the same hue."""
+        count = len(exposure)
+        power = self._uniform(count, 1, MOST_STRETCH)
+        power = torch.where(self._uniform(count, 0, 1) < self.stretch_share, power, 1.0)
+        return exposure * exposure.amax(1, keepdim=True).clamp_min(1) ** (power - 1)
 
     def _with_pages(self, exposure: Tensor) -> Tensor:
         """Return exposures [B, 3, S, S], some with a sheet, a wall or snow that is lit to about white, not a lamp."""

@@ -21,7 +21,9 @@ _COLUMNS = {
 _SETS = {
     "plain": "sRGB, 8 bits, 0.2 to 20 % of the pixels at white",
     "camera": "random camera curves, white balance, noise, JPEG and exposures; the curve known to a fifth of a stop",
+    "bright lamps": "the same, light above white raised to a random power of up to 2.2",
 }
+_AREAS = {"30": "up to 30", "300": "31 to 300", "3000": "301 to 3000", "27648": "more"}
 _TEXT = """# The prior for light above white
 
 How well the network that comes with the package estimates clipped light ([Light above white](light.md)), on photos of
@@ -40,6 +42,13 @@ five of the ten panoramas. By quarters of the deviation:
 | mean deviation, stops | RMS, stops | within one deviation |
 | -: | -: | -: |
 {quarters}
+
+Trainings hold light at its expected value, the mean of a log-normal distribution. Its sum over that of the true light,
+all photos together, by the number of values that clip in a photo of 96 x 96 pixels:
+
+| photos | {areas} |
+| --- |{rules}
+{energies}
 """
 
 
@@ -50,10 +59,15 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     args = parser.parse_args()
     figures = json.loads(args.figures.read_text())
-    tables = "\n\n".join(f"**{title}**\n\n{_table(figures[name])}" for name, title in _SETS.items() if name in figures)
+    tables = "\n\n".join(
+        f"**{name}: {title}**\n\n{_table(figures[name])}" for name, title in _SETS.items() if name in figures
+    )
     network = figures["camera"]["network"]
     rows = [f"| {row['deviation']:.2f} | {row['rms']:.2f} | {row['within']:.0%} |" for row in network["by_deviation"]]
+    ratios = {name: figures[name]["network"]["energy"] for name in _SETS}
+    energies = [f"| {name} | {' | '.join(f'{row[area]:.2f}' for area in _AREAS)} |" for name, row in ratios.items()]
     values = {"page": PAGE, "tables": tables, "within": network["within_one_deviation"], "quarters": "\n".join(rows)}
+    values |= {"areas": " | ".join(_AREAS.values()), "rules": " -: |" * len(_AREAS), "energies": "\n".join(energies)}
     (args.folder / f"{PAGE}.md").write_text(_TEXT.format(**values))
     _plot(np.array(network["sample"]), args.folder / "images" / f"{PAGE}.png")
 

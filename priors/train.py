@@ -125,7 +125,7 @@ def main() -> None:
     save_file(tensors, args.out, {"deviation_scale": f"{scale:.4f}"})
     if args.judge:
         figures = judge(network, scale, pack, unseen, chosen, seed=2, device=args.device)
-        args.out.with_suffix(".json").write_text(json.dumps(figures, indent=1))
+        args.out.with_suffix(".json").write_text(json.dumps(figures))
         print(json.dumps(figures))
 
 

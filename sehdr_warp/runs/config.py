@@ -107,7 +107,7 @@ class LossConfig(_Table):
     clipped_smoothness: Weight = 0.001
     """weight of the squared difference between the log light of a clipped pixel and the mean around it; applies if
     exposures are compared"""
-    clipped_estimate: Weight = 0.003
+    clipped_estimate: Weight = 0.01
     """weight of the squared distance between the log light of clipped pixels and its estimate, in standard deviations;
     applies if exposures are compared; estimates come from the learned prior and from gain maps"""
     light_prior: bool = True

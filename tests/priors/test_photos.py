@@ -47,3 +47,14 @@ def test_every_source_has_a_licence_and_some_are_held_out():
     sources = listed_sources()
     assert len({source.name for source in sources}) == len(sources) == 46
     assert sum(source.held_out for source in sources) == 10
+
+
+def test_brighter_lamps_are_brighter_where_they_clip_alone(pack):
+    usual, stretched = (
+        Camera(pack, "cpu", np.array([0]), rooms=False, seed=5, stretch_share=share).take(8, 64) for share in (0.0, 1.0)
+    )
+    lamps = (usual.truth > 1) & (stretched.clipped > 0)
+    assert lamps.any() and (stretched.truth[lamps] > usual.truth[lamps]).float().mean() > 0.95
+    assert stretched.truth.max() <= 2.2 * usual.truth.max()
+    # A channel below white may clip with its lamp, never the other way around.
+    assert (stretched.clipped >= usual.clipped).float().mean() > 0.999
