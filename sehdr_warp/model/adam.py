@@ -97,6 +97,6 @@ class Adam:
                 start = FIRST_HARMONIC[group["name"]]
                 interval = self.sh_update_interval if start else 1
                 harmonics_adam_step(
-                    values, start, harmonics, *state, **rate, **options, live=active_count, turns=interval
+                    values, start, harmonics, *state, **rate, **options, active_count=active_count, turns=interval
                 )
-        adam_steps(steps_with_gradient, skipped, **options, live=active_count)
+        adam_steps(steps_with_gradient, skipped, **options, active_count=active_count)

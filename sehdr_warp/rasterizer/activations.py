@@ -52,24 +52,26 @@ class _BoundedExponential(torch.autograd.Function):
         return result, None
 
 
-def opacities_with_penalty(logits: Tensor, weight: float, live: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def opacities_with_penalty(logits: Tensor, weight: float, active_count: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return the sigmoids of [N] logits, N >= 1, and `weight` times their mean, a scalar; differentiable once.
 
-    live: [1] int32 on the device, how many the mean counts, if those behind them have a sigmoid of 0.
+    active_count: [1] int32 on the device, how many the mean counts, if those behind them have a sigmoid of 0.
     """
     if logits.device.type == "cuda":
-        return _Opacities.apply(logits, weight, live)
+        return _Opacities.apply(logits, weight, active_count)
     opacities = torch.sigmoid(logits)
-    return opacities, weight * (opacities.mean() if live is None else opacities.sum() / live[0])
+    return opacities, weight * (opacities.mean() if active_count is None else opacities.sum() / active_count[0])
 
 
 class _Opacities(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, logits, weight, live):
+    def forward(ctx, logits, weight, active_count):
         logits = logits.detach().contiguous()
         opacities, shares = torch.empty_like(logits), logits.new_empty(min(len(logits), MEAN_THREADS))
-        launch(opacities_kernel(warp_scalar(logits.dtype)), len(shares), logits, weight, live, opacities, shares)
-        ctx.weight, ctx.live = weight, live
+        launch(
+            opacities_kernel(warp_scalar(logits.dtype)), len(shares), logits, weight, active_count, opacities, shares
+        )
+        ctx.weight, ctx.active_count = weight, active_count
         ctx.save_for_backward(opacities)
         ctx.set_materialize_grads(False)
         return opacities, shares.sum()
@@ -79,6 +81,9 @@ class _Opacities(torch.autograd.Function):
     def backward(ctx, grad_opacities, grad_mean):
         (opacities,) = ctx.saved_tensors
         result = torch.empty_like(opacities)
-        kernel, inputs = opacities_backward_kernel(warp_scalar(opacities.dtype)), (opacities, ctx.weight, ctx.live)
+        kernel, inputs = (
+            opacities_backward_kernel(warp_scalar(opacities.dtype)),
+            (opacities, ctx.weight, ctx.active_count),
+        )
         launch(kernel, len(opacities), *inputs, grad_opacities, grad_mean, result)
         return result, None, None

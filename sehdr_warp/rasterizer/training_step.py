@@ -20,22 +20,26 @@ def check_finite(
     loss: Tensor,
     norms: Tensor,
     incomplete: Tensor | None = None,
-    tally: Tensor | None = None,
-    pairs: Tensor | None = None,
+    step_counters: Tensor | None = None,
+    intersections: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return two scalars, 1 or 0: whether a step is skipped, and whether it is made.
 
     It is skipped if the loss or a norm is not finite or `incomplete` is true. loss: float32 scalar; norms: [K] float32;
     incomplete: bool scalar.
 
-    tally: [3] int64, counts steps that are not finite; with pairs, an int64 scalar, it also holds the most
-    intersections and counts the incomplete steps.
+    step_counters: [3] int64, counts steps that are not finite; with intersections, an int64 scalar, it also holds the
+    most intersections and counts the incomplete steps.
     """
     step_flags = norms.new_empty(2)
     if incomplete is None:
         incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
-    none = torch.empty(0, dtype=torch.int64, device=norms.device) if tally is None or pairs is None else None
-    counters = (none if tally is None else tally), (none if pairs is None else pairs)
+    none = (
+        torch.empty(0, dtype=torch.int64, device=norms.device)
+        if step_counters is None or intersections is None
+        else None
+    )
+    counters = (none if step_counters is None else step_counters), (none if intersections is None else intersections)
     launch(kernels.check_finite, 1, loss.detach(), norms, incomplete, *counters, step_flags)
     return step_flags[0], step_flags[1]
 
@@ -87,7 +91,7 @@ class AdamStep(NamedTuple):
         second_moment: changed in place.
         step: float32 of one element, the number of this step, from 1.
         rate: float32 of one element, or a number, which cannot change in a CUDA graph.
-        width: numbers in a Gaussian's row if adam_steps() gets `live`; else 0.
+        width: numbers in a Gaussian's row if adam_steps() gets `active_count`; else 0.
     """
 
     parameter: Tensor
@@ -106,13 +110,14 @@ def adam_steps(
     *,
     betas: tuple[float, float],
     epsilon: float,
-    live: Tensor | None = None,
+    active_count: Tensor | None = None,
 ) -> None:
     """Update parameters and moments by Adam in place; nothing if `skipped`, float32 of one element, is 1.
 
     By torch on the CPU. On a GPU, most of which torch's update leaves idle, by a kernel of the same numbers, several
-    parameters at once. Nothing waits for the device, so the call can be part of a CUDA graph. live: [1] int32, how many
-    rows count; the gradients of others are 0.
+    parameters at once. Nothing waits for the device, so the call can be part of a CUDA graph.
+
+    active_count: [1] int32, how many rows count; the gradients of others are 0.
 
     Raises:
         ValueError: if a tensor is not contiguous float32 of the parameter's shape.
@@ -126,7 +131,7 @@ def adam_steps(
                 raise ValueError(f"the {name.replace('_', ' ')} is {is_}, expected contiguous float32 {list(shape)}")
     steps = [step for step in steps if step.parameter.numel()]
     if skipped.device.type == "cuda":
-        _steps_by_kernel(steps, skipped, betas, epsilon, live)
+        _steps_by_kernel(steps, skipped, betas, epsilon, active_count)
         return
     numbers: Any = {"beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon, "found_inf": skipped}
     numbers |= {"amsgrad": False, "maximize": False}
@@ -136,8 +141,8 @@ def adam_steps(
             torch._fused_adam_(*lists, lr=float(rate), **numbers)  # pyright: ignore[reportPrivateImportUsage]
 
 
-def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, live=None) -> None:
-    nothing, live = [skipped.view(1)[:0]] * 6, _live(live, skipped)
+def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, active_count=None) -> None:
+    nothing, active_count = [skipped.view(1)[:0]] * 6, _active_count(active_count, skipped)
     for start in range(0, len(steps), kernels.AT_ONCE):
         group = steps[start : start + kernels.AT_ONCE]
         arguments = []
@@ -149,7 +154,7 @@ def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, live=No
         widths = [step.width for step in group] + [0] * (kernels.AT_ONCE - len(group))
         numbers = *widths, *_decays(betas), epsilon
         arguments = [*numbers, *arguments]
-        launch(kernels.update_by_adam, most, skipped.view(1), live, *arguments)
+        launch(kernels.update_by_adam, most, skipped.view(1), active_count, *arguments)
 
 
 @torch.no_grad()
@@ -165,7 +170,7 @@ def harmonics_adam_step(
     rate: Tensor | float,
     betas: tuple[float, float],
     epsilon: float,
-    live: Tensor | None = None,
+    active_count: Tensor | None = None,
     turns: int = 1,
 ) -> None:
     """Do adam_steps() for coefficients of harmonics [N, K, 3] from number `start` on.
@@ -175,7 +180,7 @@ def harmonics_adam_step(
     """
     if not parameter.numel():
         return
-    options = step, _rate(rate, skipped), skipped, _live(live, skipped), *_decays(betas), epsilon
+    options = step, _rate(rate, skipped), skipped, _active_count(active_count, skipped), *_decays(betas), epsilon
     values = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
     in_turn = parameter.numel() if turns == 1 else -(-parameter.numel() // (kernels.TURN * turns)) * kernels.TURN
@@ -184,8 +189,8 @@ def harmonics_adam_step(
     launch(kernel, stride, *arguments)
 
 
-def _live(live: Tensor | None, like: Tensor) -> Tensor:
-    return torch.empty(0, dtype=torch.int32, device=like.device) if live is None else live
+def _active_count(active_count: Tensor | None, like: Tensor) -> Tensor:
+    return torch.empty(0, dtype=torch.int32, device=like.device) if active_count is None else active_count
 
 
 def _rate(rate: Tensor | float, like: Tensor) -> Tensor:

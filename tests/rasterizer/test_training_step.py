@@ -109,14 +109,14 @@ def test_rows_that_do_not_count_are_left_alone(device):
         AdamStep(tensor, torch.ones_like(tensor), torch.zeros_like(tensor), torch.zeros_like(tensor), one, one, width)
         for tensor, width in ((values, 4), (other, 0))
     ]
-    live = torch.tensor([5], dtype=torch.int32, device=device)
-    training_step._steps_by_kernel(steps, 0 * one, *OPTIONS.values(), live)
+    active_count = torch.tensor([5], dtype=torch.int32, device=device)
+    training_step._steps_by_kernel(steps, 0 * one, *OPTIONS.values(), active_count)
     assert (values[:5] == values[0, 0]).all() and values[0, 0] < 0 and not values[5].any() and other.all()
     moments = (torch.zeros(6, 15, 3, device=device) for _ in range(3))
     ones = torch.ones(6, 3, device=device)
     factors = HarmonicsGradients(ones[None], 0 * ones[:1], ones, 3)
     parameter, *state = moments
-    harmonics_adam_step(parameter, 1, factors, *state, one, 0 * one, rate=0.1, **OPTIONS, live=live)
+    harmonics_adam_step(parameter, 1, factors, *state, one, 0 * one, rate=0.1, **OPTIONS, active_count=active_count)
     assert parameter[:5, 1].all() and not parameter[5].any() and not state[0][5].any()
 
 
