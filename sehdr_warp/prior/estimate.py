@@ -15,10 +15,6 @@ from .network import LightNetwork, network_input
 WEIGHTS = Path(__file__).with_name("clipped_light.safetensors")
 LARGEST = 160  # Pixels of the longer side that the network sees; larger photos are averaged down
 MOST_BYTES = 3_000_000  # Of a weights file
-HELD_DEVIATION = 1.0
-"""Standard deviation, stops, with which every estimate of the prior holds a training. Its own would pool several photos
-of a lamp with a bias, because the photos that are most sure expect least: over 114 views of lamps the correlation is
-0.98, and the pooled light came out 3 stops too dark in place of 0.9."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +73,6 @@ def combined_estimates(
     prior: LightPrior | None,
     stated: Tensor | None = None,
     stated_deviation: float = 0.0,
-    *,
-    holding: bool = False,
 ) -> Tensor:
     """Return what is known of a photo's clipped light, from the prior and from what its file states.
 
@@ -88,7 +82,6 @@ def combined_estimates(
         prior: None leaves it out.
         stated: [H, W, 3], light in multiples of white, at least 1 where it is known, as View.light_above_white has it.
         stated_deviation: standard deviation of its natural logarithm.
-        holding: for the loss of a training, in which estimates of the prior count alike (HELD_DEVIATION).
 
     Returns:
         [h, w, 6] float16 at the size of `coarse_size`: for each channel the natural logarithm of the expected light
@@ -97,12 +90,11 @@ def combined_estimates(
     """
     size = coarse_size(*exposure.shape[:2])
     total = exposure.new_zeros(*size, 3)
-    precision, firmness = torch.zeros_like(total), torch.zeros_like(total)
+    precision = torch.zeros_like(total)
     if prior is not None:
         estimate = prior.estimate(exposure, clipped)
         deviation = estimate.deviation * math.log(2)
         precision += deviation**-2
-        firmness += (HELD_DEVIATION * math.log(2)) ** -2
         # The mean of light, not of its logarithm: lamps then have their energy in the mean.
         total += precision * (estimate.mean * math.log(2) + deviation.square() / 2)
     if stated is not None and stated_deviation > 0:
@@ -113,11 +105,9 @@ def combined_estimates(
         weight = (share > 0).to(exposure) / stated_deviation**2
         total += weight * light / share.clamp_min(1e-6)
         precision += weight
-        firmness += weight
     some = _averaged(clipped.to(exposure), size) > 0
     mean = torch.where(some, total / precision.clamp_min(1e-12), 0)
-    weight = firmness if holding else precision
-    return torch.cat([mean, torch.where(some, weight.sqrt(), 0)], 2).half()
+    return torch.cat([mean, torch.where(some, precision.sqrt(), 0)], 2).half()
 
 
 def _averaged(values: Tensor, size: tuple[int, int]) -> Tensor:

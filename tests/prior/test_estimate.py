@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.prior import LightPrior, coarse_size, combined_estimates, load_prior
-from sehdr_warp.prior.estimate import HELD_DEVIATION, WEIGHTS
+from sehdr_warp.prior.estimate import WEIGHTS
 from sehdr_warp.prior.network import LightNetwork
 
 
@@ -61,18 +61,6 @@ def test_what_a_file_states_counts_by_its_precision():
     sure, unsure = (combined_estimates(exposure, clipped, small_prior(), stated, d)[6, 12, 0] for d in (0.01, 100.0))
     assert sure == pytest.approx(math.log(8), abs=1e-2)
     assert unsure == pytest.approx(float(combined_estimates(exposure, clipped, small_prior())[6, 12, 0]), rel=1e-2)
-
-
-def test_estimates_of_the_prior_hold_alike_and_what_a_file_states_holds_by_its_deviation():
-    exposure, clipped = photo()
-    usual, holding = (combined_estimates(exposure, clipped, load_prior(), holding=h) for h in (False, True))
-    assert torch.equal(usual[..., :3], holding[..., :3])
-    inside = holding[..., 3:][clipped].float()
-    assert inside.min() == inside.max() == pytest.approx(1 / (HELD_DEVIATION * math.log(2)), rel=1e-3)
-    assert usual[..., 3:][clipped].float().std() > 0
-    stated = torch.where(clipped, 8.0, 0.0)
-    both = combined_estimates(exposure, clipped, small_prior(), stated, 0.25, holding=True)
-    assert float(both[6, 12, 3]) == pytest.approx(math.hypot(1 / (HELD_DEVIATION * math.log(2)), 4), rel=1e-2)
 
 
 def test_nothing_known_is_precision_zero():
