@@ -17,7 +17,7 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene
 from sehdr_warp.training.initialization import make_field
 from sehdr_warp.training.losses import data_loss, with_opacity_penalty
-from sehdr_warp.training.targets import training_views
+from sehdr_warp.training.targets import photo_source
 from sehdr_warp.training.trainer import Trainer
 
 STEPS, SIZE = 40, 32
@@ -69,7 +69,7 @@ def _learning_rates(device):
 def _gradient_norms(device):
     """Finite, and none drowns the photo's by 1e4."""
     field = _trainer(device).field
-    view = training_views(_photos().train_views, field.base_time, device, truth=False)[0]
+    view = photo_source(_photos().train_views, field.base_time, device, truth=False)[0]
     norms, broken = {}, 0
     for name, ssim, opacity in (("L1", 0.0, 0.0), ("L1 and SSIM", 0.2, 0.0), ("opacity", 0.0, 0.01)):
         config = load_config("default", {"loss.ssim_weight": ssim, "loss.opacity_weight": opacity}).loss

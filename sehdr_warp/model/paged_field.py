@@ -40,7 +40,7 @@ class PagedField(RadianceField):
             field.gaussians,
             field.response.to(device) if isinstance(field.response, torch.nn.Module) else field.response,
             fusion=None if field.fusion is None else field.fusion.to(device),
-            **field.options(),
+            **_options(field),
         )
         self.confidence = field.confidence
         self._device, self.budget = device, budget
@@ -133,7 +133,7 @@ class PagedField(RadianceField):
             pages = [self._empty()]
         joined = {name: torch.cat([page[name] for page in pages]) for name in pages[0]}
         confidence = joined.pop("confidence", None)
-        part = RadianceField(Gaussians(**joined), self.response, fusion=self.fusion, **self.options())
+        part = RadianceField(Gaussians(**joined), self.response, fusion=self.fusion, **_options(self))
         part.requires_grad_(False)
         part.confidence = confidence
         return part
@@ -228,3 +228,15 @@ def boxes_in_view(camera: Camera, low: np.ndarray, high: np.ndarray) -> np.ndarr
     normals = edges @ camera.world_to_camera[:3, :3]
     inside = (middle - camera.position) @ normals.T + half @ np.abs(normals).T >= 0
     return np.all(inside, axis=1)
+
+
+def _options(field: RadianceField) -> dict[str, Any]:
+    """Return the keyword arguments of a field that differs in Gaussians, response and fusion alone."""
+    return {
+        "base_time": field.base_time,
+        "color_model": field.color_model.name,
+        "tone_map": field.tone_map,
+        "antialiased": field.antialiased,
+        "deterministic": field.deterministic,
+        "normalization": field.normalization,
+    }

@@ -6,7 +6,6 @@ sorted and blended once.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -132,17 +131,6 @@ class RadianceField(nn.Module):
         self.color_model, self.tone_map = make_color_model(color_model), tone_map
         self.antialiased, self.deterministic = antialiased, deterministic
         self.register_buffer("confidence", None, persistent=False)
-
-    def options(self) -> dict[str, Any]:
-        """Return the keyword arguments of a field that differs in Gaussians, response and fusion alone."""
-        return {
-            "base_time": self.base_time,
-            "color_model": self.color_model.name,
-            "tone_map": self.tone_map,
-            "antialiased": self.antialiased,
-            "deterministic": self.deterministic,
-            "normalization": self.normalization,
-        }
 
     @property
     def render_device(self) -> torch.device:

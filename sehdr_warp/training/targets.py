@@ -10,7 +10,6 @@ from torch.nn import functional
 
 from ..model.camera_tensors import CameraTensors
 from ..rasterizer.code_residual import CodeScale, code_tensor
-from ..response import Response
 from ..scene import View
 from .losses import Target, code_scale, select_view
 
@@ -98,26 +97,10 @@ class ViewStack:
         return TrainingView(camera, time, replace(self.targets, **parts))
 
 
-def training_views(
-    views: Sequence[View], base_time: float, device, *, truth: bool, clipping=True, light: Response | None = None
-) -> list[TrainingView]:
-    """Upload views to a device.
-
-    Args:
-        views: The training views.
-        base_time: Exposure time dt_1 of the field, seconds.
-        device: Torch device.
-        truth: Also upload HDR truth.
-        clipping: Treat clipped codes as intervals.
-        light: Response by which exposures are compared, None to compare encoded values.
-    """
-    return list(photo_source(views, base_time, device, truth=truth, clipping=clipping, light=light))
-
-
 def photo_source(
     views, base_time: float, device, *, truth: bool, clipping=True, light=None, estimates: list[Tensor] | None = None
 ) -> "PhotoSource":
-    """Return the views of training_views() as a sequence that uploads each on access.
+    """Return training views as a sequence that uploads each on access.
 
     Args:
         views: The training views.

@@ -13,7 +13,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
 from sehdr_warp.training.seeding import seed_gaussians
-from sehdr_warp.training.targets import training_views
+from sehdr_warp.training.targets import photo_source
 from sehdr_warp.training.train import train
 
 from .wall_and_lamp import LAMP, WALL, wall_and_lamp
@@ -85,7 +85,7 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     wall = replace(scene, views=tuple(dark))
     field = make_field(wall, config, LINEAR, device)
     normalized = field.normalization.scene(scene)
-    views = training_views(normalized.train_views, field.base_time, device, truth=False)
+    views = photo_source(normalized.train_views, field.base_time, device, truth=False)
     matcher = make_matcher(normalized, LINEAR, device)
     with torch.no_grad():
         # Opaque, so that the wall is explained from the start.
