@@ -1,7 +1,5 @@
 """Command lines of `sehdr-warp export`, `mesh` and `convert`. torch is imported when they run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -108,7 +106,7 @@ class Mesh:
     """cpu or cuda:N; by default the first GPU if there is one."""
 
 
-def _splat_edits(options: EditOptions) -> SplatEdits:
+def _splat_edits(options: EditOptions) -> "SplatEdits":
     """Return edits that need no photos; raise SehdrError for values that cannot be."""
     from .splat_edits import SplatEdits
 
@@ -117,7 +115,7 @@ def _splat_edits(options: EditOptions) -> SplatEdits:
     return SplatEdits(**{name: value for name, value in vars(options).items() if name not in ("mask_only", "data")})
 
 
-def _with_masks(edits: SplatEdits, options: EditOptions, run: Run | Splats) -> SplatEdits:
+def _with_masks(edits: "SplatEdits", options: EditOptions, run: "Run | Splats") -> "SplatEdits":
     """Return edits with the photos' masks, if --mask-only asks for them."""
     from ..runs.run import Run
 

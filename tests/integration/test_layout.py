@@ -11,6 +11,7 @@ TOPICS = {
     "benchmarks": {"bench"},
     "blocks": {"shared_decisions"},
     "compat/gsplat": {"against_gsplat", "simple_trainer"},
+    "kernels": {"cuda_compilation"},
     "output": {"blender", "pictures"},
     "rasterizer": {"blend_blocks", "culling", "extremes", "properties", "rasterize"},
     "response": {"responses"},
