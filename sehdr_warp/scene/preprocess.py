@@ -104,7 +104,7 @@ def require_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], fold
         del codes, values  # Free the memory before the next photo is read.
     if visible < total * 1e-3 or total == 0:
         if total == 0:
-            remedy = "masks keep what is white, and of photos with transparency opaque pixels count"
+            remedy = "masks keep what is white, and transparent photos their opaque pixels"
             raise InputError(folder, "masks or transparency leave out all pixels of the training photos", remedy)
         state = f"black or white in {100 - 100 * visible / total:.1f} % (mean {light / total:.3f})"
         remedy = "expose them so that the scene shows, or choose another exposure index"

@@ -195,5 +195,5 @@ def test_masks_that_leave_out_everything_are_named(tmp_path):
     for photo in (tmp_path / "images").iterdir():
         (tmp_path / "masks").mkdir(exist_ok=True)
         Image.new("L", (64, 48)).save(tmp_path / "masks" / photo.name)
-    with pytest.raises(InputError, match="masks or transparency leave out all pixels .*; white keeps a pixel"):
+    with pytest.raises(InputError, match="masks or transparency leave out all pixels .*; masks keep what is white"):
         load(tmp_path)
