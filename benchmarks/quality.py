@@ -51,8 +51,8 @@ METHOD_FIELDS = (
     "response.name",
     *("fusion.enabled", "loss.form", "loss.ldr_weight", "loss.hdr_weight", "loss.linear_weight"),
 )
-"""What makes a method, which its plan does not change. Steps, learning rates and the largest number of Gaussians are
-planned for every method alike, also where its preset has no plan."""
+"""Fields that make a method: its plan does not change them. Steps, learning rates and the largest number of Gaussians
+are planned for every method alike, also where its preset has no plan."""
 WARM_UP_ITERATIONS = 30
 """Of a training that is thrown away before the first of its kind in a process: kernels are compiled, steps recorded.
 All schedules scale with the length, so every part of a training is in it."""

@@ -14,8 +14,8 @@ SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
 MOST_CLIPPED, LEAST_CLIPPED = 0.7, 5e-4  # Shares of a photo's pixels
 ROOM_SHARE = 0.35  # Of the photos of a training
 STRETCH_SHARE, MOST_STRETCH = 0.5, 2.2
-"""Of the photos, those whose light above white is raised to a random power up to this. Panoramas of 512 columns average
-small lamps with what surrounds them; photos resolve them."""
+"""Share of photos whose light above white is raised to a random power, and the largest power. Panoramas of 512 columns
+average small lamps with what surrounds them; photos resolve them."""
 PAGE_SHARE = 0.2  # Of the photos, those with a white surface that is no lamp
 PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
 LEVELS = 255

@@ -46,7 +46,7 @@ def test_the_subject_fits_into_every_picture(tmp_path):
 
 
 def test_a_path_shows_little_more_than_its_photos(tmp_path):
-    """Of photos that show a third of the ball: twice as much around it, and their height along an arc."""
+    """Show twice as much around a ball that fills a third of the photos, and their height along an arc."""
     run = ball(tmp_path)
     for span, height in ((360, 2 * 0.75), (90, 1.0)):
         photos = around(24, 4, span=span, fov=12)

@@ -146,13 +146,13 @@ def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
 
 
 def test_what_cannot_be_recorded_is_launched():
-    kind, asked = graph_cache.GraphPool(), []
+    pool, requests = graph_cache.GraphPool(), []
 
-    def record(pairs):
-        asked.append(pairs)
+    def record(intersections):
+        requests.append(intersections)
         raise torch.OutOfMemoryError("no memory")
 
-    assert not any(kind.take(record) for _ in range(graph_cache.WARMUP_CALLS + 5)) and len(asked) == 1
+    assert not any(pool.take(record) for _ in range(graph_cache.WARMUP_CALLS + 5)) and len(requests) == 1
 
 
 def test_only_the_latest_kinds_are_remembered():

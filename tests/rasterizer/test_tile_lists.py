@@ -112,16 +112,16 @@ def test_subtiles_are_those_that_an_ellipse_touches(device):
     columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
     (x, y, *_), (a, b, c, cutoff) = (record[lists.gaussians.long()].t()[..., None, None] for record in splats[:2])
     dx, dy = columns + 0.5 - x, rows + 0.5 - y
-    seen = a * dx * dx + 2 * b * dx * dy + c * dy * dy <= cutoff
+    visible = a * dx * dx + 2 * b * dx * dy + c * dy * dy <= cutoff
     lengths = (lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]).long()
     tiles = torch.repeat_interleave(torch.arange(4, device=device), lengths)
     # Rows of tiles, of subtiles, of pixels; then columns of each.
-    by_subtile = seen.view(-1, 2, 4, 4, 2, 2, 8).any(6).any(3)[torch.arange(len(tiles)), tiles // 2, :, tiles % 2]
-    told = (lists.subtile_masks[:, None].int() >> torch.arange(8, device=device)) & 1
-    assert len(tiles) == lists.intersection_count > 40 and 0.1 < told.float().mean() < 0.9
+    by_subtile = visible.view(-1, 2, 4, 4, 2, 2, 8).any(6).any(3)[torch.arange(len(tiles)), tiles // 2, :, tiles % 2]
+    flags = (lists.subtile_masks[:, None].int() >> torch.arange(8, device=device)) & 1
+    assert len(tiles) == lists.intersection_count > 40 and 0.1 < flags.float().mean() < 0.9
     # An ellipse may pass between the pixels of a subtile that it touches.
-    assert not (by_subtile.reshape(-1, 8) & ~told.bool()).any()
-    assert (by_subtile.reshape(-1, 8) == told.bool()).float().mean() > 0.95
+    assert not (by_subtile.reshape(-1, 8) & ~flags.bool()).any()
+    assert (by_subtile.reshape(-1, 8) == flags.bool()).float().mean() > 0.95
 
 
 @pytest.mark.parametrize("keep_emit_order", [False, True])

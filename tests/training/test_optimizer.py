@@ -20,13 +20,13 @@ def test_a_guarded_step_is_made_or_left_out_whole(device, incomplete, bad):
     before = means.detach().clone()
     loss = (means * (nan if bad else 1.0)).sum()
     loss.backward()
-    told = None if incomplete is None else torch.tensor(incomplete, device=device)
+    flag = None if incomplete is None else torch.tensor(incomplete, device=device)
     step_counters = torch.zeros(3, dtype=torch.int64, device=device)
-    made = guarded_step(optimizer, loss, told, step_counters=step_counters)
+    step = guarded_step(optimizer, loss, flag, step_counters=step_counters)
     assert step_counters.tolist() == [bad, 0, 0]
-    assert bool(made) == (not bad and not incomplete)
-    assert torch.equal(means, before) == (not bool(made))
-    assert float(optimizer.state[means]["step"]) == float(made)
+    assert bool(step) == (not bad and not incomplete)
+    assert torch.equal(means, before) == (not bool(step))
+    assert float(optimizer.state[means]["step"]) == float(step)
 
 
 @pytest.mark.parametrize(("iterations", "batch", "interval"), [(4000, 1, 2), (3999, 1, 1), (8000, 2, 2), (7999, 2, 1)])
