@@ -16,8 +16,8 @@ from sehdr_warp.files import read_json, write_json
 from sehdr_warp.parallel import thread_count
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.training.launch import RankInfo, device_of_rank
 from sehdr_warp.training.machine import torch_settings
-from sehdr_warp.training.rank_info import RankInfo, device_of_rank
 from sehdr_warp.training.ranks import GO, Ranks, join_ranks
 
 from .results import check, new_result

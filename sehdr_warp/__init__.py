@@ -34,9 +34,8 @@ _HOMES = {
     "training.initialization": ("match_points",),
     "training.plan": ("Plan", "make_plan"),
     "runs.run": ("Run", "Splats", "load_run", "load_splats"),
-    "training.step": ("Step",),
     "training.train": ("create_trainer", "train"),
-    "training.trainer": ("Trainer",),
+    "training.trainer": ("Step", "Trainer"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)  # noqa: PLE0605 # pyright: ignore[reportUnsupportedDunderAll]

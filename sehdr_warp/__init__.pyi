@@ -19,9 +19,8 @@ from .scene import Camera, Scene, View, embedded_scenes, load_cameras, load_scen
 from .scene.stack import calibrate
 from .training.initialization import match_points
 from .training.plan import Plan, make_plan
-from .training.step import Step
 from .training.train import create_trainer, train
-from .training.trainer import Trainer
+from .training.trainer import Step, Trainer
 
 __all__ = [
     "Camera",

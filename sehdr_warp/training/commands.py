@@ -112,7 +112,7 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         args: the options.
         argv: the words of the command line, with which --gpus starts the other ranks.
     """
-    from .rank_info import device_of_rank, launched_as
+    from .launch import device_of_rank, launched_as
 
     gpus, info = args.machine.gpus, launched_as()
     if gpus < 1:
@@ -156,7 +156,7 @@ def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, or print a plan, on this rank."""
     from ..runs.device import pick_device
     from ..runs.run_writer import RunWriter
-    from .hdr_truth import check_dataset_truth
+    from .losses import check_dataset_truth
 
     output, resumed, out = args.output, None, args.output.out
     if args.training.plan_only:
@@ -253,7 +253,7 @@ def _train_blocks(args: Train) -> None:
     from ..blocks.block_plan import BlockPlan
     from ..blocks.train import is_in_blocks, train_in_blocks
     from ..runs.device import pick_device
-    from .rank_info import device_of_rank
+    from .launch import device_of_rank
 
     output, machine = args.output, args.machine
     if output.out is None:
@@ -349,7 +349,7 @@ def _config(args: Train, saved):
 
 def _ending(path: Path, summary: dict) -> str:
     """Return the lines that end a training: its result, and what to type next."""
-    from .held_out import format_scores
+    from .run_output import format_scores
 
     scores = [figures for line in summary["metrics"] if (figures := format_scores(line))]
     heldout = f", {scores[-1]}" if scores else ""

@@ -4,8 +4,9 @@ The evidence is the light of points that several photos show: the gains that exp
 scene.exposure_compensation, and only the parts that clearly explain them are corrected.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from ..scene.exposure_compensation import (
     remaining_vignetting,
     rough_gains,
 )
+from ..scene.normalization import normalization_of
 from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
 from .plan import Decision
@@ -104,6 +106,23 @@ class Compensation:
 
 
 @dataclass(frozen=True)
+class PreparedPhotos:
+    """Photos to train on.
+
+    Attributes:
+        scene: The scene, with drift of exposure, white balance and vignetting taken out of its photos.
+        gains: The drift; None if there is none.
+        matcher: Returns the matcher of the training photos, which is created once.
+        decision: Line of the plan; None if nothing was estimated.
+    """
+
+    scene: Scene
+    gains: ExposureCompensation | None
+    matcher: Callable[[], Matcher]
+    decision: Decision | None
+
+
+@dataclass(frozen=True)
 class SharedDecisions:
     """Decisions that several trainings of one set of photos share, so that their Gaussians have the same colors.
 
@@ -122,6 +141,37 @@ class SharedDecisions:
         names = {view.name for view in views}
         parts = ({name: value for name, value in part.items() if name in names} for part in vars(self.gains).values())
         return ExposureCompensation(*parts)
+
+
+def prepare_photos(
+    scene: Scene,
+    config: Config,
+    response: Response,
+    device: torch.device | str,
+    shared: SharedDecisions | None = None,
+    *,
+    estimate: bool = True,
+) -> PreparedPhotos:
+    """Take drift of exposure, white balance and vignetting out of the photos of a scene.
+
+    Args:
+        scene: The scene, in its own coordinates.
+        config: Options of the training, after the plan.
+        response: Response of the camera.
+        device: Device to match points on.
+        shared: Decisions of a larger set that the scene is part of, which replace an estimate.
+        estimate: Estimate a compensation if the config asks for it.
+    """
+    normalization = normalization_of(scene)
+    if shared is None and estimate and estimates_compensation(scene, config, response):
+        result = estimate_compensation(normalization.scene(scene), config, response, device)
+        gains, decision, matcher = result.gains, result.decision, lambda: result.matcher
+    else:
+        gains, decision, matcher = None if shared is None else shared.gains_of(scene.views), None, None
+    if gains is not None:
+        scene = gains.normalize_photos(scene, response)
+    matcher = matcher or cache(partial(make_matcher, normalization.scene(scene), response, device))
+    return PreparedPhotos(scene, gains, matcher, decision)
 
 
 def estimates_compensation(scene: Scene, config: Config, response: Response) -> bool:

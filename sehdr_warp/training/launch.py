@@ -1,21 +1,136 @@
-"""Start the ranks of a multi-GPU training as processes of this machine, and end them together."""
+"""Processes that train together: start them for --gpus, and read rank and node that torchrun or --gpus state."""
 
 import logging
 import os
+import platform
 import signal
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import timedelta
 from multiprocessing.connection import wait
 from pathlib import Path
 
+import torch
 import torch.distributed as dist
 import torch.multiprocessing as processes
 
-from ..errors import SehdrError
-from .rank_info import FILE_STORE
+from ..errors import InputError, SehdrError
 
+FILE_STORE = "SEHDR_RANKS"
+"""Environment variable with the file through which the ranks of --gpus find each other."""
 GRACE = 5.0  # Seconds that other ranks have to end after one has ended, and again after SIGTERM
+
+
+@dataclass(frozen=True)
+class RankInfo:
+    """Rank and node of a process.
+
+    Attributes:
+        rank: Number among all processes.
+        count: Number of processes.
+        local_rank: Number among those of this node.
+        local_count: Processes of this node.
+        node: Number of this node.
+        nodes: Number of nodes.
+    """
+
+    rank: int
+    count: int
+    local_rank: int
+    local_count: int
+    node: int = 0
+    nodes: int = 1
+
+    @staticmethod
+    def on_one_node(rank: int, count: int) -> "RankInfo":
+        """Return the info of a rank if all are on this machine."""
+        return RankInfo(rank, count, rank, count)
+
+    @property
+    def several_nodes(self) -> bool:
+        """True if the processes are on several nodes."""
+        return self.nodes > 1
+
+    @property
+    def leads_node(self) -> bool:
+        """True for the process of a node that reads the photos for it."""
+        return self.local_rank == 0
+
+    def __str__(self) -> str:
+        """Return the rank, with its node if there are several."""
+        where = f" on node {self.node} ({platform.node()})" if self.several_nodes else ""
+        return f"rank {self.rank} of {self.count}{where}"
+
+    def node_of(self, rank: int) -> int:
+        """Return the node of another rank; nodes have equal numbers of processes, and ranks in order."""
+        return rank // self.local_count
+
+
+def launched_as() -> RankInfo | None:
+    """Return the info that a launcher sets for this process; None if there is no launcher, or one process."""
+
+    def number(name: str, default: int) -> int:
+        with suppress(KeyError, ValueError):
+            return int(os.environ[name])
+        return default
+
+    try:
+        rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    except (KeyError, ValueError):
+        return None
+    local_count = number("LOCAL_WORLD_SIZE", count)
+    local_rank, node = number("LOCAL_RANK", rank % local_count), number("GROUP_RANK", rank // local_count)
+    nodes = number("GROUP_WORLD_SIZE", -(-count // local_count))
+    if nodes * local_count != count:
+        problem = f"{count} ranks on {nodes} nodes, and {local_count} on this one"
+        raise SehdrError(f"{problem}: start as many on each, with --nproc-per-node")
+    return RankInfo(rank, count, local_rank, local_count, node, nodes) if count > 1 else None
+
+
+def device_of_rank(rank: int, device: str | None) -> torch.device:
+    """Return the device of a rank, by its number on its node: a GPU of its own, or the CPU if named or without GPUs."""
+    if device not in (None, "cpu", "cuda"):
+        raise InputError(f"device {device}", "is one, and each rank takes its own", "use cpu or cuda, or leave it out")
+    if device == "cpu" or (device is None and not torch.cuda.is_available()):
+        if rank >= (most := max(2, os.cpu_count() or 1)):
+            raise SehdrError(f"{rank + 1} ranks on {os.cpu_count()} processors: start {most} at most")
+        return torch.device("cpu")
+    if (there := torch.cuda.device_count()) <= rank:
+        raise SehdrError(f"rank {rank} finds {there} GPUs: start as many ranks as there are, or give --device cpu")
+    return torch.device("cuda", rank)
+
+
+def open_store(info: RankInfo, patience: float) -> dist.Store:
+    """Return the store of the ranks: a file of --gpus, or torchrun's server.
+
+    Args:
+        info: Of this process.
+        patience: Seconds to wait for the server.
+
+    Raises:
+        SehdrError: If there is no server, naming its address.
+    """
+    if path := os.environ.get(FILE_STORE):
+        return dist.FileStore(path, info.count + 1)
+    if missing := [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]:
+        problem = f"RANK and WORLD_SIZE are set, and {' and '.join(missing)} not"
+        raise SehdrError(f"{problem}: start with torchrun or --gpus, or unset RANK")
+    host, port = os.environ["MASTER_ADDR"], os.environ["MASTER_PORT"]
+    of_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    serves = info.rank == 0 and not of_agent
+    try:
+        # Not torch's rendezvous(), which does not say who is missing.
+        wait = timedelta(seconds=patience)
+        store = dist.TCPStore(host, int(port), info.count, serves, wait, wait_for_workers=False)
+        # An agent's server outlives a restart of its processes.
+        return dist.PrefixStore(f"attempt_{os.environ['TORCHELASTIC_RESTART_COUNT']}", store) if of_agent else store
+    except (RuntimeError, ValueError) as error:
+        problem = f"{info} cannot {'serve' if serves else 'reach'} {host}:{port} ({str(error).splitlines()[0]:.120})"
+        remedy = "check that node 0 runs and that this port is free and open, and start with torchrun"
+        raise SehdrError(f"{problem}; {remedy}") from None
 
 
 def launch(count: int, run: Callable[[list[str]], None], words: list[str]) -> None:

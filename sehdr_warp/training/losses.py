@@ -1,18 +1,22 @@
-"""The loss of a training step: photos against rendered photos, HDR truth against exposures."""
+"""The loss of a training step, and the HDR truth that it needs: photos against renders, truth against exposures."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..errors import InputError
 from ..model.radiance_field import RadianceField, TrainRender
 from ..rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from ..rasterizer.code_residual import CodeScale, code_residual, code_values
 from ..rasterizer.photo_loss import photo_loss
 from ..rasterizer.ssim import image_distance, ssim
 from ..response import Response, ToneMapper
-from ..runs.config import LossConfig
+from ..runs.config import Config, LossConfig
+from ..scene import Scene
 
 CODE = 1 / 255  # One step of an 8-bit photo
 MU = 5000.0  # Parameter of the mu-law in which HDR images are compared
@@ -20,6 +24,7 @@ KNEE = 8.0  # Code of 255 at white / mu in the mu-law of photos, linear below an
 INTERVALS_FROM = 0.85
 """Fraction of a training after which bright codes are intervals. From the start, clipped light would have fewer pixels
 around it that determine it."""
+_REMEDY = "take a scene with HDR truth, or a preset that needs none"
 ANCHOR = 0.5  # Encoded value of the unit exposure that anchor_loss aims at: the middle of the range
 
 
@@ -236,3 +241,69 @@ def data_loss(
 def with_opacity_penalty(loss: Tensor, photo: TrainRender) -> Tensor:
     """Return the loss plus the opacity penalty, if the view was rendered with an opacity weight."""
     return loss if photo.opacity_penalty is None else loss + photo.opacity_penalty
+
+
+def largest_hdr_truth(scene: Scene, loss: LossConfig) -> float:
+    """Return the largest radiance in the HDR truth of the training views inside masks; 1.0 if the loss needs none.
+
+    Raises:
+        InputError: With scene and field, if truth that the loss needs is missing or black.
+    """
+    check_scene_truth(scene, loss)
+    if not loss.uses_hdr:
+        return 1.0
+    truths = [(view.hdr, view.mask) for view in scene.train_views if view.hdr is not None]
+    values = (hdr if mask is None else hdr[mask > 0] for hdr, mask in truths)
+    largest = max((float(radiance.max()) for radiance in values if radiance.size), default=0.0)
+    if not largest > 0:
+        problem = f"the HDR truth that {_truth_field(loss)} needs is black in every training view"
+        raise InputError(scene.name, problem, _REMEDY)
+    return largest
+
+
+def check_hdr_truth(scene: str, views: Sequence[tuple[str, bool]], loss: LossConfig) -> None:
+    """Raise InputError, with scene and field, if HDR truth that the loss needs is missing.
+
+    Args:
+        scene: Name of the scene.
+        views: For each training view its name and whether it has HDR truth.
+        loss: The loss.
+    """
+    if not loss.uses_hdr:
+        return
+    if not any(has_truth for _, has_truth in views):
+        problem = f"no training view has the HDR truth that {_truth_field(loss)} needs"
+        raise InputError(scene, problem, _REMEDY)
+    if loss.ldr_weight == 0 and (lacking := next((name for name, has_truth in views if not has_truth), None)):
+        problem = f"view {lacking} lacks the HDR truth that {_truth_field(loss)} needs where loss.ldr_weight = 0.0"
+        raise InputError(scene, problem, _REMEDY)
+
+
+def _truth_field(loss: LossConfig) -> str:
+    """Return the field of the loss that needs HDR truth, with its value."""
+    return f"loss.hdr_weight = {loss.hdr_weight}" if loss.hdr_weight > 0 else "loss.hdr_truth = true"
+
+
+def check_scene_truth(scene: Scene, loss: LossConfig) -> None:
+    """Raise InputError if training views of a scene lack HDR truth that the loss needs."""
+    check_hdr_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], loss)
+
+
+def check_dataset_truth(data: Mapping[str, Any], config: Config) -> None:
+    """Raise InputError if a dataset lacks HDR truth that the loss needs, before its photos are read.
+
+    Args:
+        data: Arguments of load_scene().
+        config: Config before the plan.
+    """
+    from ..scene.load import parse_dataset
+    from ..scene.names import unique_names
+
+    # A plan removes the loss between brackets and truth that is missing.
+    removed = config.plan.enabled and not config.loss.hdr_weight
+    if not config.loss.uses_hdr or removed:
+        return
+    dataset = parse_dataset(data["path"], exposure_index=data.get("exposure_index"), holdout=data.get("holdout"))
+    records = zip(unique_names(dataset.records), dataset.records, strict=True)
+    views = [(name, record.hdr is not None) for name, record in records if record.split == "train"]
+    check_hdr_truth(dataset.name, views, config.loss)

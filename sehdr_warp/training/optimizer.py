@@ -1,4 +1,4 @@
-"""Adam over the Gaussians, the fusion and a learned response, with 3DGS's learning rates.
+"""Adam over the Gaussians, the fusion and a learned response, with 3DGS's learning rates; and the moving average.
 
 For steps of B photos, learning rates are multiplied by the square root of B, and the decays of the moments are raised
 to the power of B: gradients of photos count as independent, so that B photos move a parameter about as far, and with
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..model.adam import BETAS, FIRST_HARMONIC, Adam
-from ..model.gaussians import PARAMETER_NAMES
+from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients
 from ..rasterizer.training_step import check_finite, norms
@@ -22,6 +22,8 @@ from ..runs.config import Config
 # Higher harmonics are 3/4 of all parameters and the Adam step is bandwidth-bound, so on a GPU only every second part of
 # them is updated per step.
 SH_UPDATE_INTERVAL = 2
+SAMPLES_PER_WINDOW = 10  # Of the moving average; consecutive iterations differ too little to be worth the time
+WINDOWS = 5  # Windows before the end at which the average begins; older samples would weigh less than 1 %
 SH_INTERVAL_FROM = 4000  # Steps of the shortest training to which SH_UPDATE_INTERVAL applies; shorter ones lose quality
 
 
@@ -208,3 +210,52 @@ def _parameters_by_name(optimizer: Adam) -> Iterator[tuple[str, Tensor]]:
     for group in optimizer.param_groups:
         for index, parameter in enumerate(group["params"]):
             yield f"{group['name']}.{index}.", parameter
+
+
+class MovingAverage:
+    """Exponential moving average of Gaussians over about schedule.ema_window of the last iterations.
+
+    With it no single photo dominates the end of a training. It starts after the last change of the number of Gaussians.
+
+    Attributes:
+        every: Iterations between samples.
+        weight: Weight of a new sample; 1 disables the average.
+        first: Iteration after which samples are taken.
+        means: The averages by parameter name; empty before the first sample.
+    """
+
+    def __init__(self, config: Config, last_change: int):
+        """Create an average without samples; `last_change` is the last iteration that changes the Gaussians' number."""
+        self.total = config.schedule.iterations
+        window = config.scaled(config.schedule.ema_window) if config.schedule.ema_window else 1
+        self.every = max(1, window // SAMPLES_PER_WINDOW)
+        self.weight = self.every / window
+        self.first = max(self.total - WINDOWS * window, last_change)
+        self.means: dict[str, Tensor] = {}
+
+    @torch.no_grad()
+    def update(self, iteration: int, photos: int, gaussians: Gaussians) -> None:
+        """Update the average after a step of `photos` iterations; at the last iteration, copy it to the Gaussians."""
+        if self.weight == 1 or iteration <= self.first:
+            return
+        if iteration % self.every < photos or iteration >= self.total:
+            now = gaussians.tensors()
+            if self.means:
+                # A plain mean at first, so that the first sample does not weigh more than others.
+                samples = (iteration - self.first) // self.every
+                means = [self.means[name] for name in now]
+                torch._foreach_lerp_(means, list(now.values()), max(self.weight, 1 / (samples + 1)))
+            else:
+                self.means = {name: values.clone() for name, values in now.items()}
+        if iteration >= self.total:
+            for name, values in gaussians.tensors().items():
+                values.copy_(self.means[name])
+            self.means = {}
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the averages for a checkpoint."""
+        return self.means
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from the averages of state()."""
+        self.means = state

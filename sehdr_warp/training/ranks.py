@@ -29,7 +29,7 @@ from ..model.adam import Adam
 from ..model.gaussians import Gaussians
 from ..parallel import WAITING_NOTICE, run_interruptibly, thread_count
 from ..scene.photo_file import PhotoFile, can_share, open_shared
-from .rank_info import RankInfo, open_store
+from .launch import RankInfo, open_store
 from .strategies import Strategy
 
 log = logging.getLogger(__name__)

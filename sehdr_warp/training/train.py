@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Iterator, Mapping
-from functools import cache, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,10 @@ from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
 from ..scene import Scene
 from ..scene.normalization import normalization_of
-from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
+from .compensation import SharedDecisions, prepare_photos
 from .following import send_training, several_ranks_notes
-from .hdr_truth import check_scene_truth
-from .initialization import make_field, make_matcher, response_for_training, sizes_of
+from .initialization import make_field, response_for_training, sizes_of
+from .losses import check_scene_truth
 from .machine import Stopwatch, summary_writer
 from .plan import apply_plan
 from .ranks import Ranks
@@ -93,12 +92,11 @@ def create_trainer(
         resumes = folder.check(resume=resume, overwrite=overwrite)
         try:
             if resumes:
-                trainer = _resume(scene, folder, config, device, ranks, tensorboard)
+                trainer = _resumed_trainer(scene, folder, config, device, ranks, tensorboard)
             else:
                 config = config or Config()
-                trainer = _begin(
-                    scene, folder, config, device, ranks, tensorboard, data or {}, shared, overwrite=overwrite
-                )
+                options = (ranks, tensorboard, data or {}, shared)
+                trainer = _new_trainer(scene, folder, config, device, *options, overwrite=overwrite)
             if ranks is not None:
                 send_training(ranks, trainer, exposure_compensation(folder.read_info()))
         except BaseException:
@@ -111,7 +109,7 @@ def create_trainer(
     return trainer
 
 
-def _begin(
+def _new_trainer(
     scene: Scene,
     folder: RunWriter,
     config: Config,
@@ -123,41 +121,31 @@ def _begin(
     *,
     overwrite: bool,
 ) -> Trainer:
-    """Plan, choose the response, compensate exposure, initialise the field, and begin the run folder."""
+    """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder."""
     watch = Stopwatch()
-    normalized = normalization_of(scene).scene(scene)
-    config, plan = apply_plan(normalized, config, device)
+    config, plan = apply_plan(normalization_of(scene).scene(scene), config, device)
     check_scene_truth(scene, config.loss)
     response = response_for_training(scene, config)
-    matcher, gains = cache(partial(make_matcher, normalized, response, device)), None
-    compensated = scene
-    if shared is not None:
-        gains = shared.gains_of(scene.views)
-        compensated = scene if gains is None else gains.normalize_photos(scene, response)
-        matcher = cache(partial(make_matcher, normalization_of(scene).scene(compensated), response, device))
-    elif plan is not None and estimates_compensation(scene, config, response):
-        with watch:
-            result = estimate_compensation(normalized, config, response, device)
-        gains, plan = result.gains, plan.with_decision(result.decision)
-        matcher = lambda: result.matcher  # noqa: E731
-        compensated = scene if gains is None else gains.normalize_photos(scene, response)
     with watch:
-        time = None if shared is None else shared.base_time
-        field = make_field(compensated, config, response, device, matcher, time)
+        photos = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
+        base_time = None if shared is None else shared.base_time
+        field = make_field(photos.scene, config, response, device, photos.matcher, base_time)
     output = RunOutput(folder, config, tensorboard=tensorboard)
-    trainer = Trainer(compensated, config, field, matcher=matcher, ranks=ranks, output=output)
+    trainer = Trainer(photos.scene, config, field, matcher=photos.matcher, ranks=ranks, output=output)
     trainer.seconds = watch.seconds
+    if plan is not None and photos.decision is not None:
+        plan = plan.with_decision(photos.decision)
     # The folder is begun last, when the scene is known to be usable.
     tensors, values = trainer.state()
     state = tensors, values | {"seconds": trainer.seconds}
     plan_values = None if plan is None else plan.to_dict()
-    folder.begin(scene, config, field, data, plan_values, state, gains=gains, overwrite=overwrite)
+    folder.begin(scene, config, field, data, plan_values, state, gains=photos.gains, overwrite=overwrite)
     for line in plan.lines() if plan is not None else ():
         log.info("%s", line)
     return trainer
 
 
-def _resume(
+def _resumed_trainer(
     scene: Scene,
     folder: RunWriter,
     config: Config | None,

@@ -23,25 +23,61 @@ from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..runs.run import Run, as_rec709
 from ..scene import Camera, Scene
-from . import optimizer as adam
 from .initialization import sizes_of
 from .losses import data_loss, extra_images, with_opacity_penalty
 from .machine import interruptible, torch_settings
 from .matching import Matcher
+from .optimizer import guarded_step, means_rate, set_means_rate
 from .photo_stream import PhotoStream
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .seeding import seed_gaussians
-from .step import Step
-from .step_values import Gradients, StepResult
 from .strategies import SEED_STRIDE, Proposals
 from .targets import TrainingView, ViewStack
-from .training_state import TrainingState
+from .training_state import Gradients, StepResult, TrainingState
 
 log = logging.getLogger(__name__)
 
 CHECK_EVERY = 20  # Iterations between checks of the counts that steps keep on the device
 COMPARE_EVERY = 500  # Iterations between checks that all ranks have the same Gaussians
+
+
+class Step:
+    """Values of a training after a step.
+
+    `loss`, `psnr` and `gaussians` are read from the device when they are accessed, until the next step.
+
+    Attributes:
+        iteration: Iterations done.
+        total: Iterations in all.
+        seconds: Duration of the training so far.
+        seconds_left: Estimated time to the end; None after the first step.
+    """
+
+    def __init__(self, trainer: TrainingState):
+        """Take the values of a trainer after a step."""
+        self._trainer = trainer
+        self.iteration, self.total, self.seconds = trainer.iteration, trainer.total, trainer.seconds
+        self.seconds_left: float | None = None
+
+    def __repr__(self) -> str:
+        """Return iteration and time; nothing is read from the device."""
+        return f"Step({self.iteration} of {self.total}, {self.seconds:.1f} s)"
+
+    @property
+    def loss(self) -> float:
+        """Loss of the step."""
+        return self._trainer.timed(lambda: self._trainer.loss)
+
+    @property
+    def psnr(self) -> float:
+        """PSNR of the step's photo, dB."""
+        return self._trainer.timed(self._trainer.psnr)
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians."""
+        return self._trainer.field.gaussians.count
 
 
 class Trainer(TrainingState):
@@ -171,8 +207,8 @@ class Trainer(TrainingState):
         self.iteration += self.step_batch
         views, gaussians = self._training_views(), self.field.gaussians
         index = self._view_index = self.order.next()
-        means_lr = adam.means_rate(self.config, self.extent, self.iteration, self.batch)
-        adam.set_means_rate(self.optimizer, means_lr)
+        means_lr = means_rate(self.config, self.extent, self.iteration, self.batch)
+        set_means_rate(self.optimizer, means_lr)
         if self.reserves_rows and not self._rows:
             self._reserve_rows()
         needs_means2d_grad = self.strategy.needs_gradients(self.iteration)
@@ -268,7 +304,7 @@ class Trainer(TrainingState):
         incomplete = rendering.overflow
         if self._flat is not None:
             loss, incomplete, harmonics = self._flat.distribute()
-        applied = adam.guarded_step(
+        applied = guarded_step(
             self.optimizer,
             loss,
             incomplete,

@@ -1,40 +1,118 @@
 """State of a training: scene, field, optimizer, strategy, random generators."""
 
+import operator
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from ..errors import SehdrError
+from ..errors import InputError, SehdrError
 from ..model.radiance_field import RadianceField
+from ..rasterizer import HarmonicsGradients, Rendering
 from ..rasterizer.code_residual import CodeScale
 from ..runs.checkpoint import under
 from ..runs.config import Config
 from ..runs.light_estimates import light_estimates
 from ..scene import Scene
-from . import optimizer as adam
-from .graph_capacity import GraphCapacity
-from .hdr_truth import largest_hdr_truth
 from .initialization import make_matcher, scene_extent
-from .losses import INTERVALS_FROM, compares_exposures
+from .losses import INTERVALS_FROM, compares_exposures, largest_hdr_truth
 from .matching import Matcher
-from .moving_average import MovingAverage
-from .photo_order import PhotoOrder
+from .optimizer import FlatGradients, MovingAverage, load_optimizer_tensors, make_optimizer, optimizer_tensors
 from .photo_stream import PhotoStream, make_view_source
 from .ranks import Ranks
-from .step_graphs import StepGraphs
-from .step_values import StepResult
+from .step_graphs import GraphCapacity, StepGraphs
 from .strategies import make_strategy
 from .targets import TrainingView, ViewStack, photo_source
-from .wide_views import has_wide_views
 
 T = TypeVar("T")
 
 MAX_RESERVE = 1.5  # Largest number of reserved rows as a multiple of the count; they cost memory and a little time
 MAX_SKIPPED = 20  # More skipped steps than this end the training; a step is skipped if it is not finite
+
+
+def has_wide_views(scene: Scene, config: Config) -> bool:
+    """Return whether some training views are not pinholes.
+
+    Raises:
+        InputError: if there are, and the densification needs projected centers, which only pinholes have.
+    """
+    wide = next((view for view in scene.train_views if not view.camera.is_pinhole), None)
+    if wide is not None and config.densification.strategy != "mcmc":
+        problem = f"view {wide.name} is {wide.camera.projection}, for which densification.strategy = "
+        problem += f"{config.densification.strategy!r} has no projected centers"
+        raise InputError(scene.name, problem, "use densification.strategy=mcmc")
+    return wide is not None
+
+
+class PhotoOrder:
+    """The order of `count` photos; all ranks draw the same order, and each takes its own photo of a step."""
+
+    def __init__(self, count: int, seed: int, rank: int = 0, ranks: int = 1):
+        """Create an order.
+
+        Args:
+            count: Number of photos.
+            seed: Seed of the order.
+            rank: Number of this process.
+            ranks: Number of processes that train together.
+        """
+        self._count, self._rank, self._ranks = count, rank, ranks
+        self._remaining: list[int] = []
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def next(self) -> int:
+        """Return the index of this rank's next photo."""
+        batch = []
+        for _ in range(self._ranks):
+            if not self._remaining:
+                self._remaining = torch.randperm(self._count, generator=self._generator).tolist()
+            batch.append(self._remaining.pop())
+        return batch[self._rank]
+
+    def peek(self) -> int | None:
+        """Return what next() will return, or None if a new order has to be drawn first."""
+        return self._remaining[-1 - self._rank] if self._rank < len(self._remaining) else None
+
+    def state(self) -> tuple[Tensor, list[int]]:
+        """Return the generator's state and the photos that remain of this order."""
+        return self._generator.get_state(), list(self._remaining)
+
+    def load_state(self, generator: Tensor, remaining: list) -> None:
+        """Continue from state(); raises ValueError if it names photos that do not exist."""
+        self._generator.set_state(generator.cpu())
+        self._remaining = [operator.index(photo) for photo in remaining]
+        if not all(0 <= photo < self._count for photo in self._remaining):
+            raise ValueError(f"the order of the photos names others than the {self._count} there are")
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Result of Trainer.compute_gradients, beside the gradients that the parameters hold.
+
+    Attributes:
+        loss: Scalar loss of this rank's photo.
+        image: [H, W, 3] rendered image that was compared with the photo.
+        rendering: Result of the rasterizer, without tensors that nothing reads any more.
+        needs_means2d_grad: Whether the strategy accumulates the gradients of the projected means.
+        harmonics: Gradients of the harmonics in factored form; None if the parameters hold them.
+    """
+
+    loss: Tensor
+    image: Tensor
+    rendering: Rendering
+    needs_means2d_grad: bool
+    harmonics: HarmonicsGradients | None
+
+
+class StepResult(NamedTuple):
+    """Loss of a step, mean over the ranks, and the image [H, W, 3] that was compared with this rank's photo."""
+
+    loss: Tensor
+    image: Tensor
 
 
 class TrainingState:
@@ -75,7 +153,7 @@ class TrainingState:
         normalized = field.normalization.scene(scene)
         views = self._views = normalized.train_views
         self.extent = scene_extent(normalized)
-        self.optimizer = adam.make_optimizer(field, config, self.extent, self.batch)
+        self.optimizer = make_optimizer(field, config, self.extent, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in views)
         positions = torch.tensor([view.camera.position.tolist() for view in views], device=self.device)
         self.strategy = make_strategy(config, self.extent, pixels, positions)
@@ -102,7 +180,7 @@ class TrainingState:
         field.gaussians.release()
         # On a GPU, gradients of the harmonics stay in factored form: they would be 48 numbers per Gaussian.
         self.factored = self.device.type == "cuda"
-        self._flat: adam.FlatGradients | None = None
+        self._flat: FlatGradients | None = None
 
     @property
     def degree(self) -> int:
@@ -178,7 +256,7 @@ class TrainingState:
             "gaussians": self.field.gaussians.tensors(),
             "fusion": {} if self.field.fusion is None else self.field.fusion.state_dict(),
             "response": response.state_dict() if isinstance(response, torch.nn.Module) else {},
-            "optimizer": adam.optimizer_tensors(self.optimizer, self.batch),
+            "optimizer": optimizer_tensors(self.optimizer, self.batch),
             "densification": self.strategy.state(self.field.gaussians.count),
             "average": self.average.state(),
         }
@@ -189,7 +267,7 @@ class TrainingState:
 
     def load_state(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
         """Continue from state(); the field's Gaussians must already be those of the state."""
-        adam.load_optimizer_tensors(self.optimizer, under(tensors, "optimizer."), self.batch)
+        load_optimizer_tensors(self.optimizer, under(tensors, "optimizer."), self.batch)
         statistics = {name: value.to(self.device) for name, value in under(tensors, "densification.").items()}
         self.strategy.load_state(statistics)
         self.average.load_state({name: value.to(self.device) for name, value in under(tensors, "average.").items()})
@@ -212,11 +290,11 @@ class TrainingState:
         if gaussians.reserved != self._rows:
             gaussians.reserve(self._rows, self.optimizer)
 
-    def _flat_gradients(self) -> adam.FlatGradients:
+    def _flat_gradients(self) -> FlatGradients:
         """Return the buffer of all gradients, which ranks exchange; allocated anew when parameters change."""
         if self._flat is None or not self._flat.fits(self.optimizer):
             self._flat = None  # Freed first, because it is large.
-            self._flat = adam.FlatGradients(self.optimizer, self.rank, self.batch, factored=self.factored)
+            self._flat = FlatGradients(self.optimizer, self.rank, self.batch, factored=self.factored)
         return self._flat
 
     def _training_views(self) -> ViewStack | PhotoStream | Sequence[TrainingView]:

@@ -1,8 +1,8 @@
 """Whole trainings on a GPU, with recorded steps and with launched ones."""
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training.held_out import evaluate_views
 from sehdr_warp.training.initialization import make_field, response_for_training
+from sehdr_warp.training.run_output import evaluate_views
 from sehdr_warp.training.trainer import Trainer
 
 

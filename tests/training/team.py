@@ -18,7 +18,7 @@ def run_team(work, folder: Path, *arguments) -> None:
 
 
 def _rank(rank: int, work, folder: Path, arguments: tuple) -> None:
-    from sehdr_warp.training.rank_info import RankInfo
+    from sehdr_warp.training.launch import RankInfo
     from sehdr_warp.training.ranks import join_ranks
 
     os.environ |= {"WORLD_SIZE": str(RANKS), "SEHDR_RANKS": str(folder / "meeting"), "SEHDR_RANK_TIMEOUT": "60"}

@@ -17,7 +17,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder, describe_scene
 from sehdr_warp.training.following import _check_same_photos
-from sehdr_warp.training.rank_info import RankInfo, launched_as
+from sehdr_warp.training.launch import RankInfo, launched_as
 
 from ..refusals import call
 from .toy import toy_scene

@@ -1,14 +1,17 @@
-"""Learning rates over a training."""
+"""Learning rates over a training, and the moving average that it ends with."""
 
 from math import nan
 
 import pytest
 import torch
 
+from sehdr_warp.runs.checkpoint import Checkpoint
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.training.optimizer import guarded_step, make_optimizer
+from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.training.optimizer import WINDOWS, MovingAverage, guarded_step, make_optimizer
+from sehdr_warp.training.train import create_trainer, train
 
-from .toy import toy_field
+from .toy import QUICK, load_unscaled, toy_field
 
 
 @pytest.mark.parametrize("incomplete", [None, False, True])
@@ -33,3 +36,57 @@ def test_a_guarded_step_is_made_or_left_out_whole(device, incomplete, bad):
 def test_harmonics_step_in_turn_where_there_are_steps_enough(iterations, batch, interval):
     config = load_config("default", {"schedule.iterations": iterations})
     assert make_optimizer(toy_field(), config, 1.0, batch).sh_update_interval == interval
+
+
+AVERAGED = QUICK | {"schedule.iterations": 40, "schedule.ema_window": 4500, "densification.refine_stop_iter": 20}
+
+
+class Moving:
+    """Gaussians of one number, which is the iteration."""
+
+    def __init__(self):
+        self.value = torch.zeros(3)
+
+    def tensors(self):
+        return {"means": self.value}
+
+
+@pytest.mark.parametrize("average", [0, 100, 1000])
+def test_the_mean_is_as_old_as_its_span(average):
+    iterations = 6000
+    config = load_config("default", {"schedule.iterations": iterations, "schedule.ema_window": 5 * average})
+    moving_average, gaussians = MovingAverage(config, 500), Moving()
+    begin = max(iterations - WINDOWS * average, 500) + average // 10
+    for iteration in range(1, iterations + 1):
+        gaussians.value.fill_(iteration)
+        moving_average.update(iteration, 1, gaussians)
+        if iteration < iterations:
+            assert (gaussians.value == iteration).all()
+            assert bool(moving_average.state()) == (average > 0 and iteration >= begin)
+    age = iterations - float(gaussians.value[0])
+    assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not moving_average.state()
+
+
+def test_means_begin_when_the_count_stays():
+    config = load_config("default", {"schedule.iterations": 1000, "schedule.ema_window": 15_000})
+    assert MovingAverage(config, 500).first == 500
+
+
+def test_a_training_that_stops_in_between_ends_in_the_same_bits(scene, tmp_path):
+    config = load_unscaled("default", AVERAGED)
+    whole = train(scene, tmp_path / "whole", config, device="cpu")
+    training = create_trainer(scene, tmp_path / "parts", config, device="cpu")
+    for step in training:
+        if step.iteration == 30:
+            training.stop()
+    stopped = RunFolder(tmp_path / "parts").newest_checkpoint()
+    assert isinstance(stopped, Checkpoint) and any(name.startswith("average.") for name in stopped.tensors)
+    resumed = train(scene, tmp_path / "parts", device="cpu", resume=True)
+    last = load_unscaled("default", AVERAGED | {"schedule.ema_window": 0})
+    plain = train(scene, tmp_path / "plain", last, device="cpu")
+    for name, values in whole.model.gaussians.tensors().items():
+        assert torch.equal(values, resumed.model.gaussians.tensors()[name]), name
+    differs = [
+        not torch.equal(a, b) for a, b in zip(whole.model.gaussians.parameters(), plain.model.gaussians.parameters())
+    ]
+    assert all(differs)

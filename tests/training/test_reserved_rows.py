@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training import graph_capacity, training_state
+from sehdr_warp.training import step_graphs, training_state
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.strategies import base
 from sehdr_warp.training.trainer import Trainer
@@ -43,7 +43,7 @@ def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monk
 def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch):
     monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)
     monkeypatch.setattr(training_state, "MAX_RESERVE", 8.0)
-    monkeypatch.setattr(graph_capacity, "MIN_HEADROOM", 0.0)
+    monkeypatch.setattr(step_graphs, "MIN_HEADROOM", 0.0)
     config = VARIANTS["default"]
     training = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cuda:0"))
     for _ in range(48):

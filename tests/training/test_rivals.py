@@ -14,9 +14,8 @@ from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.runs.config_files import load_config, override_config, preset_names
-from sehdr_warp.training.hdr_truth import largest_hdr_truth
 from sehdr_warp.training.initialization import make_field, response_for_training
-from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
+from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss, largest_hdr_truth
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 
@@ -88,7 +87,7 @@ def test_photos_of_no_weight_teach_nothing(scene):
 
 @pytest.mark.parametrize("preset", ["truth", "hdr-gs-truth", "paper-truth"])
 def test_a_scene_without_truth_is_refused_by_name_and_field(scene, tmp_path, preset, monkeypatch):
-    for work in ("response_for_training", "estimate_compensation", "make_field"):
+    for work in ("response_for_training", "prepare_photos", "make_field"):
         monkeypatch.setattr(f"sehdr_warp.training.train.{work}", lambda *_: pytest.fail("worked for nothing"))
     field = "loss.hdr_truth = true" if preset == "paper-truth" else "loss.hdr_weight = "
     with pytest.raises(InputError, match=f"^toy: no training view has the HDR truth that {field}"):

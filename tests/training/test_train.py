@@ -13,8 +13,8 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
-from sehdr_warp.training.held_out import evaluate_views
 from sehdr_warp.training.initialization import make_field, response_for_training
+from sehdr_warp.training.run_output import evaluate_views
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sehdr_warp.rasterizer.training_step import check_finite
-from sehdr_warp.training.graph_capacity import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
+from sehdr_warp.training.step_graphs import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
 
 MANY = 10 * MIN_CAPACITY
 
