@@ -123,7 +123,8 @@ def _header(run: Any, scene: Scene) -> Markup:
         "held-out HDR, mu-law": _decibels(last, "psnr_mu"),
     }
     items = join(markup("<li>{}<b>{}</b></li>", name, value) for name, value in facts.items() if value is not None)
-    notes = join(markup("<li>{}</li>", note) for note in scene.notes)
+    # A response that was guessed is named when the photos are read again, so that only the training noted its doubt.
+    notes = join(markup("<li>{}</li>", note) for note in dict.fromkeys((*run.notes(), *scene.notes)))
     device = summary.get("device")
     return markup(
         '<header>\n<p class="quiet">sehdr-warp report</p>\n<h1>{}</h1>\n<p class="quiet">{}</p>\n'

@@ -54,6 +54,7 @@ UNLIKELY, LINEAR_PRIOR = 12.0, 1000.0
 # How likely it is beforehand that no formula made the photos, and the probability from which a formula is taken for the
 # truth (docs/response.md: set on half of the scenes and curves).
 NO_FORMULA, DECISIVE = 0.5, 0.25
+UNSURE = 0.4  # Stops of uncertainty from which a note says that the response is a guess
 # Edges that are judged at once; photos larger than MOST_PIXELS are read in bands.
 BATCH, MOST_PIXELS, BAND_ROWS = 256, 400_000, 32
 
@@ -117,6 +118,17 @@ class ResponseSelection:
     edge_count: int
     scores: tuple[ResponseScore, ...]
     uncertainty: float
+
+    @property
+    def note(self) -> str | None:
+        """A line that says how uncertain the response is; None if it is sure, or if nothing tells."""
+        if not self.uncertainty > UNSURE:
+            return None
+        return (
+            f"the response {self.response.name} is a guess: curves that explain the photos as well differ from it by "
+            f"{self.uncertainty:.1f} stops between dark and bright; name it with --response, or measure it with "
+            "`sehdr-warp calibrate`"
+        )
 
 
 def select_response(

@@ -245,6 +245,10 @@ class Run(_RenderedScene):
         """Return times, memory and counts of the training; empty if it has not ended."""
         return self.folder.read_summary()
 
+    def notes(self) -> list[str]:
+        """Return what was noted when the photos were read for the training."""
+        return list(self.folder.read_scene()["notes"])
+
     def decisions(self) -> list[dict]:
         """Return the decisions of the run's plan: name, choice, reason and fields of each; empty without a plan."""
         return self.folder.read_decisions()

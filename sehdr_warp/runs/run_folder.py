@@ -164,7 +164,8 @@ class RunFolder:
 
     def read_scene(self) -> dict:
         """Return the values of scene.json, see describe_scene()."""
-        return self._read(self.scene, lambda path: read_values(path, SceneValues))
+        values = self._read(self.scene, lambda path: read_values(path, SceneValues))
+        return {"notes": []} | values
 
     def read_cameras(self) -> tuple[CameraEntry, ...]:
         """Return the views of the scene, in its order."""

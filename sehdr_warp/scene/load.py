@@ -23,6 +23,7 @@ from .types import Scene
 
 if TYPE_CHECKING:
     from ..response import Response
+    from ..response.selection import ResponseSelection
 
 __all__ = [
     "choose_response",
@@ -36,7 +37,6 @@ __all__ = [
 ]
 _log = logging.getLogger("sehdr_warp.scene")
 _MOST_SAMPLED = 24  # Photos that a response is chosen from: they have more edges than are looked at
-_UNSURE = 0.4  # Uncertainty of a chosen response, in stops, from which a line says that it is a guess
 _BELOW_WHITE = 0.97  # Code of the largest light of a gain map, in light: from 0.99 on codes count as clipped
 
 
@@ -110,7 +110,10 @@ def load_scene(
         if dataset.kind == "raw":
             matrix = color_matrix([record.image for record in dataset.records])
     elif str(curve) == "auto":
-        curve, chosen_by = choose_response(dataset, method, candidates), (method, tuple(map(str, candidates)))
+        selection = _select_response(dataset, method, candidates)
+        curve, chosen_by = selection.response, (method, tuple(map(str, candidates)))
+        if selection.note:
+            dataset = replace(dataset, notes=(*dataset.notes, selection.note))
     elif str(curve) == "learned":
         curve = response_by_name("srgb")
     names = unique_names(dataset.records)
@@ -181,6 +184,10 @@ def choose_response(
     Raises:
         InputError: if the photos show nothing.
     """
+    return _select_response(dataset, method, candidates).response
+
+
+def _select_response(dataset: DataparserOutputs, method: str, candidates: Sequence[str]) -> "ResponseSelection":
     records = dataset.training
 
     def codes() -> Iterator[tuple[np.ndarray, None]]:
@@ -212,8 +219,8 @@ def sample_photos(photos: Sequence, method: str) -> Sequence:
 
 def select_response_for(
     codes: Iterable[np.ndarray], files: list[Path | None], method: str, candidates: Sequence[str]
-) -> "Response":
-    """Return the candidate that fits the codes of sample_photos() best.
+) -> "ResponseSelection":
+    """Select the candidate that fits the codes of sample_photos() best.
 
     Args:
         codes: of the photos.
@@ -225,12 +232,4 @@ def select_response_for(
     from ..response.selection import select_response
 
     curves = [response for name in candidates for response in responses_named(name)] or None
-    selection = select_response(codes, curves, method=method, from_camera=are_camera_jpegs(files))
-    if selection.uncertainty > _UNSURE:
-        _log.info(
-            "the response %s is a guess: curves that explain the photos as well differ from it by %.1f stops between "
-            "dark and bright; name it with --response, or measure it with `sehdr-warp calibrate`",
-            selection.response.name,
-            selection.uncertainty,
-        )
-    return selection.response
+    return select_response(codes, curves, method=method, from_camera=are_camera_jpegs(files))

@@ -64,7 +64,10 @@ def response_for_training(scene: Scene, config: Config) -> Response:
         return scene.response
     views = scene.train_views
     codes = [view.codes for view in sample_photos(views, options.method)]
-    return select_response_for(codes, [view.source for view in views], options.method, options.candidates)
+    selection = select_response_for(codes, [view.source for view in views], options.method, options.candidates)
+    if selection.note:
+        _log.info("%s", selection.note)
+    return selection.response
 
 
 def make_field(

@@ -70,6 +70,9 @@ class AnalyticRun:
     def summary(self):
         return {"device": "abacus"}
 
+    def notes(self):
+        return ["a note of the training"]
+
     def decisions(self):
         return []
 

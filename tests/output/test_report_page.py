@@ -74,6 +74,7 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     assert len(text) < 5e6
     expected = ["Light above white", "Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
     assert headings(text) == [*expected, "What was left out, and why", "Figures", "Error against time", "Cameras"]
+    assert "<li>a note of the training</li>" in text
     for told in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
         assert told in text
     assert '<rect x="3.8" y="5.8"' in text  # Around the box, by three units of a 32-pixel photo
@@ -174,6 +175,7 @@ def evil_report(tmp_path):
     region = {"photo": views[0].name, "column": 5.0, "row": 7.0, "pixels": 9, "stops": 1.25, "box": [4, 6, 3, 3]}
     unexplained = {"regions": EVIL, "photos": EVIL, "worst": [region]}
     run.summary = lambda: {"device": EVIL, "unexplained": unexplained}
+    run.notes = lambda: [EVIL + EVIL]
     run.decisions = lambda: [{"name": EVIL, "choice": EVIL, "reason": EVIL}]
     evaluation = EVALUATION | {
         "views": [EVALUATION["views"][0] | {"name": EVIL}],

@@ -40,6 +40,17 @@ def test_exif_times_count_sensitivity_and_aperture(tmp_path):
     assert "ISO differs (100 to 400)" in text and "exposures differ: 1/400 to 1 s" in text
 
 
+def test_a_response_that_is_a_guess_is_noted(tmp_path):
+    write_colmap(tmp_path, name="{:03d}.png")
+    for path in (tmp_path / "images").iterdir():
+        with Image.open(path) as photo:
+            ramp = np.linspace(30, 220, photo.width).astype(np.uint8)
+            Image.fromarray(np.broadcast_to(ramp[None, :, None], (photo.height, photo.width, 3)).copy()).save(path)
+    notes = load_scene(tmp_path).notes
+    assert sum("is a guess: curves that explain the photos as well differ" in note for note in notes) == 1
+    assert not any("is a guess" in note for note in load_scene(tmp_path, response="srgb").notes)
+
+
 @pytest.mark.parametrize(
     "seconds, text",
     [(1 / 640, "1/640 s"), (0.000634115, "1/1577 s"), (0.125, "1/8 s"), (0.28, "0.28 s"), (0.4, "0.4 s"), (8, "8 s")],
