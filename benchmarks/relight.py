@@ -35,7 +35,8 @@ SIZE, SAMPLES, DEPTH = 96, 256, 3  # Pixels of a ball, paths of a pixel, and sur
 RADIUS, DISTANCE = 0.05, 0.6  # Meters: of a ball, and from the balls to the camera
 SHOWN = ("lamps", "night", "window"), (1, 2, 3)
 """Rooms and exposures that are compared."""
-METHODS = "default", "3dgs", "truth"
+METHODS = "default", "3dgs", "paper", "truth"
+PICTURED = ("default", "map"), ("default", "lights"), ("3dgs", "map"), ("paper", "map")
 
 
 def main(jobs: tyro.conf.Positional[Path], /, json: Path, picture: Path | None = None, samples: int = SAMPLES) -> None:
@@ -44,7 +45,8 @@ def main(jobs: tyro.conf.Positional[Path], /, json: Path, picture: Path | None =
     Args:
         jobs: folder of quality's jobs.
         json: file of the result.
-        picture: PNG with a row for each room at exposure 2: truth, map, lights, and 3dgs's map.
+        picture: PNG with a row for each room at exposure 2: the truth, then default's map and lights, and the maps of
+            3dgs and of paper.
         samples: paths of a pixel.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -65,8 +67,8 @@ def main(jobs: tyro.conf.Positional[Path], /, json: Path, picture: Path | None =
             row |= {"off": float(np.abs(lit - truth).mean() / truth.mean()), "energy": float(lit.mean() / truth.mean())}
             result["rows"].append(row)
             LOG.info("%s", row)
-        if exposure == SHOWN[1][1] and method != METHODS[2]:
-            strips.append((scene, method, truth, list(pictures.values())))
+        if exposure == SHOWN[1][1] and method != METHODS[-1]:
+            strips.append((scene, truth, {(method, by): lit for by, lit in pictures.items()}))
     if not result["rows"]:
         raise SehdrError(f"{jobs}: holds no light of {', '.join(SHOWN[0])}; run quality with these scenes")
     result["command"] = "python -m benchmarks.relight JOBS --json docs/reports/results/relight.json"
@@ -144,14 +146,13 @@ def _emitter(mi: Any, shape: LightShape, radiance: np.ndarray, place: np.ndarray
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f(matrix), "emitter": emitter}
 
 
-def _montage(strips: Sequence[tuple[str, str, np.ndarray, list[np.ndarray]]]) -> np.ndarray:
-    """Return [H, W, 3] sRGB: for each room the truth, map and lights of the first method, and map of the second."""
+def _montage(strips: Sequence[tuple[str, np.ndarray, dict[tuple[str, str], np.ndarray]]]) -> np.ndarray:
+    """Return [H, W, 3] sRGB: a row for each room, of the truth and of PICTURED; black where there is none."""
     rows = []
     for scene in dict.fromkeys(strip[0] for strip in strips):
         mine = [strip for strip in strips if strip[0] == scene]
-        truth = mine[0][2]
-        pictures = [truth, *(each for strip in mine for each in strip[3])][:4]
-        pictures += [np.zeros_like(truth)] * (4 - len(pictures))
+        truth, lit = mine[0][1], {key: picture for strip in mine for key, picture in strip[2].items()}
+        pictures = [truth, *(lit.get(key, np.zeros_like(truth)) for key in PICTURED)]
         rows.append(np.concatenate(pictures, axis=1) * (0.9 / max(float(np.percentile(truth, 99.5)), 1e-9)))
     return encode_srgb(np.clip(np.concatenate(rows), 0, 1))
 

@@ -44,6 +44,7 @@ def write_reports(folder: Path) -> list[Path]:
             pages.append(folder / f"{name}.png")
             with atomic_path(pages[-1], ours=True) as temporary:
                 PLOTS[name](result, temporary)
+        if "caption" in page and (folder / f"{name}.png").is_file():
             parts.append(f"![{page['caption']}]({name}.png)")
         pages.append(_write(folder / f"{name}.md", [*parts, *TABLES[name](result), *result["notes"]]))
         machine = result["machine"]
@@ -416,7 +417,15 @@ def _trust_tables(result: dict) -> Iterable[str]:
         )
 
 
+def _relight_tables(result: dict) -> Iterable[str]:
+    rows = [row | {"lit by": f"{row['method']}, {row['by']}"} for row in result["rows"]]
+    for title, field, form in (("Pixels, mean difference over the mean", "off", ".0%"), ("Light", "energy", ".2f")):
+        yield f"## {title} of the truth"
+        yield _pivot(rows, {"room=scene": "", "exposure": "d"}, "lit by", field, form)
+
+
 TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
+    "relight": _relight_tables,
     "quality": _quality_tables,
     "seeds": _seeds_tables,
     "seeds-cpu": _seeds_tables,
