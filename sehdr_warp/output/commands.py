@@ -168,6 +168,8 @@ class Lights:
     """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
     up: str | None = None
     """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
+    inpaint: bool = True
+    """Fill directions of the map that no photo covers with the light around them; alpha still tells them."""
     overwrite: bool = False
     """Replace files that exist."""
     device: str | None = None
@@ -225,7 +227,8 @@ def run_lights(args: Lights) -> None:
     if args.out is None:
         print(lights_table(run.find_lights(), luminance_of_one(run)))
         return
-    for path in write_lights(run, args.out, axes=args.axes, up=args.up, overwrite=args.overwrite):
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device")}
+    for path in write_lights(run, args.out, **options):
         print(path)
 
 

@@ -5,7 +5,7 @@ import logging
 from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ LAYOUTS = ("latlong", "cube")
 SUFFIXES = (".exr", ".hdr")
 # A direction counts as covered above this alpha. A covered share below _LEAST_COVERED gives a warning, as do surfaces
 # nearer than _NEAR times the spread of the cameras in more than half of all directions: the point is inside something.
-_COVERED, _LEAST_COVERED, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
+COVERED, _LEAST_COVERED, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
 # Photos walk around what they look at if most of them look at it within this cosine and they stand on all sides of it;
 # what is nearer to it than this part of the distance of the nearest camera is then left out of a map at the center.
 _FACING, _SIDES, _CLEARANCE = 0.7, 0.5, 0.5
@@ -114,14 +114,14 @@ def write_environment_map(
     position = _point(at, cameras, photos)
     if beyond is None:
         beyond = 0.0
-        if isinstance(at, str) and at == "center" and (focus := walked_around(photos)) is not None:
-            position = focus
-            beyond = _CLEARANCE * min(float(np.linalg.norm(camera.position - focus)) for camera in photos)
-            place = ", ".join(f"{value:.4g}" for value in focus)
-            log.info(
-                "the photos walk around (%s): the map is what surrounds that point beyond %.3g; --beyond changes it",
-                *(place, beyond),
-            )
+        if isinstance(at, str) and at == "center":
+            position, beyond = map_center(photos)
+            if beyond:
+                place = ", ".join(f"{value:.4g}" for value in position)
+                text = (
+                    "the photos walk around (%s): the map is what surrounds that point beyond %.3g; --beyond changes it"
+                )
+                log.info(text, place, beyond)
     to_world = transform.rotation.T
     directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in photos])) if photos else 0.0
@@ -134,7 +134,7 @@ def write_environment_map(
         added = (1 - alpha[..., None]) * inpainted(hdr, alpha, directions, weight)
     clipped = rendered.clipped
     shares = light_shares(hdr, added, clipped, weight, run.response.white / run.base_time)
-    coverage = 100 * weight[alpha > _COVERED].sum() / weight.sum()
+    coverage = 100 * weight[alpha > COVERED].sum() / weight.sum()
     log.info("%s: %.0f %% of all directions seen", path.name, coverage)
     log.info("its light is\n%s", shares.table())
     hdr = exposure * from_rec709(hdr + added, colorspace)
@@ -287,7 +287,7 @@ def inpainted(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight
     columns, rows = _COARSE, _COARSE // 2
     across, down = (np.pi - np.arctan2(x, z)) / (2 * np.pi) * columns, np.arccos(np.clip(y, -1, 1)) / np.pi * rows
     cells = np.minimum(down.astype(int), rows - 1) * columns + across.astype(int) % columns
-    covered = alpha > _COVERED
+    covered = alpha > COVERED
     logs = np.log(np.maximum(hdr[covered] / alpha[covered][:, None], _DARKEST))
     values = np.concatenate([logs, np.ones((len(logs), 1))], axis=1) * weight[covered][:, None]
     sums = np.stack([np.bincount(cells[covered], column, rows * columns) for column in values.T], axis=1)
@@ -297,6 +297,27 @@ def inpainted(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight
     wrapped = np.pad(light.reshape(rows, columns, 3), ((0, 0), (1, 1), (0, 0)), mode="wrap")
     at = np.stack([down - 0.5, across + 0.5])
     return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)
+
+
+class MapCenter(NamedTuple):
+    """Where a map of a whole scene is taken, and what is left out of it.
+
+    Attributes:
+        position: [3], scene coordinates.
+        beyond: Distance within which Gaussians are left out, scene units; 0 leaves out none.
+    """
+
+    position: np.ndarray
+    beyond: float
+
+
+def map_center(photos: list[Camera]) -> MapCenter:
+    """Return the mean place of the training cameras, or, if they walk around something, what surrounds that."""
+    focus = walked_around(photos)
+    if focus is None:
+        return MapCenter(np.mean([camera.position for camera in photos], axis=0), 0.0)
+    nearest = min(float(np.linalg.norm(camera.position - focus)) for camera in photos)
+    return MapCenter(focus, _CLEARANCE * nearest)
 
 
 def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], photos: list[Camera]) -> np.ndarray:
@@ -338,7 +359,7 @@ def walked_around(photos: list[Camera]) -> np.ndarray | None:
 
 def _judge(run, position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:
     """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is."""
-    share = weight[alpha > _COVERED].sum() / weight.sum()
+    share = weight[alpha > COVERED].sum() / weight.sum()
     place = ", ".join(f"{value:.4g}" for value in position)
     if share < 1e-3:
         remedy = "choose a point among the cameras (center, camera:NAME)"
@@ -346,7 +367,7 @@ def _judge(run, position, photos: list[Camera], alpha: np.ndarray, distance: np.
     if share < _LEAST_COVERED:
         log.warning("from (%s) only %.1f %% of all directions are seen: is it within the scene?", place, 100 * share)
     spread = np.linalg.norm(np.ptp([camera.position for camera in photos], axis=0)) if len(photos) > 1 else 0.0
-    near = weight[(alpha > _COVERED) & (distance < _NEAR * spread)].sum() / weight.sum()
+    near = weight[(alpha > COVERED) & (distance < _NEAR * spread)].sum() / weight.sum()
     if near > 0.5:
         log.warning(
             "from (%s) %.0f %% of all directions are blocked at once: is it inside of something?", place, 100 * near

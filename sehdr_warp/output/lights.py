@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from sehdr_warp.errors import SehdrError
 
 from ..files import atomic_path, check_absent
-from .environment_map import envmap, render_map
+from .environment_map import COVERED, envmap, inpainted, latlong, map_center, render_map, solid_angles
 from .exr import exr_header, rgb_channels, write_exr
+from .images import as_array
 from .light_unit import luminance_of_one
 from .render_views import provenance
 from .world_transform import WorldTransform, world_transform
@@ -60,20 +62,23 @@ def write_lights(
     *,
     axes: str = "upright",
     up: str | None = None,
+    inpaint: bool = True,
     overwrite: bool = False,
 ) -> list[Path]:
     """Write the lights of a scene; return the files.
 
     A light is a group of Gaussians that the photos clipped. With its size, its radiance gives the light that the
     training views show. A USD file has a SphereLight or RectLight for each, and a DomeLight for everything else: a
-    map from the middle of the training cameras, `<stem>_rest.exr`, in which the lights are dark. If the unit of the
-    run's light is known, lights and dome are in cd/m^2, as USD has them.
+    map from where write_environment_map() takes it, `<stem>_rest.exr`, in which the lights are dark. Its alpha is the
+    coverage by photos. If the unit of the run's light is known, lights and dome are in cd/m^2, as USD has them.
 
     Args:
         run: From load_run or train.
         path: .json, or .usda.
         axes: As in world_transform.
         up: As in world_transform.
+        inpaint: Fill directions of the dome that no photo covers with the light around them, so that they do not
+            darken what the dome lights.
         overwrite: Replace files that exist.
 
     Raises:
@@ -97,7 +102,7 @@ def write_lights(
     unit = luminance_of_one(run)
     rows = [_described(f"light_{index}", light, transform, unit or 1.0) for index, light in enumerate(lights)]
     if suffix == ".usda":
-        _write_rest(run, rest, lights, transform, overwrite)
+        _write_rest(run, rest, lights, transform, inpaint, overwrite)
         text = usd_lights(rows, run.scene_name, rest.name, unit or 1.0)
     else:
         units = f"{'relative radiance' if unit is None else 'cd/m^2'}, linear Rec.709"
@@ -184,13 +189,42 @@ def _tuple(values) -> str:
     return "(" + ", ".join(repr(float(value)) for value in values) + ")"
 
 
-def _write_rest(run: Any, path: Path, lights: Sequence[Any], transform: WorldTransform, overwrite: bool) -> None:
-    """Write the map of a scene from the middle of its training cameras, with the lights dark."""
+def _write_rest(
+    run: Any, path: Path, lights: Sequence[Any], transform: WorldTransform, inpaint: bool, overwrite: bool
+) -> None:
+    """Write the map of a scene's surroundings, with the lights dark; arguments as in write_lights."""
     cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
-    middle = np.mean([camera.position for camera in cameras], axis=0)
+    position, beyond = map_center(cameras)
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in cameras]))
-    rest = render_map(run, middle, MAP_SIZE, "latlong", transform.rotation, focal, without=[x.members for x in lights])
-    hdr = rest.hdr
+    members = [light.members for light in lights]
+    rest = render_map(run, position, MAP_SIZE, "latlong", transform.rotation, focal, without=members, beyond=beyond)
+    hdr, directions, weight = rest.hdr, latlong(MAP_SIZE) @ transform.rotation, solid_angles(MAP_SIZE, "latlong")
+    options = {"focal": focal, "beyond": beyond}
+    # Dark lights are not the light around them.
+    source = np.where(_shows_lights(run, members, position, transform.rotation, **options), 0, rest.alpha)
+    if inpaint and (source > COVERED).any():
+        added = (1 - rest.alpha[..., None]) * inpainted(hdr, source, directions, weight)
+        dark, total = (float((light.mean(2) * weight).sum()) for light in (added, hdr + added))
+        unseen = 100 * float((weight * (1 - rest.alpha)).sum() / weight.sum())
+        text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"
+        log.info(text, path.name, unseen, 100 * dark / max(total, 1e-30))
+        hdr = hdr + added
     header = exr_header("rec709", 1.0, provenance=provenance(run), white_luminance=luminance_of_one(run))
     header["envmap"] = envmap("latlong")
-    write_exr(path, rgb_channels(hdr), header=header, overwrite=overwrite)
+    write_exr(path, rgb_channels(hdr) | {"A": rest.alpha}, header=header, overwrite=overwrite)
+
+
+def _shows_lights(
+    run: Any, members: Sequence[torch.Tensor], position: np.ndarray, to_scene: np.ndarray, focal: float, beyond: float
+) -> np.ndarray:
+    """Return [H, W] whether half of the light of a map's pixel and more comes from Gaussians of lights.
+
+    Measured in a coarser map, since what is filled in is smooth.
+    """
+    size = MAP_SIZE // 8
+    part = torch.zeros(run.gaussian_count, device=run.device)
+    for index in members:
+        part[index] = 1
+    options = {"focal_length": focal, "pixel_angle": 2 * np.pi / size, "beyond": beyond, "shares": part}
+    rendered = run.render_directions(position, latlong(size) @ to_scene, **options)
+    return np.kron(as_array(rendered.clipped) > 0.5, np.ones((8, 8), bool))

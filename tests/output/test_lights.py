@@ -1,6 +1,7 @@
 """Files of lights: what they hold, read by OpenUSD, and that they light as the scene does."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ import torch
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.lights import lights_table, write_lights
+from sehdr_warp.output.splat_edits import merged
 from sehdr_warp.runs.run import Splats
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
 
 from .helpers import Entry, camera
 from .test_environment_map import lamps
@@ -68,10 +70,10 @@ def test_usd_lights_stand_and_shine_as_the_scene_s(tmp_path, run):
 
 
 def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
-    write_lights(run, tmp_path / "lights.usda", axes="scene")
+    write_lights(run, tmp_path / "lights.usda", axes="scene", inpaint=False)
     image = read_hdr(tmp_path / "lights_rest.exr")
     run.find_lights = list
-    write_lights(run, tmp_path / "none.usda", axes="scene")
+    write_lights(run, tmp_path / "none.usda", axes="scene", inpaint=False)
     whole = read_hdr(tmp_path / "none_rest.exr")
     from sehdr_warp.output.environment_map import latlong
 
@@ -80,6 +82,41 @@ def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
         place = np.unravel_index(np.argmax(directions @ axis), directions.shape[:2])
         expected = 0 if index < 3 else whole[place]
         assert image[place] == pytest.approx(expected, abs=1e-3) and whole[place].max() > 1
+
+
+def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, logged):
+    write_lights(run, tmp_path / "lights.usda", axes="scene")
+    channels, _ = read_exr_channels(tmp_path / "lights_rest.exr")
+    filled, alpha = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
+    assert "no photo shows 94 % of all directions" in logged[0]
+    write_lights(run, tmp_path / "dark.usda", axes="scene", inpaint=False)
+    dark = read_hdr(tmp_path / "dark_rest.exr")
+    unseen, visible = alpha == 0, alpha > 0.98
+    assert not dark[unseen].any() and filled[visible] == pytest.approx(dark[visible], rel=0.05, abs=0.2)
+    # The three lamps that are lights are dark in the map, and do not darken what is filled in around them.
+    lit = dark[dark.mean(2) > 1]
+    assert filled[unseen].min() > 0.5 * lit.min() and filled[unseen].max() < 1.01 * lit.max()
+
+
+def test_the_map_of_a_walk_around_something_is_what_surrounds_it(tmp_path, monkeypatch):
+    pytest.importorskip("pxr")
+    from sehdr_warp.model.baking import field_of
+
+    angles = 2 * np.pi * np.arange(8) / 8
+    places = 2 * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
+    cameras = tuple(Entry(str(i), "train", camera(position=tuple(place))) for i, place in enumerate(places))
+    wall, statue = lamps(), replace(lamps(), means=lamps().means * 0.02, log_scales=lamps().log_scales - 3)
+    around = lights_map(tmp_path / "wall", field_of(wall), cameras)
+    both = lights_map(tmp_path / "both", field_of(merged([wall, statue])), cameras)
+    np.testing.assert_allclose(both, around, rtol=1e-3, atol=1e-3)
+
+
+def lights_map(folder, field, cameras):
+    scene = Splats(folder, field, cameras)
+    scene.find_lights = list
+    folder.mkdir()
+    write_lights(scene, folder / "lights.usda", axes="scene")
+    return read_hdr(folder / "lights_rest.exr")
 
 
 def test_the_table_names_place_size_and_doubt():
