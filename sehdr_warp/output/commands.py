@@ -168,8 +168,8 @@ class Lights:
     """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
     up: str | None = None
     """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
-    inpaint: bool = True
-    """Fill directions of the map that no photo covers with the light around them; alpha still tells them."""
+    unseen: Literal["inpaint", "black"] = "inpaint"
+    """inpaint: directions of the map that no photo covers get the light around them; alpha still tells them."""
     overwrite: bool = False
     """Replace files that exist."""
     device: str | None = None

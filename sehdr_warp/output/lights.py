@@ -21,6 +21,7 @@ from .world_transform import WorldTransform, world_transform
 
 log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".usda")
+UNSEEN = ("inpaint", "black")
 MAP_SIZE = 1024  # Pixels across of the map of what is no light
 _STAGE = """#usda 1.0
 (
@@ -62,7 +63,7 @@ def write_lights(
     *,
     axes: str = "upright",
     up: str | None = None,
-    inpaint: bool = True,
+    unseen: str = "inpaint",
     overwrite: bool = False,
 ) -> list[Path]:
     """Write the lights of a scene; return the files.
@@ -77,8 +78,8 @@ def write_lights(
         path: .json, or .usda.
         axes: As in world_transform.
         up: As in world_transform.
-        inpaint: Fill directions of the dome that no photo covers with the light around them, so that they do not
-            darken what the dome lights.
+        unseen: "inpaint": directions of the dome that no photo covers get the light around them, so that they do not
+            darken what the dome lights. "black": they are black.
         overwrite: Replace files that exist.
 
     Raises:
@@ -89,6 +90,8 @@ def write_lights(
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise SehdrError(f"{path}: lights are written as one of {', '.join(SUFFIXES)}; choose a suffix")
+    if unseen not in UNSEEN:
+        raise SehdrError(f"unseen {unseen!r} is not one of {', '.join(UNSEEN)}")
     rest = path.with_name(f"{path.stem}_rest.exr")
     files = [path] if suffix == ".json" else [path, rest]
     for file in files:
@@ -102,7 +105,7 @@ def write_lights(
     unit = luminance_of_one(run)
     rows = [_described(f"light_{index}", light, transform, unit or 1.0) for index, light in enumerate(lights)]
     if suffix == ".usda":
-        _write_rest(run, rest, lights, transform, inpaint, overwrite)
+        _write_rest(run, rest, lights, transform, unseen, overwrite)
         text = usd_lights(rows, run.scene_name, rest.name, unit or 1.0)
     else:
         units = f"{'relative radiance' if unit is None else 'cd/m^2'}, linear Rec.709"
@@ -190,7 +193,7 @@ def _tuple(values) -> str:
 
 
 def _write_rest(
-    run: Any, path: Path, lights: Sequence[Any], transform: WorldTransform, inpaint: bool, overwrite: bool
+    run: Any, path: Path, lights: Sequence[Any], transform: WorldTransform, unseen: str, overwrite: bool
 ) -> None:
     """Write the map of a scene's surroundings, with the lights dark; arguments as in write_lights."""
     cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
@@ -202,12 +205,12 @@ def _write_rest(
     options = {"focal": focal, "beyond": beyond}
     # Dark lights are not the light around them.
     source = np.where(_shows_lights(run, members, position, transform.rotation, **options), 0, rest.alpha)
-    if inpaint and (source > COVERED).any():
+    if unseen == "inpaint" and (source > COVERED).any():
         added = (1 - rest.alpha[..., None]) * inpainted(hdr, source, directions, weight)
         dark, total = (float((light.mean(2) * weight).sum()) for light in (added, hdr + added))
-        unseen = 100 * float((weight * (1 - rest.alpha)).sum() / weight.sum())
+        share = 100 * float((weight * (1 - rest.alpha)).sum() / weight.sum())
         text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"
-        log.info(text, path.name, unseen, 100 * dark / max(total, 1e-30))
+        log.info(text, path.name, share, 100 * dark / max(total, 1e-30))
         hdr = hdr + added
     header = exr_header("rec709", 1.0, provenance=provenance(run), white_luminance=luminance_of_one(run))
     header["envmap"] = envmap("latlong")

@@ -70,10 +70,10 @@ def test_usd_lights_stand_and_shine_as_the_scene_s(tmp_path, run):
 
 
 def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
-    write_lights(run, tmp_path / "lights.usda", axes="scene", inpaint=False)
+    write_lights(run, tmp_path / "lights.usda", axes="scene", unseen="black")
     image = read_hdr(tmp_path / "lights_rest.exr")
     run.find_lights = list
-    write_lights(run, tmp_path / "none.usda", axes="scene", inpaint=False)
+    write_lights(run, tmp_path / "none.usda", axes="scene", unseen="black")
     whole = read_hdr(tmp_path / "none_rest.exr")
     from sehdr_warp.output.environment_map import latlong
 
@@ -89,7 +89,7 @@ def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, 
     channels, _ = read_exr_channels(tmp_path / "lights_rest.exr")
     filled, alpha = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
     assert "no photo shows 94 % of all directions" in logged[0]
-    write_lights(run, tmp_path / "dark.usda", axes="scene", inpaint=False)
+    write_lights(run, tmp_path / "dark.usda", axes="scene", unseen="black")
     dark = read_hdr(tmp_path / "dark_rest.exr")
     unseen, visible = alpha == 0, alpha > 0.98
     assert not dark[unseen].any() and filled[visible] == pytest.approx(dark[visible], rel=0.05, abs=0.2)
@@ -127,6 +127,8 @@ def test_the_table_names_place_size_and_doubt():
 def test_what_cannot_be_written_is_refused(tmp_path, run):
     with pytest.raises(SehdrError, match="choose a suffix"):
         write_lights(run, tmp_path / "lights.txt")
+    with pytest.raises(SehdrError, match="unseen 'grey' is not one of inpaint, black"):
+        write_lights(run, tmp_path / "lights.usda", unseen="grey")
     (tmp_path / "lights_rest.exr").write_text("mine")
     with pytest.raises(InputError, match="lights_rest.exr"):
         write_lights(run, tmp_path / "lights.usda")
