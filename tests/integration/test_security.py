@@ -21,8 +21,9 @@ from tests.make_scenes import write_llff
 from tests.trial import harness
 
 ROOT = Path(__file__).resolve().parents[2]
-STRANGERS, SENDERS, CASES, REQUESTS = (
-    f"trial/test_{n}.py::test" for n in ("strangers", "senders", "cases", "requests")
+STRANGERS, CASES, REQUESTS = (f"trial/test_{n}.py::test" for n in ("strangers", "cases", "requests"))
+HOSTILE_CAMERAS, HOSTILE_LOOKS, HOSTILE_PHOTOS, HOSTILE_PLACES, HOSTILE_RUNS, HOSTILE_SPLATS = (
+    f"trial/test_hostile_{n}.py::test" for n in ("cameras", "looks", "photos", "places", "runs", "splats")
 )
 RUNS, HERE = "runs/test_run_folder.py::test", "integration/test_security.py::test"
 HELD_BY = {
@@ -30,18 +31,18 @@ HELD_BY = {
     "Only a training that holds": [
         f"{RUNS}_only_a_training_finishes_an_interrupted_write",
         f"{CASES}_two_trainings_do_not_mix",
-        f"{SENDERS}_locks_that_are_no_locks",
+        f"{HOSTILE_RUNS}_locks_that_are_no_locks",
     ],
     "Links inside a run are refused": [
         f"{RUNS}_a_link_is_refused_even_to_a_sound_file",
         f"{STRANGERS}_links_in_a_sent_run",
-        f"{SENDERS}_further_links_in_a_run",
-        f"{SENDERS}_links_that_a_user_made",
+        f"{HOSTILE_RUNS}_further_links_in_a_run",
+        f"{HOSTILE_PLACES}_links_that_a_user_made",
     ],
     "All JSON of a run is checked": [
         f"{RUNS}_a_summary_of_another_shape_is_refused",
         f"{CASES}_tampered_runs",
-        f"{SENDERS}_shapes_of_summary_plan_and_metrics",
+        f"{HOSTILE_RUNS}_shapes_of_summary_plan_and_metrics",
     ],
     "What decides the picture": [
         "runs/test_checkpoint.py::test_what_decides_the_picture_is_hashed_with_the_checkpoint"
@@ -56,18 +57,18 @@ HELD_BY = {
     "Text from outside enters HTML escaped": [
         "output/test_report_page.py::test_browsers_run_our_script_and_no_other",
         "output/test_report_page.py::test_no_markup_is_made_but_by_the_one_function",
-        f"{SENDERS}_names_of_photos_on_pages_and_terminals",
+        f"{HOSTILE_PLACES}_names_of_photos_on_pages_and_terminals",
     ],
     "Control characters from outside": [
         "test_console.py::test_a_terminal_obeys_nothing_of_what_files_say",
-        f"{SENDERS}_names_in_lists_on_terminals",
+        f"{HOSTILE_PLACES}_names_in_lists_on_terminals",
     ],
-    "Pictures are decoded by content": [f"{CASES}_hostile_photos", f"{SENDERS}_photos_that_were_made"],
+    "Pictures are decoded by content": [f"{CASES}_hostile_photos", f"{HOSTILE_PHOTOS}_photos_that_were_made"],
     "Sizes and counts are bounded": [
         f"{STRANGERS}_gltf_of_strangers",
         f"{CASES}_sparse_files_of_4_gib_are_not_read_whole",
-        f"{SENDERS}_splats_that_were_made",
-        f"{SENDERS}_opcodes_of_dng",
+        f"{HOSTILE_SPLATS}_splats_that_were_made",
+        f"{HOSTILE_PHOTOS}_opcodes_of_dng",
         f"{RUNS}_sparse_files_are_not_read",
         "scene/test_heif.py::test_parts_of_an_item_that_overlap_take_no_memory",
     ],
@@ -75,7 +76,7 @@ HELD_BY = {
         f"{CASES}_inputs_that_are_pipes_are_not_waited_for",
         "test_files.py::test_devices_and_pipes_are_not_read",
     ],
-    "Names in a data set stay inside": [f"{HERE}_names_of_a_set_stay_inside", f"{SENDERS}_links_in_a_set"],
+    "Names in a data set stay inside": [f"{HERE}_names_of_a_set_stay_inside", f"{HOSTILE_PLACES}_links_in_a_set"],
     "OpenUSD and MATLAB files, and videos": [
         "test_sandbox.py::test_bounds",
         "scene/test_video.py::test_counts_beyond_the_file_take_no_memory",
@@ -83,20 +84,20 @@ HELD_BY = {
     "A stage that refers to files": [
         "test_sandbox.py::test_a_stage_leads_to_no_other_folder",
         "scene/test_video.py::test_a_clip_that_names_other_files_is_refused",
-        f"{SENDERS}_clips_that_were_made",
+        f"{HOSTILE_CAMERAS}_clips_that_were_made",
     ],
     "LUTs of a config must be files": [
         "output/test_ocio.py::test_luts_that_cannot_be_read_are_told_in_a_line",
-        f"{SENDERS}_luts_that_were_made",
-        f"{SENDERS}_archives_of_configs",
+        f"{HOSTILE_LOOKS}_luts_that_were_made",
+        f"{HOSTILE_LOOKS}_archives_of_configs",
     ],
     "The caches": [
         "rasterizer/test_kernel_cache.py::test_damaged_modules_go_and_are_told_once",
         "scene/test_video.py::test_frames_are_kept_in_the_cache",
     ],
     "The processes of one training": ["training/test_ranks.py::test_ranks_stay_alike_and_one_can_go_on"],
-    "It reads the paths": [f"{SENDERS}_what_commands_open"],
-    "It writes only to the paths": [f"{STRANGERS}_names_of_output", f"{SENDERS}_what_commands_open"],
+    "It reads the paths": [f"{HOSTILE_PLACES}_what_commands_open"],
+    "It writes only to the paths": [f"{STRANGERS}_names_of_output", f"{HOSTILE_PLACES}_what_commands_open"],
     "A file is replaced only": [
         f"{CASES}_obstacles_are_kept",
         "test_files.py::test_existing_file_is_kept_unless_asked",
@@ -108,7 +109,7 @@ HELD_BY = {
         "output/test_film.py::test_formats_of_several_files_and_none_are_refused_before_the_work",
         f"{STRANGERS}_films",
     ],
-    "It connects to nothing": [f"{HERE}_the_trial_sees_programs_and_connections", f"{SENDERS}_clips_that_were_made"],
+    "It connects to nothing": [f"{HERE}_the_trial_sees_programs_and_connections", f"{HOSTILE_CAMERAS}_clips_that_were_made"],
     "`view` alone listens": [
         f"{HERE}_the_viewer_listens_on_this_machine_alone",
         f"{HERE}_the_trial_sees_programs_and_connections",
