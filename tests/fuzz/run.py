@@ -22,7 +22,8 @@ from pathlib import Path
 from sehdr_warp import sandbox
 
 from .mutate import mutate
-from .readers import READERS, Workspace
+from .reader import Workspace
+from .readers import READERS
 
 LONGEST_MESSAGE = 1000
 

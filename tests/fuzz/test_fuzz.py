@@ -8,7 +8,8 @@ from sehdr_warp import sandbox
 from sehdr_warp.errors import InputError
 
 from .mutate import mutate
-from .readers import READERS, Reader, Workspace
+from .reader import Reader, Workspace
+from .readers import READERS
 from .run import fork_server, fuzz, make_input, share, try_input
 
 

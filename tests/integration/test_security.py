@@ -109,7 +109,10 @@ HELD_BY = {
         "output/test_film.py::test_formats_of_several_files_and_none_are_refused_before_the_work",
         f"{STRANGERS}_films",
     ],
-    "It connects to nothing": [f"{HERE}_the_trial_sees_programs_and_connections", f"{HOSTILE_CAMERAS}_clips_that_were_made"],
+    "It connects to nothing": [
+        f"{HERE}_the_trial_sees_programs_and_connections",
+        f"{HOSTILE_CAMERAS}_clips_that_were_made",
+    ],
     "`view` alone listens": [
         f"{HERE}_the_viewer_listens_on_this_machine_alone",
         f"{HERE}_the_trial_sees_programs_and_connections",

@@ -13,7 +13,7 @@ from sehdr_warp.runs.photo_signatures import changed_photos, photo_signature
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
-from tests.fuzz.readers import PLAN, REGION, SUMMARY, _confidence, _run
+from tests.fuzz.run_readers import PLAN, REGION, SUMMARY, make_confidence, make_run
 from tests.training.toy import toy_scene
 from tests.trial.harness import files_in
 
@@ -21,7 +21,7 @@ from tests.trial.harness import files_in
 @pytest.fixture
 def run(tmp_path):
     """A run with every file that a run may have."""
-    _confidence(tmp_path / "run")
+    make_confidence(tmp_path / "run")
     return tmp_path / "run"
 
 
@@ -82,7 +82,7 @@ def test_links_in_place_of_an_interrupted_write_move_nothing(run, name, place):
 def test_only_a_training_finishes_an_interrupted_write(run):
     """A new run, complete beside the one that it replaces: reading leaves both alone, a training takes the new one."""
     other = run.parent / "other"
-    _run(other)
+    make_run(other)
     (other / ".lock").unlink()
     for name in ("summary.json", "metrics.jsonl"):
         (other / name).unlink()

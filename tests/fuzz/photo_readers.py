@@ -1,0 +1,180 @@
+"""Small photos, HDR images and clips to damage, and their readers."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
+from sehdr_warp.scene.color_encoding import stated_encoding
+from sehdr_warp.scene.exposure import exif_exposure
+from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
+from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
+from sehdr_warp.scene.images import open_image
+from sehdr_warp.scene.linear_photos import color_matrix, raw_exposure
+from sehdr_warp.scene.masks import read_mask
+from sehdr_warp.scene.photos import photo_sizes, read_photo
+from sehdr_warp.scene.video import codes, decode, open_clip
+from sehdr_warp.scene.video_frames import choose_frames
+from tests.make_scenes import pattern
+from tests.scene.clips import pan, write_clip
+from tests.scene.dng_files import area, gain_map, mosaic, opcodes, write_tagged_dng
+from tests.scene.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
+from tests.scene.raw_files import write_dng
+from tests.scene.test_color_encoding import icc_profile
+
+from .reader import Reader, each
+
+
+def make_exr(folder: Path) -> None:
+    pixels = np.linspace(0, 3, 8 * 6 * 3, dtype=np.float32).reshape(6, 8, 3)
+    channels = {name: pixels[..., i] for i, name in enumerate("RGB")}
+    write_exr(folder / "half.exr", channels)
+    write_exr(folder / "float.exr", channels, pixel="float")
+    write_multipart_exr(folder / "parts.exr", [Part(channels, name="a"), Part(channels, name="b")])
+
+
+def make_radiance(folder: Path) -> None:
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2.0\n\n-Y 4 +X 9\n"
+    row = b"\x02\x02\x00\x09" + (b"\x89\x40" + b"\x89\x50" + b"\x09abcdefghi" + b"\x89\x81")
+    (folder / "coded.hdr").write_bytes(header + row * 4)
+    (folder / "flat.hdr").write_bytes(header.replace(b"X 9", b"X 3") + bytes(range(120, 168)))
+
+
+def make_photos(folder: Path) -> None:
+    picture = Image.fromarray(pattern(12, 10))
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    tags.get_ifd(0x8769)[33434] = 0.01
+    for name in ("a.jpg", "a.png", "a.tif"):
+        picture.save(folder / name, exif=tags)
+    picture.save(folder / "a.webp")
+    picture.convert("RGBA").save(folder / "b.png")
+    picture.convert("P").save(folder / "c.png")
+    picture.save(folder / "a.bmp")
+    Image.fromarray(np.arange(120, dtype=np.uint16).reshape(10, 12)).save(folder / "d.png")
+
+
+def make_raw(folder: Path) -> None:
+    write_dng(folder / "a.dng", np.linspace(0, 1, 32 * 24 * 3).reshape(24, 32, 3))
+
+
+def read_upright(path: Path):
+    return read_photo(path, oriented=True)
+
+
+def read_matrix(path: Path):
+    return color_matrix([path])
+
+
+def save_heif(folder: Path, name: str, pixels: np.ndarray, **options) -> Path:
+    """A photo as .heic or .avif."""
+    image = Image.fromarray(pixels)
+    if name.endswith(".avif"):
+        image.save(folder / name, quality=90, **options)
+    else:
+        import pillow_heif
+
+        pillow_heif.from_pillow(image).save(folder / name, quality=90, **options)
+    return folder / name
+
+
+def make_gain_maps(folder: Path) -> None:
+    base, gain = pattern(16, 12), pattern(8, 6)[..., 0]
+    iso = 0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0" + iso_metadata(2.5, channels=3)
+    write_jpeg_pair(folder / "iso.jpg", base, gain, [iso])
+    write_jpeg_pair(folder / "xmp.jpg", base, gain, [xmp_segment({"GainMapMax": "2.5", "HDRCapacityMax": "2.5"})])
+    apple = xmp_segment({"HDRGainMapHeadroom": "4"}, "HDRGainMap", "http://ns.apple.com/HDRGainMap/1.0/")
+    write_jpeg_pair(folder / "apple.jpg", base, gain, [apple])
+    for suffix in (".heic", ".avif"):
+        files = [
+            save_heif(folder, f"{n}{suffix}", p) for n, p in (("b", base), ("g", np.repeat(gain[..., None], 3, 2)))
+        ]
+        write_heif_pair(folder / f"iso{suffix}", *files, iso=iso_metadata(2.5))
+        if suffix == ".heic":
+            write_heif_pair(folder / "apple.heic", *files, apple_xmp=apple[1].partition(b"\0")[2])
+        for file in files:
+            file.unlink()
+
+
+def read_light(path: Path):
+    found = read_gain_map(path, oriented=True)
+    return has_gain_map(path), light_of(read_photo(path), found) if found is not None else None
+
+
+def make_heic(folder: Path) -> None:
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    tags.get_ifd(0x8769)[33434] = 0.01
+    for name in ("a.heic", "a.avif"):
+        save_heif(folder, name, pattern(16, 12), exif=tags.tobytes())
+    import pillow_heif
+
+    deep = np.linspace(0, 65535, 16 * 12 * 3).astype(np.uint16)
+    pillow_heif.from_bytes("RGB;16", (16, 12), deep.tobytes()).save(folder / "deep.heic", quality=90)
+
+
+def make_icc(folder: Path) -> None:
+    (folder / "matrix.icc").write_bytes(icc_profile("Display P3"))
+    (folder / "gamma.icc").write_bytes(icc_profile("Adobe RGB (1998)", 2.2))
+    table = b"curv\0\0\0\0" + struct.pack(">I9H", 9, *range(0, 65536, 8191))
+    (folder / "table.icc").write_bytes(icc_profile("sRGB", curve=table))
+
+
+def read_icc(path: Path):
+    """Through a photo that holds it, which is read all the same if the profile is damaged."""
+    photo = path.with_suffix(".jpg")
+    try:
+        Image.fromarray(pattern(8, 6)).save(photo, icc_profile=path.read_bytes())
+    except (ValueError, OSError):  # A profile that no JPEG holds
+        return None
+    pixels = read_photo(photo).pixels
+    with open_image(photo) as image:
+        encoding = stated_encoding(image)
+    return encoding.to_linear(pixels) if encoding is not None else None
+
+
+def make_video(folder: Path) -> None:
+    frames = list(pan(12, 48, 64, 4))  # x265 damages memory below 50 pixels.
+    for name in ("a.mp4", "a.mkv", "a.avi", "a.mts"):
+        write_clip(folder / name, frames, codec="libx264", pixels="yuv420p")
+    write_clip(folder / "hlg.mov", frames, tags=(18, 9, 9), pixels="yuv420p10le", rotation=90)
+    write_clip(folder / "lossless.mkv", frames, codec="ffv1")
+
+
+def read_video(path: Path):
+    clip = open_clip(path)
+    chosen = choose_frames(clip)
+    return [codes(frame, clip.color) for _, frame in decode(clip, set(chosen.numbers[:2]))]
+
+
+def make_dng_opcodes(folder: Path) -> None:
+    size, stored = (24, 32), np.full((24, 32), 9000, np.uint16)
+    rows = struct.pack(">I", 24) + np.linspace(0.5, 1.5, 24).astype(">f4").tobytes()
+    lists = {
+        "map": {51009: opcodes(gain_map(np.full((3, 4), 1.5), size))},
+        "row": {51009: opcodes((12, area(size) + rows), (8, area(size) + struct.pack(">I2d", 1, 0.05, 0.8)))},
+        "bad": {51008: opcodes((5, struct.pack(">3I", 0, 1, 1) + struct.pack(">6I", 4, 6, 2, 3, 4, 5)))},
+        "lens": {
+            51022: opcodes((3, struct.pack(">7d", 1, 0, 0, 0, 0, 0.5, 0.5)),
+                           (1, struct.pack(">I8d", 1, 0.9, 0, 0, 0, 0, 0, 0.5, 0.5)))
+        },
+    }  # fmt: skip
+    for name, tags in lists.items():
+        write_tagged_dng(folder / f"{name}.dng", stored, tags)
+    write_tagged_dng(folder / "linear.dng", np.repeat(stored[..., None], 3, 2))
+    write_tagged_dng(folder / "mosaic.dng", (mosaic(np.full((24, 32, 3), 0.3)) * 65535).astype(np.uint16))
+
+
+READERS = {
+    "exr": Reader(make_exr, ("*.exr",), each(hdr_size, read_hdr, read_exr_channels)),
+    "radiance": Reader(make_radiance, ("*.hdr",), each(read_hdr), cost=0.5),
+    "photos": Reader(make_photos, ("*",), each(photo_sizes, read_mask, exif_exposure, read_upright), cost=1.2),
+    "raw": Reader(make_raw, ("*",), each(photo_sizes, raw_exposure, read_matrix, read_upright), cost=2),
+    "gain-maps": Reader(make_gain_maps, ("*",), each(read_light), cost=1.6),
+    "heic": Reader(make_heic, ("*",), each(photo_sizes, exif_exposure, read_upright), cost=0.9),
+    "icc": Reader(make_icc, ("*.icc",), each(read_icc), cost=4),
+    "video": Reader(make_video, ("*",), each(read_video), cost=150),
+    "dng-opcodes": Reader(make_dng_opcodes, ("*",), each(photo_sizes, raw_exposure, read_upright), cost=6),
+}
