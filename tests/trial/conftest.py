@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.report_pages import trial_table
+from benchmarks.report_tables import trial_table
 from benchmarks.results import markdown_table
 from tests.fuzz.run import keep, kept, told
 

@@ -1,0 +1,176 @@
+"""Tables of the page of quality, and the table of the README."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from statistics import fmean, median
+from typing import Any
+
+from .quality import EXPOSURES, KNOWN, LEARNED, UPPER_BOUND
+from .report_tables import PAGES, pivot
+from .results import groups, markdown_table, parted
+
+FIRST_TITLE = "trained by"  # Of the README's table
+NOTHING_CLIPS = 0.001  # Of the pixels
+
+
+def quality_tables(result: dict) -> Iterable[str]:
+    """Return the paragraphs of the page of quality."""
+    rows, columns, places = result["rows"], PAGES["quality"]["means"], ("scene", "curve", "exposure", "seed", "device")
+    bounds = groups([row for row in rows if row["method"] == UPPER_BOUND], *places)
+    for row in rows:
+        (bound, *_) = bounds.get(tuple(row[field] for field in places), [row])
+        row["to_bound"] = None if bound is row else row["gt_max"] - bound["gt_max"]
+    yield "## In short: the middle exposure, one seed, the curve known"
+    yield markdown_table(in_short(rows), SHORT)
+    known_rows = [row for row in rows if row["response"] in (KNOWN, LEARNED)]
+    yield from _irradiance_tables(known_rows)
+    yield from _energy_tables(known_rows)
+    for curve, response in groups([row for row in rows if row["response"] != LEARNED], "curve", "response"):
+        members = [row for row in rows if row["curve"] == curve and row["response"] in (response, LEARNED)]
+        table = []
+        for (method,), mine in groups(members, "method").items():
+            line = {"method": method, "n": len(mine), "worst": min(row["gt_max"] for row in mine)}
+            line |= {name: sum(row[name] for row in mine) for name in ("lights_count", "lights_lost")}
+            seeds = [[row["gt_max"] for row in here] for here in groups(mine, "scene", "exposure").values()]
+            if max(map(len, seeds)) > 1:
+                line["below_mean"] = max(fmean(values) - min(values) for values in seeds)
+            for _, field, _ in parted(columns):
+                values = [row[field] for row in mine if field not in line and row.get(field) is not None]
+                line |= {field: fmean(values)} if values else {}
+            table.append(line)
+        yield f"## Curve {curve}, response {response}"
+        yield markdown_table(table, columns)
+        yield "gt-max by scene and exposure, mean over seeds, dB:"
+        fields = ("scene", "exposure", "method")
+        means = [
+            dict(zip(fields, key)) | {"dB": fmean(row["gt_max"] for row in here)}
+            for key, here in groups(members, *fields).items()
+        ]
+        yield pivot(means, {"scene": "", "exposure": "d"}, "method", "dB", ".2f")
+        yield from _whole_by_seed(members)
+    shared = max(row["shared_by"] for row in rows)
+    if shared > 1:
+        yield f"{shared} trainings shared a device: seconds and renders / s are those of a shared one."
+
+
+def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
+    """Return the mean over scenes and exposures of each seed that has them all, if several have."""
+    places, table = groups(rows, "scene", "exposure").keys(), []
+    for (method, seed), mine in sorted(groups(rows, "method", "seed").items()):
+        if groups(mine, "scene", "exposure").keys() == places:
+            away = [row["to_bound"] for row in mine if row["to_bound"] is not None]
+            line = {"method": method, "seed": seed, "gt-max dB": fmean(row["gt_max"] for row in mine)}
+            table.append(line | {"to U": fmean(away) if away else None})
+    if len({line["seed"] for line in table}) > 1:
+        yield "Means over all scenes and exposures, by seed:"
+        yield markdown_table(table, {"method": "", "seed": "d", "gt-max dB": ".2f", "to U": "+.2f"})
+
+
+SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": "", "irradiance off": ".0%", "worst room": ".0%"}
+SHORT |= {"light energy": ".2f", "5th to 95th percentile": ""}
+
+
+def in_short(rows: Sequence[Mapping]) -> list[dict]:
+    """Return a row for each method: means over scenes of one seed at the middle exposure, with the curve known.
+
+    "irradiance off" is a mean over scenes, and "worst room" the largest; "light energy" is the median over lights that
+    clip, and "5th to 95th percentile" the range of the 5th to the 95th percentile. None and a dash without figures.
+    """
+    middle = [row for row in rows if (row["exposure"], row["seed"]) == (EXPOSURES // 2, rows[0]["seed"])]
+    return [
+        {
+            "method": method,
+            "HDR dB": fmean(row["gt_max"] for row in mine),
+            "photos dB": fmean(row["ldr"] for row in mine),
+            "lost": f"{sum(row['lights_lost'] for row in mine)} of {sum(row['lights_count'] for row in mine)} lights",
+            "irradiance off": _over_rows(mine, "irradiance", fmean),
+            "worst room": _over_rows(mine, "irradiance", max),
+            **_light_energy(mine),
+        }
+        for (method, response), mine in groups(middle, "method", "response").items()
+        if response in (KNOWN, LEARNED)
+    ]
+
+
+def _over_rows(rows: Sequence[Mapping], field: str, summary: Callable[[list[float]], float]) -> float | None:
+    """Return the summary of a field over the rows that have it; None if none has."""
+    values = [row[field] for row in rows if row.get(field) is not None]
+    return summary(values) if values else None
+
+
+def _light_energy(rows: Sequence[Mapping]) -> dict[str, Any]:
+    """Return the median and the range of the energy of lights that clip, as in_short() has them."""
+    energies = sorted(energy for row in rows for energy in row.get("light_energies") or ())
+    if not energies:
+        return {"light energy": None, "5th to 95th percentile": "-"}
+    low, high = (energies[round(part * (len(energies) - 1))] for part in (0.05, 0.95))
+    return {"light energy": median(energies), "5th to 95th percentile": f"{low:.2f} to {high:.2f}"}
+
+
+def _energy_tables(rows: Sequence[Mapping]) -> Iterable[str]:
+    """Energy of the lights that clip, by method and exposure."""
+    table = []
+    for (method, exposure), mine in sorted(groups(rows, "method", "exposure").items()):
+        energies = [energy for row in mine for energy in row.get("light_energies") or ()]
+        if energies:
+            near = (sum(0.5 <= energy <= 2 for energy in energies)) / len(energies)
+            counts = {
+                "lost": sum(row["lights_lost"] for row in mine),
+                "lights": sum(row["lights_count"] for row in mine),
+            }
+            table.append({"method": method, "exposure": exposure, "n": len(energies), "near": near} | counts)
+            table[-1] |= _light_energy(mine)
+    if table:
+        yield "## Energy of the lights that photos clip, over the truth's"
+        columns = {"method": "", "exposure": "d", "lights that clip=n": "d", "median=light energy": ".2f"}
+        columns |= {"percentiles=5th to 95th percentile": "", "half to twice=near": ".0%"}
+        columns |= {"all lights=lights": "d", "lost": "d"}
+        yield markdown_table(table, columns)
+
+
+def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
+    """Error of the light on surfaces, by what clips."""
+    rows = [row for row in rows if row.get("irradiance") is not None]
+    if not rows:
+        return
+    yield "## Irradiance: off by, and what the photos clip"
+    medians = []
+    for (method,), mine in groups(rows, "method").items():
+        whole = [row["irradiance"] for row in mine if row["clipped_share"] < NOTHING_CLIPS]
+        medians += [f"{method} {median(whole):.1%} ({len(whole)} trainings)"] if whole else []
+    if medians:
+        yield f"Where less than {NOTHING_CLIPS:.1%} of the pixels clip, in the median: {', '.join(medians)}."
+    means = [
+        {"scene": scene, "exposure": exposure, "method": method, "off": fmean(row["irradiance"] for row in here)}
+        for (scene, exposure, method), here in groups(rows, "scene", "exposure", "method").items()
+    ]
+    clipped = [
+        {"scene": row["scene"], "exposure": row["exposure"], "method": "clipped pixels", "off": row["clipped_share"]}
+        for row in {(row["scene"], row["exposure"]): row for row in rows}.values()
+    ]
+    yield pivot([*clipped, *means], {"scene": "", "exposure": "d"}, "method", "off", ".1%")
+
+
+def readme_table(rows: Sequence[Mapping]) -> str:
+    """Return the rows of in_short() that the README shows, as Markdown; figures that no row has are left out."""
+    labels = PAGES["quality"]["readme"]
+    short = {row["method"]: row for row in in_short(rows) if row["method"] in labels}
+    irradiance = any(row["irradiance off"] is not None for row in short.values())
+    titles = [FIRST_TITLE, "HDR", "photos", "lights below half", *["irradiance off: mean, worst"] * irradiance]
+    titles += ["light energy: median, 5th to 95th percentile"]
+    lines = []
+    for method, label in labels.items():
+        if (row := short.get(method)) is None:
+            continue
+        off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}, {row['worst room']:.0%}"
+        energy = "-" if row["light energy"] is None else f"{row['light energy']:.2f}, {row['5th to 95th percentile']}"
+        lights_lost = row["lost"].removesuffix(" lights")
+        cells = [
+            label,
+            f"{row['HDR dB']:.1f} dB",
+            f"{row['photos dB']:.1f} dB",
+            lights_lost,
+            *[off] * irradiance,
+            energy,
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join([f"| {' | '.join(titles)} |", f"| ---{' | -:' * (len(titles) - 1)} |", *lines])
