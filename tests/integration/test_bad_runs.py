@@ -1,91 +1,31 @@
-"""Damaged runs, full disks and signals through the command line: one clear line, nothing half-written, nothing lost."""
+"""Damaged runs, cameras and flags through the command line: one clear line, and nothing changed."""
 
-import json
 import shutil
-import signal
-import subprocess
-import sys
 
 import pytest
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
 
-from ..full_disk import full_disk
 from ..refusals import call, refused
-
-# ------------------------------------------------------------------------------------------------------------- runs
-
-
-LITTLE = ("--max-size", "40", "--response", "hdr-nerf", "--model.initial-density", "0")
+from .damage import (
+    checkpoint_of,
+    cut_tensors,
+    edit_json,
+    edit_view,
+    flip_byte,
+    remove_value,
+    resign,
+    shorten_means,
+    snapshot,
+)
 
 
 @pytest.fixture
-def trained(embedded_run):
-    return embedded_run
-
-
-@pytest.fixture
-def run(trained, tmp_path):
+def run(embedded_run, tmp_path):
     """A copy to damage."""
-    shutil.copytree(trained, tmp_path / "run")
+    shutil.copytree(embedded_run, tmp_path / "run")
     return tmp_path / "run"
-
-
-def snapshot(folder) -> dict:
-    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def checkpoint_of(run):
-    return next((run / "checkpoints").iterdir())
-
-
-def flip_byte(path, at: int = -5):
-    content = bytearray(path.read_bytes())
-    content[at] ^= 0x10
-    path.write_bytes(content)
-
-
-def edit_json(path, **fields):
-    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
-
-
-def edit_view(run, **fields):
-    """Change the first view or its camera, and state the file's hash anew, so that the value itself is checked."""
-    values = json.loads((run / "scene.json").read_text())
-    for name, value in fields.items():
-        (values["views"][0] if name in values["views"][0] else values["views"][0]["camera"])[name] = value
-    (run / "scene.json").write_text(json.dumps(values))
-    edit_json(checkpoint_of(run) / "checkpoint.json", run=RunFolder(run).hashes())
-
-
-def resign(run, change):
-    """Changes a checkpoint's tensors and states their hash anew."""
-    import hashlib
-
-    from safetensors.torch import load, save
-
-    folder = checkpoint_of(run)
-    tensors = load((folder / "state.safetensors").read_bytes())
-    change(tensors)
-    content = save(tensors)
-    (folder / "state.safetensors").write_bytes(content)
-    hashes = {"sha256": hashlib.sha256(content).hexdigest(), "run": RunFolder(run).hashes()}
-    edit_json(folder / "checkpoint.json", **hashes)
-
-
-def remove_value(path, name):
-    path.write_text(json.dumps({key: value for key, value in json.loads(path.read_text()).items() if key != name}))
-
-
-def cut_tensors(run):
-    path = checkpoint_of(run) / "state.safetensors"
-    path.write_bytes(path.read_bytes()[:-9])
-
-
-def shorten_means(tensors):
-    tensors["gaussians.means"] = tensors["gaussians.means"][:3].clone()
 
 
 HASH = "state.safetensors: its SHA-256"
@@ -246,9 +186,9 @@ CAMERAS = {
 
 
 @pytest.mark.parametrize("case", CAMERAS)
-def test_camera_files(trained, tmp_path, capfd, case):
+def test_camera_files(embedded_run, tmp_path, capfd, case):
     (tmp_path / "path.json").write_text(CAMERAS[case])
-    arguments = ("render", trained, "--out", tmp_path / "out", "--device", "cpu")
+    arguments = ("render", embedded_run, "--out", tmp_path / "out", "--device", "cpu")
     assert "path.json" in refused(capfd, *arguments, "--cameras", tmp_path / "path.json")
     assert not (tmp_path / "out").exists()
 
@@ -276,14 +216,14 @@ def test_camera_files(trained, tmp_path, capfd, case):
         (("--device", "tpu"), "tpu"),
     ],
 )
-def test_render_flags(trained, tmp_path, capfd, flags, words):
-    line = refused(capfd, "render", trained, "--out", tmp_path / "out", "--device", "cpu", *flags)
+def test_render_flags(embedded_run, tmp_path, capfd, flags, words):
+    line = refused(capfd, "render", embedded_run, "--out", tmp_path / "out", "--device", "cpu", *flags)
     assert words in line and not (tmp_path / "out").exists()
 
 
-def test_nothing_is_replaced(trained, tmp_path, capfd):
+def test_nothing_is_replaced(embedded_run, tmp_path, capfd):
     out = tmp_path / "out"
-    arguments = ("render", trained, "--out", out, "--device", "cpu", "--evs=-2,0")
+    arguments = ("render", embedded_run, "--out", out, "--device", "cpu", "--evs=-2,0")
     assert call(*arguments) == 0
     (out / "notes.txt").write_text("mine")
     before = snapshot(out)
@@ -296,109 +236,20 @@ def test_nothing_is_replaced(trained, tmp_path, capfd):
         assert (out / place).read_text() == "mine"
         (out / place).unlink()
     (tmp_path / "scene.ply").write_text("mine")
-    assert "--overwrite" in refused(capfd, "export", trained, "--out", tmp_path / "scene.ply")
+    assert "--overwrite" in refused(capfd, "export", embedded_run, "--out", tmp_path / "scene.ply")
     (tmp_path / "report").mkdir()
     (tmp_path / "report" / "stops.png").write_text("mine")
-    assert "--overwrite" in refused(capfd, "report", trained, "--out", tmp_path / "report", "--device", "cpu")
+    assert "--overwrite" in refused(capfd, "report", embedded_run, "--out", tmp_path / "report", "--device", "cpu")
     assert (tmp_path / "scene.ply").read_text() == (tmp_path / "report" / "stops.png").read_text() == "mine"
     (tmp_path / "a.ply").mkdir()
-    assert "is a file" in refused(capfd, "render", trained, "--out", tmp_path / "scene.ply", "--device", "cpu")
-    assert "is a folder" in refused(capfd, "export", trained, "--out", tmp_path / "a.ply")
+    assert "is a file" in refused(capfd, "render", embedded_run, "--out", tmp_path / "scene.ply", "--device", "cpu")
+    assert "is a folder" in refused(capfd, "export", embedded_run, "--out", tmp_path / "a.ply")
     several = ("--kind", "ldr", "--exposure", "1/60,1/125")
-    assert call("export", trained, "--out", tmp_path / "b.ply", *several, "-q") == 2
+    assert call("export", embedded_run, "--out", tmp_path / "b.ply", *several, "-q") == 2
     assert "one exposure; name one" in capfd.readouterr().err
-    assert "no photo has a mask" in refused(capfd, "export", trained, "--out", tmp_path / "b.ply", "--mask-only")
-    assert call("export", trained, "--out", tmp_path / "b.ply", "--data", tmp_path, "-q") == 2
+    assert "no photo has a mask" in refused(capfd, "export", embedded_run, "--out", tmp_path / "b.ply", "--mask-only")
+    assert call("export", embedded_run, "--out", tmp_path / "b.ply", "--data", tmp_path, "-q") == 2
     assert "only read for --mask-only" in capfd.readouterr().err
-
-
-# --------------------------------------------------------------------------------------------- full disks and signals
-
-
-@pytest.mark.parametrize(
-    "command", [("render",), ("render", "--evs=-2,0,2", "--multipart"), ("export",), ("report",)], ids=" ".join
-)
-def test_full_disk(trained, tmp_path, capfd, command, coarse_figures):
-    out = tmp_path / "out"
-    out = out.with_suffix(".ply") if command[0] == "export" else out
-    before = tmp_path / "before" / out.name
-    assert call(command[0], trained, "--out", before, "--device", "cpu", *command[1:]) == 0, "kernels are compiled now"
-    shutil.rmtree(before.parent)
-    with full_disk():
-        line = refused(capfd, command[0], trained, "--out", out, "--device", "cpu", *command[1:])
-    assert "cannot be written" in line and ".tmp" not in line and list(tmp_path.iterdir()) == []
-
-
-def test_full_disk_while_training_keeps_the_last_checkpoint(trained, tmp_path, capfd):
-    out = tmp_path / "run"
-    shutil.copytree(trained, out)
-    values = json.loads((out / "config.json").read_text())
-    values["schedule"]["iterations"] = 34
-    (out / "config.json").write_text(json.dumps(values))
-    resign(out, lambda tensors: None)
-    before = snapshot(out / "checkpoints")
-    flags = ("--device", "cpu", "--resume")
-    with full_disk():
-        line = refused(capfd, "train", "embedded", "--out", out, *flags)
-    assert "cannot be written" in line and snapshot(out / "checkpoints") == before
-    assert call("train", "embedded", "--out", out, *flags) == 0, "and goes on once there is room"
-
-
-def test_read_only_place(trained, tmp_path, capfd, coarse_figures):
-    """/proc takes no new files, not even root's."""
-    for command in ("render", "export", "report"):
-        line = refused(capfd, command, trained, "--out", "/proc/sehdr/out.ply")
-        assert "/proc/sehdr" in line
-    assert "/proc/sehdr" in refused(capfd, "train", "embedded", "--out", "/proc/sehdr", *LITTLE)
-
-
-def start(*arguments) -> subprocess.Popen:
-    # Tests that run in a shell's background have SIGINT ignored, and children inherit that.
-    code = "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    code += "runpy.run_module('sehdr_warp', run_name='__main__')"
-    command = [sys.executable, "-c", code, *(str(argument) for argument in arguments)]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-
-
-def wait_for(process: subprocess.Popen, words: str) -> None:
-    for line in process.stderr:
-        if words in line:
-            return
-    raise AssertionError(f"{words!r} was never said; status {process.wait()}")
-
-
-def test_interrupted_render_leaves_nothing(trained, tmp_path):
-    process = start("render", trained, "--out", tmp_path / "out", "--cameras", "orbit", "--count", "2000", "--evs=-2,0")
-    wait_for(process, " of 2000")
-    process.send_signal(signal.SIGINT)
-    assert "Traceback" not in process.communicate(timeout=60)[1] and process.returncode == 130
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_interrupted_training_can_be_used(tmp_path, capfd):
-    out = tmp_path / "run"
-    process = start("train", "embedded", "--out", out, "--iterations", "100000", "--device", "cpu", *LITTLE)
-    wait_for(process, "iteration 1/")
-    process.send_signal(signal.SIGINT)
-    rest = process.communicate(timeout=60)[1]
-    assert process.returncode == 130 and "--resume" in rest and "Traceback" not in rest
-    assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
-
-
-def test_kill_while_a_checkpoint_is_written(trained, tmp_path):
-    """What a killed process leaves beside a checkpoint is not taken for one, and is cleared by the next."""
-    out = tmp_path / "run"
-    shutil.copytree(trained, out)
-    whole = checkpoint_of(out)
-    half = whole.with_name(f".{whole.name[:-1]}9.0123abcd.tmp")
-    shutil.copytree(whole, half)
-    (half / "checkpoint.json").unlink()
-    torn = whole.with_name(f"{whole.name[:-1]}9")
-    shutil.copytree(whole, torn)
-    (torn / "state.safetensors").write_bytes((whole / "state.safetensors").read_bytes()[:1000])
-    assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
-    assert call("train", "embedded", "--out", out, "--device", "cpu", "--resume") == 0
-    assert [path.name for path in sorted((out / "checkpoints").iterdir()) if path != half] == [whole.name]
 
 
 def test_a_folder_that_is_no_run_is_not_replaced_and_the_remedy_says_so(tmp_path):
