@@ -111,7 +111,7 @@ def _blocks(study: Study, plan: BlockPlan, name: str, at_once: int) -> float:
     out.mkdir(exist_ok=True)
     plan.write(out)
     began = time.perf_counter()
-    run_blocks(out, plan, device="cpu" if study.device.type == "cpu" else None, gpus=at_once)
+    run_blocks(out, plan, device=study.device, gpus=at_once)
     seconds = time.perf_counter() - began
     parts = [json.loads(path.read_text()) for path in sorted(out.glob("blocks/*/summary.json"))]
     figures = {field: [part.get(field) for part in parts] for field in ("gaussians", "train_seconds")}

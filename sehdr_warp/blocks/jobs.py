@@ -5,12 +5,15 @@ its newest checkpoint; SLURM jobs that reach their time limit or are preempted a
 """
 
 import logging
+import os
 import secrets
 import time
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from ..errors import SehdrError
 from .block_plan import BlockPlan
@@ -24,10 +27,21 @@ MONTH = 30 * 24 * 60  # Minutes, for jobs of this machine, which have no time li
 
 
 class BlockJob:
-    """A block's training as submitit runs it; checkpoint() makes SLURM requeue a job whose time is over."""
+    """A block's training as submitit runs it; checkpoint() makes SLURM requeue a job whose time is over.
+
+    Attributes:
+        gpu: GPU of the job, as CUDA_VISIBLE_DEVICES names it; None if SLURM assigns it, or on a CPU.
+    """
+
+    def __init__(self, gpu: str | None = None):
+        """Store the GPU."""
+        self.gpu = gpu
 
     def __call__(self, *arguments: Any) -> BlockResult:
         """Train the block; arguments as of train_block()."""
+        if self.gpu is not None:
+            # submitit hides all GPUs from a job of this machine that asks for none, and knows them by number alone.
+            os.environ["CUDA_VISIBLE_DEVICES"] = self.gpu
         return train_block(*arguments)
 
     def checkpoint(self, *arguments: Any) -> Any:
@@ -41,8 +55,8 @@ def run_blocks(
     out: Path,
     plan: BlockPlan,
     *,
-    device: str | None,
-    gpus: int,
+    device: torch.device,
+    gpus: int = 1,
     photos: str = "auto",
     slurm: Mapping[str, str] | None = None,
 ) -> None:
@@ -51,8 +65,8 @@ def run_blocks(
     Args:
         out: Folder of the merged run, with blocks.json.
         plan: The plan.
-        device: "cpu", "cuda:N" or None for GPUs if there are any.
-        gpus: Blocks to train at once on this machine, each on a GPU of its own.
+        device: The CPU, or the first GPU to use.
+        gpus: Blocks to train at once on this machine, each on a GPU of its own from `device` on; SLURM gets all at once.
         photos: Where photos are stored, see load_scene().
         slurm: Parameters of SLURM jobs, such as {"partition": "gpu"}; None for this machine.
 
@@ -65,17 +79,22 @@ def run_blocks(
         log.info("%d of %d blocks are finished already", finished, len(plan.blocks))
     if not waiting:
         return
-    executors = _executors(out, device, gpus, slurm, len(waiting))
+    on_gpu = device.type == "cuda"
+    executor = _executor(out, slurm, on_gpu=on_gpu)
+    slots = min(gpus, len(waiting)) if slurm is None else len(waiting)
+    names = visible_gpus(device, slots) if on_gpu and slurm is None else [None] * slots
+    work = [BlockJob(name) for name in names]
+    job_device = None if on_gpu else "cpu"
     tries, errors = dict.fromkeys(waiting, 0), {}
     running: dict[int, tuple[int, Any]] = {}
     try:
         while waiting or running:
-            for slot in range(len(executors)):
+            for slot in range(slots):
                 if slot in running or not waiting:
                     continue
                 index = waiting.popleft()
                 tries[index] += 1
-                running[slot] = index, executors[slot].submit(BlockJob(), out.absolute(), index, device, photos)
+                running[slot] = index, executor.submit(work[slot], out.absolute(), index, job_device, photos)
                 log.info("%s: training begins, %d photos", plan.blocks[index].name, len(plan.blocks[index].views))
             time.sleep(POLL)
             for slot, (index, job) in list(running.items()):
@@ -103,8 +122,15 @@ def run_blocks(
         raise SehdrError(f"{name}{others}: {error}; {remedy}")
 
 
-def _executors(out: Path, device: str | None, gpus: int, slurm: Mapping[str, str] | None, count: int) -> list[Any]:
-    """Return an executor of submitit for each job that may run at the same time."""
+def visible_gpus(device: torch.device, count: int) -> list[str]:
+    """Return the names that CUDA_VISIBLE_DEVICES has for `count` GPUs from `device` on."""
+    first, visible = device.index or 0, os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = visible.split(",") if visible else [str(index) for index in range(first + count)]
+    return [name.strip() for name in names[first : first + count]]
+
+
+def _executor(out: Path, slurm: Mapping[str, str] | None, *, on_gpu: bool) -> Any:
+    """Return submitit's executor, of this machine or of SLURM."""
     try:
         import submitit
     except ImportError:
@@ -114,16 +140,11 @@ def _executors(out: Path, device: str | None, gpus: int, slurm: Mapping[str, str
     logs = out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
     if slurm is not None:
         executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
-        executor.update_parameters(name="sehdr-warp", **_slurm_parameters(slurm, gpu=device != "cpu"))
-        return [executor] * count
-    executors = []
-    for slot in range(min(gpus, count)):
-        executor = submitit.LocalExecutor(folder=logs)
-        executor.update_parameters(timeout_min=MONTH)
-        if gpus > 1 and device != "cpu":
-            executor.update_parameters(gpus_per_node=1, visible_gpus=[slot])
-        executors.append(executor)
-    return executors
+        executor.update_parameters(name="sehdr-warp", **_slurm_parameters(slurm, gpu=on_gpu))
+        return executor
+    executor = submitit.LocalExecutor(folder=logs)
+    executor.update_parameters(timeout_min=MONTH)
+    return executor
 
 
 def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any]:

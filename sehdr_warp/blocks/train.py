@@ -50,7 +50,7 @@ def train_in_blocks(
         out: Folder of the merged run; the blocks' runs are in `blocks/` below it.
         config: Options of the training, the same for each block.
         count: Number of blocks; None chooses it.
-        device: Device to measure and merge on; blocks train on the same, or on the first GPUs of this machine.
+        device: Device to measure and merge on; blocks train on it and the GPUs that follow it.
         gpus: Blocks to train at once.
         slurm: Parameters of SLURM jobs; None trains on this machine.
         resume: Continue; finished blocks are not run again.
@@ -76,7 +76,7 @@ def train_in_blocks(
         with writing(out):
             make_parents(out / FILE)
         plan.write(out)
-    run_blocks(out, plan, device="cpu" if device.type == "cpu" else None, gpus=gpus, photos=photos, slurm=slurm)
+    run_blocks(out, plan, device=device, gpus=gpus, photos=photos, slurm=slurm)
     folder = merge_blocks(out, plan)
     run = load_run(out, device=device)
     errors = _measure(run, plan, photos)

@@ -129,7 +129,7 @@ def test_other_commands_take_the_merged_run(merged, tmp_path):
 
 
 def test_finished_blocks_are_not_run_again(merged, monkeypatch):
-    monkeypatch.setattr(jobs, "_executors", lambda *_: pytest.fail("a job was started"))
+    monkeypatch.setattr(jobs, "_executor", lambda *_, **__: pytest.fail("a job was started"))
     before = (merged / "checkpoints").stat().st_mtime_ns
     assert call("train", "--resume", "--out", merged, "--device", "cpu") == 0
     assert (merged / "checkpoints").stat().st_mtime_ns != before, "merged again"
@@ -156,6 +156,29 @@ def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capf
     for words in (["--blocks", "1"], ["--blocks", "many"], ["--slurm", "partition=gpu"], ["--blocks", "2", "--view"]):
         assert call("train", survey, "--out", tmp_path / "run", *words, "-q") == 2
     assert len(capfd.readouterr().err.splitlines()) == 4
+
+
+@pytest.mark.parametrize(
+    ("first", "count", "visible", "names"),
+    [
+        ("cuda", 1, None, ["0"]),
+        ("cuda:1", 2, None, ["1", "2"]),
+        ("cuda:0", 2, "3,5", ["3", "5"]),
+        ("cuda:1", 1, "GPU-8f6c, GPU-71aa", ["GPU-71aa"]),
+    ],
+)
+def test_blocks_take_the_gpus_that_the_user_made_visible(monkeypatch, first, count, visible, names):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert jobs.visible_gpus(torch.device(first), count) == names
+
+
+def test_a_job_sees_its_gpu_although_submitit_hides_all(monkeypatch, tmp_path):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # As submitit starts a job that asks for no GPU.
+    monkeypatch.setattr(jobs, "train_block", lambda *_: os.environ["CUDA_VISIBLE_DEVICES"])
+    assert jobs.BlockJob("1")(tmp_path, 0, None, "auto") == "1"
+    assert jobs.BlockJob()(tmp_path, 0, "cpu", "auto") == "1", "SLURM assigns GPUs itself"
 
 
 def test_slurm_jobs_take_the_parameters(tmp_path):
