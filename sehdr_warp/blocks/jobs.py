@@ -66,7 +66,8 @@ def run_blocks(
         out: Folder of the merged run, with blocks.json.
         plan: The plan.
         device: The CPU, or the first GPU to use.
-        gpus: Blocks to train at once on this machine, each on a GPU of its own from `device` on; SLURM gets all at once.
+        gpus: Blocks to train at once on this machine, each on a GPU of its own from `device` on. SLURM gets all at
+            once.
         photos: Where photos are stored, see load_scene().
         slurm: Parameters of SLURM jobs, such as {"partition": "gpu"}; None for this machine.
 

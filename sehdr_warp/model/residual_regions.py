@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,77 +47,97 @@ class Region:
     box: tuple[int, int, int, int]
 
 
+class PhotoComparison(NamedTuple):
+    """Difference of a scene from its photos.
+
+    Attributes:
+        regions: Regions that the scene does not reproduce, largest area times stops first.
+        brightness_offsets: Stops by which whole photos are brighter than the scene, by the views' names: the median
+            over pixels that are neither clipped nor dark, less the median over photos. Photos with few such pixels are
+            left out.
+    """
+
+    regions: list[Region]
+    brightness_offsets: dict[str, float]
+
+
 @torch.no_grad()
-def find_residual_regions(field: RadianceField, views: Sequence[View], *, degree: int | None = None) -> list[Region]:
-    """Find regions in which a field differs from photos, largest area times stops first.
+def compare_photos(field: RadianceField, views: Sequence[View], *, degree: int | None = None) -> PhotoComparison:
+    """Compare a field with photos.
 
     At most MAX_VIEWS photos are compared, evenly chosen. Regions smaller than MIN_PIXELS, and lines one pixel wide
     as edges leave them, are ignored.
     """
-    regions = []
+    regions, medians = [], {}
     compared = every_nth(views, MAX_VIEWS)
     for _, view in tracked("comparing photos with the scene", compared, log):
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
-        for row, column, stops in _regions(view, exposure, field.response):
-            first_column, top = int(column.min()), int(row.min())
-            middle = round(float(column.mean()) + 0.5, 1), round(float(row.mean()) + 0.5, 1)
-            box = first_column, top, int(column.max()) - first_column + 1, int(row.max()) - top + 1
-            regions.append(Region(view.name, *middle, len(row), round(float(stops.mean()), 2), box))
-    return sorted(regions, key=lambda region: -region.pixels * abs(region.stops))
-
-
-@torch.no_grad()
-def brightness_offsets(field: RadianceField, views: Sequence[View], *, degree: int | None = None) -> dict[str, float]:
-    """Return the stops by which whole photos are brighter than the scene, by the views' names.
-
-    It is the median over pixels that are neither clipped nor dark, less the median over photos. Photos with few such
-    pixels are left out. At most MAX_VIEWS photos are compared, evenly chosen.
-    """
-    medians = {}
-    for view in every_nth(views, MAX_VIEWS):
-        exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
-        stops, _ = _differences(view, exposure, field.response)
-        exposed = ((view.image > _EXPOSED[0]) & (view.image < _EXPOSED[1])).all(2)
+        photo = view.image
+        stops, code = _differences(view, photo, exposure, field.response)
+        for labels, sizes in _labels(stops, code):
+            regions += _regions(view.name, labels, sizes, stops)
+        exposed = ((photo > _EXPOSED[0]) & (photo < _EXPOSED[1])).all(2)
         exposed &= True if view.mask is None else view.mask > 0.5
         if exposed.mean() > _LEAST_EXPOSED:
             medians[view.name] = float(np.median(stops[exposed]))
     middle = float(np.median(list(medians.values()))) if medians else 0.0
-    return {name: round(value - middle, 2) for name, value in medians.items()}
+    offsets = {name: round(value - middle, 2) for name, value in medians.items()}
+    return PhotoComparison(sorted(regions, key=lambda region: -region.pixels * abs(region.stops)), offsets)
 
 
 def high_residual_mask(view: View, exposure: torch.Tensor, response: Response) -> torch.Tensor:
     """Return a [H, W] bool mask of the pixels in regions where a photo differs from the scene's exposure [H, W, 3]."""
     mask = np.zeros(exposure.shape[:2], bool)
-    for row, column, _ in _regions(view, exposure, response):
-        mask[row, column] = True
+    for labels, sizes in _labels(*_differences(view, view.image, exposure, response)):
+        mask |= (sizes >= MIN_PIXELS)[labels]
     return torch.from_numpy(mask).to(exposure.device)
 
 
-def _regions(view: View, exposure: torch.Tensor, response: Response) -> Iterator[tuple[np.ndarray, ...]]:
-    """Yield rows, columns and stops of the pixels of each region."""
+def _labels(stops: np.ndarray, code: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield a [H, W] int32 number of each pixel's region, 0 outside, and the regions' sizes [N + 1], that of 0 being 0.
+
+    Regions that are too bright and too dark come separately: one that is both has a mean difference of 0.
+    """
     from scipy import ndimage
 
-    stops, code = _differences(view, exposure, response)
-    labels = np.empty(stops.shape, np.int32)
-    for sign in (
-        1,
-        -1,
-    ):  # Separately: a region that is partly too bright and partly too dark has a mean difference of 0.
+    for sign in (1, -1):
         large = (sign * stops >= MIN_STOPS) & (code >= MIN_CODE_DIFFERENCE)
+        labels = np.empty(stops.shape, np.int32)
         ndimage.label(ndimage.binary_opening(large, np.ones((2, 2))), np.ones((3, 3)), output=labels)
-        for index, place in enumerate(ndimage.find_objects(labels), start=1):
-            row, column = np.nonzero(labels[place] == index)
-            if len(row) >= MIN_PIXELS:
-                row, column = row + place[0].start, column + place[1].start
-                yield row, column, stops[row, column]
+        sizes = np.bincount(labels.ravel())
+        sizes[0] = 0
+        yield labels, sizes
 
 
-def _differences(view: View, exposure: torch.Tensor, response: Response) -> tuple[np.ndarray, np.ndarray]:
-    """Return two [H, W] arrays: stops by which the photo is brighter, and the largest difference of encoded values.
+def _regions(photo: str, labels: np.ndarray, sizes: np.ndarray, stops: np.ndarray) -> Iterator[Region]:
+    """Yield the regions of MIN_PIXELS and more."""
+    from scipy import ndimage
+
+    large = np.flatnonzero(sizes >= MIN_PIXELS)
+    if not len(large):
+        return
+    rows, columns = np.nonzero(labels)
+    index = labels[rows, columns]
+    row, column, mean = (
+        np.bincount(index, values, len(sizes)) / np.maximum(sizes, 1)
+        for values in (rows, columns, stops[rows, columns])
+    )
+    boxes = ndimage.find_objects(labels)
+    for each in large:
+        down, across = boxes[each - 1]
+        box = across.start, down.start, across.stop - across.start, down.stop - down.start
+        middle = round(float(column[each]) + 0.5, 1), round(float(row[each]) + 0.5, 1)
+        yield Region(photo, *middle, int(sizes[each]), round(float(mean[each]), 2), box)
+
+
+def _differences(
+    view: View, image: np.ndarray, exposure: torch.Tensor, response: Response
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return two [H, W] arrays: stops by which a view's image is brighter, and the largest difference of codes.
 
     Both are 0 if the photo is clipped and the scene at white, and where a mask excludes the photo.
     """
-    photo = torch.from_numpy(view.image).to(exposure.device)
+    photo = torch.from_numpy(image).to(exposure.device)
     rendered = response.encode_extended(exposure).clamp(0, 1)
     # A photo does not distinguish exposures below half a code.
     light = [response.decode(encoded.clamp_min(HALF_CODE)).mean(2) for encoded in (photo, rendered)]

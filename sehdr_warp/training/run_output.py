@@ -12,7 +12,7 @@ from ..evaluation.metrics import psnr
 from ..evaluation.protocols import normalize, tone_map
 from ..model.confidence import Evidence, gather_evidence
 from ..model.radiance_field import RadianceField
-from ..model.residual_regions import MAX_LISTED, brightness_offsets, find_residual_regions, regions_to_dict
+from ..model.residual_regions import MAX_LISTED, compare_photos, regions_to_dict
 from ..runs.checkpoint import first_not_finite
 from ..runs.config import Config
 from ..runs.light_estimates import light_estimates
@@ -139,8 +139,7 @@ class RunOutput:
     def _report_residuals(self, run: Run, trainer: TrainingState) -> None:
         """Compare the training photos with the scene, and list the regions that differ in summary and log."""
         views = trainer.scene.train_views
-        regions = find_residual_regions(run.model, views, degree=run.degree)
-        offsets = brightness_offsets(run.model, views, degree=run.degree)
+        regions, offsets = compare_photos(run.model, views, degree=run.degree)
         unexplained = {"unexplained": regions_to_dict(regions), "brightness_offsets": offsets}
         self.folder.write_summary(run.summary() | unexplained)
         if regions:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sehdr_warp.model.confidence import gather_evidence
-from sehdr_warp.model.residual_regions import brightness_offsets, find_residual_regions
+from sehdr_warp.model.residual_regions import compare_photos
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.train import train
 
@@ -32,7 +32,7 @@ def test_a_missing_lamp_is_named_and_told(tmp_path, caplog):
     run = train(without_lamp(scene), tmp_path / "run", CONFIG, device="cpu")
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["unexplained"]["regions"] == 0
     assert "not explained" not in caplog.text
-    regions = find_residual_regions(run.model, scene.views)
+    regions = compare_photos(run.model, scene.views).regions
     assert {region.photo for region in regions} == {view.name for view in scene.views} and len(regions) == 9
     cameras = {view.name: view.camera for view in scene.views}
     for region in regions:
@@ -56,28 +56,28 @@ def test_a_missing_lamp_is_named_and_told(tmp_path, caplog):
 def test_what_does_not_count_is_not_missing_and_light_that_is_not_there_is(tmp_path, caplog):
     scene = wall_and_lamp()
     run = train(scene, tmp_path / "run", CONFIG, device="cpu")
-    assert not find_residual_regions(run.model, scene.views)
+    assert not compare_photos(run.model, scene.views).regions
     dark = without_lamp(scene)
     assert (
-        all(region.stops < -1 for region in find_residual_regions(run.model, dark.views))
+        all(region.stops < -1 for region in compare_photos(run.model, dark.views).regions)
         and "summary" not in caplog.text
     )
-    black = find_residual_regions(run.model, [replace(view, codes=np.zeros_like(view.codes)) for view in scene.views])
+    black = compare_photos(run.model, [replace(view, codes=np.zeros_like(view.codes)) for view in scene.views]).regions
     # A black photo says "less than half a code", not "none": from white of a linear curve that is 9 stops.
     assert min(region.stops for region in black) > -np.log2(2 * 255) - 0.01 and black
     half = np.where(np.arange(64)[:, None, None] < 32, 255, 0).repeat(64, 1).repeat(3, 2).astype(np.uint8)
-    regions = find_residual_regions(run.model, [replace(view, codes=half) for view in scene.views])
+    regions = compare_photos(run.model, [replace(view, codes=half) for view in scene.views]).regions
     # White above, black below: two regions that touch, and not one that is off by nothing in the mean.
     assert min(abs(region.stops) for region in regions) >= 1 and {region.stops > 0 for region in regions} == {
         True,
         False,
     }
     masked = [replace(view, mask=np.zeros((64, 64), np.float32)) for view in dark.views]
-    assert find_residual_regions(run.model, dark.views) and not find_residual_regions(run.model, masked)
+    assert compare_photos(run.model, dark.views).regions and not compare_photos(run.model, masked).regions
     # A whole photo of another exposure is told by its offset; clipped pixels do not count.
     names = [view.name for view in scene.views]
     longer = [replace(scene.views[0], exposure_time=scene.views[0].exposure_time / 2), *scene.views[1:]]
-    offsets = brightness_offsets(run.model, longer)
+    offsets = compare_photos(run.model, longer).brightness_offsets
     assert list(offsets) == names and offsets[names[0]] == pytest.approx(1.0, abs=0.1)
     assert all(abs(offsets[name]) < 0.1 for name in names[1:])
     # A training reports what its photos show and the scene does not hold.
