@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..scene import Camera
-from ..scene.photo_checks import FEWEST_PHOTOS
+from ..scene.photos import FEWEST_PHOTOS
 
 MARGIN = 0.1  # Enlargement of a core for the choice of its photos, as a fraction of its extent, on each side
 LEAST_PART = 0.15  # A block trains on photos of which its enlarged core fills at least this part

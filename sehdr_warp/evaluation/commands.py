@@ -77,7 +77,7 @@ class Compare:
 def run_evaluate(options: Evaluate) -> None:
     """Evaluate, print the figures and write them."""
     from ..files import check_absent, write_json
-    from .table import format_table
+    from .compare import format_table
 
     if options.pictures.truth is None:
         _refuse_unused(options.pictures, PictureOptions(), "needs --truth, the set to compare pictures with")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError
-from ..output.names import safe_names
+from ..output.images import safe_names
 from ..scene import Scene, View
 from ..scene.hdr_files import read_hdr
 from .evaluate import Evaluation

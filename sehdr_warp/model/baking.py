@@ -19,9 +19,9 @@ from ..scene import Camera
 from ..scene.normalization import Normalization
 from ..splats.arrays import HARMONIC_0, GaussianArrays, evaluate_colors, harmonic_basis
 from .adam import Adam
+from .color_models import rec709_of
 from .gaussians import Gaussians
 from .radiance_field import RadianceField
-from .sensor_colors import rec709_of
 
 # Smallest radiance whose logarithm is taken.
 DARKEST = 1e-12

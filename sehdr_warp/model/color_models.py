@@ -1,24 +1,22 @@
-"""Color models: spherical harmonics as log exposure, exposure, or encoded values.
+"""Color models: spherical harmonics as log exposure, exposure, or encoded values; and colors of sensors.
 
 Colors are exposures x = E dt_1 at the field's base time (c^{l_1} in the paper), so that their size, and with it the
 learning rates, does not depend on the unit of time.
 """
 
 import numpy as np
+import torch
 from torch import Tensor
 from torch.nn.functional import hardtanh
 
 from ..rasterizer.activations import bounded_exponential
 from ..response import Response
 
-EXPOSURE_FLOOR = (
-    1e-6  # Smallest exposure of the linear model; keeps logarithms finite, 100 times below 8-bit black in sRGB
-)
+EXPOSURE_FLOOR = 1e-6  # Smallest exposure of the linear model, so that logs are finite; 0.01 of 8-bit black in sRGB
 LOG_EXPOSURE_LIMIT = 40.0  # Largest absolute log exposure; exp of it stays finite in float32, squared and summed
-CODE_RANGE = (
-    1 / 255,
-    250 / 255,
-)  # Encoded values of start colors are clipped to this: outside, a photo states only a bound
+CODE_RANGE = 1 / 255, 250 / 255  # Start colors are clipped to these encoded values; outside, photos state only a bound
+# Fractions of the white level between which a channel's value blends from its own to the clipped estimate.
+_CLIPPED = 0.75, 0.95
 
 
 class ColorModel:
@@ -86,3 +84,30 @@ def make_color_model(name: str) -> ColorModel:
 def _clip_to_codes(encoded: np.ndarray) -> np.ndarray:
     """Clip encoded values to the range in which a photo states a color."""
     return np.clip(np.asarray(encoded, dtype=np.float64), *CODE_RANGE)
+
+
+def rec709_of(radiance: Tensor, matrix: np.ndarray, base_time: float) -> Tensor:
+    """Convert radiance in a sensor's own RGB to linear Rec.709.
+
+    All channels of a sensor clip at the same value, so a pixel clipped in all of them would turn magenta by white
+    balance alone. A channel near its white level therefore counts as at least as bright as the brightest of the three
+    after white balance. Colors outside the Rec.709 gamut have negative components, which are set to 0.
+
+    Args:
+        radiance: [..., 3] sensor RGB, in which white is 1 / base_time.
+        matrix: [3, 3] from sensor RGB to linear Rec.709, white balance included.
+        base_time: Exposure time of the photos, seconds.
+
+    Returns:
+        [..., 3] linear Rec.709, >= 0.
+    """
+    to_rec709 = torch.tensor(matrix, dtype=radiance.dtype, device=radiance.device)
+    neutral = torch.linalg.solve(to_rec709, torch.ones_like(to_rec709[0]))
+    neutral = neutral / neutral.max()
+    exposure = radiance * base_time
+    low, high = _CLIPPED
+    clipped = ((exposure - low) / (high - low)).clamp(0, 1)
+    clipped = clipped * clipped * (3 - 2 * clipped)
+    balanced = exposure / neutral
+    balanced = balanced + clipped * (balanced.amax(dim=-1, keepdim=True) - balanced)
+    return ((balanced * neutral / base_time) @ to_rec709.T).clamp_min(0)

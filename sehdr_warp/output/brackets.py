@@ -19,8 +19,7 @@ from ..files import atomic_folder, atomic_path, write_json
 from ..model.exposure import Exposure, Items, read_exposures
 from .colorspace import color_space, from_rec709
 from .exr import Part, check_finite, exr_header, rgb_channels, stored_pixel_type, write_exr, write_multipart_exr
-from .images import exposure_exif, quantize, write_picture
-from .names import safe_names
+from .images import exposure_exif, quantize, safe_names, write_picture
 
 log = logging.getLogger(__name__)
 LDR_FORMATS = ("jpeg", "png", "png16")

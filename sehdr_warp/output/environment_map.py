@@ -15,12 +15,11 @@ from sehdr_warp.scene import Camera
 from ..files import check_absent
 from .camera_paths import common_focus
 from .colorspace import color_space, from_rec709
-from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr
+from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr, write_radiance
 from .images import as_array
 from .light_pictures import exposure_of_white
 from .light_shares import light_shares
 from .light_unit import EFFICACY, luminance_of_one
-from .radiance_file import write_radiance
 from .render_views import provenance
 from .world_transform import AXES, world_transform
 

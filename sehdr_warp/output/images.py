@@ -1,5 +1,10 @@
-"""Encoded pictures: PNG with 8 or 16 bits and JPEG, with EXIF exposure times. Reading is in scene/images.py."""
+"""Write pictures: PNG with 8 or 16 bits and JPEG with EXIF exposure times; and names of their files.
 
+Reading is in scene/images.py.
+"""
+
+import re
+from collections.abc import Sequence
 from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
@@ -10,10 +15,13 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from ..files import atomic_path
-from ..scene.png16 import png16
+from ..scene.images import png16
 
 _EXIF_IFD, _EXPOSURE_TIME, _EXPOSURE_BIAS, _SOFTWARE, _DATE = 0x8769, 0x829A, 0x9204, 0x0131, 0x9003
 EXIF_TIME = "%Y:%m:%d %H:%M:%S"
+# Separators, what Windows forbids, and control characters.
+_FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
+_LONGEST = 120
 
 
 def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
@@ -65,3 +73,22 @@ def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | Non
 def as_array(value) -> np.ndarray:
     """Return a torch tensor on any device, or an array, as an array."""
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+
+
+def safe_names(names: Sequence[str]) -> list[str]:
+    """Return file names for views that are all different, also on systems that ignore case.
+
+    Letters that some system forbids become `_`, leading dots are dropped, names are cut at 120 bytes, and repeated
+    names get a number.
+    """
+    cleaned = [_FORBIDDEN.sub("_", name).strip().lstrip(".").rstrip(". ") for name in names]
+    # The file system's limit counts bytes, and prefixes and suffixes still come.
+    cleaned = [name.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore") or "view" for name in cleaned]
+    reserved, taken_names, result = {name.casefold() for name in cleaned}, set(), []
+    for name in cleaned:
+        candidate, number = name, 2
+        while candidate.casefold() in taken_names or (number > 2 and candidate.casefold() in reserved):
+            candidate, number = f"{name}_{number}", number + 1
+        taken_names.add(candidate.casefold())
+        result.append(candidate)
+    return result

@@ -15,7 +15,7 @@ from PIL import Image
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import View
 
-from ..model.sensor_colors import rec709_of
+from ..model.color_models import rec709_of
 from .html import EMPTY, data_block, join, markup
 from .images import as_array, quantize
 from .tonemap import encode_srgb

@@ -26,10 +26,9 @@ from .camera_paths import evenly, interpolate, orbit
 from .colorspace import from_rec709
 from .exr import Part, rgb_channels, write_multipart_exr
 from .framing import film_camera, frame_subject
-from .images import as_array, quantize, write_picture
+from .images import as_array, quantize, safe_names, write_picture
 from .light_pictures import exposure_of_white
 from .light_unit import luminance_of_one, read_light_unit
-from .names import safe_names
 from .ocio import ocio_view
 from .tonemap import ToneMap, fit_tone_map
 from .world_transform import WorldTransform, describe, world_transform

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..errors import InputError, SehdrError
 from ..model.baking import field_of
+from ..model.color_models import rec709_of
 from ..model.confidence import Evidence, gather_evidence
 from ..model.exposure import exposure_times
 from ..model.fusion import NeuralExposureFusion
@@ -18,7 +19,6 @@ from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.lights import Light, find_lights
 from ..model.paged_field import PagedField
 from ..model.radiance_field import RadianceField, RenderedView, Surroundings
-from ..model.sensor_colors import rec709_of
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure_compensation import ExposureCompensation

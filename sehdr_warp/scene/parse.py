@@ -14,7 +14,7 @@ from .hdr_files import exr_exposure_time
 from .linear_photos import float_time
 from .masks import assign_masks
 from .names import unique_names
-from .photo_checks import usable_photos
+from .photos import usable_photos
 from .read_folders import (
     find_photos,
     image_folder,

@@ -1,13 +1,135 @@
-"""Photos of any kind: encoded images, RAW files and float images, by their suffix."""
+"""Photos of any kind (encoded, RAW, float), by their suffix: sizes, codes, and checks by their headers.
 
+What cannot be used is left out and named before anything is decoded.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError
+from .color_encoding import note_of, stated_encoding
+from .dataparser import UNPLACED, ImageRecord
 from .hdr_files import hdr_size
-from .images import EncodedImage, image_sizes, read_ldr, require_file
+from .images import EncodedImage, image_sizes, open_image, read_ldr, require_file
+from .lens import Lens
 from .linear_photos import kind_of, raw_sizes, read_raw, tone_mapped
 
+FEWEST_PHOTOS = 3  # A training needs at least as many
+_MOST_NAMED = 3
+_KINDS = {"encoded": "photos of codes", "raw": "RAW photos", "float": "float images"}
 _ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
+
+
+def usable_photos(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], str, list[str]]:
+    """Check photos by their headers, and read what they state of their colors.
+
+    Photos that cannot be opened, do not fit their camera's size, or are of another kind than most are left out, unless
+    too few would remain.
+
+    Args:
+        records: the photos; those without a camera yet have no lens to fit.
+
+    Returns:
+        The usable photos, their kind (encoded, linear, raw or float), and notes.
+
+    Raises:
+        InputError: if most photos cannot be used, as the first of them.
+    """
+    if not records or any(record.derived for record in records):
+        return list(records), "encoded", []
+    kind, selected, notes = _most_common_kind(records)
+    usable, problems = [], []
+    for record in selected:
+        try:
+            usable.append(_checked(record))
+        except InputError as error:
+            problems.append(error)
+    notes += left_out(problems, len(selected))
+    if kind == "encoded":
+        notes += note_of({record.image.name: record.encoding for record in usable})
+        light = [record.encoding is not None and record.encoding.light is not None for record in usable]
+        if any(light):
+            linear = 2 * sum(light) >= len(light)
+            odd = [r.image.name for r, states in zip(usable, light, strict=True) if states != linear]
+            usable = [record for record, states in zip(usable, light, strict=True) if states == linear]
+            kind = "linear" if linear else kind
+            if odd:
+                state = "do not state their light as the others do" if linear else "state light and the others do not"
+                notes.append(f"{_names_text(odd)} {state} and were left out")
+    return usable, kind, notes
+
+
+def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
+    """Return the lens at the photo's size, and whether the pixels are to be turned as EXIF says.
+
+    COLMAP ignores the EXIF orientation, other tools follow it: the size that agrees with the camera's decides, and the
+    stored orientation wins if both agree. Photos may be smaller than the camera's size by a whole factor (images_2).
+
+    Raises:
+        InputError: if no orientation and factor fits.
+    """
+    lens = record.lens
+    size, turned = photo_sizes(record.image)
+    choices = [(size, False), (turned, True)] if record.oriented is None else [(turned, True)]
+    for factor in range(1, 17):
+        for (width, height), oriented in choices:
+            if factor == 1 and (width, height) == (lens.width, lens.height):
+                return lens, oriented
+            if factor > 1 and abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
+                return lens.resized(width, height), oriented
+    problem = f"image is {size[0]} x {size[1]}, its camera {lens.width} x {lens.height}"
+    raise InputError(record.image, problem, "use the images that the cameras were solved for")
+
+
+def left_out(problems: Sequence[InputError], count: int) -> list[str]:
+    """Return a note on photos that cannot be used.
+
+    Args:
+        problems: what is wrong with each.
+        count: of all photos.
+
+    Raises:
+        InputError: the first problem, if more than half of the photos or all but two have one.
+    """
+    if not problems:
+        return []
+    rest = count - len(problems)
+    if 2 * len(problems) > count or rest < min(FEWEST_PHOTOS, count):
+        raise problems[0]
+    reasons = "; ".join(f"{Path(error.path).name}: {error.problem}" for error in problems[:_MOST_NAMED])
+    more = " ..." if len(problems) > _MOST_NAMED else ""
+    return [f"{len(problems)} of {count} photos cannot be used and were left out ({reasons}{more})"]
+
+
+def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRecord], list[str]]:
+    kinds = Counter(kind_of(record.image) for record in records)
+    kind = max(_KINDS, key=lambda each: kinds[each])  # Of equal numbers the first in the table.
+    others = [record for record in records if kind_of(record.image) != kind]
+    if not others:
+        return kind, list(records), []
+    kind_names = " and ".join(name for each, name in _KINDS.items() if each != kind and kinds[each])
+    reason = f"were left out, because most are {_KINDS[kind]}: photos of one set are of one kind"
+    notes = [f"{_names_text([record.image.name for record in others])} ({kind_names}) {reason}"]
+    return kind, [record for record in records if kind_of(record.image) == kind], notes
+
+
+def _checked(record: ImageRecord) -> ImageRecord:
+    """Return the photo with what its file states of its colors. Raises InputError if it cannot be used."""
+    if kind_of(record.image) == "encoded":
+        with open_image(record.image) as image:
+            record = replace(record, encoding=stated_encoding(image))
+    if record.lens is UNPLACED:
+        photo_sizes(record.image)
+    else:
+        fitted_lens(record)
+    return record
+
+
+def _names_text(names: Sequence[str]) -> str:
+    listing = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
+    return f"{len(names)} photos: {listing}" if len(names) > 1 else listing
 
 
 def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -24,9 +24,8 @@ from .lens import Lens, Undistortion, area_average
 from .linear_photos import float_codes, kind_of, linear_codes
 from .masks import mask_note, read_mask
 from .names import unique_names
-from .photo_checks import fitted_lens, left_out
 from .photo_file import PhotoKeeper
-from .photos import read_photo
+from .photos import fitted_lens, left_out, read_photo
 from .types import Scene, View, codes_of
 from .wide_camera import solid_angles
 

@@ -29,7 +29,7 @@ from .names import (
     sibling,
     view_and_exposure,
 )
-from .photo_checks import FEWEST_PHOTOS
+from .photos import FEWEST_PHOTOS
 from .sfm import reconstruct
 from .sfm_panorama import are_panoramas, reconstruct_panoramas
 from .stack import refuse_stack

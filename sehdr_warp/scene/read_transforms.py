@@ -17,8 +17,7 @@ from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
 from .names import distinct, find_image, renamed_note, sibling
-from .photo_checks import left_out
-from .photos import photo_sizes
+from .photos import left_out, photo_sizes
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"

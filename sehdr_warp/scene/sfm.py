@@ -31,8 +31,7 @@ from ..progress import Stage, stage, tracked
 from .colmap_model import SparseModel, read_model
 from .colmap_rows import counted_rows
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
-from .photo_checks import left_out
-from .photos import read_photo
+from .photos import left_out, read_photo
 
 _log = logging.getLogger("sehdr_warp.scene")
 

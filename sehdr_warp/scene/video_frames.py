@@ -20,8 +20,8 @@ from ..files import atomic_folder
 from ..own_files import is_sealed
 from ..progress import stage
 from .dataparser import DataparserOutputs
+from .images import png16
 from .names import list_images
-from .png16 import png16
 from .read_folders import find_photos
 from .sfm import file_digest
 from .video import Clip, codes, decode, grey, open_clip

@@ -1,17 +1,30 @@
-"""Points of the surfaces that photos show: a plane sweep (Collins 1996) for individually chosen pixels."""
+"""Points of the surfaces that photos show: a plane sweep (Collins 1996) for individually chosen pixels.
 
+A training starts from such points, and seed_gaussians() adds Gaussians where a photo is reproduced worst, at depths on
+which photos agree.
+"""
+
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
+from ..model.color_models import ColorModel
+from ..model.radiance_field import RadianceField
 from ..parallel import prefetch_map
 from ..rasterizer.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matched_points, matching_costs, trusted_depths
+from ..rasterizer.residual_sampling import sample_residual_pixels
 from ..response import Response
 from ..scene import Camera, View, codes_of
+from ..splats.arrays import HARMONIC_0
+from .strategies import Proposals
+from .strategies.mcmc import MAX_DISTANCE
+from .targets import TrainingView
 
 LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels
 PLANES = 48, 256  # Smallest and largest number of depths to try; within these they are a pixel of parallax apart
@@ -29,6 +42,9 @@ GUESS = 0.25, 8.0  # Range of depths without enough matches, in units of the foc
 SLACK = 0.6, 2.0  # Factors that extend the range of the matches
 ALIKE = 0.05  # Photos whose exposures differ by fewer stops are compared as they are
 CHUNK = 1 << 20  # Costs held at one time
+MAX_SEEDS = 500  # Gaussians per refinement
+INITIAL_OPACITY = 0.5  # Of a seeded Gaussian; high enough for the training to shape them
+MIN_ERROR = 0.02  # Mean difference of encoded values above which a pixel can be seeded
 
 
 @dataclass(frozen=True)
@@ -216,3 +232,60 @@ def _parallax(cameras: Sequence[Camera], neighbors: np.ndarray, near: float, far
     apart = np.linalg.norm(positions[:, None] - positions[neighbors], axis=2) * focal[:, None]
     apart = apart[neighbors >= 0]
     return float(np.median(apart)) * (1 / near - 1 / far) if len(apart) else 0.0
+
+
+@torch.no_grad()
+def seed_gaussians(
+    field: RadianceField,
+    matcher: Matcher,
+    rendered: Tensor,
+    view: TrainingView,
+    index: int,
+    number: Tensor,
+    bound: int,
+    random_seed: int,
+) -> Proposals:
+    """Return new Gaussians at pixels sampled by their squared error. Does not wait for the device.
+
+    Args:
+        field: The field that is trained.
+        matcher: Matcher of the training photos.
+        rendered: [H, W, 3] the view as the scene renders it, encoded.
+        view: The view.
+        index: Index of the view in the matcher.
+        number: int64 [], number of Gaussians.
+        bound: Upper bound of `number` on the host.
+        random_seed: Seed of the sampling.
+    """
+    bound = min(bound, MAX_SEEDS) if min(matcher.size(index)) > 2 * BORDER else 0
+    uniform, target = torch.from_numpy(np.random.default_rng(random_seed).random(bound)), view.target
+    if rendered.device.type == "cuda":
+        uniform = uniform.pin_memory().to(rendered.device, non_blocking=True)
+    pixels, sampled = sample_residual_pixels(
+        *(rendered, target.codes, target.index, target.mask, uniform, index, matcher.size(index)), least=MIN_ERROR
+    )
+    matches, valid = matcher.match_each(pixels)
+    valid &= sampled & (torch.arange(bound, device=valid.device) < number)
+    starts = _start_values(field.color_model, field.response, matches.colors.device)
+    start = starts.gather(0, (matches.colors * 255).round().long())
+    rest = field.gaussians.harmonics_rest
+    nearer = (MAX_DISTANCE / matches.points.norm(dim=1)).clamp_max(1.0)
+    quaternions = torch.zeros(bound, 4, device=rest.device)
+    quaternions[:, 0] = 1
+    rows = {
+        "means": matches.points * nearer[:, None],
+        "log_scales": (matches.footprints * nearer).log()[:, None].repeat(1, 3),
+        "quaternions": quaternions,
+        "opacity_logits": rest.new_full((bound,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
+        "harmonics_dc": (start / HARMONIC_0).to(rest)[:, None, :],
+        "harmonics_rest": rest.new_zeros(bound, *rest.shape[1:]),
+    }
+    order = valid.byte().argsort(descending=True, stable=True)
+    return Proposals({name: values[order] for name, values in rows.items()}, valid.sum())
+
+
+@lru_cache(maxsize=1)
+def _start_values(model: ColorModel, response: Response, device: torch.device) -> Tensor:
+    """Return [256, 3] start values of the harmonics' constant part for each 8-bit code."""
+    levels = np.arange(256, dtype=np.float32)[:, None].repeat(3, 1) / np.float32(255)
+    return torch.from_numpy(model.start(levels, response)).to(device)

@@ -26,12 +26,11 @@ from ..scene import Camera, Scene
 from .initialization import sizes_of
 from .losses import data_loss, extra_images, with_opacity_penalty
 from .machine import interruptible, torch_settings
-from .matching import Matcher
+from .matching import Matcher, seed_gaussians
 from .optimizer import guarded_step, means_rate, set_means_rate
 from .photo_stream import PhotoStream
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
-from .seeding import seed_gaussians
 from .strategies import SEED_STRIDE, Proposals
 from .targets import TrainingView, ViewStack
 from .training_state import Gradients, StepResult, TrainingState

@@ -9,9 +9,8 @@ import pytest
 
 import sehdr_warp as sw
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table
+from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table, format_table
 from sehdr_warp.evaluation.evaluate import evaluate
-from sehdr_warp.evaluation.table import format_table
 from sehdr_warp.output.exr import write_exr
 from sehdr_warp.runs.config import Config
 

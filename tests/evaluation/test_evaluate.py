@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.evaluation.compare import format_table
 from sehdr_warp.evaluation.evaluate import evaluate
-from sehdr_warp.evaluation.table import format_table
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, encoded_values
 

@@ -56,11 +56,11 @@ ALLOWED = {
         "model.exposure",
         "model.baking",
         "model.lights",
-        "model.sensor_colors",
+        "model.color_models",
         "model.visibility",
     },
     "viewer": ANY | {"runs", "scene", "output", "splats", "model.lights"},
-    "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.names", "output.charts"},
+    "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.images", "output.charts"},
     "runs": ANY | {"scene", "response", "prior", "model", "splats", "output.notebook"},
     "training": ANY
     | {

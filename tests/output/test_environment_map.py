@@ -18,7 +18,7 @@ from sehdr_warp.output.environment_map import (
     walked_around,
     write_environment_map,
 )
-from sehdr_warp.output.radiance_file import write_radiance
+from sehdr_warp.output.exr import write_radiance
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
 from sehdr_warp.splats import GaussianArrays

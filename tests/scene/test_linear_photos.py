@@ -8,10 +8,9 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.model.sensor_colors import rec709_of
-from sehdr_warp.output.exr import rgb_channels, write_exr
+from sehdr_warp.model.color_models import rec709_of
+from sehdr_warp.output.exr import rgb_channels, write_exr, write_radiance
 from sehdr_warp.output.images import write_picture
-from sehdr_warp.output.radiance_file import write_radiance
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import Splats

@@ -12,7 +12,7 @@ from sehdr_warp.rasterizer.plane_sweep import BORDER
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
-from sehdr_warp.training.seeding import seed_gaussians
+from sehdr_warp.training.matching import seed_gaussians
 from sehdr_warp.training.targets import photo_source
 from sehdr_warp.training.train import train
 

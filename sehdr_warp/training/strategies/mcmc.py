@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer
-from ...model.reserved_rows import moments_of
+from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, moments_of
 from ...rasterizer.relocation import SampledRows, clear_rows, copy_rows, count_copies, number_places, share_opacities
 from ...rasterizer.training_step import add_position_noise
 from ...runs.config import Config, McmcConfig
