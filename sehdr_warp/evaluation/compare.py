@@ -79,10 +79,10 @@ def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
             raise SehdrError(f"{problem}; train it with some held out (--holdout 8), or further")
         config = run.config.model_dump(mode="json", exclude={"seed"})
         groups.setdefault(json.dumps([run.scene_name, run.data, config], sort_keys=True, default=str), []).append(run)
-    return [_row(members) for members in groups.values()]
+    return [_compared(members) for members in groups.values()]
 
 
-def _row(runs: Sequence) -> ComparedRuns:
+def _compared(runs: Sequence) -> ComparedRuns:
     names = {"iterations": "iterations", "gaussians": "gaussian_count", "seconds": "train_seconds"}
     last = [run.metrics()[-1] | {column: getattr(run, name) for column, name in names.items()} for run in runs]
     figures = {column: [line.get(column) for line in last] for column in COLUMNS}

@@ -5,7 +5,7 @@ Each is a part of its own in the EXR file, tagged as data.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from sehdr_warp.scene.wide_camera import pixel_directions
 
 from .exr import Part, as_data
 from .images import as_array
+
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class ViewData:
         depth: [H, W] in the file's units, along the camera's axis; 0 where nothing is.
     """
 
-    run: Any
+    run: "LoadedScene"
     camera: Camera
     camera_in_file: Camera
     alpha: np.ndarray
@@ -77,7 +80,7 @@ def _clipped(view: ViewData) -> Channels:
     return {"clipped": _require_values(view.run, view.run.render_clipped(view.camera))}
 
 
-def _require_values(run, values) -> np.ndarray:
+def _require_values(run: "LoadedScene", values) -> np.ndarray:
     if values is None:
         raise SehdrError(f"{run.path}: its confidence was not measured; `sehdr-warp report` does, from the photos")
     return as_array(values)

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from ..progress import tracked
 from .images import as_array
 from .splat_edits import Box, Sphere
 from .world_transform import WorldTransform
+
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
 
 log = logging.getLogger(__name__)
 MOST_VIEWS, _VIEW_SIZE = 40, 400  # Training views that are fused, and their longest side in pixels
@@ -34,7 +37,7 @@ class DepthView:
     radiance: torch.Tensor
 
 
-def depth_view(run: Any, camera: Camera, transform: WorldTransform) -> DepthView:
+def depth_view(run: "LoadedScene", camera: Camera, transform: WorldTransform) -> DepthView:
     """Render a view; depth at edges and where little covers the pixel is 0."""
     small = camera.within(_VIEW_SIZE)
     rendered = run.render(small)

@@ -5,7 +5,7 @@ import logging
 from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from .light_shares import light_shares
 from .light_unit import EFFICACY, luminance_of_one
 from .render_views import provenance
 from .world_transform import AXES, world_transform
+
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
 
 log = logging.getLogger(__name__)
 LAYOUTS = ("latlong", "cube")
@@ -50,7 +53,7 @@ _FACES = np.array(
 
 
 def write_environment_map(
-    run: Any,
+    run: "LoadedScene",
     path: Path | str,
     *,
     at: str | tuple[float, float, float] = "center",
@@ -180,7 +183,7 @@ class RenderedMap:
 
 
 def render_map(
-    run: Any, position: np.ndarray, size: int, layout: str, to_scene: np.ndarray, focal: float, **options: Any
+    run: "LoadedScene", position: np.ndarray, size: int, layout: str, to_scene: np.ndarray, focal: float, **options: Any
 ) -> RenderedMap:
     """Render an environment map in pixels as fine as the photos' and average them to the map's.
 
@@ -356,7 +359,9 @@ def walked_around(photos: list[Camera]) -> np.ndarray | None:
     return focus if np.mean(facing > _FACING) > 0.8 and around else None
 
 
-def _judge(run, position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:
+def _judge(
+    run: "LoadedScene", position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray
+) -> None:
     """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is."""
     share = weight[alpha > COVERED].sum() / weight.sum()
     place = ", ".join(f"{value:.4g}" for value in position)

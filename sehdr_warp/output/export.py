@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from ..subsets import every_nth
 from .splat_edits import SplatEdits, merged, most_visible, without_strays
 from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
 
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
+
 log = logging.getLogger(__name__)
 KINDS = ("ldr", "hdr")
 _JUDGED = 8  # Views that tell what a file kept
@@ -38,7 +41,7 @@ _WORDS = ((42.0, "no visible loss"), (36.0, "close copy"), (30.0, "small differe
 
 
 def export(
-    run: Any,
+    run: "LoadedScene",
     path: Path | str,
     *,
     kind: str | None = None,
@@ -126,12 +129,12 @@ def export(
     return path
 
 
-def training_cameras(run: Any) -> list[Camera]:
+def training_cameras(run: "LoadedScene") -> list[Camera]:
     """Return the training cameras of a run."""
     return [entry.camera for entry in run.cameras if entry.split == "train"]
 
 
-def _converted(run: Any, color_model: str, time: float) -> GaussianArrays:
+def _converted(run: "LoadedScene", color_model: str, time: float) -> GaussianArrays:
     """Return the Gaussians of a run in its own coordinates and in the colors of a file.
 
     Display colors are those of a photo of `time` seconds.
@@ -168,7 +171,7 @@ def loss_in_words(decibels: float) -> str:
     return "visible loss"
 
 
-def _log_loss(path: Path, run: Any, gaussians: GaussianArrays, kind: str, time: float) -> None:
+def _log_loss(path: Path, run: "LoadedScene", gaussians: GaussianArrays, kind: str, time: float) -> None:
     """Measure and log how well Gaussians in the scene's own coordinates show the scene."""
     views = _judged(run)
     where = f"{len(views)} view{'s' * (len(views) != 1)}"
@@ -189,7 +192,7 @@ def _log_loss(path: Path, run: Any, gaussians: GaussianArrays, kind: str, time: 
 
 
 def _log_file_loss(
-    path: Path, run: Any, reference: GaussianArrays | None, to_file: WorldTransform, kind: str, time: float
+    path: Path, run: "LoadedScene", reference: GaussianArrays | None, to_file: WorldTransform, kind: str, time: float
 ) -> None:
     """Measure and log what a compressed file loses, read back, beside the scene or the edited Gaussians."""
     views = _judged(run)
@@ -207,13 +210,13 @@ def _log_file_loss(
     log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, beside, loss_in_words(decibels), size)
 
 
-def _judged(run) -> Sequence[Camera]:
+def _judged(run: "LoadedScene") -> Sequence[Camera]:
     held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
     views = held_out or [entry.camera for entry in run.cameras]
     return every_nth(views, _JUDGED)
 
 
-def _photographed(run, time: float) -> Callable:
+def _photographed(run: "LoadedScene", time: float) -> Callable:
     """Return a function that renders simulated photos, or light for a scene in a sensor's colors."""
     return _display_picture(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
@@ -224,7 +227,7 @@ def _edited(gaussians: GaussianArrays, time: float) -> Callable:
     return lambda camera: field.render_ldr(camera, time)
 
 
-def _display_picture(run, time: float) -> Callable:
+def _display_picture(run: "LoadedScene", time: float) -> Callable:
     """Return a function that renders radiance at an exposure time, encoded by sRGB."""
     from ..response import response_by_name
 
@@ -232,7 +235,7 @@ def _display_picture(run, time: float) -> Callable:
     return lambda camera: encode(run.render(camera).hdr * time)
 
 
-def _write_cameras(path: Path, run: Any, transform: WorldTransform, overwrite: bool) -> None:
+def _write_cameras(path: Path, run: "LoadedScene", transform: WorldTransform, overwrite: bool) -> None:
     described = []
     for index, entry in enumerate(run.cameras):
         camera = transform.camera(entry.camera)

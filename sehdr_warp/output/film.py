@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from .images import as_array
 from .light_pictures import display_gain
 from .render_views import shared_tone_map
 from .tonemap import encode_srgb
+
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +82,7 @@ TRANSFERS |= dict.fromkeys(LOGS, Transfer("prores_ks", "yuv444p10le", {"profile"
 
 
 def write_film(
-    run: Any,
+    run: "LoadedScene",
     out: Path | str,
     cameras: Sequence[Camera],
     *,

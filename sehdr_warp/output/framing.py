@@ -4,7 +4,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from sehdr_warp.scene import Camera
 
 from .camera_paths import common_focus, evenly, look_at_pose, surround
 from .images import as_array
+
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
 
 log = logging.getLogger(__name__)
 FILM_SIZES = ((640, 360), (1280, 720), (1920, 1080))
@@ -31,7 +34,7 @@ def film_size(photos: Sequence[Camera]) -> tuple[int, int]:
     return next((size for size in FILM_SIZES if size[1] >= short), FILM_SIZES[-1])
 
 
-def subject_radius(run: Any, photos: Sequence[Camera], focus: np.ndarray) -> float | None:
+def subject_radius(run: "LoadedScene", photos: Sequence[Camera], focus: np.ndarray) -> float | None:
     """Return the radius around the focus that holds most of what the photos look at; None if nothing is there."""
     distances = []
     reach = _REACH * float(np.median([np.linalg.norm(camera.position - focus) for camera in photos]))
@@ -52,7 +55,7 @@ def film_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:
     return replace(camera, width=width, height=height, fx=camera.fx * scale, fy=camera.fy * scale, cx=cx, cy=cy)
 
 
-def frame_subject(run: Any, path: Sequence[Camera], photos: Sequence[Camera]) -> list[Camera]:
+def frame_subject(run: "LoadedScene", path: Sequence[Camera], photos: Sequence[Camera]) -> list[Camera]:
     """Return a path around the photos' focus whose pictures hold the whole subject and are not blocked.
 
     The lens opens until the sphere of subject_radius fits, to at most 75 degrees: up to twice the picture if photos
@@ -79,7 +82,9 @@ def frame_subject(run: Any, path: Sequence[Camera], photos: Sequence[Camera]) ->
     return [replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom) for camera in cleared]
 
 
-def _in_front_of_obstacles(run: Any, path: Sequence[Camera], focus: np.ndarray, radius: float) -> list[Camera]:
+def _in_front_of_obstacles(
+    run: "LoadedScene", path: Sequence[Camera], focus: np.ndarray, radius: float
+) -> list[Camera]:
     """Return the cameras, moved towards the focus if what is near fills the middle of their pictures."""
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
@@ -108,7 +113,7 @@ def _in_front_of_obstacles(run: Any, path: Sequence[Camera], focus: np.ndarray, 
     return [replace(camera, world_to_camera=np.linalg.inv(pose)) for camera, pose in zip(path, poses, strict=True)]
 
 
-def _surface(run: Any, camera: Camera) -> np.ndarray:
+def _surface(run: "LoadedScene", camera: Camera) -> np.ndarray:
     """Return points [N, 3] of the surface that a camera shows."""
     rendered = run.render(camera)
     depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)

@@ -4,7 +4,7 @@ import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from .images import as_array
 from .light_unit import luminance_of_one
 from .render_views import provenance
 from .world_transform import WorldTransform, world_transform
+
+if TYPE_CHECKING:
+    from ..runs.run import Run
 
 log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".usda")
@@ -58,7 +61,7 @@ _DOME = """    def DomeLight "Rest"
 
 
 def write_lights(
-    run: Any,
+    run: "Run",
     path: Path | str,
     *,
     axes: str = "upright",
@@ -193,7 +196,7 @@ def _tuple(values) -> str:
 
 
 def _write_rest(
-    run: Any, path: Path, lights: Sequence[Any], transform: WorldTransform, unseen: str, overwrite: bool
+    run: "Run", path: Path, lights: Sequence[Any], transform: WorldTransform, unseen: str, overwrite: bool
 ) -> None:
     """Write the map of a scene's surroundings, with the lights dark; arguments as in write_lights."""
     cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
@@ -218,7 +221,7 @@ def _write_rest(
 
 
 def _shows_lights(
-    run: Any, members: Sequence[torch.Tensor], position: np.ndarray, to_scene: np.ndarray, focal: float, beyond: float
+    run: "Run", members: Sequence[torch.Tensor], position: np.ndarray, to_scene: np.ndarray, focal: float, beyond: float
 ) -> np.ndarray:
     """Return [H, W] whether half of the light of a map's pixel and more comes from Gaussians of lights.
 

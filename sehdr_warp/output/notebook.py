@@ -1,13 +1,15 @@
 """Display of a run in a notebook: its figures, and a view under an exposure slider that needs no kernel."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .html import markup, page_file, whole_page
+from .html import duration, markup, page_file, whole_page
 from .images import as_array
 from .light_pictures import dial, display_gain
-from .report_page import duration
+
+if TYPE_CHECKING:
+    from ..runs.run import Run
 
 _LONGEST = 420  # Pixels of a side of the picture, which the notebook keeps
 _STYLE = "body { padding: 12px; font-size: 13px; } canvas { display: block; width: 100%; border-radius: 3px; }"
@@ -15,7 +17,7 @@ _STYLE += " p { margin: 0 0 8px; color: #8a8783; } .exposure { display: grid; gr
 _STYLE += " gap: 14px; align-items: center; margin: 8px 0 0; } output { text-align: right; }"
 
 
-def run_html(run: Any) -> str:
+def run_html(run: "Run") -> str:
     """Return HTML of a run: one frame with all it needs, which static pages of a notebook show too."""
     entries = run.cameras
     opening = next((entry for entry in entries if entry.split == "test"), entries[0] if entries else None)

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from .ocio import ocio_view
 from .tonemap import ToneMap, fit_tone_map
 from .world_transform import WorldTransform, describe, world_transform
 
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
+
 log = logging.getLogger(__name__)
 SPLITS = ("train", "test", "all")
 PATHS = ("orbit", "interpolate")
@@ -42,7 +45,7 @@ _LEAST_ALPHA = 0.01  # Mean coverage below which a picture counts as empty: stra
 
 
 def render_views(
-    run: Any,
+    run: "LoadedScene",
     out: Path | str,
     *,
     cameras: str | Path = "test",
@@ -187,7 +190,7 @@ def _camera_files(views: Sequence[tuple[str, Camera]], transform: WorldTransform
     return files
 
 
-def shared_tone_map(run: Any, cameras: Sequence[Camera]) -> ToneMap:
+def shared_tone_map(run: "LoadedScene", cameras: Sequence[Camera]) -> ToneMap:
     """Return one tone map for all pictures of some cameras, fitted to a few small renders."""
     return fit_tone_map([as_array(run.render(camera.within(_FIT_SIZE)).hdr) for camera in evenly(cameras, _FIT_VIEWS)])
 
@@ -274,7 +277,7 @@ def select_cameras(
     return list(zip(safe_names([name for name, _ in views]), [camera for _, camera in views], strict=True))
 
 
-def _from_file(run: Any, path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
+def _from_file(run: "LoadedScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
     """Return the cameras of a file in the scene's own coordinates."""
     views = load_cameras(path)
     if path.suffix.lower() not in EXCHANGE_SUFFIXES:
@@ -288,7 +291,7 @@ def _from_file(run: Any, path: Path, transform: WorldTransform | None) -> list[t
     return [(name, back.camera(camera)) for name, camera in views]
 
 
-def provenance(run) -> dict[str, str]:
+def provenance(run: "LoadedScene") -> dict[str, str]:
     """Return where a picture came from, as text by key."""
     unit = read_light_unit(run)
     values = {"scene": run.scene_name, "iterations": run.iterations, "units": str(unit or "relative radiance")}
@@ -296,7 +299,7 @@ def provenance(run) -> dict[str, str]:
     return {key: str(value) for key, value in values.items() if value not in (None, "")}
 
 
-def _focus_distance(run, cameras: Sequence[Camera]) -> float:
+def _focus_distance(run: "LoadedScene", cameras: Sequence[Camera]) -> float:
     """Return the median depth in a small render of the middle camera; 1 if it is empty."""
     if not cameras:
         return 1.0

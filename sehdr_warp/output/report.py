@@ -5,7 +5,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,11 +22,14 @@ from .report_page import STOPS, report_page
 from .report_page import stops_text as _stops
 from .tonemap import expose, fit_tone_map
 
+if TYPE_CHECKING:
+    from ..runs.run import Run
+
 log = logging.getLogger(__name__)
 
 
 def write_report(
-    run: Any,
+    run: "Run",
     scene: Scene,
     out: Path | str,
     *,

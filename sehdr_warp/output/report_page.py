@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
@@ -16,7 +16,7 @@ from sehdr_warp.scene.lens import area_average
 from ..model.lights import Light
 from .comparison import Comparison, darker_stops
 from .diagrams import camera_map, training_svg
-from .html import EMPTY, join, markup, page_file, whole_page
+from .html import EMPTY, duration, join, markup, page_file, whole_page
 from .light_pictures import (
     SPLIT,
     dial,
@@ -32,6 +32,9 @@ from .light_unit import luminance_of_one, read_light_unit
 from .tonemap import expose, fit_tone_map
 from .ultra_hdr import MOST_STOPS, ultra_hdr
 
+if TYPE_CHECKING:
+    from ..runs.run import Run
+
 STOPS = (-4, -2, 0, 2, 4)
 _PICTURE, _DIAL, _STRIP = 880, 420, 220  # Longest sides of pictures, pixels
 _MOST_PHOTOS = 6  # With unexplained regions
@@ -40,7 +43,7 @@ SPACE = "\N{NARROW NO-BREAK SPACE}"
 
 
 def report_page(
-    run: Any,
+    run: "Run",
     scene: Scene,
     comparisons: Sequence[Comparison],
     brightest: Comparison,
@@ -104,7 +107,7 @@ def _wide(body: Markup) -> Markup:
     return markup('<div class="wide">{}</div>', body) if body else EMPTY
 
 
-def _header(run: Any, scene: Scene) -> Markup:
+def _header(run: "Run", scene: Scene) -> Markup:
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     times = sorted({view.exposure_time for view in scene.train_views or scene.views})
@@ -136,7 +139,7 @@ def _header(run: Any, scene: Scene) -> Markup:
     )
 
 
-def _pictures(run: Any, comparisons: Sequence[Comparison], times: Mapping[str, float], held_out: bool) -> Markup:
+def _pictures(run: "Run", comparisons: Sequence[Comparison], times: Mapping[str, float], held_out: bool) -> Markup:
     """Photo, scene and truth, two at a time with a slider between them."""
     figures, gain = [], display_gain(run.response)
     for each in comparisons:
@@ -240,7 +243,7 @@ def _confidence(comparisons: Sequence[Comparison]) -> Markup:
     return _section("Confidence", lead, _views(figures) + scale)
 
 
-def _unexplained(run: Any, scene: Scene) -> Markup:
+def _unexplained(run: "Run", scene: Scene) -> Markup:
     """Show the photos with the worst unexplained regions, each region in a box."""
     unexplained = run.summary().get("unexplained")
     if unexplained is None:
@@ -328,7 +331,7 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> Markup:
     return _section("Figures", markup("{}.{}", split, note), body)
 
 
-def _map(run: Any, comparisons: Sequence[Comparison]) -> Markup:
+def _map(run: "Run", comparisons: Sequence[Comparison]) -> Markup:
     tone_map = fit_tone_map([each.hdr for each in comparisons])
     lead = markup(
         'From above, as the photos see it. <span style="color: var(--accent)">Amber</span>: trained on. '
@@ -338,7 +341,7 @@ def _map(run: Any, comparisons: Sequence[Comparison]) -> Markup:
     return _section("Cameras", lead, _figure(svg))
 
 
-def _footer(run: Any, held_out: bool) -> Markup:
+def _footer(run: "Run", held_out: bool) -> Markup:
     return markup(
         "<footer>\n<p>sehdr-warp {}. Brackets as OpenEXR: <code>sehdr-warp render {} --out views{} --evs=-4,-2,0,2,4"
         "</code></p>\n<p>{}, and clipped light is not in the photos.</p>\n</footer>",
@@ -380,14 +383,6 @@ def _size(picture: np.ndarray, longest: int) -> tuple[int, int]:
 def stops_text(stops: float) -> str:
     """Format stops as `+2 EV`, `-1.5 EV` with a true minus sign, or `0 EV`."""
     return f"{round(stops, 1):+g} EV".replace("-", "\N{MINUS SIGN}") if stops else "0 EV"
-
-
-def duration(time: float) -> str:
-    """Format seconds as `45 s`, `3 min 20 s` or `2 h 5 min`."""
-    minutes, rest = divmod(round(time), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s" if minutes else f"{rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"
 
 
 def number(value: float | None, digits: int) -> str:

@@ -7,7 +7,7 @@ are. It blends into half floats, which light.js exposes: light above white stays
 import base64
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,10 +22,15 @@ from .light_pictures import curve_table, display_gain
 from .splat_edits import SplatEdits, most_visible, without_strays
 from .world_transform import world_transform
 
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
+
 _HALF = float(np.finfo(np.float16).max)
 
 
-def write_scene_page(run: Any, path: Path | str, *, edits: SplatEdits | None = None, overwrite: bool = False) -> Path:
+def write_scene_page(
+    run: "LoadedScene", path: Path | str, *, edits: SplatEdits | None = None, overwrite: bool = False
+) -> Path:
     """Write a run as one HTML file that any browser with WebGL2 shows; return the path.
 
     The page has an exposure slider and needs no network. Means are float32, all else half.

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from sehdr_warp.scene import Camera, View
 from ..model.visibility import contributions, count_views, mask_shares
 from ..splats import GaussianArrays
 from .camera_paths import common_focus
+
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
 
 log = logging.getLogger(__name__)
 LEAST_OPACITY = 1 / 255
@@ -107,7 +110,7 @@ class SplatEdits:
         regions = self.crop or self.cut or self.mask_views is not None
         return bool(regions or self.min_views or self.min_opacity > LEAST_OPACITY)
 
-    def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: Any) -> np.ndarray:
+    def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: "LoadedScene") -> np.ndarray:
         """Return [N], which Gaussians stay.
 
         Args:
@@ -144,7 +147,7 @@ class SplatEdits:
         return stays
 
 
-def most_visible(stays: np.ndarray, count: int, run: Any) -> np.ndarray:
+def most_visible(stays: np.ndarray, count: int, run: "LoadedScene") -> np.ndarray:
     """Return [N], which of the Gaussians that stay are the `count` that contribute most to the training views.
 
     Raises:

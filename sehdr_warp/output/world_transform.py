@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from sehdr_warp.scene import Camera
 from ..files import read_json, write_json
 from ..splats import STREAMED_SOG
 from .camera_paths import common_focus, middle_index, typical_roll, up_direction
+
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
 
 log = logging.getLogger(__name__)
 AXES = ("upright", "scene")
@@ -96,7 +99,7 @@ class WorldTransform:
 
 
 def world_transform(
-    run: Any, axes: str = "upright", *, up: str | Sequence[float] | None = None, scale: float | None = None
+    run: "LoadedScene", axes: str = "upright", *, up: str | Sequence[float] | None = None, scale: float | None = None
 ) -> WorldTransform:
     """Return the transform from a scene's own coordinates to those of its files.
 
@@ -116,7 +119,7 @@ def world_transform(
     """
     if axes not in AXES:
         raise SehdrError(f"axes {axes!r} is not one of {', '.join(AXES)}")
-    matrix = getattr(run, "world_matrix", None)
+    matrix = run.world_matrix
     orientation = read_orientation(run)
     if axes == "scene":
         if up is not None:
@@ -184,7 +187,7 @@ class Orientation(NamedTuple):
     scale: float | None = None
 
 
-def read_orientation(run: Any) -> Orientation:
+def read_orientation(run: "LoadedScene") -> Orientation:
     """Return the up direction and the scale that are kept with a run.
 
     Raises:
@@ -202,7 +205,7 @@ def read_orientation(run: Any) -> Orientation:
     return Orientation(up, scale)
 
 
-def write_orientation(run: Any, *, up: Sequence[float] | None = None, scale: float | None = None) -> Path:
+def write_orientation(run: "LoadedScene", *, up: Sequence[float] | None = None, scale: float | None = None) -> Path:
     """Keep an up direction and a scale with a run; None leaves what is kept. Return the file.
 
     Args:

@@ -35,27 +35,35 @@ log = logging.getLogger(__name__)
 MEMORY_SHARE = 0.8  # Largest part of a GPU's free memory that the Gaussians of a picture take
 
 
-class _RenderedScene:
-    """A RadianceField as a scene to render, with SH degree `degree`.
+class LoadedScene:
+    """A scene to render: a Run, or Splats from a file of Gaussians.
 
     Radiance is linear Rec.709; simulated photos have the colors of the photos.
 
     Attributes:
         path: The run folder, or the file.
+        scene_name: Name of the scene.
         cameras: Views of the scene.
+        iterations: Iterations of the training; None if it is not known.
         model: The radiance field.
+        response: Camera response.
         degree: SH degree to render with.
         base_time: Exposure time of the photos, seconds.
         color_matrix: [3, 3] from the field's colors to linear Rec.709, if it was trained on sensor RGB; else None.
+        world_matrix: [4, 4] from the scene's own coordinates to those of its file of Gaussians, if stated; else None.
         exposure_compensation: Exposure compensation of the training photos, if there was one.
     """
 
     path: Path
+    scene_name: str
     cameras: tuple[CameraEntry, ...]
+    iterations: int | None = None
     model: RadianceField
+    response: Response
     degree: int
     base_time: float
     color_matrix: np.ndarray | None = None
+    world_matrix: np.ndarray | None = None
     exposure_compensation: ExposureCompensation | None = None
 
     @property
@@ -116,7 +124,7 @@ class _RenderedScene:
         return None if share is None else self.model.render_mean(camera, share)
 
 
-class Splats(_RenderedScene):
+class Splats(LoadedScene):
     """A file of Gaussians as a scene to render, re-expose and export. Its response is sRGB.
 
     Attributes:
@@ -125,10 +133,7 @@ class Splats(_RenderedScene):
         base_time: Exposure time that the file states, seconds; else 1.
         cameras: Views listed in a `<stem>.cameras.json` beside the file, as export writes it, or in a cameras.json, as
             the reference release of 3D Gaussian Splatting writes it; else none.
-        world_matrix: [4, 4] from the scene's own coordinates to the file's, if the file states it; else None.
     """
-
-    iterations = None
 
     def __init__(
         self,
@@ -168,7 +173,7 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
     return Splats(path, model, cameras, gaussians.world_matrix)
 
 
-class Run(_RenderedScene):
+class Run(LoadedScene):
     """A trained scene.
 
     Attributes:

@@ -3,7 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -150,7 +150,7 @@ class ViewerScene:
 
     def facts(self) -> dict[str, Any]:
         """Return what the page knows of the run, as plain values."""
-        transform = world_transform(self) if hasattr(self, "path") else None  # A training has no folder yet.
+        transform = world_transform(cast(Any, self)) if hasattr(self, "path") else None  # A training has no folder yet.
         own = {} if transform is None else {"up": transform.rotation[1].tolist(), "upright": transform.matrix.tolist()}
         facts = {
             "name": self.name,

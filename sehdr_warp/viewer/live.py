@@ -54,7 +54,7 @@ class LiveTraining(ViewerScene):
             "iterations": self.run.iteration,
             "cameras": self.run.scene.views,
         }
-        attributes |= {"color_matrix": self.run.scene.color_matrix}
+        attributes |= {"color_matrix": self.run.scene.color_matrix, "world_matrix": None}
         if name not in attributes:
             raise AttributeError(name)
         return attributes[name]

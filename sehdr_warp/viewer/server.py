@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from PIL import Image
 
@@ -183,13 +183,13 @@ class Viewer:
             if photo is None or self._closed.is_set():
                 raise Refusal(404, "no such photo")
             buffer = io.BytesIO()
-            picture = Image.fromarray(quantize(shown_photo(self._run({"run": run}), photo)))
+            picture = Image.fromarray(quantize(shown_photo(cast(Any, self._run({"run": run})), photo)))
             picture.save(buffer, "PNG", compress_level=1)
         client.reserve(buffer.tell())
         return buffer.getvalue()
 
-    def _save(self, run: SavedRun, cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
-        """Return files of cameras, as `render` writes them: one EXR, a zip of brackets and all, or a film."""
+    def _save(self, run: Any, cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
+        """Return files of cameras of a SavedRun, as `render` writes them: EXR, a zip of brackets and all, or a film."""
         stops, evs = _stops(request), str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
         pictures = len(evs.split(",")) + 1 if evs else 1
         pixels = pictures * sum(camera.width * camera.height for camera in cameras)

@@ -49,6 +49,8 @@ class GammaResponse:
 class AnalyticRun:
     """Stands for a trained run: a sky whose radiance depends on the viewing direction, six decades of it."""
 
+    world_matrix = None
+
     response = GammaResponse()
     base_time, color_matrix, exposure_compensation = 0.5, None, None
     scene_name = "sky"
