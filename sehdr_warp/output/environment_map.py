@@ -302,7 +302,7 @@ def inpainted(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight
 
 
 class MapCenter(NamedTuple):
-    """Where a map of a whole scene is taken, and what is left out of it.
+    """Position from which a map of a whole scene is rendered, and what is left out of it.
 
     Attributes:
         position: [3], scene coordinates.
