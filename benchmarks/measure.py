@@ -32,7 +32,7 @@ def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), /, work: Path = Path
     for name in pages or names:
         print(f"== {name}", flush=True)
         try:
-            write_json(REPORTS / "results" / f"{name}.json", measure(PAGES[name], work / build() / name), ours=True)
+            write_json(REPORTS / "results" / f"{name}.json", measure(PAGES[name], work / build() / name), internal=True)
         except SehdrError as error:
             failed.append(name)
             print(error, file=sys.stderr)

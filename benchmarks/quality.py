@@ -301,7 +301,7 @@ def work(jobs: Sequence[Job], out: Path, device: str, shared_by: int, lpips: str
             _write_failure(folder, "its process ended without a result")
             try:
                 result = run_job(job, folder, "cuda:0" if device == "cuda" else device, lpips)
-                write_json(folder / RESULT, result | {"shared_by": shared_by}, ours=True)
+                write_json(folder / RESULT, result | {"shared_by": shared_by}, internal=True)
                 (folder / FAILURE).unlink()
                 LOG.info("%s: done", job.label)
             except SehdrError as error:
@@ -314,7 +314,7 @@ def work(jobs: Sequence[Job], out: Path, device: str, shared_by: int, lpips: str
 
 
 def _write_failure(folder: Path, error: str) -> None:
-    write_json(folder / FAILURE, {"error": " ".join(error.split())[:1000]}, ours=True)
+    write_json(folder / FAILURE, {"error": " ".join(error.split())[:1000]}, internal=True)
 
 
 def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:

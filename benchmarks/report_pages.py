@@ -36,7 +36,7 @@ def write_reports(folder: Path) -> list[Path]:
         parts += [machine_line(result) + "."]
         if name in PLOTS:
             pages.append(folder / f"{name}.png")
-            with atomic_path(pages[-1], ours=True) as temporary:
+            with atomic_path(pages[-1], internal=True) as temporary:
                 PLOTS[name](result, temporary)
         if "caption" in page and (folder / f"{name}.png").is_file():
             parts.append(f"![{page['caption']}]({name}.png)")
@@ -64,7 +64,7 @@ def _read(path: Path) -> dict:
 
 
 def _write(path: Path, parts: Sequence[str]) -> Path:
-    with atomic_path(path, ours=True) as temporary:
+    with atomic_path(path, internal=True) as temporary:
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return path
 
@@ -73,7 +73,7 @@ def write_readme(path: Path, result: dict) -> None:
     """Write the figures of the page of quality into the table of the README."""
     text, table = path.read_text(encoding="utf-8"), readme_table(result["rows"])
     start = text.index(f"| {FIRST_TITLE} |")
-    with atomic_path(path, ours=True) as temporary:
+    with atomic_path(path, internal=True) as temporary:
         temporary.write_text(text[:start] + table + text[text.index("\n\n", start) :], encoding="utf-8")
 
 

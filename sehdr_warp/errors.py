@@ -10,6 +10,8 @@ from pathlib import Path
 MAX_MESSAGE_PART = 400
 """Characters of a path and of a problem that a message shows; both may come from a damaged file."""
 
+NOT_FINITE_REMEDY = "it is not written; train again from an earlier checkpoint or with another seed"
+
 _ARGUMENTS = {
     "--resume": "resume=True",
     "--overwrite": "overwrite=True",

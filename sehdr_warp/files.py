@@ -34,7 +34,7 @@ _MAX_LINE = 16 << 20
 
 
 @contextmanager
-def atomic_path(path: Path | str, overwrite: bool = False, *, ours: bool = False) -> Iterator[Path]:
+def atomic_path(path: Path | str, overwrite: bool = False, *, internal: bool = False) -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; what is written there becomes `path` when the block ends.
 
     The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are made.
@@ -43,44 +43,44 @@ def atomic_path(path: Path | str, overwrite: bool = False, *, ours: bool = False
     Args:
         path: The file.
         overwrite: A file that this program wrote may be replaced.
-        ours: `path` is a name of the program's own in a folder of its own: any file there is replaced, and the list is
-            not kept.
+        internal: `path` is a name of the program's own in a folder of its own: any file there is replaced, and the
+            list is not kept.
 
     Raises:
         InputError: If `path` exists (unless it may be replaced), or is a folder, a link or a device.
         SehdrError: If the disk is full or the folder is not writable.
     """
-    with _written_beside(Path(path), overwrite, ours, folder=False) as temporary:
+    with _written_beside(Path(path), overwrite, internal, folder=False) as temporary:
         yield temporary
 
 
 @contextmanager
-def atomic_folder(path: Path | str, overwrite: bool = False, *, ours: bool = False) -> Iterator[Path]:
+def atomic_folder(path: Path | str, overwrite: bool = False, *, internal: bool = False) -> Iterator[Path]:
     """Yield a temporary folder that becomes `path` when the block ends; arguments and errors as in atomic_path.
 
     An empty folder at `path` counts as absent. With overwrite, one that holds only files of this program is set aside,
     and removed once the new one is in its place.
     """
-    with _written_beside(Path(path), overwrite, ours, folder=True) as temporary:
+    with _written_beside(Path(path), overwrite, internal, folder=True) as temporary:
         temporary.mkdir()
         yield temporary
 
 
 @contextmanager
-def _written_beside(path: Path, overwrite: bool, ours: bool, folder: bool) -> Iterator[Path]:
+def _written_beside(path: Path, overwrite: bool, internal: bool, folder: bool) -> Iterator[Path]:
     remove_stale(path)
-    ours = ours or any(_NAMES.fullmatch(part.name) for part in (path, *path.absolute().parents))
-    check_absent(path, overwrite, folder=folder, ours=ours)
+    internal = internal or any(_NAMES.fullmatch(part.name) for part in (path, *path.absolute().parents))
+    check_absent(path, overwrite, folder=folder, internal=internal)
     with writing(path):
         new_parents, temporary = make_parents(path), _beside(path)
         try:
             yield temporary
-            if folder and not ours:
+            if folder and not internal:
                 seal(temporary)
             for file in (temporary, *temporary.rglob("*")):
                 _sync(file)
-            check_absent(path, overwrite, folder=folder, ours=ours)
-            if not (folder or ours):
+            check_absent(path, overwrite, folder=folder, internal=internal)
+            if not (folder or internal):
                 list_file(temporary, path)
             _put(temporary, path)
         except BaseException as error:
@@ -94,7 +94,7 @@ def _written_beside(path: Path, overwrite: bool, ours: bool, folder: bool) -> It
             raise
 
 
-def write_json(path: Path | str, value: Any, overwrite: bool = False, *, ours: bool = False) -> None:
+def write_json(path: Path | str, value: Any, overwrite: bool = False, *, internal: bool = False) -> None:
     """Write plain values as indented UTF-8 JSON, atomically; NaN and infinity become null, because JSON has neither.
 
     Raises:
@@ -102,7 +102,7 @@ def write_json(path: Path | str, value: Any, overwrite: bool = False, *, ours: b
         TypeError: For a value that is not plain.
     """
     text = json.dumps(_finite(value), indent=2, ensure_ascii=False) + "\n"
-    with atomic_path(path, overwrite, ours=ours) as temporary:
+    with atomic_path(path, overwrite, internal=internal) as temporary:
         # Bytes of a file's name that are no UTF-8 become escapes, which JSON has as well.
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
@@ -229,7 +229,7 @@ def contained(folder: Path, name: str, source: Path) -> Path:
     raise InputError(source, f"file name {name!r:.80} {problem}", f"use a path relative to {folder} without '..'")
 
 
-def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False, ours: bool = False) -> None:
+def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False, internal: bool = False) -> None:
     """Check before the work that a file or folder can be written; arguments as in atomic_path.
 
     Raises:
@@ -245,7 +245,7 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
         kinds = {"a link": path.is_symlink(), "a folder": path.is_dir(), "a file": path.is_file()}
         here = next((kind for kind, holds in kinds.items() if holds), "a device or a pipe")
         raise InputError(path, f"is {here}, not {'a folder' if folder else 'a file'}", "choose another name")
-    if ours or (folder and not any(path.iterdir())):
+    if internal or (folder and not any(path.iterdir())):
         return
     if not overwrite:
         raise InputError(path, "exists already", "choose another place, or ask for it to be replaced (--overwrite)")
@@ -317,13 +317,13 @@ def remove_stale(path: Path) -> None:
     """
     try:
         names = [match for name in os.listdir(path.parent) if (match := _NAMES.fullmatch(name))]
-    except OSError:  # No such folder yet, or not ours to read.
+    except OSError:  # No such folder yet, or not readable.
         return
     for match in (match for match in names if match[2] == _process_space() and not _runs(int(match[3]))):
-        leftover, ours = path.parent / match[0], (match[1], match[5] or "") == (_stem(path), path.suffix[:20])
-        if match[4] == "tmp" or (ours and path.exists()):
+        leftover, same_target = path.parent / match[0], (match[1], match[5] or "") == (_stem(path), path.suffix[:20])
+        if match[4] == "tmp" or (same_target and path.exists()):
             remove(leftover)
-        elif ours:
+        elif same_target:
             with suppress(OSError):  # Another process was as quick.
                 os.rename(leftover, path)
 

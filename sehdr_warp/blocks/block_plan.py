@@ -148,7 +148,7 @@ class BlockPlan:
             "axes": self.axes.tolist(),
             "blocks": [_block_values(block) for block in self.blocks],
         }
-        write_json(folder / FILE, values, ours=True)
+        write_json(folder / FILE, values, internal=True)
 
     @staticmethod
     def read(folder: Path) -> "BlockPlan":

@@ -111,9 +111,11 @@ def pu21_metrics(
         "psnr" in dB, and "ssim".
     """
     factor = peak_luminance / maximum(truth, mask)
-    ours, theirs = prediction.double() * factor, truth.double() * factor
-    decibels = psnr(pu21_encode(ours), pu21_encode(theirs), mask, peak=PU21_PEAK)
-    gray, gray_truth = (pu21_encode((image @ image.new_tensor(LUMINANCE))[..., None]) for image in (ours, theirs))
+    predicted_luminance, true_luminance = prediction.double() * factor, truth.double() * factor
+    decibels = psnr(pu21_encode(predicted_luminance), pu21_encode(true_luminance), mask, peak=PU21_PEAK)
+    gray, gray_truth = (
+        pu21_encode((image @ image.new_tensor(LUMINANCE))[..., None]) for image in (predicted_luminance, true_luminance)
+    )
     return {"psnr": decibels, "ssim": ssim(gray, gray_truth, mask, peak=PU21_PEAK)}
 
 

@@ -19,6 +19,7 @@ from ..response.curve import HALF_CODE
 from ..scene import View
 from .radiance_field import RadianceField
 from .residual_regions import MAX_VIEWS, high_residual_mask
+from .visibility import blending_weights
 
 log = logging.getLogger(__name__)
 
@@ -125,7 +126,7 @@ def gather_evidence(
     every = -(-len(views) // MAX_VIEWS) or 1
     for index, view in tracked("measuring confidence on photos", views, log):
         if index % every:
-            peak = torch.maximum(peak, _blending_weights(field, view))
+            peak = torch.maximum(peak, blending_weights(field, view.camera, view.mask))
             continue
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         weight = torch.ones_like(exposure[..., 0])
@@ -156,14 +157,3 @@ def _deviation(estimates: Tensor, photo: Tensor) -> Tensor:
         for size, coarse in zip(photo.shape[:2], estimates.shape[:2], strict=True)
     )
     return 1 / (math.log(2) * estimates[rows][:, columns, 3:].to(photo))
-
-
-def _blending_weights(field: RadianceField, view: View) -> Tensor:
-    """Return the sum [N] of each Gaussian's blending weights in a view inside its mask, pixels."""
-    device = field.gaussians.means.device
-    weight = torch.ones(view.camera.height, view.camera.width, device=device)
-    if view.mask is not None:
-        weight = torch.tensor(view.mask, device=device)
-    # Three channels like a training's features, so that no further kernel is compiled.
-    images = weight[..., None].expand(-1, -1, 3).contiguous()
-    return field.weighted_sums(field.camera_tensors(view.camera), images)[:, 0]

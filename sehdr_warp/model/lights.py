@@ -101,15 +101,15 @@ def find_lights(
     if not len(members):
         return []
     gaussians = field.gaussians
-    places = field.normalization.scene_points(gaussians.means[members].cpu().numpy())
+    positions = field.normalization.scene_points(gaussians.means[members].cpu().numpy())
     widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
     confidence = None if field.confidence is None else field.confidence[members].cpu().numpy()
     covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
     total = max(_light_at(field, middle, cameras, degree), 1e-30)
     lights = []
-    for group in _groups(places, REACH * float(np.median(widths))):
-        shape = _shape(places[group], widths[group], weights[group], middle)
+    for group in _groups(positions, REACH * float(np.median(widths))):
+        shape = _shape(positions[group], widths[group], weights[group], middle)
         area = float(_fitted(shape, covered[:, group].sum(1, keepdims=True), cameras)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
         sides = [side * min(max(area, 1e-4), 1e4) ** 0.5 for side in shape.size]
@@ -157,23 +157,23 @@ def _view_sums(field: RadianceField, camera: Camera, degree: int | None) -> tupl
     return sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit)
 
 
-def _groups(places: np.ndarray, reach: float) -> list[np.ndarray]:
+def _groups(positions: np.ndarray, reach: float) -> list[np.ndarray]:
     """Return the connected groups of points that are nearer to each other than `reach`, as indices."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    pairs = KDTree(places).query_pairs(reach, output_type="ndarray")
-    links = coo_matrix((np.ones(len(pairs)), pairs.T), (len(places), len(places)))
+    pairs = KDTree(positions).query_pairs(reach, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), pairs.T), (len(positions), len(positions)))
     count, labels = connected_components(links, directed=False)
     return [np.flatnonzero(labels == label) for label in range(count)]
 
 
-def _shape(places: np.ndarray, widths: np.ndarray, weights: np.ndarray, middle: np.ndarray) -> LightShape:
+def _shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, middle: np.ndarray) -> LightShape:
     """Return the rectangle or sphere with the weighted mean and variances of Gaussians."""
     weights = weights / weights.sum()
-    position = weights @ places
-    offsets = places - position
+    position = weights @ positions
+    offsets = positions - position
     covariance = (offsets * weights[:, None]).T @ offsets
     values, vectors = np.linalg.eigh(covariance)
     # A Gaussian reaches beyond its center on the light's face, but not across a flat one.

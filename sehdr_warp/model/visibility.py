@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +28,7 @@ def count_views(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
     subset = every_nth(cameras, MOST_VIEWS)
     views = torch.zeros(field.gaussians.count, device=field.gaussians.means.device)
     for camera in subset:
-        views += _blending_weights(field, camera) > LEAST_WEIGHT
+        views += blending_weights(field, camera.within(VIEW_SIZE)) > LEAST_WEIGHT
     return views * (len(cameras) / len(subset))
 
 
@@ -36,7 +37,7 @@ def contributions(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
     """Return [N], the sum of each Gaussian's blending weights over cameras, pixels; arguments as in count_views."""
     total = torch.zeros(field.gaussians.count, device=field.gaussians.means.device)
     for camera in every_nth(cameras, MOST_VIEWS):
-        total += _blending_weights(field, camera)
+        total += blending_weights(field, camera.within(VIEW_SIZE))
     return total
 
 
@@ -59,8 +60,12 @@ def mask_shares(field: RadianceField, views: Sequence[View]) -> Tensor:
     return torch.where(sums[:, 0] > LEAST_WEIGHT, sums[:, 1] / sums[:, 0].clamp_min(LEAST_WEIGHT), 0.0)
 
 
-def _blending_weights(field: RadianceField, camera: Camera) -> Tensor:
-    """Return [N], the sum of each Gaussian's blending weights in a small picture of a camera, pixels."""
-    small = camera.within(VIEW_SIZE)
-    ones = torch.ones((small.height, small.width, 3), device=field.gaussians.means.device)
-    return field.weighted_sums(field.camera_tensors(small), ones)[:, 0]
+def blending_weights(field: RadianceField, camera: Camera, mask: np.ndarray | None = None) -> Tensor:
+    """Return [N], the sum of each Gaussian's blending weights in a picture of a camera inside a mask [H, W], pixels."""
+    device = field.gaussians.means.device
+    weight = torch.ones(camera.height, camera.width, device=device)
+    if mask is not None:
+        weight = torch.tensor(mask, device=device)
+    # Three channels like a training's features, so that no further kernel is compiled.
+    images = weight[..., None].expand(-1, -1, 3).contiguous()
+    return field.weighted_sums(field.camera_tensors(camera), images)[:, 0]

@@ -45,8 +45,8 @@ def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
 
 def middle_index(cameras: Sequence[Camera]) -> int:
     """Return the index of the camera nearest to the median position."""
-    places = _positions(cameras)
-    return int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))
+    positions = _positions(cameras)
+    return int(np.argmin(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
 
 
 def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[Camera]:

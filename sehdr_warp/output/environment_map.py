@@ -218,7 +218,7 @@ def render_map(
     return RenderedMap(*(joined(field.name) for field in fields(RenderedMap)))
 
 
-def _averaged_map(seen: Any, finer: int) -> RenderedMap:
+def _averaged_map(rendered: Any, finer: int) -> RenderedMap:
     """Return a render along directions as pixels of `finer` x `finer` of its own."""
 
     def averaged(values: np.ndarray) -> np.ndarray:
@@ -231,14 +231,14 @@ def _averaged_map(seen: Any, finer: int) -> RenderedMap:
         mean = averaged(values * weight) / np.where(total > 0, total, 1)
         return np.where(total > 0, mean, averaged(values)).astype(np.float32)
 
-    hdr, alpha, distance = (as_array(values) for values in (seen.hdr, seen.alpha, seen.distance))
+    hdr, alpha, distance = (as_array(values) for values in (rendered.hdr, rendered.alpha, rendered.distance))
     coverage, light = alpha * (distance > 0), np.maximum(hdr.mean(2), 0)
     return RenderedMap(
         averaged(hdr),
         averaged(alpha),
         weighted(distance, coverage),
-        None if seen.confidence is None else weighted(seen.confidence, coverage),
-        None if seen.clipped is None else weighted(seen.clipped, light),
+        None if rendered.confidence is None else weighted(rendered.confidence, coverage),
+        None if rendered.clipped is None else weighted(rendered.clipped, light),
     )
 
 

@@ -26,8 +26,9 @@ from ..splats import (
     read_gaussians,
     write_gaussians,
 )
+from ..splats.arrays import concatenated
 from ..subsets import every_nth
-from .splat_edits import SplatEdits, merged, most_visible, without_strays
+from .splat_edits import SplatEdits, most_visible, without_strays
 from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 KINDS = ("ldr", "hdr")
-_JUDGED = 8  # Views that tell what a file kept
+_MAX_COMPARED = 8  # Views in which a file is compared with the scene
 _DARKER = 4  # Stops below the photos' exposure, where light above their white shows
 _WORDS = ((42.0, "no visible loss"), (36.0, "close copy"), (30.0, "small differences"))  # From this many dB on
 
@@ -102,24 +103,24 @@ def export(
     color_model = "display" if kind == "ldr" else radiance
     whole, parts = [], []
     for scene in (run, *merge):
-        gaussians = _converted(scene, color_model, time)
+        gaussians = _gaussians_in_colors(scene, color_model, time)
         whole.append(gaussians)
         mask = edits.mask(gaussians.opacities, upright.points(gaussians.means), scene)
         part = gaussians.rows(mask)
         if edits.max_gaussians is not None and part.count > (most := max(1, edits.max_gaussians // (1 + len(merge)))):
             subset = gaussians.rows(most_visible(mask, most, scene))
-            picture = _edited(part, time) if edits.changes_pictures else _photographed(scene, time)
+            picture = _gaussians_renderer(part, time) if edits.changes_pictures else _photo_renderer(scene, time)
             part = subset if color_model != "display" else refine(subset, picture, training_cameras(scene))
         parts.append(without_strays(part, training_cameras(scene)))
-    gaussians = merged(parts)
-    delivered = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
+    gaussians = concatenated(parts)
+    file_gaussians = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
     if isinstance(run, Splats) and run.world_matrix is not None:
-        delivered = replace(delivered, world_matrix=to_file.matrix @ run.world_matrix)
-    write_gaussians(path, delivered.padded(degree or 0), overwrite=overwrite)
+        file_gaussians = replace(file_gaussians, world_matrix=to_file.matrix @ run.world_matrix)
+    write_gaussians(path, file_gaussians.padded(degree or 0), overwrite=overwrite)
     if cameras:
         _write_cameras(beside, run, to_file, overwrite)
     meaning = f"display colors of {shutter(time)}" if kind == "ldr" else "scene-linear radiance"
-    count, harmonics = delivered.count, max(delivered.degree, degree or 0)
+    count, harmonics = file_gaussians.count, max(file_gaussians.degree, degree or 0)
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, count, harmonics, meaning)
     if not merge:
         reference = gaussians if edits.changes_pictures else None
@@ -134,7 +135,7 @@ def training_cameras(run: "LoadedScene") -> list[Camera]:
     return [entry.camera for entry in run.cameras if entry.split == "train"]
 
 
-def _converted(run: "LoadedScene", color_model: str, time: float) -> GaussianArrays:
+def _gaussians_in_colors(run: "LoadedScene", color_model: str, time: float) -> GaussianArrays:
     """Return the Gaussians of a run in its own coordinates and in the colors of a file.
 
     Display colors are those of a photo of `time` seconds.
@@ -145,7 +146,7 @@ def _converted(run: "LoadedScene", color_model: str, time: float) -> GaussianArr
         return gaussians_of(run.model, color_model, positions, color_matrix=run.color_matrix)
     gaussians = gaussians_of(run.model, "display", positions, time, run.color_matrix)
     if gaussians.color_model != run.model.color_model.name:
-        return refine(gaussians, _photographed(run, time), photos)
+        return refine(gaussians, _photo_renderer(run, time), photos)
     return gaussians
 
 
@@ -173,19 +174,19 @@ def loss_in_words(decibels: float) -> str:
 
 def _log_loss(path: Path, run: "LoadedScene", gaussians: GaussianArrays, kind: str, time: float) -> None:
     """Measure and log how well Gaussians in the scene's own coordinates show the scene."""
-    views = _judged(run)
+    views = _cameras_to_compare(run)
     where = f"{len(views)} view{'s' * (len(views) != 1)}"
     if not views:
         log.info("it is not compared with the scene, which has no cameras of its own")
     elif kind == "ldr":
-        decibels = agreement(gaussians, _photographed(run, time), views, time)
+        decibels = agreement(gaussians, _photo_renderer(run, time), views, time)
         words = loss_in_words(decibels)
         log.info(
             "kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white", decibels, where, words
         )
     else:
         dark = time / 2**_DARKER
-        bright, dim = (agreement(gaussians, _display_picture(run, t), views, t) for t in (time, dark))
+        bright, dim = (agreement(gaussians, _display_renderer(run, t), views, t) for t in (time, dark))
         words = loss_in_words(min(bright, dim))
         text = "kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s (%s)"
         log.info(text, bright, dim, _DARKER, where, words)
@@ -195,39 +196,39 @@ def _log_file_loss(
     path: Path, run: "LoadedScene", reference: GaussianArrays | None, to_file: WorldTransform, kind: str, time: float
 ) -> None:
     """Measure and log what a compressed file loses, read back, beside the scene or the edited Gaussians."""
-    views = _judged(run)
+    views = _cameras_to_compare(run)
     if not views:
         return
     # SPZ does not state the exposure time.
     gaussians = replace(read_gaussians(path).transformed(to_file.inverse().matrix), base_time=time)
     if reference is None:
-        picture, beside = _photographed(run, time), "the scene"
+        picture, beside = _photo_renderer(run, time), "the scene"
     else:
-        picture, beside = _edited(reference, time), "what was exported"
+        picture, beside = _gaussians_renderer(reference, time), "what was exported"
     decibels = agreement(gaussians, picture, views, time)
     files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
     size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
     log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, beside, loss_in_words(decibels), size)
 
 
-def _judged(run: "LoadedScene") -> Sequence[Camera]:
+def _cameras_to_compare(run: "LoadedScene") -> Sequence[Camera]:
     held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
     views = held_out or [entry.camera for entry in run.cameras]
-    return every_nth(views, _JUDGED)
+    return every_nth(views, _MAX_COMPARED)
 
 
-def _photographed(run: "LoadedScene", time: float) -> Callable:
+def _photo_renderer(run: "LoadedScene", time: float) -> Callable:
     """Return a function that renders simulated photos, or light for a scene in a sensor's colors."""
-    return _display_picture(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
+    return _display_renderer(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
 
-def _edited(gaussians: GaussianArrays, time: float) -> Callable:
+def _gaussians_renderer(gaussians: GaussianArrays, time: float) -> Callable:
     """Return a function that renders simulated photos of Gaussians in the scene's own coordinates."""
     field = field_of(gaussians)
     return lambda camera: field.render_ldr(camera, time)
 
 
-def _display_picture(run: "LoadedScene", time: float) -> Callable:
+def _display_renderer(run: "LoadedScene", time: float) -> Callable:
     """Return a function that renders radiance at an exposure time, encoded by sRGB."""
     from ..response import response_by_name
 

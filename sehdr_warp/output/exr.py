@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 
 from sehdr_warp import __version__
-from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.errors import NOT_FINITE_REMEDY, InputError, SehdrError
 from sehdr_warp.scene import Camera
 
 from ..files import atomic_path
 from .colorspace import chromaticities, color_space
 from .images import EXIF_TIME
 
-NOT_FINITE = "it is not written; train again from an earlier checkpoint or with another seed"
 _TYPES = {"half": np.float16, "float": np.float32}
 # OpenCV axes (+y down, +z forward) to the axes of worldToCamera (+y up, -z forward).
 _FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -174,7 +173,7 @@ def check_finite(path: Path, image: np.ndarray, what: str) -> None:
         y, x, *channel = place = tuple(np.argwhere(bad)[0])
         first = f"{'RGB'[channel[0]]} = {image[place]}" if channel else image[place]
         fault = f"{what.format(count=int(bad.sum()))} are not finite, the first {first} at x={x}, y={y}"
-        raise InputError(path, fault, NOT_FINITE)
+        raise InputError(path, fault, NOT_FINITE_REMEDY)
 
 
 def _is_depth(name: str) -> bool:

@@ -67,7 +67,7 @@ TRANSFERS = {
     "hlg": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": _X265}, 9, 18, 9),
     "hdr10": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": f"{_X265}:{_MASTER}"}, 9, 16, 9),
 }
-LOGS = {
+LOG_CURVES = {
     "logc3": ("ARRI LogC3", "ARRI Wide Gamut 3"),
     "slog3": ("S-Log3", "S-Gamut3.Cine"),
     "acescct": ("ACEScct", "ACEScg"),
@@ -78,7 +78,7 @@ FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".av
 """FFmpeg's formats by suffix: those of one file. Others write further files beside it, whoever owns their names."""
 _SLOWEST, _FASTEST = 0.1, 1000.0
 """Frames a second."""
-TRANSFERS |= dict.fromkeys(LOGS, Transfer("prores_ks", "yuv444p10le", {"profile": "4444"}, 2, 2, 1))
+TRANSFERS |= dict.fromkeys(LOG_CURVES, Transfer("prores_ks", "yuv444p10le", {"profile": "4444"}, 2, 2, 1))
 
 
 def write_film(
@@ -145,7 +145,7 @@ def write_film(
                 for packet in stream.encode():
                     container.mux(packet)
         except (av.FFmpegError, ValueError) as error:
-            remedy = f"choose {'.mov' if transfer in LOGS else '.mp4'} or another size"
+            remedy = f"choose {'.mov' if transfer in LOG_CURVES else '.mp4'} or another size"
             raise SehdrError(f"{out}: cannot be written as a film ({error}); {remedy}") from error
     return out
 
@@ -176,14 +176,14 @@ def encode(light: np.ndarray, transfer: str) -> np.ndarray:
 
     sdr: Rec.709's primaries, the sRGB curve. hdr10: Rec.2020, SMPTE ST 2084 of cd/m2. hlg: Rec.2020, BT.2100's OETF of
     the scene light that its system gamma of 1.2 shows as this light on a display of 1000 cd/m2. logc3 (at EI 800),
-    slog3, acescct: in the primaries of LOGS.
+    slog3, acescct: in the primaries of LOG_CURVES.
     """
     if transfer == "sdr":
         return encode_srgb(light)
-    if transfer in LOGS:
+    if transfer in LOG_CURVES:
         import colour
 
-        curve, primaries = LOGS[transfer]
+        curve, primaries = LOG_CURVES[transfer]
         linear = np.maximum(np.asarray(light, np.float64) @ matrix_to(primaries).T, 1e-10)
         return np.clip(colour.log_encoding(linear, curve), 0, 1)
     wide = np.maximum(np.asarray(light, np.float64) @ matrix_from_rec709("rec2020").T, 0) * REFERENCE_WHITE

@@ -108,8 +108,8 @@ def _in_front_of_obstacles(
     blocked = np.count_nonzero(advance)
     log.info("orbit: something near blocked %d of %d views; they come in front of it", blocked, len(checked))
     up = [-camera.world_to_camera[1, :3] for camera in path]
-    places = [camera.position + part * (focus - camera.position) for camera, part in zip(path, parts, strict=True)]
-    poses = [look_at_pose(place, focus, direction) for place, direction in zip(places, up, strict=True)]
+    positions = [camera.position + part * (focus - camera.position) for camera, part in zip(path, parts, strict=True)]
+    poses = [look_at_pose(place, focus, direction) for place, direction in zip(positions, up, strict=True)]
     return [replace(camera, world_to_camera=np.linalg.inv(pose)) for camera, pose in zip(path, poses, strict=True)]
 
 

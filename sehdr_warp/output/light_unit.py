@@ -121,7 +121,7 @@ def meter(
     if clipped is not None and float(clipped[rows, columns].mean()) > _CLIPPED:
         log.warning("photos clip at %g,%g of %s: its light is an estimate; read a darker place", x, y, view)
     unit = LightUnit(_checked(light / rendered), view, (float(x), float(y)), reading)
-    write_json(Path(run.path) / UNIT_FILE, asdict(unit), ours=True)
+    write_json(Path(run.path) / UNIT_FILE, asdict(unit), internal=True)
     return unit
 
 

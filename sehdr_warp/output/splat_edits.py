@@ -135,34 +135,34 @@ class SplatEdits:
         if self.mask_views is not None:
             masked = [view for view in self.mask_views if view.mask is not None]
             steps["outside of the masks"] = mask_shares(run.model, masked).cpu().numpy() < _LEAST_SHARE
-        stays = np.ones(len(opacities), bool)
+        mask = np.ones(len(opacities), bool)
         for reason, goes in steps.items():
-            stays &= ~goes
+            mask &= ~goes
             if goes.any():
                 log.info("left out: %d Gaussians (%.0f %%) %s", goes.sum(), 100 * goes.mean(), reason)
-        if not stays.any():
+        if not mask.any():
             low, high = (np.percentile(upright_means, q, axis=0) for q in (2, 98))
             extent = " to ".join(", ".join(f"{v:.3g}" for v in corner) for corner in (low, high))
             raise SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in upright coordinates")
-        return stays
+        return mask
 
 
-def most_visible(stays: np.ndarray, count: int, run: "LoadedScene") -> np.ndarray:
+def most_visible(mask: np.ndarray, count: int, run: "LoadedScene") -> np.ndarray:
     """Return [N], which of the Gaussians that stay are the `count` that contribute most to the training views.
 
     Raises:
         SehdrError: If the scene has no training cameras.
     """
-    if stays.sum() <= count:
-        return stays
+    if mask.sum() <= count:
+        return mask
     cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
     if not cameras:
         raise SehdrError(f"{run.path}: has no training cameras that tell what contributes; leave max_gaussians out")
-    share = np.where(stays, contributions(run.model, cameras).cpu().numpy(), -1)
-    largest = np.zeros(len(stays), bool)
+    share = np.where(mask, contributions(run.model, cameras).cpu().numpy(), -1)
+    largest = np.zeros(len(mask), bool)
     largest[np.argsort(-share, kind="stable")[:count]] = True
-    removed_rows = stays & ~largest
-    part = share[removed_rows].sum() / max(share[stays].sum(), 1e-12)
+    removed_rows = mask & ~largest
+    part = share[removed_rows].sum() / max(share[mask].sum(), 1e-12)
     log.info("left out: %d Gaussians that make %.1f %% of the pictures", removed_rows.sum(), 100 * part)
     return largest
 
@@ -176,9 +176,9 @@ def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> Gaus
     """
     if not cameras:
         return gaussians
-    places = np.stack([camera.position for camera in cameras])
-    center = np.median(places, axis=0)
-    reach = float(np.percentile(np.linalg.norm(places - center, axis=1), 90))
+    positions = np.stack([camera.position for camera in cameras])
+    center = np.median(positions, axis=0)
+    reach = float(np.percentile(np.linalg.norm(positions - center, axis=1), 90))
     focus = common_focus(cameras)
     if focus is not None:
         reach = max(reach, float(np.linalg.norm(focus - center)))
@@ -202,11 +202,3 @@ def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> Gaus
         (far & ~faint).sum(),
     )
     return moved.rows(~faint)
-
-
-def merged(parts: Sequence[GaussianArrays]) -> GaussianArrays:
-    """Return several sets of Gaussians in one space, of one color model and exposure, as one."""
-    degree = max(part.degree for part in parts)
-    padded = [part.padded(degree) for part in parts]
-    names = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
-    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in padded]) for name in names})

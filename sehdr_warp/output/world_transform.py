@@ -222,7 +222,7 @@ def write_orientation(run: "LoadedScene", *, up: Sequence[float] | None = None, 
         "up": None if direction is None else direction.tolist(),
         "scale": before.scale if scale is None else _checked_scale(scale),
     }
-    write_json(path, values, ours=True)
+    write_json(path, values, internal=True)
     return path
 
 

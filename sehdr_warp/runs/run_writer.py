@@ -158,7 +158,7 @@ class RunWriter(RunFolder):
         from .. import __version__
 
         info = {"format": FORMAT, "version": __version__} | info
-        with atomic_folder(self.path / NEW, ours=True) as beside:
+        with atomic_folder(self.path / NEW, internal=True) as beside:
             new = RunWriter(beside)
             if plan is not None:
                 write_json(new.plan, plan)
@@ -203,12 +203,12 @@ class RunWriter(RunFolder):
     def extend(self, iterations: int) -> None:
         """Set more iterations for a training that goes on; its config and checkpoints stay as they are."""
         self._hold()
-        write_json(self.extension, {"iterations": iterations}, ours=True)
+        write_json(self.extension, {"iterations": iterations}, internal=True)
 
     def write_summary(self, values: dict) -> None:
         """Write times, memory and counts of the training; see SummaryValues."""
         self._hold()
-        write_json(self.summary, values, ours=True)
+        write_json(self.summary, values, internal=True)
 
     def append_metrics(self, line: dict) -> None:
         """Add the figures of an evaluation; see MetricsValues."""
@@ -220,7 +220,7 @@ class RunWriter(RunFolder):
         """Remove the evaluations after an iteration, because a resumed training makes them again."""
         self._hold()
         lines = [line for line in self.read_metrics() if line["iteration"] <= iteration]
-        with atomic_path(self.metrics, ours=True) as beside:
+        with atomic_path(self.metrics, internal=True) as beside:
             beside.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
 
     def write_checkpoint(self, tensors: dict[str, Tensor], values: dict, *, keep: int) -> Path:
@@ -240,7 +240,7 @@ class RunWriter(RunFolder):
             data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
             plain = values | {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest(), "run": self._hashes}
             remove_checkpoint(final)
-            with atomic_folder(final, ours=True) as beside:
+            with atomic_folder(final, internal=True) as beside:
                 (beside / TENSORS).write_bytes(data)
                 (beside / VALUES).write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
         folders = self._checkpoint_folders()
@@ -263,7 +263,7 @@ def write_confidence(folder: RunFolder, evidence: Evidence, checkpoint_hash: str
     # One key: safetensors writes several in any order, and the same run is to give the same file.
     metadata = {"sehdr_warp": json.dumps(confidence_metadata(checkpoint_hash), sort_keys=True)}
     data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, metadata)
-    with atomic_path(folder.confidence, ours=True) as beside:
+    with atomic_path(folder.confidence, internal=True) as beside:
         beside.write_bytes(data)
 
 

@@ -13,11 +13,11 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_text
 from ..sandbox import read_sandboxed
+from ..splats import USD_SUFFIXES
 from ..splats.usd import open_stage, pxr
 from .camera import Camera
 from .read_transforms import pose_from_opengl
 
-USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 EXCHANGE_SUFFIXES = (*USD_SUFFIXES, ".chan")
 USD_SIZE = ("sehdr:width", "sehdr:height")
 """Attributes of a UsdGeomCamera that state its picture's size in pixels, which USD itself does not."""

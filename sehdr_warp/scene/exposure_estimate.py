@@ -56,5 +56,5 @@ def _factor(view: View, timed: list[View], points: np.ndarray, response: Respons
             difference = light[0][shared.any(1)] - others
             return float(np.exp(np.nanmedian(difference))), count
     gains = initial_gains([view, *timed], response).gains
-    ours = np.log(gains[view.name])
-    return float(np.exp(np.median(ours) - np.median([np.log(gains[other.name]) for other in timed]))), 0
+    log_gains = np.log(gains[view.name])
+    return float(np.exp(np.median(log_gains) - np.median([np.log(gains[other.name]) for other in timed]))), 0

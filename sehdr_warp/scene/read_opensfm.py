@@ -107,10 +107,10 @@ def _points(model: dict, path: Path) -> PointCloud:
     if not points:
         return NO_POINTS
     try:
-        places = np.array([point["coordinates"] for point in points.values()], np.float64).reshape(-1, 3)
+        positions = np.array([point["coordinates"] for point in points.values()], np.float64).reshape(-1, 3)
         colors = np.array([point.get("color", (128, 128, 128)) for point in points.values()], np.float64).reshape(-1, 3)
-        if not (np.isfinite(places).all() and np.isfinite(colors).all()):
+        if not (np.isfinite(positions).all() and np.isfinite(colors).all()):
             raise ValueError("not finite")
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise InputError(path, f"its points cannot be used ({error!r:.60})", _REMEDY) from None
-    return PointCloud(places, np.clip(colors / 255, 0, 1).astype(np.float32))
+    return PointCloud(positions, np.clip(colors / 255, 0, 1).astype(np.float32))

@@ -3,13 +3,14 @@
 import json
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import NOT_FINITE_REMEDY, InputError
 
 log = logging.getLogger(__name__)
 HARMONIC_0 = 0.5 / math.sqrt(math.pi)
@@ -17,7 +18,6 @@ HARMONIC_0 = 0.5 / math.sqrt(math.pi)
 MAX_DEGREE = 3
 SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
 """Seconds that a base exposure time may have; beyond, radiance leaves the range of float32."""
-_NOT_FINITE = "it is not written; train again from an earlier checkpoint or with another seed"
 # A logit beyond this is an opacity of 0 or 1 in float32.
 _MOST_LOGIT = 20.0
 # Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.
@@ -139,10 +139,17 @@ class GaussianArrays:
             bad = ~np.isfinite(getattr(self, name)).reshape(self.count, -1).all(1)
             if bad.any():
                 fault = f"{name} of {int(bad.sum())} Gaussians are not finite, the first at {int(np.argmax(bad))}"
-                raise InputError(path, fault, _NOT_FINITE)
+                raise InputError(path, fault, NOT_FINITE_REMEDY)
 
 
 _ARRAYS = tuple(field.name for field in fields(GaussianArrays))[:5]
+
+
+def concatenated(parts: Sequence[GaussianArrays]) -> GaussianArrays:
+    """Return several sets of Gaussians in one space, of one color model and exposure, as one of the largest degree."""
+    degree = max(part.degree for part in parts)
+    padded = [part.padded(degree) for part in parts]
+    return replace(padded[0], **{name: np.concatenate([getattr(part, name) for part in padded]) for name in _ARRAYS})
 
 
 def degree_of(coefficients: float, path: Path) -> int:

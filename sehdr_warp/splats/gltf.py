@@ -14,7 +14,7 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_matrix
+from .arrays import HARMONIC_0, GaussianArrays, concatenated, degree_of, read_matrix
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPACE = "srgb_rec709_display"
@@ -92,7 +92,7 @@ def read_glb(path: Path) -> GaussianArrays:
         raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
     if not parts:
         raise InputError(path, f"has no primitive with {EXTENSION}", "export Gaussians by the ratified extension")
-    return _joined(parts)
+    return concatenated(parts)
 
 
 def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path: Path) -> GaussianArrays:
@@ -167,14 +167,6 @@ def _moved(gaussians: GaussianArrays, matrix: np.ndarray, path: Path) -> Gaussia
     if np.linalg.det(matrix[:3, :3]) < 0:
         raise InputError(path, "mirrors its Gaussians by a node's transform", "bake the transform into the Gaussians")
     return replace(gaussians.transformed(matrix), world_matrix=gaussians.world_matrix)
-
-
-def _joined(parts: list[GaussianArrays]) -> GaussianArrays:
-    """Return the Gaussians of several primitives as one, of the largest degree among them."""
-    degree = max(part.degree for part in parts)
-    padded = [part.padded(degree) for part in parts]
-    names = "means", "log_scales", "quaternions", "opacity_logits", "harmonics"
-    return replace(padded[0], **{name: np.concatenate([getattr(part, name) for part in padded]) for name in names})
 
 
 def _harmonic_names(degree: int) -> list[str]:

@@ -159,8 +159,8 @@ def compared_image(photo: TrainRender, target: Target) -> Tensor:
 
 def clipped_weights(config: LossConfig, target: Target) -> ClippedWeights:
     """Return the weights of the terms for clipped light; without estimates, the second is 0."""
-    hold = 0.0 if target.estimates is None else config.clipped_estimate
-    return ClippedWeights(config.clipped_smoothness, hold)
+    estimate_weight = 0.0 if target.estimates is None else config.clipped_estimate
+    return ClippedWeights(config.clipped_smoothness, estimate_weight)
 
 
 def compares_exposures(config: LossConfig, field: RadianceField) -> bool:

@@ -141,7 +141,7 @@ class FlatGradients:
 
     def fits(self, optimizer: Adam) -> bool:
         """Return whether the optimizer still has the same parameters."""
-        return all(ours is theirs for ours, theirs in zip(self.all, _parameters(optimizer), strict=True))
+        return all(old is new for old, new in zip(self.all, _parameters(optimizer), strict=True))
 
     @torch.no_grad()
     def collect(self, loss: Tensor, incomplete: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:

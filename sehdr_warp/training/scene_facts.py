@@ -135,6 +135,6 @@ def _plateau(views: Sequence[View]) -> int:
 def _viewing_directions(poses: np.ndarray) -> tuple[float, float]:
     """Return SceneFacts.view_alignment and .ahead of cameras [V, 4, 4]."""
     forward = poses[:, 2, :3]
-    places = -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
-    inwards = np.einsum("vi,vi->v", places.mean(axis=0) - places, forward)
+    positions = -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
+    inwards = np.einsum("vi,vi->v", positions.mean(axis=0) - positions, forward)
     return float(np.linalg.norm(forward.mean(axis=0))), float((inwards > 0).mean())

@@ -39,16 +39,16 @@ class EditedOpacities:
         logits = run.model.gaussians.opacity_logits
         original = logits.detach().clone() if self.original is None else self.original
         if edits is None:
-            stays = np.ones(len(original), bool)
+            mask = np.ones(len(original), bool)
         else:
             means = run.model.gaussians.means.detach().cpu().numpy()
             opacities = torch.sigmoid(original).cpu().numpy()
-            stays = edits.mask(opacities, world_transform(run).points(means), run)
+            mask = edits.mask(opacities, world_transform(run).points(means), run)
         with torch.no_grad():
             logits.copy_(original)
-            logits[torch.from_numpy(~stays).to(logits.device)] = _HIDDEN_LOGIT
+            logits[torch.from_numpy(~mask).to(logits.device)] = _HIDDEN_LOGIT
         self.original = None if edits is None else original
-        return int(stays.sum())
+        return int(mask.sum())
 
 
 @dataclass

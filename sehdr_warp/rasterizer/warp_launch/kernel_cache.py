@@ -63,5 +63,5 @@ def _lines(cache: Path) -> set[bytes]:
 
 
 def _keep(cache: Path) -> None:
-    with suppress(OSError, SehdrError), atomic_path(cache / LIST, ours=True) as beside:
+    with suppress(OSError, SehdrError), atomic_path(cache / LIST, internal=True) as beside:
         beside.write_bytes(b"".join(line + b"\n" for line in sorted(_lines(cache))))

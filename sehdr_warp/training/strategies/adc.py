@@ -142,13 +142,13 @@ class AdcStrategy(Strategy):
         Among the new ones, those that would be removed are not appended. If nothing would be left, only split ones are
         removed.
         """
-        stays, appended = ~split, added
-        good = stays & self._is_good(gaussians.tensors(), oversized)
+        remaining, appended = ~split, added
+        good = remaining & self._is_good(gaussians.tensors(), oversized)
         index = self._is_good(added, oversized).nonzero()[:, 0]
         if len(index) or bool(good.any()):
-            stays, appended = good, {name: values[index] for name, values in added.items()}
-        if not bool(stays.all()):
-            gaussians.keep(stays, optimizer)
+            remaining, appended = good, {name: values[index] for name, values in added.items()}
+        if not bool(remaining.all()):
+            gaussians.keep(remaining, optimizer)
         if len(appended["means"]):
             gaussians.append(appended, optimizer)
 
