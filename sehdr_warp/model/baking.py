@@ -5,6 +5,7 @@ light, so no harmonics represent the scene exactly. They are fitted for each Gau
 rendered images of the scene (refine).
 """
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..progress import stage, tracked
 from ..response import response_by_name
 from ..scene import Camera
 from ..scene.normalization import Normalization
@@ -23,6 +25,7 @@ from .color_models import rec709_of
 from .gaussians import Gaussians
 from .radiance_field import RadianceField
 
+log = logging.getLogger(__name__)
 # Smallest radiance whose logarithm is taken.
 DARKEST = 1e-12
 COARSE = 1e-3  # Of the median size of Gaussians: larger errors of float32 positions keep them in float64
@@ -190,16 +193,18 @@ def bake(gaussians: GaussianArrays, change: Colors, color_model: str, camera_pos
     weights = np.repeat([_SPHERE_WEIGHT / len(sphere), 1 / max(count, 1)], [len(sphere), count])
     offset = 0.5 if color_model == "display" else 0.0
     fitted = np.empty_like(gaussians.harmonics)
-    for start in range(0, len(gaussians.means), _CHUNK):
-        rows = slice(start, start + _CHUNK)
-        part = replace(gaussians, means=gaussians.means[rows], harmonics=gaussians.harmonics[rows])
-        rays = part.means[:, None].astype(np.float64) - cameras
-        rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12)
-        directions = np.concatenate([np.broadcast_to(sphere, (len(rays), *sphere.shape)), rays], axis=1)
-        target = change(evaluate_colors(part, directions)) - offset
-        basis = harmonic_basis(directions, gaussians.degree)
-        weighted = (basis * weights[:, None]).swapaxes(1, 2)
-        fitted[rows] = np.linalg.solve(weighted @ basis, weighted @ target)
+    with stage("fitting colors of Gaussians", len(gaussians.means), log) as progress:
+        for start in range(0, len(gaussians.means), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            part = replace(gaussians, means=gaussians.means[rows], harmonics=gaussians.harmonics[rows])
+            rays = part.means[:, None].astype(np.float64) - cameras
+            rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12)
+            directions = np.concatenate([np.broadcast_to(sphere, (len(rays), *sphere.shape)), rays], axis=1)
+            target = change(evaluate_colors(part, directions)) - offset
+            basis = harmonic_basis(directions, gaussians.degree)
+            weighted = (basis * weights[:, None]).swapaxes(1, 2)
+            fitted[rows] = np.linalg.solve(weighted @ basis, weighted @ target)
+            progress.update(rows.stop)
     return gaussians.with_colors(fitted, color_model)
 
 
@@ -223,7 +228,7 @@ def refine(
     field = field_of(gaussians).to(device)
     fitted = {name: getattr(field.gaussians, name).requires_grad_() for name in RATES}
     optimizer = Adam([{"params": [value]} for value in fitted.values()])
-    for step, index in enumerate(order):
+    for step, index in tracked("fitting colors and opacities to pictures of the scene, steps", order, log):
         decay = 0.5 * (1 + math.cos(math.pi * step / len(order)))
         for group, rate in zip(optimizer.param_groups, RATES.values(), strict=True):
             group["lr"] = rate * decay

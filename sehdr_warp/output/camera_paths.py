@@ -23,6 +23,8 @@ _PARALLEL = np.sin(np.radians(6)) ** 2
 # their pitch by their horizon; then the pictures' mean decides. Where they look around, it moves up by less than 1/10
 # of the cameras' mean pitch.
 _MEAN_UP_WEIGHT = 0.005
+# Middle eigenvalue of the level axes' products, below which cameras look one way: the mean squared sine of 6 degrees.
+_ONE_WAY = np.sin(np.radians(6)) ** 2
 _CANCELED, _ALIKE = 0.3, 0.7  # Length of the mean up of pictures, and of the mean viewing direction
 _DOWN = 0.2  # Mean of the pictures' up along the common up below which the viewing directions decide its sign
 
@@ -151,6 +153,17 @@ def typical_roll(cameras: Sequence[Camera], up: np.ndarray) -> float:
     """Return the median angle, in radians, between the level axes of pictures and the horizon of an up direction."""
     level = _level_axes(np.stack([camera.world_to_camera[:3, :3] for camera in cameras]), up)
     return float(np.median(np.arcsin(np.clip(np.abs(level @ up), 0, 1))))
+
+
+def is_pitch_known(cameras: Sequence[Camera], up: np.ndarray) -> bool:
+    """Return whether cameras turn enough for their level axes to tell the horizon, not only its direction along one.
+
+    Cameras that all look one way are level along their common axis; how far they are pitched, their poses do not say.
+    """
+    axes = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
+    level = _level_axes(axes, up)
+    looks_down = abs(float(axes[:, 1].mean(axis=0) @ up)) < _DOWN  # From the air: the axes of view tell up.
+    return looks_down or bool(np.linalg.eigvalsh(level.T @ level / len(level))[1] > _ONE_WAY)
 
 
 def _level_axes(axes: np.ndarray, up: np.ndarray) -> np.ndarray:

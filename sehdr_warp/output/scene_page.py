@@ -5,6 +5,7 @@ are. It blends into half floats, which light.js exposes: light above white stays
 """
 
 import base64
+import logging
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +26,7 @@ from .world_transform import world_transform
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
 
+log = logging.getLogger(__name__)
 _HALF = float(np.finfo(np.float16).max)
 
 
@@ -90,6 +92,7 @@ def write_scene_page(
     page = whole_page(run.scene_name, page_file("scene.css"), body, scripts, workers=True)
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(page, encoding="utf-8")
+    log.info("%s: %d Gaussians, %.1f MB; light above white stays", path.name, gaussians.count, len(page) / 1e6)
     return path
 
 

@@ -20,7 +20,7 @@ from sehdr_warp.scene import Camera
 
 from ..files import read_json, write_json
 from ..splats import STREAMED_SOG
-from .camera_paths import common_focus, middle_index, typical_roll, up_direction
+from .camera_paths import common_focus, is_pitch_known, middle_index, typical_roll, up_direction
 
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
@@ -140,6 +140,11 @@ def world_transform(
         if roll > _WORST_ROLL:
             text = "the photos share no up direction (typically %.0f degrees off); set --up x,y,z, or --axes scene"
             log.warning(text, math.degrees(roll))
+        elif not is_pitch_known(cameras, direction):
+            log.info(
+                "the photos all look one way, so their mean tilt counts as level; if that is not so, set --up, or pick "
+                "three points of the floor in the viewer"
+            )
     rotation, origin = _rotation(direction, cameras[middle_index(cameras)] if cameras else None), np.zeros(3)
     if cameras:
         focus = common_focus(cameras)

@@ -6,13 +6,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.camera_exchange import camera_path
-from sehdr_warp.output.camera_paths import orbit, up_direction
+from sehdr_warp.output.camera_paths import is_pitch_known, orbit, up_direction
 from sehdr_warp.output.export import export
 from sehdr_warp.output.render_views import render_views, select_cameras
 from sehdr_warp.output.world_transform import WorldTransform, world_transform, write_orientation
 from sehdr_warp.runs.run import Splats, load_splats
-from sehdr_warp.scene import Camera, load_cameras, look_at
+from sehdr_warp.scene import Camera, load_cameras, load_scene, look_at
 from sehdr_warp.splats import read_gaussians, write_gaussians
 
 from ..splats.test_splat_files import gaussians
@@ -55,6 +56,26 @@ def test_up_is_within_three_degrees(name, positions, target, options):
     up = turn @ [0, 1, 0]
     cameras = photos(up, positions @ turn.T, turn @ np.array(target), **options)
     assert degrees(up_direction(cameras), up) < 3, name
+
+
+@pytest.mark.parametrize("room", ["room", "lamps", "glass", "study", "sunlit"])
+def test_rooms_whose_cameras_turn_are_upright_within_a_degree(room):
+    cameras = [view.camera for view in load_scene(f"embedded:{room}", max_size=32, response="srgb").train_views]
+    direction = up_direction(cameras)
+    assert degrees(direction, np.array([0, 0, 1])) < 1 and is_pitch_known(cameras, direction)
+
+
+def test_photos_that_all_look_one_way_are_said_to_tell_no_pitch(tmp_path, logged):
+    """A camera that slides along a table and looks down on it: its tilt cannot be told from a tilted table."""
+    positions = [(0.1 * x, 0.1 * y, -2.0) for x in range(4) for y in range(3)]
+    poses = [look_at(place, np.add(place, (0, -0.36, 1)), up=(0, 1, 0)) for place in positions]
+    cameras = [Camera(32, 24, 40, 40, 16, 12, pose) for pose in poses]
+    entries = [Entry(str(i), "train", each) for i, each in enumerate(cameras)]
+    scene = Splats(tmp_path / "run", field_of(gaussians()), entries)
+    assert degrees(world_transform(scene).rotation[1], np.array([0, 1, 0])) == pytest.approx(19.8, abs=0.1)
+    assert any("all look one way" in line and "--up" in line for line in logged)
+    logged.clear()
+    assert world_transform(scene, up="y").rotation[1] == pytest.approx([0, 1, 0]) and not logged
 
 
 def test_up_of_a_flight_that_looks_straight_down():
