@@ -1,7 +1,10 @@
 """`python -m sehdr_warp` and the script `sehdr-warp`: the command line, loaded where interrupts are caught."""
 
+import os
 import signal
 import sys
+
+_OUT_OF_MEMORY = b"sehdr-warp: out of memory; raise the limit (ulimit -v), or use smaller photos (--max-size)\n"
 
 
 def run() -> None:
@@ -16,6 +19,10 @@ def run() -> None:
 
         main()
     except BaseException as error:
+        if isinstance(error, MemoryError) or (isinstance(error, ImportError) and "map segment" in str(error)):
+            # While modules load, or because even the line of main() found no memory: nothing is allocated here.
+            os.write(2, _OUT_OF_MEMORY)
+            os._exit(1)
         # An interrupt while modules load or main() ends, or an exception into which a library turned it.
         if isinstance(error, KeyboardInterrupt) or (interrupted() and not isinstance(error, SystemExit)):
             print("sehdr-warp: interrupted", file=sys.stderr)

@@ -144,6 +144,9 @@ def parse_command(words: list[str]) -> tuple[Callable, Any]:
 
 def _run(argv: list[str]) -> None:
     """Set the process up and run a command line."""
+    words = [word for word in argv if word not in ("-q", "--quiet", "--verbose", "--debug")]
+    if words and words[0] in _COMMANDS and words[0] not in _WITHOUT_TORCH and not {"-h", "--help"} & {*words}:
+        _check_address_space()
     from .process import calm_threads, check_working_directory
 
     check_working_directory()
@@ -156,7 +159,6 @@ def _run(argv: list[str]) -> None:
     silence_exit()
     quiet, verbose = {"-q", "--quiet"} & {*argv}, "--verbose" in argv
     show_logs("warning" if quiet else "debug" if verbose else "info")
-    words = [word for word in argv if word not in ("-q", "--quiet", "--verbose", "--debug")]
     if not words or words[0] in ("-h", "--help"):
         print(_help())
         return
@@ -164,8 +166,6 @@ def _run(argv: list[str]) -> None:
         print(f"{PROGRAM} {__version__}")
         return
     run, options = parse_command(words)
-    if words[0] not in _WITHOUT_TORCH:
-        _check_address_space()
     with stages_on_terminal():
         if "argv" in inspect.signature(run).parameters:
             run(options, argv=argv)

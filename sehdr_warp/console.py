@@ -59,6 +59,8 @@ def show_logs(level: str = "info") -> None:
     logger.handlers = [other for other in logger.handlers if not isinstance(other, _LogLines)] + [handler]
     logger.setLevel(level.upper())
     logger.propagate = False
+    if level != "debug":  # Of a damaged photo, which the package names itself.
+        logging.getLogger("PIL").setLevel(logging.CRITICAL)
 
 
 def follow(steps: Iterable[Any], total: int) -> None:

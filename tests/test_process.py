@@ -127,6 +127,19 @@ def test_what_the_surroundings_refuse_is_one_line(error, told):
     assert found is None if told is None else str(found).startswith(told)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of address space as Linux has them")
+@pytest.mark.parametrize("mebibytes", [18, 24, 40, 200])
+def test_little_address_space_is_one_line_whatever_finds_none(tmp_path, mebibytes):
+    """Also while modules load, and if not even the line of the error finds memory."""
+    call = f"ulimit -v {mebibytes << 10}; {sys.executable} -m sehdr_warp train embedded --out run"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    ended = subprocess.run(
+        ["bash", "-c", call], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1 and ended.stderr.startswith("sehdr-warp: out of memory"), ended.stderr
+    assert "ulimit -v" in ended.stderr and ended.stderr.count("\n") == 1 and list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("columns", [1, 5])
 def test_narrow_terminals_get_help(columns):
     call = [sys.executable, "-m", "sehdr_warp", "train", "--help"]

@@ -17,7 +17,7 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from ..errors import InputError, SehdrError
-from ..files import read_json, write_json
+from ..files import read_json, refuse_links, write_json
 from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_from_dict, field_and_problem, override_config
@@ -41,16 +41,20 @@ MOST_MATCHED = 400  # Photos that are matched for that
 OVERLAP = 1.3  # Photos and Gaussians of all blocks together, relative to the whole set, for the choice of their number
 
 
+_THREE = Field(min_length=3, max_length=3)
+
+
 class BlockValues(BaseModel):
     """A block in blocks.json."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=True)
-    name: str
+    name: Annotated[str, Field(pattern=r"^block_[0-9]{1,9}$")]
+    """A folder's name, which must not lead to another place."""
     views: list[str]
     fraction: Annotated[float, Field(gt=0, le=1)]
-    low: list[float | None]
-    high: list[float | None]
-    margin: list[FiniteFloat]
+    low: Annotated[list[float | None], _THREE]
+    high: Annotated[list[float | None], _THREE]
+    margin: Annotated[list[FiniteFloat], _THREE]
 
 
 class BlockPlanValues(BaseModel):
@@ -66,8 +70,8 @@ class BlockPlanValues(BaseModel):
     exposure_compensation: GainValues | None
     exposure_times: dict[str, Annotated[float, Field(gt=0)]]
     config: dict[str, Any]
-    axes: list[list[FiniteFloat]]
-    blocks: list[BlockValues]
+    axes: Annotated[list[Annotated[list[FiniteFloat], _THREE]], _THREE]
+    blocks: Annotated[list[BlockValues], Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -154,9 +158,10 @@ class BlockPlan:
     def read(folder: Path) -> "BlockPlan":
         """Read blocks.json; raise InputError if it cannot be used."""
         path = folder / FILE
+        refuse_links(path, folder)
         values, remedy = read_json(path, 256 << 20), "train again, with --overwrite"
         try:
-            BlockPlanValues.model_validate(values)
+            _check_blocks(BlockPlanValues.model_validate(values))
             response = Response.from_dict(values["response"])
             blocks = tuple(_block_from(each) for each in values["blocks"])
         except ValidationError as error:
@@ -324,6 +329,15 @@ def _block_values(block: Block) -> dict[str, Any]:
     low, high = ([float(bound) if np.isfinite(bound) else None for bound in face] for face in faces)
     values = {"name": block.name, "views": list(block.views), "fraction": block.fraction, "low": low, "high": high}
     return values | {"margin": block.margin.tolist()}
+
+
+def _check_blocks(plan: BlockPlanValues) -> None:
+    """Raise ValueError if two blocks have a name, or a view of a block has no exposure time."""
+    names = [block.name for block in plan.blocks]
+    if len(set(names)) < len(names):
+        raise ValueError("two blocks have the same name")
+    if unknown := {view for block in plan.blocks for view in block.views} - plan.exposure_times.keys():
+        raise ValueError(f"exposure_times lacks {min(unknown):.80}")
 
 
 def _block_from(values: dict[str, Any]) -> Block:

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 
 from ..errors import InputError
-from ..files import make_parents, writing
+from ..files import make_parents, refuse_links, writing
 from ..runs.config import Config
 from ..runs.open import load_photos, response_for_loading
 from ..runs.run import Run, load_run
 from ..runs.run_writer import RunWriter
 from .block_plan import FILE, BlockPlan, make_block_plan
-from .job import FOLDER
+from .job import FOLDER, folder_of
 from .jobs import run_blocks
 from .merge import merge_blocks
 from .seams import SeamErrors, measure_seams
@@ -72,7 +72,8 @@ def train_in_blocks(
         if plan is None:
             return None
         if overwrite:
-            shutil.rmtree(out / FOLDER, ignore_errors=True)
+            for place in (*out.glob(f"{FOLDER}/block_*"), out / FOLDER / "logs"):
+                shutil.rmtree(place, ignore_errors=True)
         with writing(out):
             make_parents(out / FILE)
         plan.write(out)
@@ -98,6 +99,8 @@ def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
         raise InputError(out, "is a file", "choose another folder for the run")
     if not out.exists() or not any(out.iterdir()):
         return False
+    for name in (FOLDER, FILE):
+        refuse_links(out / name, out)
     if is_in_blocks(out):
         if not (resume or overwrite):
             raise InputError(out, "exists and is not empty", "choose another, or use --resume or --overwrite")
@@ -109,6 +112,8 @@ def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
 def _continued(out: Path, data: dict[str, Any], config: Config, count: int | None) -> BlockPlan:
     """Return the plan of a training in blocks to continue; raise InputError if something else was asked for."""
     plan = BlockPlan.read(out)
+    for index in range(len(plan.blocks)):
+        refuse_links(folder_of(out, plan, index), out)
     remedy = "continue with the same photos and options, or train anew with --overwrite"
     if data != plan.data:
         name = next(name for name in {**data, **plan.data} if data.get(name) != plan.data.get(name))

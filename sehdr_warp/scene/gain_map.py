@@ -20,7 +20,7 @@ from PIL import Image, TiffImagePlugin
 
 from ..errors import InputError
 from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, with_primary
-from .images import PILLOW_ERRORS, EncodedImage, check_size, exif_of, open_image, orientation_of, turn_upright
+from .images import PILLOW_ERRORS, EncodedImage, exif_of, open_image, orientation_of, turn_upright
 from .linear_photos import linear_codes
 from .primaries import srgb_to_linear
 
@@ -237,7 +237,8 @@ def _item_pixels(path: Path, items: HeifItems, number: int, photo: tuple[int, in
 
 def _pixels(image: Image.Image, photo: tuple[int, int]) -> np.ndarray:
     """Return [h, w, 1 or 3] float32 in [0, 1] of an opened gain map, which has at most the photo's pixels."""
-    check_size(Path("gain map"), *image.size, most=max(photo[0] * photo[1], 1))
+    if not 0 < image.width * image.height <= photo[0] * photo[1]:
+        raise ValueError(f"it has {image.width} x {image.height} pixels, the photo {photo[0]} x {photo[1]}")
     image = image if image.mode in ("L", "RGB") else image.convert("RGB")
     values = np.asarray(image)
     return (values.reshape(*values.shape[:2], -1) / np.float32(255)).astype(np.float32)

@@ -5,7 +5,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageFile, TiffImagePlugin
+from PIL import Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
 
 BIG_ENDIAN = "a BigTIFF whose bytes are in big-endian order"
 _MOST_PAGES = 16  # That are looked at
@@ -86,8 +86,11 @@ def read_planes(image: ImageFile.ImageFile, path: Path) -> np.ndarray:
                 count = len(tags[tag]) // tags[277]
                 fields[tag] = tags[tag][plane * count : (plane + 1) * count]
         single = _HEADS[order] + struct.pack(f"{order}I", len(data)) + data[8:] + _directory(fields, len(data), order)
-        with Image.open(io.BytesIO(single), formats=("TIFF",)) as one:
-            planes.append(np.asarray(one).astype(np.uint16))
+        try:
+            with Image.open(io.BytesIO(single), formats=("TIFF",)) as one:
+                planes.append(np.asarray(one).astype(np.uint16))
+        except UnidentifiedImageError:  # Its message names an object of Python.
+            raise ValueError(f"the strips of channel {plane + 1} are damaged") from None
     return np.stack(planes, axis=2)
 
 

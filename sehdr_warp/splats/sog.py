@@ -118,7 +118,8 @@ def read_sog(path: Path) -> GaussianArrays:
 def refusing_damage(path: Path) -> Iterator[None]:
     """Raise InputError in place of what a damaged file makes of its numbers, names and pictures."""
     try:
-        yield
+        with np.errstate(over="ignore", invalid="ignore"):  # Values that are not finite are left out and counted later.
+            yield
     except (zipfile.BadZipFile, zlib.error, RecursionError, Image.DecompressionBombError, *_FAULTS) as error:
         raise InputError(path, f"is damaged SOG ({error!r:.120})", _DAMAGED) from None
 

@@ -64,16 +64,31 @@ def read_streamed_sog(path: Path) -> GaussianArrays:
             if "lods" in node and "0" in node["lods"]:
                 part = node["lods"]["0"]
                 parts.setdefault(int(part["file"]), []).append((int(part["offset"]), int(part["count"])))
-        found: list[GaussianArrays] = []
+        found: dict[Path, GaussianArrays] = {}
         for index, ranges in sorted(parts.items()):
+            if index < 0:
+                raise ValueError(f"file {index}")
             chunk = contained(path.parent, meta["filenames"][index], path)
+            if chunk in found:
+                raise ValueError("a chunk is listed twice")
             folder = chunk.parent
             gaussians = gaussians_of_files(lambda name, folder=folder: read_bytes(contained(folder, name, path)), chunk)
-            rows = np.concatenate([np.arange(start, start + count) for start, count in ranges])
-            found.append(gaussians.rows(rows))
+            found[chunk] = gaussians.rows(_rows(ranges, gaussians.count))
         if not found:
             raise ValueError("no node has Gaussians of level 0")
-    return merged_chunks(found)
+    return merged_chunks([*found.values()])
+
+
+def _rows(ranges: list[tuple[int, int]], count: int) -> np.ndarray:
+    """Return the rows of (first, number) of a chunk.
+
+    Raises ValueError for rows that a chunk of `count` does not have: a small file must not take much memory.
+    """
+    if any(first < 0 or number < 0 or first + number > count for first, number in ranges):
+        raise ValueError(f"Gaussians outside of a chunk of {count}")
+    if sum(number for _, number in ranges) > count:
+        raise ValueError(f"more Gaussians than a chunk of {count} has")
+    return np.concatenate([np.arange(first, first + number) for first, number in ranges])
 
 
 def merged_chunks(parts: list[GaussianArrays]) -> GaussianArrays:

@@ -180,6 +180,17 @@ def test_a_damaged_gain_map_is_named_and_the_photo_is_used(tmp_path, caplog, seg
     assert read_ldr(tmp_path / "a.jpg").pixels.shape == base.shape
 
 
+def test_a_map_of_more_pixels_than_its_photo_counts_as_none(tmp_path, caplog):
+    """As it is left behind where a photo was cut or scaled down."""
+    _, base, gain = pair()
+    write_jpeg_pair(tmp_path / "a.jpg", base[:8, :8], gain, [iso_segment()])
+    with caplog.at_level(logging.WARNING, "sehdr_warp.scene"):
+        assert read_gain_map(tmp_path / "a.jpg") is None
+    assert (
+        f"a.jpg: its gain map is damaged (it has {WIDTH // 2} x {HEIGHT // 2} pixels, the photo 8 x 8)" in caplog.text
+    )
+
+
 def write_set(folder, count=4):
     """Posed photos with gain maps, all of one scene."""
     light, base, gain = pair()

@@ -317,6 +317,18 @@ def test_bigtiff(tmp_path, planes):
         read_ldr(tmp_path / "b.tif")
 
 
+def test_planes_without_strips_are_told_by_their_channel(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    options = {"photometric": "rgb", "planarconfig": "separate"}
+    tifffile.imwrite(tmp_path / "a.tif", RNG.integers(0, 65536, (3, 12, 16), dtype=np.uint16), byteorder="<", **options)
+    data = (tmp_path / "a.tif").read_bytes()
+    changed = data.replace(struct.pack("<HHI", 273, 4, 3), struct.pack("<HHI", 273, 4, 1))
+    assert changed != data, "tifffile states three places of strips"
+    (tmp_path / "a.tif").write_bytes(changed)
+    with pytest.raises(InputError, match="cannot be decoded .the strips of channel 1 are damaged."):
+        read_ldr(tmp_path / "a.tif")
+
+
 @pytest.mark.parametrize("stored, words", [
     (np.zeros((8, 8, 5), np.uint16), "5 channels of 16 bits"), (np.zeros((8, 8, 3), np.uint32), "3 channels of 32 bits")
 ])  # fmt: skip

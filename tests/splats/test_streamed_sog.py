@@ -75,6 +75,33 @@ def test_levels_of_other_programs(tmp_path, small_chunks):
             read_gaussians(path)
 
 
+@pytest.mark.parametrize(
+    "part, named",
+    [
+        ({"count": 10**12}, "outside of a chunk"), ({"offset": 149}, "outside of a chunk"),
+        ({"offset": -9, "count": 9}, "outside of a chunk"), ({"file": -1}, "file -1"),
+        ({"count": 90}, "more Gaussians than a chunk of 150 has"),
+    ],
+)  # fmt: skip
+def test_a_small_index_takes_no_memory_that_its_chunks_do_not_state(tmp_path, small_chunks, part, named):
+    path = tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, natural())
+    meta = json.loads(path.read_text())
+    meta["tree"] = {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 40} | part}}] * 2}
+    path.write_text(json.dumps(meta))
+    with pytest.raises(InputError, match=named):
+        read_gaussians(path)
+
+
+def test_a_chunk_is_read_once(tmp_path, small_chunks):
+    path = tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, natural())
+    meta = json.loads(path.read_text())
+    path.write_text(json.dumps(meta | {"filenames": meta["filenames"][:1] * 4}))
+    with pytest.raises(InputError, match="a chunk is listed twice"):
+        read_gaussians(path)
+
+
 def test_splat_transform_reads_them(tmp_path, small_chunks):
     tool = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
     given, path = natural(), tmp_path / "town" / "lod-meta.json"

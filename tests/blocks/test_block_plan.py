@@ -1,0 +1,96 @@
+"""blocks.json as somebody may have sent it: names and links that lead elsewhere, and odd shapes."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.blocks.block_plan import FILE, Block, BlockPlan
+from sehdr_warp.blocks.division import Cell
+from sehdr_warp.blocks.train import train_in_blocks
+from sehdr_warp.errors import InputError
+from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config import Config
+from sehdr_warp.scene.normalization import Normalization
+from sehdr_warp.training.compensation import SharedDecisions
+
+DATA = {"path": "photos"}
+
+
+@pytest.fixture
+def plan(tmp_path):
+    """Two halves of space with a photo each, in tmp_path/run."""
+    (tmp_path / "run").mkdir()
+    halves = Cell(np.full(3, -np.inf), np.full(3, np.inf)).halves(0, 0.0)
+    blocks = [Block(f"block_{n}", (f"photo_{n}",), 0.5, half, np.ones(3)) for n, half in enumerate(halves)]
+    shared, place = SharedDecisions(0.5, None), Normalization(np.zeros(3), 1.0)
+    times = {"photo_0": 0.5, "photo_1": 0.25}
+    response = response_by_name("srgb")
+    plan = BlockPlan("town", DATA, response, place, shared, times, Config(), np.eye(3), tuple(blocks))
+    plan.write(tmp_path / "run")
+    return plan
+
+
+def test_a_plan_is_read_as_it_was_written(tmp_path, plan):
+    read = BlockPlan.read(tmp_path / "run")
+    assert (read.scene, read.data, read.exposure_times) == ("town", DATA, plan.exposure_times)
+    assert [(block.name, block.views, block.fraction) for block in read.blocks] == [
+        (block.name, block.views, block.fraction) for block in plan.blocks
+    ]
+    assert read.blocks[0].cell.high[0] == 0 and np.isinf(read.blocks[0].cell.low).all()
+
+
+@pytest.mark.parametrize(
+    "fields, named",
+    [
+        ({"name": "../../other"}, "blocks.name"),
+        ({"name": "/tmp/other"}, "blocks.name"),
+        ({"name": "block_1"}, "two blocks have the same name"),
+        ({"views": ["photo_9"]}, "exposure_times lacks photo_9"),
+        ({"margin": [1.0]}, "blocks.margin"),
+        ({"low": [None] * 4}, "blocks.low"),
+        ({"low": [9.0] * 3}, "is not a box"),
+    ],
+)
+def test_blocks_that_cannot_be(tmp_path, plan, fields, named):
+    path = tmp_path / "run" / FILE
+    values = json.loads(path.read_text())
+    values["blocks"][0] |= fields
+    path.write_text(json.dumps(values))
+    with pytest.raises(InputError, match=named):
+        BlockPlan.read(tmp_path / "run")
+
+
+@pytest.mark.parametrize("fields", [{"axes": [[1.0, 0.0, 0.0]]}, {"blocks": []}, {"base_time": 0}, {"format": 9}])
+def test_plans_that_cannot_be(tmp_path, plan, fields):
+    path = tmp_path / "run" / FILE
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+    with pytest.raises(InputError, match=f"{FILE}: .*{next(iter(fields))}"):
+        BlockPlan.read(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "flag, place",
+    [
+        ("resume", "blocks"),
+        ("resume", "blocks/block_1"),
+        ("resume", FILE),
+        ("overwrite", "blocks"),
+        ("overwrite", FILE),
+    ],
+)
+def test_links_in_the_run_are_not_followed(tmp_path, plan, flag, place):
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "notes.txt").write_text("mine")
+    link = tmp_path / "run" / place
+    link.parent.mkdir(exist_ok=True)
+    target = theirs
+    if place == FILE:
+        target = link.rename(theirs / FILE)
+    link.symlink_to(target)
+    before = {path: path.read_bytes() for path in theirs.iterdir()}
+    with pytest.raises(InputError, match="is a link"):
+        train_in_blocks(DATA, tmp_path / "run", Config(), 2, device=torch.device("cpu"), **{flag: True})
+    assert {path: path.read_bytes() for path in theirs.iterdir()} == before
