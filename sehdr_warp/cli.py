@@ -61,12 +61,19 @@ COMMANDS = {
 }
 """Every command by name, under the headings of the help."""
 _COMMANDS = {name: command for group in COMMANDS.values() for name, command in group.items()}
+_FILM = f"{PROGRAM} render RUN --cameras orbit --video orbit.mp4 writes a film, --out DIR pictures"
 _RENAMED = {
     "panorama": f"the command is {PROGRAM} envmap",
     "resume": f"{PROGRAM} train --resume --out RUN continues a training",
     "continue": f"{PROGRAM} train --resume --out RUN continues a training",
     "demo": f"{PROGRAM} train embedded --preset demo --out RUN trains one; make demo, in a checkout, reports on it",
     "score": f"the command is {PROGRAM} eval FOLDER --truth SET",
+    "orbit": _FILM,
+    "film": _FILM,
+    "video": _FILM,
+    "share": f"{PROGRAM} export RUN --out scene.html writes a page to share",
+    "brackets": f"{PROGRAM} render RUN --out DIR --evs=-4,-2,0,2,4 writes brackets",
+    "hdri": f"the command is {PROGRAM} envmap",
     "bench": "it left the installed program; in a checkout, run python -m benchmarks",
 }
 """Hints for commands of earlier versions, and for words that people expect to be commands."""
