@@ -27,21 +27,10 @@ MONTH = 30 * 24 * 60  # Minutes, for jobs of this machine, which have no time li
 
 
 class BlockJob:
-    """A block's training as submitit runs it; checkpoint() makes SLURM requeue a job whose time is over.
-
-    Attributes:
-        gpu: GPU of the job, as CUDA_VISIBLE_DEVICES names it; None if SLURM assigns it, or on a CPU.
-    """
-
-    def __init__(self, gpu: str | None = None):
-        """Store the GPU."""
-        self.gpu = gpu
+    """A block's training as submitit runs it; checkpoint() makes SLURM requeue a job whose time is over."""
 
     def __call__(self, *arguments: Any) -> BlockResult:
         """Train the block; arguments as of train_block()."""
-        if self.gpu is not None:
-            # submitit hides all GPUs from a job of this machine that asks for none, and knows them by number alone.
-            os.environ["CUDA_VISIBLE_DEVICES"] = self.gpu
         return train_block(*arguments)
 
     def checkpoint(self, *arguments: Any) -> Any:
@@ -80,12 +69,9 @@ def run_blocks(
         log.info("%d of %d blocks are finished already", finished, len(plan.blocks))
     if not waiting:
         return
-    on_gpu = device.type == "cuda"
-    executor = _executor(out, slurm, on_gpu=on_gpu)
     slots = min(gpus, len(waiting)) if slurm is None else len(waiting)
-    names = visible_gpus(device, slots) if on_gpu and slurm is None else [None] * slots
-    work = [BlockJob(name) for name in names]
-    job_device = None if on_gpu else "cpu"
+    executors = _executors(out, device, slots, slurm)
+    job_device = "cpu" if device.type == "cpu" else None
     tries, errors = dict.fromkeys(waiting, 0), {}
     running: dict[int, tuple[int, Any]] = {}
     try:
@@ -95,7 +81,7 @@ def run_blocks(
                     continue
                 index = waiting.popleft()
                 tries[index] += 1
-                running[slot] = index, executor.submit(work[slot], out.absolute(), index, job_device, photos)
+                running[slot] = index, executors[slot].submit(BlockJob(), out.absolute(), index, job_device, photos)
                 log.info("%s: training begins, %d photos", plan.blocks[index].name, len(plan.blocks[index].views))
             time.sleep(POLL)
             for slot, (index, job) in list(running.items()):
@@ -130,8 +116,8 @@ def visible_gpus(device: torch.device, count: int) -> list[str]:
     return [name.strip() for name in names[first : first + count]]
 
 
-def _executor(out: Path, slurm: Mapping[str, str] | None, *, on_gpu: bool) -> Any:
-    """Return submitit's executor, of this machine or of SLURM."""
+def _executors(out: Path, device: torch.device, slots: int, slurm: Mapping[str, str] | None) -> list[Any]:
+    """Return an executor of submitit for each job that may run at the same time."""
     try:
         import submitit
     except ImportError:
@@ -141,11 +127,17 @@ def _executor(out: Path, slurm: Mapping[str, str] | None, *, on_gpu: bool) -> An
     logs = out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
     if slurm is not None:
         executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
-        executor.update_parameters(name="sehdr-warp", **_slurm_parameters(slurm, gpu=on_gpu))
-        return executor
-    executor = submitit.LocalExecutor(folder=logs)
-    executor.update_parameters(timeout_min=MONTH)
-    return executor
+        executor.update_parameters(name="sehdr-warp", **_slurm_parameters(slurm, gpu=device.type == "cuda"))
+        return [executor] * slots
+    executors = [submitit.LocalExecutor(folder=logs) for _ in range(slots)]
+    for executor in executors:
+        executor.update_parameters(timeout_min=MONTH)
+    if device.type == "cuda":
+        for executor, name in zip(executors, visible_gpus(device, slots), strict=True):
+            # submitit hides all GPUs from a job that asks for none. It wants numbers there, but passes names on, too.
+            executor.update_parameters(gpus_per_node=1)
+            executor.parameters["visible_gpus"] = [name]
+    return executors
 
 
 def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any]:

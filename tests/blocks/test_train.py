@@ -129,7 +129,7 @@ def test_other_commands_take_the_merged_run(merged, tmp_path):
 
 
 def test_finished_blocks_are_not_run_again(merged, monkeypatch):
-    monkeypatch.setattr(jobs, "_executor", lambda *_, **__: pytest.fail("a job was started"))
+    monkeypatch.setattr(jobs, "_executors", lambda *_: pytest.fail("a job was started"))
     before = (merged / "checkpoints").stat().st_mtime_ns
     assert call("train", "--resume", "--out", merged, "--device", "cpu") == 0
     assert (merged / "checkpoints").stat().st_mtime_ns != before, "merged again"
@@ -174,11 +174,11 @@ def test_blocks_take_the_gpus_that_the_user_made_visible(monkeypatch, first, cou
     assert jobs.visible_gpus(torch.device(first), count) == names
 
 
-def test_a_job_sees_its_gpu_although_submitit_hides_all(monkeypatch, tmp_path):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # As submitit starts a job that asks for no GPU.
-    monkeypatch.setattr(jobs, "train_block", lambda *_: os.environ["CUDA_VISIBLE_DEVICES"])
-    assert jobs.BlockJob("1")(tmp_path, 0, None, "auto") == "1"
-    assert jobs.BlockJob()(tmp_path, 0, "cpu", "auto") == "1", "SLURM assigns GPUs itself"
+def test_a_job_of_this_machine_sees_its_gpu_alone(monkeypatch, tmp_path):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,GPU-71aa")
+    executors = jobs._executors(tmp_path, torch.device("cuda"), 2, None)
+    running = [executor.submit(os.getenv, "CUDA_VISIBLE_DEVICES") for executor in executors]
+    assert [job.result() for job in running] == ["3", "GPU-71aa"]
 
 
 def test_slurm_jobs_take_the_parameters(tmp_path):
