@@ -57,7 +57,7 @@ class Light:
     Attributes:
         shape: its place and size.
         radiance: [3] in the field's colors; with the shape it gives the light that the training views show.
-        lower_bound: [3] radiance that the photos vouch for: their white, or less where the light has less of a color.
+        lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
         deviation: of log2 radiance, stops, from the confidence of its Gaussians; None if that was not measured.
         share: of the light that reaches the middle of the training cameras.
         members: [K] int64, its Gaussians.

@@ -131,7 +131,7 @@ def stops_figure(comparison: Comparison, exposure_time: float):
     if comparison.confidence is not None:
         rows[1].append(np.repeat(comparison.confidence[..., None], 3, axis=2))
         titles.append("Confidence")
-        caption += " Confidence: white where the photos vouch for the light, black where they say nothing of it."
+        caption += " Confidence: white where photos show the light and agree, black where none shows it."
     return _grid(rows, titles, list(sources), caption, cell=1.9)
 
 

@@ -116,7 +116,7 @@ def _header(run: "Run", scene: Scene) -> Markup:
         "photos trained on": len(scene.train_views),
         "photos held out": len(scene.test_views),
         "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
-        "exposure" if run.exposure_compensation is None else "exposure, gains counted in": span.replace(" s to", " to"),
+        "exposure" if run.exposure_compensation is None else "exposure, compensated": span.replace(" s to", " to"),
         "response": run.response.name,
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,
@@ -215,7 +215,7 @@ def _lights(lights: Sequence[Light], unit: float | None) -> Markup:
     titles = ("", "size", "place", "share of light", measure, "certain at least", "deviation, stops")
     lead = (
         "Lamps, windows and other areas that photos clip, those that give most first. Their radiance is an estimate "
-        "with a deviation; photos vouch for what is certain. Share: of the light at the middle of the cameras."
+        "with a deviation; what photos show as white is certain. Share: of the light at the middle of the cameras."
     )
     if len(lights) > _MOST_LIGHTS:
         lead += f" The first {_MOST_LIGHTS} of {len(lights)}."
@@ -234,8 +234,8 @@ def _confidence(comparisons: Sequence[Comparison]) -> Markup:
     if not figures:
         return EMPTY
     scale = markup(
-        '<div class="scale"></div><div class="ends"><span>0: no photo tells</span>'
-        "<span>1: photos vouch for it</span></div>"
+        '<div class="scale"></div><div class="ends"><span>0: no photo shows it</span>'
+        "<span>1: photos show it and agree</span></div>"
     )
     lead = (
         "White where photos show the light unclipped and the scene agrees; a half where it is known to a factor of two."

@@ -6,7 +6,7 @@ run.json                    response, base exposure time, version, where the pho
 plan.json                   what was left out and why, if a plan was made
 metrics.jsonl               one line for each evaluation
 checkpoints/iteration_N/    tensors as safetensors, values as JSON with the hash of the tensors
-confidence.safetensors      how far the photos vouch for each Gaussian, and of which checkpoint
+confidence.safetensors      how far photos support each Gaussian, and of which checkpoint
 summary.json                times, memory and counts, once the training has ended
 
 Nothing is pickled. A run may come from anybody: reading one changes nothing in it, follows no link in it (the folder

@@ -98,7 +98,7 @@ def test_lights_are_listed_with_what_is_certain_of_them(tmp_path, monkeypatch):
 def test_exposures_that_gains_changed_are_marked(tmp_path, monkeypatch):
     assert "<li>exposure<b>" in page(tmp_path)
     monkeypatch.setattr(AnalyticRun, "exposure_compensation", object())
-    assert "<li>exposure, gains counted in<b>" in page(tmp_path / "gains")
+    assert "<li>exposure, compensated<b>" in page(tmp_path / "gains")
 
 
 def test_what_is_not_known_is_left_out(tmp_path):
