@@ -28,8 +28,11 @@ def test_bounds(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     stored = sandbox.read_sandboxed(given, tmp_path / "a", "x", "y")
     assert bytes(stored["read"]) == b"abc" and str(stored["word"]) == "é"
-    monkeypatch.setattr(sandbox, "_SECONDS", 12)
-    for read, told in ((fills_memory, "a: cannot be read as x .*allocate"), (never_ends, "not read after 12 s")):
+    for read, seconds, told in (
+        (fills_memory, sandbox._SECONDS, "a: cannot be read as x .*allocate"),
+        (never_ends, 1, "not read after 1 s"),
+    ):
+        monkeypatch.setattr(sandbox, "_SECONDS", seconds)
         with pytest.raises(InputError, match=told):
             sandbox.read_sandboxed(read, tmp_path / "a", "x", "y")
 

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -62,6 +63,13 @@ def start(*arguments) -> subprocess.Popen:
     return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
 
 
+def until(condition, seconds=60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
 def wait_for(process: subprocess.Popen, words: str) -> None:
     for line in process.stderr:
         if words in line:
@@ -73,7 +81,7 @@ def test_interrupted_render_leaves_nothing(embedded_run, tmp_path):
     process = start(
         "render", embedded_run, "--out", tmp_path / "out", "--cameras", "orbit", "--count", "2000", "--evs=-2,0"
     )
-    wait_for(process, " of 2000")
+    until(lambda: any(tmp_path.rglob("*.exr")))  # In a folder with a hidden name.
     process.send_signal(signal.SIGINT)
     assert "Traceback" not in process.communicate(timeout=60)[1] and process.returncode == 130
     assert list(tmp_path.iterdir()) == []

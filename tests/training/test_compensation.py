@@ -12,7 +12,7 @@ from sehdr_warp.scene import codes_of
 from sehdr_warp.scene.exposure_compensation import ExposureCompensation
 from sehdr_warp.training import compensation
 from sehdr_warp.training.compensation import estimate_compensation, estimates_compensation
-from sehdr_warp.training.matching import LARGEST_SIDE, at_matching_size
+from sehdr_warp.training.matching import at_matching_size
 from sehdr_warp.training.train import create_trainer
 
 from .wall_and_lamp import WALL, photographed, texture, wall_and_lamp
@@ -157,8 +157,9 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
 
 def test_large_photos_are_matched_and_evened_small(monkeypatch):
     """Full-size copies of a large set, evened again and again, would take more memory than there is."""
-    (scene, _), sizes, even = drifting(), [], ExposureCompensation._view
-    factor = LARGEST_SIDE // 64 + 4
+    (scene, _), sizes, even, most = drifting(), [], ExposureCompensation._view, 96
+    monkeypatch.setattr("sehdr_warp.training.matching.LARGEST_SIDE", most)
+    factor = 2
     large = tuple(
         replace(
             view,
@@ -174,9 +175,9 @@ def test_large_photos_are_matched_and_evened_small(monkeypatch):
 
     monkeypatch.setattr(ExposureCompensation, "_view", watched)
     gains, matcher, _ = found_in(replace(scene, views=large), CONFIG, LINEAR, "cpu")
-    assert gains is not None and max(large[0].codes.shape) > LARGEST_SIDE
-    assert sizes and max(sizes) <= LARGEST_SIDE
-    assert max(matcher.size(0)) <= LARGEST_SIDE
+    assert gains is not None and max(large[0].codes.shape) > most
+    assert sizes and max(sizes) <= most
+    assert max(matcher.size(0)) <= most
 
 
 def test_photos_of_matching_size_stay_as_they_are():

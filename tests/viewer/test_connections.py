@@ -34,8 +34,9 @@ def until(condition, seconds=20.0):
 
 def test_clients_that_never_read_make_room_for_others(serve, monkeypatch):
     monkeypatch.setattr(connections, "MOST_BYTES", 50 << 20)
+    monkeypatch.setattr(connections, "STALL", 3.0)
     server, large, largest = serve(), camera(1600, 1200), 0
-    deaf = [post(server, "/frame", {"camera": large.to_dict(), "clipped": True}) for _ in range(8)]
+    deaf = [post(server, "/frame", {"camera": large.to_dict(), "clipped": True}) for _ in range(4)]
     watched = threading.Event()
 
     def watch():
