@@ -140,13 +140,10 @@ def weights_of(camera: Camera, points: np.ndarray) -> np.ndarray:
 
     Sparse points are about as dense in every photo, but far ones are also inside of photos that do not show them.
     """
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    distance = np.linalg.norm(local, axis=1)
+    distance = np.linalg.norm(points - camera.position, axis=1)
     inside = distance > 0
     if camera.is_pinhole:
-        depth = np.maximum(local[:, 2], 1e-9)
-        column, row = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
-        inside &= (local[:, 2] > 1e-9) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        inside &= camera.project(points).inside
     weights = np.where(inside, 1 / np.maximum(distance, 1e-9), 0.0)
     return weights / weights.sum() if inside.any() else weights
 

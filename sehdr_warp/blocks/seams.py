@@ -63,6 +63,4 @@ def measure_seams(run: Run, views: tuple[View, ...], division: Division, depths:
 def _places(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """Return the points [H W, 3] of scene coordinates at the depths [H, W] of a pinhole camera's pixels."""
     row, column = np.mgrid[: camera.height, : camera.width] + 0.5
-    local = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], -1)
-    local *= depth[..., None]
-    return local.reshape(-1, 3) @ camera.world_to_camera[:3, :3] + camera.position
+    return camera.unproject(column.ravel(), row.ravel(), depth.ravel())

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
+
+if TYPE_CHECKING:
+    from ..runs.run import LoadedScene
 
 Item = TypeVar("Item")
 
@@ -32,6 +35,11 @@ _DOWN = 0.2  # Mean of the pictures' up along the common up below which the view
 def evenly(items: Sequence[Item], count: int) -> list[Item]:
     """Return at most `count` items, evenly chosen from the first to the last."""
     return [items[i] for i in sorted({round(i) for i in np.linspace(0, len(items) - 1, count)})]
+
+
+def training_cameras(run: "LoadedScene") -> list[Camera]:
+    """Return the training cameras of a scene."""
+    return [entry.camera for entry in run.cameras if entry.split == "train"]
 
 
 def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:

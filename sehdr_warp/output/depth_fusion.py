@@ -62,8 +62,7 @@ def surface_points(view: DepthView) -> np.ndarray:
     """Return the points [N, 3] of a view's depth."""
     depth, camera = view.depth.numpy(), view.camera
     row, column = np.nonzero(depth)
-    rays = [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))]
-    return (np.stack(rays, axis=1) * depth[row, column, None]) @ camera.world_to_camera[:3, :3] + camera.position
+    return camera.unproject(column + 0.5, row + 0.5, depth[row, column])
 
 
 def mesh_bounds(views: Sequence[DepthView], region: Box | Sphere | None) -> tuple[np.ndarray, np.ndarray]:

@@ -130,8 +130,7 @@ def _visible_points(cameras: Sequence[Camera], run: "LoadedScene", up: np.ndarra
         rendered = run.render(small)
         depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)
         row, column = np.nonzero((depth > 0) & (alpha > 0.9))
-        rays = np.stack([(column + 0.5 - small.cx) / small.fx, (row + 0.5 - small.cy) / small.fy, np.ones(len(row))], 1)
-        points.append((rays * depth[row, column, None]) @ small.world_to_camera[:3, :3] + small.position)
+        points.append(small.unproject(column + 0.5, row + 0.5, depth[row, column]))
         colors.append(as_array(rendered.hdr)[row, column])
     all_points, light = np.concatenate(points), np.concatenate(colors)
     below = all_points @ up < ceiling

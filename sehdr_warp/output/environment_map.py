@@ -13,7 +13,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 
 from ..files import check_absent
-from .camera_paths import common_focus
+from .camera_paths import common_focus, training_cameras
 from .colorspace import color_space, from_rec709
 from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr, write_radiance
 from .images import as_array
@@ -112,7 +112,7 @@ def write_environment_map(
         raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the scene's units")
     check_absent(path, overwrite)
     cameras = {entry.name: entry.camera for entry in run.cameras}
-    photos = [entry.camera for entry in run.cameras if entry.split == "train"]
+    photos = training_cameras(run)
     position = _point(at, cameras, photos)
     if beyond is None:
         beyond = 0.0

@@ -28,6 +28,7 @@ from ..splats import (
 )
 from ..splats.arrays import concatenated
 from ..subsets import every_nth
+from .camera_paths import training_cameras
 from .splat_edits import SplatEdits, most_visible, without_strays
 from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
 
@@ -128,11 +129,6 @@ def export(
         if path_is_lossy(path):
             _log_file_loss(path, run, reference, to_file, kind, time)
     return path
-
-
-def training_cameras(run: "LoadedScene") -> list[Camera]:
-    """Return the training cameras of a run."""
-    return [entry.camera for entry in run.cameras if entry.split == "train"]
 
 
 def _gaussians_in_colors(run: "LoadedScene", color_model: str, time: float) -> GaussianArrays:

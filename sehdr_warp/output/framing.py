@@ -118,6 +118,4 @@ def _surface(run: "LoadedScene", camera: Camera) -> np.ndarray:
     rendered = run.render(camera)
     depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)
     row, column = np.nonzero((depth > 0) & (alpha > 0.5))
-    rays = [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))]
-    local = np.stack(rays, axis=1) * depth[row, column, None]
-    return local @ camera.world_to_camera[:3, :3] + camera.position
+    return camera.unproject(column + 0.5, row + 0.5, depth[row, column])

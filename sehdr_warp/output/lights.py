@@ -12,6 +12,7 @@ import torch
 from sehdr_warp.errors import SehdrError
 
 from ..files import atomic_path, check_absent
+from .camera_paths import training_cameras
 from .environment_map import COVERED, envmap, inpainted, latlong, map_center, render_map, solid_angles
 from .exr import exr_header, rgb_channels, write_exr
 from .images import as_array
@@ -199,7 +200,7 @@ def _write_rest(
     run: "Run", path: Path, lights: Sequence[Any], transform: WorldTransform, unseen: str, overwrite: bool
 ) -> None:
     """Write the map of a scene's surroundings, with the lights dark; arguments as in write_lights."""
-    cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
+    cameras = training_cameras(run)
     position, beyond = map_center(cameras)
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in cameras]))
     members = [light.members for light in lights]

@@ -18,7 +18,7 @@ from sehdr_warp.scene import Camera
 from ..files import atomic_path, check_absent
 from ..progress import tracked
 from ..splats.usd import pxr
-from .camera_paths import evenly
+from .camera_paths import evenly, training_cameras
 from .depth_fusion import (
     MOST_VIEWS,
     depth_view,
@@ -158,7 +158,7 @@ def proxy_mesh(
     run: "LoadedScene", transform: WorldTransform, *, resolution: int = 160, region: Box | Sphere | None = None
 ) -> ProxyMesh:
     """Return the mesh of a run in the coordinates that a transform leads to; arguments as in write_proxy_mesh."""
-    cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
+    cameras = training_cameras(run)
     if not cameras:
         raise SehdrError(f"{run.path}: has no training cameras whose depth could be fused")
     views = [
@@ -247,10 +247,7 @@ def mesh_depth(mesh: ProxyMesh, camera: Camera) -> np.ndarray:
         for j in range(steps - i):
             a, b = (i + 1 / 3) / steps, (j + 1 / 3) / steps
             points = corners[:, 0] * (1 - a - b) + corners[:, 1] * a + corners[:, 2] * b
-            x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                column, row = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
-            inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            row, column, z, inside = camera.project(points)
             np.minimum.at(depth, (row[inside] * camera.width + column[inside]).astype(int), z[inside])
     return np.where(np.isfinite(depth), depth, 0).reshape(camera.height, camera.width)
 

@@ -22,7 +22,7 @@ from ..progress import tracked
 from .aovs import ViewData, data_parts, read_aovs
 from .brackets import Brackets, bracket_exposures
 from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
-from .camera_paths import evenly, interpolate, orbit
+from .camera_paths import evenly, interpolate, orbit, training_cameras
 from .colorspace import from_rec709
 from .exr import Part, rgb_channels, write_multipart_exr
 from .framing import film_camera, frame_subject
@@ -256,7 +256,7 @@ def select_cameras(
             others = choices.replace(f"{text}, ", "")
             raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
     elif text in PATHS:
-        photos = [entry.camera for entry in run.cameras if entry.split == "train"]
+        photos = training_cameras(run)
         orbiting = text == "orbit"
         path = orbit(photos, count, _focus_distance(run, photos)) if orbiting else interpolate(photos, count)
         path = [film_camera(camera, photos) for camera in path]

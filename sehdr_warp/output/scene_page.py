@@ -17,7 +17,7 @@ from sehdr_warp.errors import InputError
 from ..files import atomic_path, check_absent
 from ..model.baking import gaussians_of
 from ..splats.arrays import HARMONIC_0
-from .camera_paths import facts_of_cameras
+from .camera_paths import facts_of_cameras, training_cameras
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
 from .light_pictures import curve_table, display_gain
 from .splat_edits import SplatEdits, most_visible, without_strays
@@ -51,7 +51,7 @@ def write_scene_page(
     check_absent(path, overwrite)
     if not run.cameras:
         raise InputError(path, "the scene has no cameras to look from", "export the run, or put cameras.json beside it")
-    cameras = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
+    cameras = training_cameras(run) or [e.camera for e in run.cameras]
     gaussians = gaussians_of(
         run.model, "linear", np.array([camera.position for camera in cameras]), color_matrix=run.color_matrix
     )

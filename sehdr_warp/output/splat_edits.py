@@ -12,7 +12,7 @@ from sehdr_warp.scene import Camera, View
 
 from ..model.visibility import contributions, count_views, mask_shares
 from ..splats import GaussianArrays
-from .camera_paths import common_focus
+from .camera_paths import common_focus, training_cameras
 
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
@@ -127,7 +127,7 @@ class SplatEdits:
         if self.cut:
             steps[f"inside of {self.cut}"] = read_region(self.cut).contains(upright_means)
         if self.min_views:
-            cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
+            cameras = training_cameras(run)
             if not cameras:
                 raise SehdrError(f"{run.path}: has no training cameras to count views of; leave min_views out")
             views = count_views(run.model, cameras).cpu().numpy()
@@ -155,7 +155,7 @@ def most_visible(mask: np.ndarray, count: int, run: "LoadedScene") -> np.ndarray
     """
     if mask.sum() <= count:
         return mask
-    cameras = [entry.camera for entry in run.cameras if entry.split == "train"]
+    cameras = training_cameras(run)
     if not cameras:
         raise SehdrError(f"{run.path}: has no training cameras that tell what contributes; leave max_gaussians out")
     share = np.where(mask, contributions(run.model, cameras).cpu().numpy(), -1)

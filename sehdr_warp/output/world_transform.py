@@ -20,7 +20,7 @@ from sehdr_warp.scene import Camera
 
 from ..files import read_json, write_json
 from ..splats import STREAMED_SOG
-from .camera_paths import common_focus, is_pitch_known, middle_index, typical_roll, up_direction
+from .camera_paths import common_focus, is_pitch_known, middle_index, training_cameras, typical_roll, up_direction
 
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
@@ -129,7 +129,7 @@ def world_transform(
         return WorldTransform(back.rotation, factor * back.translation, factor * back.scale)
     factor = _checked_scale(orientation.scale if scale is None else scale)
     direction = read_direction(up) if up is not None else orientation.up
-    cameras = [entry.camera for entry in run.cameras if entry.split == "train"] or [e.camera for e in run.cameras]
+    cameras = training_cameras(run) or [e.camera for e in run.cameras]
     if direction is None and (matrix is not None or not cameras):
         # Turned about the axis of view, so that what is ahead stays ahead.
         rotation = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) else np.eye(3)

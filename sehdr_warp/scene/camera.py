@@ -1,7 +1,7 @@
 """The pinhole camera that every part of the package shares."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,22 @@ def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ position
     return pose
+
+
+class ProjectedPoints(NamedTuple):
+    """Pixels that points fall on.
+
+    Attributes:
+        row: [P] float64 whole numbers, NaN behind the camera.
+        column: [P] likewise.
+        depth: [P] along the camera's axis, NaN behind the camera.
+        inside: [P] bool, whether the picture contains the point.
+    """
+
+    row: np.ndarray
+    column: np.ndarray
+    depth: np.ndarray
+    inside: np.ndarray
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,6 +141,21 @@ class Camera:
     def intrinsics(self) -> np.ndarray:
         """fx, fy, cx, cy in pixels, float64 [4]."""
         return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
+
+    def project(self, points: np.ndarray) -> ProjectedPoints:
+        """Return the pixels of a pinhole camera that world points [P, 3] fall on; occlusion is not considered."""
+        local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.nan)
+        with np.errstate(invalid="ignore"):
+            column = np.floor(self.fx * local[:, 0] / depth + self.cx)
+            row = np.floor(self.fy * local[:, 1] / depth + self.cy)
+            inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
+        return ProjectedPoints(row, column, depth, inside)
+
+    def unproject(self, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Return the world points [P, 3] of a pinhole camera at positions x, y [P] in pixels and depths [P]."""
+        local = np.stack([(x - self.cx) / self.fx, (y - self.cy) / self.fy, np.ones_like(x)], 1) * depth[:, None]
+        return local @ self.world_to_camera[:3, :3] + self.position
 
     def resized(self, width: int, height: int) -> "Camera":
         """Return the same view at another size; principal point and focal lengths scale with each axis."""

@@ -359,12 +359,7 @@ def point_light(views: Sequence[View], points, visible, response) -> tuple[np.nd
 
 def _light(view: View, points: np.ndarray, response: Response) -> tuple[np.ndarray, np.ndarray]:
     """Return the log radiance [P, 3] of the pixels that points fall on, NaN if unknown, and their radii [P]."""
-    camera = view.camera
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.inf)
-    column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
-    row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
-    inside = (depth < np.inf) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    row, column, _, inside = view.camera.project(points)
     place = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
     if view.mask is not None:
         inside &= view.mask[place] > 0.5

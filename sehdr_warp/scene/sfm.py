@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,7 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
             photo_seconds = progress.seconds / count
             progress.update(count)
         _match(database, count, photo_seconds)
-        model = _map(database, work, len(photos), photos[0].parent)
+        model = run_mapper(database, work, len(photos), photos[0].parent)
         model.write_binary(result)
         (result / "sizes.json").write_text(json.dumps(sizes))
 
@@ -287,6 +288,15 @@ def _pairs(count: int) -> set[tuple[int, int]]:
     return {(i, i + step) for i in range(count) for step in steps if i + step < count}
 
 
+def matching_options() -> dict[str, Any]:
+    """Return the options of COLMAP's matchers that make a result repeatable."""
+    import pycolmap
+
+    options = {"verification_options": pycolmap.TwoViewGeometryOptions(), "device": pycolmap.Device.cpu}
+    options["verification_options"].ransac.random_seed = SEED
+    return options
+
+
 def _match(database: Path, count: int, photo_seconds: float) -> None:
     """Match features between photos.
 
@@ -297,8 +307,7 @@ def _match(database: Path, count: int, photo_seconds: float) -> None:
     """
     import pycolmap
 
-    options = {"verification_options": pycolmap.TwoViewGeometryOptions(), "device": pycolmap.Device.cpu}
-    options["verification_options"].ransac.random_seed = SEED
+    options = matching_options()
     match = partial(pycolmap.match_exhaustive, database, **options)
     if count > EXHAUSTIVE_LIMIT:
         pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
@@ -310,36 +319,52 @@ def _match(database: Path, count: int, photo_seconds: float) -> None:
         progress.update(progress.total)
 
 
-def _map(database: Path, work: Path, count: int, source: Path):
-    """Return the largest reconstruction, after a second try with weaker conditions if photos are missing from it."""
+def run_mapper(database: Path, work: Path, count: int, source: Path, *, name: str = "photo", views: int = 1):
+    """Return the largest reconstruction, after a second try with weaker conditions if photos are missing from it.
+
+    Args:
+        database: COLMAP's database, with matched features.
+        work: folder with `images`, for the models.
+        count: number of photos.
+        source: folder to name in the error.
+        name: of one photo, in messages.
+        views: of each photo, which form a rig; if there are several, their lenses and places in the rig are known.
+
+    Raises:
+        InputError: if fewer than two photos can be placed.
+    """
     import pycolmap
 
     best = None
+    placed = methodcaller("num_reg_images" if views == 1 else "num_reg_frames")
     for patient in (False, True):
         options = pycolmap.IncrementalPipelineOptions(min_model_size=2)
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+        for part in ("focal_length", "principal_point", "extra_params", "sensor_from_rig") if views > 1 else ():
+            setattr(options, f"ba_refine_{part}", False)
         if patient:
             options.min_num_matches = 10
             options.mapper.init_min_tri_angle = 4.0
             options.mapper.init_min_num_inliers = 50
             options.mapper.abs_pose_min_num_inliers = 15
-            _log.info("placing the photos again with weaker conditions")
+            _log.info("placing the %ss again with weaker conditions", name)
         output = work / f"model{int(patient)}"
         output.mkdir()
-        with quiet_colmap(), stage("placing photos", count, _log) as progress:
+        stage_name = f"placing {name}s" if views == 1 else f"placing views of {name}s"
+        with quiet_colmap(), stage(stage_name, count * views, _log) as progress:
             progress.later = 0.0
             counter = itertools.count(3)
             place: Any = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
             models = run_interruptibly(
                 partial(place, next_image_callback=lambda: progress.update(next(counter)))  # noqa: B023
             )
-        candidates = [*([] if best is None else [best]), *models.values()]
-        best = max(candidates, key=lambda model: model.num_reg_images(), default=None)
-        if best is not None and best.num_reg_images() == count:
+        best = max([*([] if best is None else [best]), *models.values()], key=placed, default=None)
+        if best is not None and placed(best) == count:
             return best
-    if best is None or best.num_reg_images() < 2:
-        raise InputError(source, f"none of the {count} photos could be placed by structure from motion",
-                         "take sharp photos that overlap by two thirds, or bring poses")  # fmt: skip
+    if best is None or placed(best) < 2:
+        remedy = "take sharp photos that overlap by two thirds" if views == 1 else "take them closer together"
+        problem = f"none of the {count} {name}s could be placed by structure from motion"
+        raise InputError(source, problem, f"{remedy}, or bring poses")
     return best
 
 

@@ -1,6 +1,5 @@
 """Structure from motion of panoramas: through pinhole views cut from each, which COLMAP moves as one rigid rig."""
 
-import itertools
 import json
 import logging
 import math
@@ -8,12 +7,10 @@ import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from ..errors import InputError
 from ..parallel import run_interruptibly
 from ..progress import stage, tracked
 from .colmap_model import ModelImage, SparseModel, read_points
@@ -31,7 +28,9 @@ from .sfm import (
     cached_result,
     file_digest,
     image_name,
+    matching_options,
     quiet_colmap,
+    run_mapper,
 )
 from .types import View, encoded_values
 from .wide_camera import FACE_ANGLE, face_rotations, faces_of
@@ -91,7 +90,8 @@ def reconstruct_panoramas(photos: Sequence[Path], cache: Path | str | None = Non
         database = work / "database.db"
         _write_faces(photos, work / "images")
         _match_rigs(database, work / "images", len(photos))
-        model = _map_rigs(database, work, len(photos), photos[0].parent)
+        rig = {"name": "panorama", "views": len(face_rotations())}
+        model = run_mapper(database, work, len(photos), photos[0].parent, **rig)
         poses = {}
         for number in model.reg_image_ids():
             image = model.images[number]
@@ -141,8 +141,7 @@ def _match_rigs(database: Path, images: Path, count: int) -> None:
         options = {"ref_sensor": number == 0, "image_prefix": f"face{number}/"}
         cameras.append(pycolmap.RigConfigCamera(**options, **({} if from_rig is None else {"cam_from_rig": from_rig})))
     matching = pycolmap.FeatureMatchingOptions(rig_verification=True, skip_image_pairs_in_same_frame=True)
-    options = {"verification_options": pycolmap.TwoViewGeometryOptions(), "device": pycolmap.Device.cpu}
-    options["verification_options"].ransac.random_seed = SEED
+    options = matching_options()
     with quiet_colmap():
         arguments = (database, images, [], pycolmap.CameraMode.PER_FOLDER, reader)
         extract = partial(pycolmap.extract_features, *arguments, device=pycolmap.Device.cpu)
@@ -164,37 +163,3 @@ def _match_rigs(database: Path, images: Path, count: int) -> None:
             counted_rows(database, "two_view_geometries", progress.update),
         ):
             run_interruptibly(match)
-
-
-def _map_rigs(database: Path, work: Path, count: int, source: Path):
-    """Return the reconstruction with the most panoramas; a second try has weaker conditions."""
-    import pycolmap
-
-    best = None
-    for patient in (False, True):
-        options = pycolmap.IncrementalPipelineOptions(min_model_size=2)
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
-        # The views are cut: their lens and their places in the rig are known.
-        for name in ("focal_length", "principal_point", "extra_params", "sensor_from_rig"):
-            setattr(options, f"ba_refine_{name}", False)
-        if patient:
-            options.min_num_matches = 10
-            options.mapper.init_min_tri_angle = 4.0
-            options.mapper.init_min_num_inliers = 50
-            options.mapper.abs_pose_min_num_inliers = 15
-        output = work / f"model{int(patient)}"
-        output.mkdir()
-        with quiet_colmap(), stage("placing views of panoramas", count * len(face_rotations()), _log) as progress:
-            counter = itertools.count(3)
-            place: Any = partial(pycolmap.incremental_mapping, database, work / "images", output, options)
-            models = run_interruptibly(
-                partial(place, next_image_callback=lambda: progress.update(next(counter)))  # noqa: B023
-            )
-        candidates = [*([] if best is None else [best]), *models.values()]
-        best = max(candidates, key=lambda model: model.num_reg_frames(), default=None)
-        if best is not None and best.num_reg_frames() == count:
-            break
-    if best is None or best.num_reg_frames() < 2:
-        problem = f"none of the {count} panoramas could be placed by structure from motion"
-        raise InputError(source, problem, "take them closer together, or bring poses")
-    return best

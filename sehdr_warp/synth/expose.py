@@ -134,11 +134,7 @@ def _recolored(scene: Scene, views: Sequence[View]) -> np.ndarray:
     for old, new in zip(scene.views, views, strict=True):
         if old.split != "train":
             continue
-        camera = old.camera
-        x, y, z = camera.world_to_camera[:3, :3] @ scene.points.T + camera.world_to_camera[:3, 3:]
-        depth = np.where(z > 1e-9, z, np.inf)
-        column, row = np.floor(camera.fx * x / depth + camera.cx), np.floor(camera.fy * y / depth + camera.cy)
-        visible = (z > 1e-9) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        row, column, _, visible = old.camera.project(scene.points)
         place = np.flatnonzero(visible)
         at = row[place].astype(int), column[place].astype(int)
         difference = np.abs(old.image[at] - scene.point_colors[place]).sum(axis=1)

@@ -218,7 +218,7 @@ def make_matcher(scene: Scene, response: Response, device: torch.device | str) -
     views = perspective_views(scene.train_views)
     points = every_nth(scene.points, MOST_DEPTHS)
     homogeneous = np.c_[points, np.ones(len(points))]
-    depths = [homogeneous[pixels_of(points, view)[2]] @ view.camera.world_to_camera[2] for view in views]
+    depths = [homogeneous[view.camera.project(points).inside] @ view.camera.world_to_camera[2] for view in views]
     depths = np.concatenate(depths)
     focus = float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(views)
     return Matcher(views, response, focus, device)
@@ -284,32 +284,16 @@ def points_on_rays(views, count: int, distance: float, rng: np.random.Generator)
     points = np.empty((count, 3))
     for index, view in enumerate(views):
         mine, camera = view_indices == index, view.camera
-        x = (across[mine, 0] * camera.width - camera.cx) / camera.fx
-        y = (across[mine, 1] * camera.height - camera.cy) / camera.fy
-        local = np.stack([x, y, np.ones_like(x)], 1) * depth[mine, None]
-        points[mine] = local @ camera.world_to_camera[:3, :3] + camera.position
+        x, y = across[mine, 0] * camera.width, across[mine, 1] * camera.height
+        points[mine] = camera.unproject(x, y, depth[mine])
     return points
-
-
-def pixels_of(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return row and column [P] of the pixels that points [P, 3] project to, and whether the view contains them.
-
-    Occlusion is not considered.
-    """
-    camera = view.camera
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depth = np.where(local[:, 2] > 1e-9, local[:, 2], np.nan)
-    with np.errstate(invalid="ignore"):
-        column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
-        row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
-        return row, column, (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
 
 
 def colors_in_views(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return how many photos contain each point [N], and the mean of their encoded values there [N, 3]."""
     visible, total = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
-        row, column, inside = pixels_of(points, view)
+        row, column, _, inside = view.camera.project(points)
         visible[inside] += 1
         total[inside] += view.image[row[inside].astype(int), column[inside].astype(int)]
     return visible, total / np.maximum(visible, 1)[:, None]

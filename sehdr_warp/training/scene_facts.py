@@ -11,7 +11,7 @@ from ..scene.exposure import are_camera_jpegs
 from ..scene.linear_photos import kind_of
 from ..scene.wide_camera import perspective_views
 from ..subsets import every_nth
-from .initialization import focus_distance, pixels_of, points_on_rays
+from .initialization import focus_distance, points_on_rays
 
 PROBES = 2000  # Number of places at which overlap and visibility are measured
 FEWEST_POINTS = 100  # With fewer sparse points, places along the cameras' rays are the probes
@@ -81,7 +81,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         count = min(PROBES, len(scene.points))
         probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
     visible, on_rays = (
-        np.array([pixels_of(points, view)[2] for view in views]).sum(0) for points in (probes, ray_points)
+        np.array([view.camera.project(points).inside for view in views]).sum(0) for points in (probes, ray_points)
     )
     read_views = every_nth(views, MOST_VIEWS)
     figures = np.array([_codes(view) for view in read_views])
