@@ -127,14 +127,7 @@ def maximum(image: Tensor, mask: Tensor | None) -> float:
 
 
 def region_masks(photo: Tensor) -> dict[str, Tensor]:
-    """Divide the pixels of a photo into REGIONS.
-
-    Args:
-        photo: encoded in [0, 1], [H, W, 3].
-
-    Returns:
-        A mask [H, W] bool for each region; every pixel lies in one of them.
-    """
+    """Divide the pixels of a photo, encoded in [0, 1], into REGIONS: a mask [H, W] bool for each, and none for two."""
     codes = photo * 255
     clipped = (codes >= CLIPPED_CODE - 0.5).any(2)
     dark = (codes <= DARK_CODE + 0.5).all(2)

@@ -19,11 +19,7 @@ MOST_VIEWS = 100
 def count_views(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
     """Return [N], the number of cameras that show each Gaussian; a Gaussian hidden behind others is not shown.
 
-    At most MOST_VIEWS cameras are rendered, evenly chosen, and their count is scaled to all of them.
-
-    Args:
-        field: The scene.
-        cameras: At least one, in scene coordinates.
+    Of the cameras, in scene coordinates, at most MOST_VIEWS are rendered, evenly chosen; their count is scaled to all.
     """
     subset = every_nth(cameras, MOST_VIEWS)
     views = torch.zeros(field.gaussians.count, device=field.gaussians.means.device)
@@ -43,11 +39,9 @@ def contributions(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
 
 @torch.no_grad()
 def mask_shares(field: RadianceField, views: Sequence[View]) -> Tensor:
-    """Return [N], the share of each Gaussian's blending weights that the masks of views keep; 0 if no view shows it.
+    """Return [N], the share of each Gaussian's blending weights that the masks of views, in scene coordinates, keep.
 
-    Args:
-        field: The scene.
-        views: Views with masks, in scene coordinates.
+    It is 0 if no view shows the Gaussian.
     """
     device = field.gaussians.means.device
     sums = torch.zeros((field.gaussians.count, 2), device=device)

@@ -231,13 +231,7 @@ class BracketWriter:
         return [self.out / name for name in names]
 
     def write(self, name: str, radiance: np.ndarray, camera: Camera | None) -> None:
-        """Write the bracket of a view.
-
-        Args:
-            name: Of the view, safe for files.
-            radiance: [H, W, 3] scene-linear Rec.709 radiance.
-            camera: For the EXR attributes.
-        """
+        """Write the bracket of a view: its radiance, [H, W, 3] scene-linear Rec.709; `name` is safe for files."""
         options = self.brackets
         radiance = np.asarray(radiance, np.float64)
         if radiance.shape[2:] != (3,):

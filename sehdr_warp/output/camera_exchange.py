@@ -123,11 +123,9 @@ def chan_cameras(path: CameraPath) -> str:
 
 
 def nerfstudio_path(path: CameraPath, fps: float = 24) -> str:
-    """Return a moving camera as nerfstudio's camera_path.json; the principal point is taken as the middle.
+    """Return a moving camera, in the set's own coordinates, as nerfstudio's camera_path.json.
 
-    Args:
-        path: Cameras in the set's own coordinates.
-        fps: Frames a second.
+    The principal point is taken as the middle.
     """
     first = path.cameras[0]
     entries = [

@@ -45,11 +45,7 @@ def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: 
     """Return the stops, from -8 to -1, at which pictures tell best what photo and scene hold above white.
 
     The brightest light that a photo can hold is then a middle grey, and brighter light of the scene stands out from it.
-
-    Args:
-        comparisons: The views.
-        exposure_time: Seconds at 0 EV.
-        gain: From exposures to display light (see display_gain).
+    Exposures of exposure_time seconds are at 0 EV; for `gain` see display_gain().
     """
     white = max(float(np.max(each.from_photo)) for each in comparisons) * exposure_time * gain
     return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), -8, -1))

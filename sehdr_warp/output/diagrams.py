@@ -58,15 +58,9 @@ def training_svg(metrics: Sequence[Mapping]) -> Markup:
 
 
 def camera_map(run: "LoadedScene", tone_map: Any, names: Sequence[str] = ()) -> Markup:
-    """Draw the scene from above as its training photos show it, with training and held-out cameras.
+    """Draw the scene from above as its training photos show it, with training and held-out cameras, some with `names`.
 
-    Args:
-        run: The trained run.
-        tone_map: Converts radiance [N, 3] to sRGB.
-        names: Cameras to label.
-
-    Returns:
-        SVG; empty if there are no cameras.
+    Returns SVG, empty if there are no cameras; `tone_map` converts radiance [N, 3] to sRGB.
     """
     entries = run.cameras
     if not entries:

@@ -60,12 +60,7 @@ def frame_subject(run: "LoadedScene", path: Sequence[Camera], photos: Sequence[C
 
     The lens opens until the sphere of subject_radius fits, to at most 75 degrees: up to twice the picture if photos
     surround the focus, else up to their height, because wider pictures would show what no photo does. Cameras behind
-    a wall or in a floater come forward, smoothly along the path.
-
-    Args:
-        run: The scene.
-        path: Cameras that look at the focus.
-        photos: Training cameras.
+    a wall or in a floater come forward, smoothly along the path. `photos` are the training cameras.
     """
     focus = common_focus(photos)
     radius = None if focus is None else subject_radius(run, photos, focus)

@@ -36,13 +36,7 @@ def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
 
 
 def exposure_exif(exposure_time: float, *, bias: float | None = None, captured: datetime | None = None) -> Image.Exif:
-    """Return EXIF with an exposure time.
-
-    Args:
-        exposure_time: Seconds, stored as the nearest 32-bit rational.
-        bias: ExposureBiasValue in stops.
-        captured: DateTimeOriginal.
-    """
+    """Return EXIF with an exposure time in seconds, as the nearest 32-bit rational; `bias` is in stops."""
     exif = Image.Exif()
     exif[_SOFTWARE] = "sehdr-warp"
     details = exif.get_ifd(_EXIF_IFD)

@@ -141,11 +141,7 @@ def lights_table(lights: Sequence[Any], unit: float | None = None) -> str:
 def usd_lights(rows: Sequence[dict], scene: str, rest: str, rest_intensity: float = 1.0) -> str:
     """Return the text of a stage of the lights that _described() gives, and a dome of a map beside the file.
 
-    Args:
-        rows: Lights.
-        scene: Name of the scene.
-        rest: Name of the map's file.
-        rest_intensity: Factor of the map's values.
+    `rest` is the name of the map's file, rest_intensity the factor of its values.
     """
     lights = [*(_usd(row) for row in rows), _DOME.format(file=rest, intensity=repr(float(rest_intensity)))]
     return _STAGE.format(scene=json.dumps(scene), lights="\n".join(lights))

@@ -205,14 +205,7 @@ def _areas(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def find_ground(vertices: np.ndarray, faces: np.ndarray, cameras: np.ndarray, voxel: float) -> Ground | None:
-    """Return the floor of an upright mesh: the lowest of its large level parts, below the cameras.
-
-    Args:
-        vertices: [V, 3].
-        faces: [F, 3].
-        cameras: [C, 3] places of the cameras.
-        voxel: Resolution of the mesh.
-    """
+    """Return the floor of an upright mesh: the lowest of its large level parts, below the cameras [C, 3]."""
     normals, areas = _areas(vertices, faces)
     middles = vertices[faces].mean(axis=1)
     level = (normals[:, 1] > np.cos(np.radians(20))) & (middles[:, 1] < np.percentile(cameras[:, 1], 10))

@@ -110,14 +110,9 @@ def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, c
 
 
 def stops_figure(comparison: Comparison, exposure_time: float):
-    """Draw one view at several exposures: the photo alone, the HDR scene with its confidence, and the truth.
+    """Draw one view for a plain sRGB display: the photo alone, the HDR scene with its confidence, and the truth.
 
-    Args:
-        comparison: The view.
-        exposure_time: Seconds at 0 EV.
-
-    Returns:
-        A matplotlib Figure, for a plain sRGB display.
+    Each is shown at several exposures around exposure_time, seconds, which is 0 EV.
     """
     sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}

@@ -170,9 +170,7 @@ def most_visible(mask: np.ndarray, count: int, run: "LoadedScene") -> np.ndarray
 def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> GaussianArrays:
     """Return Gaussians without strays: beyond FAR times the cameras' reach faint ones go and others come nearer.
 
-    Args:
-        gaussians: In the coordinates of the cameras.
-        cameras: Training cameras; with none, nothing changes.
+    They are in the coordinates of the training cameras; without cameras nothing changes.
     """
     if not cameras:
         return gaussians

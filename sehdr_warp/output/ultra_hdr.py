@@ -68,13 +68,7 @@ def _segment(marker: int, data: bytes) -> bytes:
 
 
 def _index(first: int, second: int, offset: int) -> bytes:
-    """Return the Multi-Picture index of two pictures.
-
-    Args:
-        first: Bytes of the first picture.
-        second: Bytes of the second.
-        offset: Of the second picture from the index's header.
-    """
+    """Return the Multi-Picture index of two pictures' bytes; the second is `offset` bytes behind the index's header."""
     entries = struct.pack(">IIIIIIII", 0x00030000, first, 0, 0, 0, second, offset, 0)
     fields = struct.pack(">HHI4s", 0xB000, 7, 4, b"0100") + struct.pack(">HHII", 0xB001, 4, 1, 2)
     fields += struct.pack(">HHII", 0xB002, 7, len(entries), 8 + 2 + 3 * 12 + 4)

@@ -211,12 +211,9 @@ def read_orientation(run: "LoadedScene") -> Orientation:
 
 
 def write_orientation(run: "LoadedScene", *, up: Sequence[float] | None = None, scale: float | None = None) -> Path:
-    """Keep an up direction and a scale with a run; None leaves what is kept. Return the file.
+    """Keep an up direction [3], scene coordinates, and a scale, meters per unit, with a run; return the file.
 
-    Args:
-        run: From load_run.
-        up: [3] in the scene's own coordinates.
-        scale: Meters for each unit of the scene.
+    None leaves what is kept.
     """
     path = Path(run.path) / ORIENTATION_FILE
     if not path.parent.is_dir():

@@ -148,10 +148,7 @@ def pose_from_quaternion(quaternion, translation, source: Path, name: str) -> np
 def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
     """Return world_to_camera [4, 4] from a camera-to-world matrix in OpenCV axes, with the nearest rotation.
 
-    Args:
-        matrix: 3 x 4 or 4 x 4.
-        source: file to name in errors.
-        name: image to name in errors.
+    The matrix is 3 x 4 or 4 x 4; errors name the file `source` and the image `name`.
 
     Raises:
         InputError: for another shape, values that are not finite, scale (beyond 1e-3), shear or reflection.

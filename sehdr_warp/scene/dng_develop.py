@@ -47,13 +47,7 @@ def clipping_level(shares: np.ndarray) -> float:
 
 
 def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorLight:
-    """Return the light of a DNG that LibRaw has opened.
-
-    Args:
-        path: of the file, for errors.
-        dng: its tags.
-        raw: rawpy's open file.
-        oriented: turn the pixels as the file's orientation says.
+    """Return the light of a DNG that LibRaw has opened; `raw` is rawpy's open file.
 
     Raises:
         InputError: if the samples do not fit the tags, or an opcode list is damaged.

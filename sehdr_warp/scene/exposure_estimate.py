@@ -20,12 +20,8 @@ def with_estimated_times(scene: Scene, names: Collection[str], response: Respons
     """Give views without an exposure time the one by which they show the light that the other views show.
 
     Points of the set are compared in the median over points and views, which hidden points do not move. In a set
-    without points, and for a view that shares too few, all views are taken to show the same median light.
-
-    Args:
-        scene: whose views of unknown time have a guess.
-        names: of these views.
-        response: of the photos.
+    without points, and for a view that shares too few, all views are taken to show the same median light. `names` are
+    the views of unknown time, which have a guess.
     """
     timed = [view for view in scene.views if view.name not in names]
     views, notes = [], []

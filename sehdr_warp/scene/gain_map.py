@@ -107,11 +107,8 @@ def _above_white(light: np.ndarray, white: np.ndarray) -> np.ndarray | None:
 def read_gain_map(path: Path, *, oriented: bool = False) -> GainMap | None:
     """Return the gain map of a photo, or None if it has none that applies to it as it is decoded.
 
-    A damaged one is named in a warning and counts as none, because the photo itself is good.
-
-    Args:
-        path: the photo.
-        oriented: turn it like the photo, as EXIF's orientation says.
+    A damaged one is named in a warning and counts as none, because the photo itself is good. `oriented` turns it like
+    the photo, as EXIF's orientation says.
 
     Raises:
         InputError: if the photo itself is missing or damaged.

@@ -95,10 +95,7 @@ def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
 def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> EncodedImage:
     """Decode a photo; 16-bit files keep their 16 bits, palettes and grey become RGB.
 
-    Args:
-        path: the file.
-        oriented: turn the pixels as the EXIF orientation says.
-        mask: accept one bit per pixel.
+    `oriented` turns the pixels as the EXIF orientation says; `mask` accepts one bit per pixel.
 
     Raises:
         InputError: if the file is missing, damaged, truncated, of another kind, or larger than MAX_PIXELS.
@@ -123,13 +120,9 @@ def has_16_bits(path: Path) -> bool:
 
 
 def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
-    """Open an image and read its header, not its pixels.
+    """Open an image and read its header, not its pixels; `mask` accepts one bit per pixel.
 
     Of a stereo pair or a photo with a gain map (MPO) it is the first image.
-
-    Args:
-        path: the file.
-        mask: accept one bit per pixel.
 
     Raises:
         InputError: if the file is missing, not an image, too large, an animation or several pages, or not grey or RGB.

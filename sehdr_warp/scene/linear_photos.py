@@ -86,10 +86,6 @@ def raw_codes(path: Path, *, oriented: bool) -> np.ndarray:
 def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
     """Return the codes of a RAW file, as raw_codes() does, and the light above white that a DNG's gain map states.
 
-    Args:
-        path: the file.
-        oriented: turn the pixels upright.
-
     Raises:
         InputError: if the file is missing or damaged, or holds what LibRaw does not decode.
     """

@@ -174,12 +174,9 @@ def as_gain_mapped(dataset: DataparserOutputs) -> DataparserOutputs:
 def choose_response(
     dataset: DataparserOutputs, method: str = "posterior", candidates: Sequence[str] = ()
 ) -> "Response":
-    """Choose the response that fits the training photos best, from their codes.
+    """Choose the response that fits the training photos best, from their codes; arguments as of load_scene().
 
-    Args:
-        dataset: up to 24 of its training photos are read, evenly spread; for method "paper" a random one.
-        method: see load_scene.
-        candidates: see load_scene.
+    Up to 24 photos are read, evenly spread; for method "paper" a random one.
 
     Raises:
         InputError: if the photos show nothing.
@@ -220,13 +217,9 @@ def sample_photos(photos: Sequence, method: str) -> Sequence:
 def select_response_for(
     codes: Iterable[np.ndarray], files: list[Path | None], method: str, candidates: Sequence[str]
 ) -> "ResponseSelection":
-    """Select the candidate that fits the codes of sample_photos() best.
+    """Select the candidate that fits the codes of sample_photos() best; further arguments as of load_scene().
 
-    Args:
-        codes: of the photos.
-        files: of all training photos, None for those computed from truth.
-        method: see load_scene.
-        candidates: see load_scene.
+    `files` are those of all training photos, None for those computed from truth.
     """
     from ..response import responses_named
     from ..response.selection import select_response

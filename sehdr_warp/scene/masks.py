@@ -95,13 +95,9 @@ def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
 
 
 def mask_note(shares: Sequence[float | None]) -> list[str]:
-    """Describe how many photos have a mask and what share of their pixels is left out.
+    """Describe how many photos have a mask and what share of their pixels is left out: one line, or none without masks.
 
-    Args:
-        shares: the mean of each photo's mask, None for a photo without one.
-
-    Returns:
-        One line, or none if no photo has a mask.
+    `shares` has the mean of each photo's mask, None for a photo without one.
     """
     masked = [share for share in shares if share is not None]
     if not masked:

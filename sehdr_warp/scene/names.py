@@ -115,12 +115,7 @@ def renamed_note(renamed: Sequence[tuple[str, Path]]) -> list[str]:
 
 
 def bases_of(images: Sequence[Path], folder: Path) -> list[Path]:
-    """List the folders that names of photos may be relative to: that of all photos, and those above it.
-
-    Args:
-        images: files of the photos, at least one.
-        folder: the data folder, which ends the list.
-    """
+    """List the folders that names of photos may be relative to: that of all photos, and those above up to `folder`."""
     common = Path(os.path.commonpath([image.parent for image in images]))
     return [common, *(place for place in common.parents if place.is_relative_to(folder))]
 

@@ -47,17 +47,9 @@ def parse_dataset(
 ) -> DataparserOutputs:
     """Parse cameras, files, exposure times and splits of a data folder; of photos only headers are read.
 
-    Everything that can refuse a set is checked before structure from motion, which takes minutes.
-
-    Args:
-        path: see load_scene.
-        exposure_index: see load_scene.
-        holdout: see load_scene.
-        cache: see load_scene.
-        check: called with the kind of the photos known and cameras not yet found; it may raise InputError.
-
-    Raises:
-        InputError: see load_scene.
+    Everything that can refuse a set is checked before structure from motion, which takes minutes. check() is called
+    with the kind of the photos known and cameras not yet found; it may raise InputError. Other arguments and errors are
+    those of load_scene().
     """
     if holdout is not None and holdout < 0:
         raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")

@@ -84,11 +84,7 @@ def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
 
 
 def left_out(problems: Sequence[InputError], count: int) -> list[str]:
-    """Return a note on photos that cannot be used.
-
-    Args:
-        problems: what is wrong with each.
-        count: of all photos.
+    """Return a note on the photos, of `count`, that have a problem and cannot be used.
 
     Raises:
         InputError: the first problem, if more than half of the photos or all but two have one.
@@ -145,13 +141,9 @@ def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:
-    """Read the codes of a photo.
+    """Read the codes of a photo, turned upright if `oriented`.
 
     RAW files have 16 bits in the sensor's primaries, float images 8 bits at an exposure of their own.
-
-    Args:
-        path: the file.
-        oriented: turn the pixels upright.
 
     Raises:
         InputError: if the file is missing, damaged or too large.

@@ -113,9 +113,7 @@ def require_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], fold
 def read_codes(record: ImageRecord, *, oriented: bool = False) -> EncodedImage:
     """Read a photo's codes, or compute them from HDR truth or light, before anything is undistorted or resized.
 
-    Args:
-        record: the photo.
-        oriented: turn the pixels as the EXIF orientation says.
+    `oriented` turns the pixels as the EXIF orientation says.
     """
     if not record.derived and kind_of(record.image) == "float":
         return EncodedImage(float_codes(read_hdr(record.image) * record.light_scale, record.seconds), None)

@@ -282,14 +282,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
 def place_photos(
     dataset: DataparserOutputs, records: Sequence[ImageRecord], folder: Path, kind: str, cache: Path | str | None
 ) -> tuple[DataparserOutputs, list[ImageRecord], list[str]]:
-    """Find the cameras of bare photos by structure from motion.
-
-    Args:
-        dataset: what find_photos returned.
-        records: its usable photos.
-        folder: the data folder.
-        kind: of the photos.
-        cache: see reconstruct().
+    """Find the cameras of bare photos, as find_photos() returned them, by structure from motion; see reconstruct().
 
     Returns:
         The dataset with its points, the photos that could be placed, and the names of the others.

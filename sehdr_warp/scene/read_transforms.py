@@ -147,12 +147,7 @@ def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str
 
 
 def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:
-    """Return a note on frames whose photos are missing.
-
-    Args:
-        absent: names of these frames.
-        count: of frames with a photo.
-    """
+    """Return a note on frames, `absent` by name, whose photos are missing beside `count` frames that have one."""
     if not absent:
         return ()
     names_text = ", ".join(absent[:3]) + (" ..." if len(absent) > 3 else "")
@@ -216,13 +211,7 @@ def pose_from_opengl(matrix: np.ndarray, path: Path, name: str) -> np.ndarray:
 
 
 def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Lens:
-    """Return the lens of a frame, whose values win over the file's.
-
-    Args:
-        values: the file's top level.
-        frame: the frame's entry.
-        image: its photo, for the size if neither states it.
-        path: to name in errors.
+    """Return the lens of a frame, whose values win over the file's; the photo's size counts if neither states one.
 
     Raises:
         InputError: if values are missing or not possible.

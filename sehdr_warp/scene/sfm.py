@@ -298,13 +298,7 @@ def matching_options() -> dict[str, Any]:
 
 
 def _match(database: Path, count: int, photo_seconds: float) -> None:
-    """Match features between photos.
-
-    Args:
-        database: COLMAP's database, with the features.
-        count: number of photos.
-        photo_seconds: time that the features of a photo took, to estimate the time of what follows.
-    """
+    """Match features between photos; those of a photo took `photo_seconds`, from which later stages are estimated."""
     import pycolmap
 
     options = matching_options()

@@ -117,12 +117,9 @@ def _read(path: Path):
 
 
 def _smoothed(log_scales: np.ndarray, logits: np.ndarray, smoothing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fuse Mip-Splatting's 3D smoothing filter (Yu et al. 2024, section 5.1) into sizes and opacities.
+    """Fuse Mip-Splatting's 3D smoothing filter (Yu et al. 2024, section 5.1) into sizes [N, 3] and opacities [N, 1].
 
-    Args:
-        log_scales: [N, 3].
-        logits: [N, 1] of the opacities.
-        smoothing: [N, 1] standard deviation of the filter in scene units.
+    `smoothing` is the standard deviation [N, 1] of the filter in scene units.
     """
     variances = np.exp(2 * log_scales.astype(np.float64))
     wide = variances + np.square(smoothing.astype(np.float64))

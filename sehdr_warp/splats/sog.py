@@ -125,12 +125,7 @@ def refusing_damage(path: Path) -> Iterator[None]:
 
 
 def gaussians_of_files(read: Callable[[str], bytes], path: Path) -> GaussianArrays:
-    """Return the Gaussians of a SOG of version 2.
-
-    Args:
-        read: returns the content of a file of the SOG.
-        path: to name in errors.
-    """
+    """Return the Gaussians of a SOG of version 2; read() returns the content of a file of it, errors name `path`."""
     meta = json.loads(read("meta.json"))
     if meta.get("version") != 2:
         problem = f"is SOG of version {meta.get('version', 1)!r:.20}"

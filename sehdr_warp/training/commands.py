@@ -108,9 +108,7 @@ class Train:
 def run_train(args: Train, argv: Sequence[str]) -> None:
     """Train, or print the plan, and print what was written and what to do next.
 
-    Args:
-        args: the options.
-        argv: the words of the command line, with which --gpus starts the other ranks.
+    `argv` are the words of the command line, with which --gpus starts the other ranks.
     """
     from .launch import device_of_rank, launched_as
 

@@ -85,13 +85,7 @@ def exchange_seconds(gaussians: float, gpus: int, nodes: int = 1) -> float:
 
 
 def training_cost(work: Workload, gpus: int = 1, nodes: int = 1) -> Cost:
-    """Return the cost of one training on GPUs, by data parallelism: each takes a photo in a step.
-
-    Args:
-        work: Size of the training.
-        gpus: GPUs of all nodes together.
-        nodes: Number of nodes.
-    """
+    """Return the cost of one training on GPUs of all nodes, by data parallelism: each takes a photo in a step."""
     mean = work.gaussians / GROWTH
     steps = math.ceil(work.iterations / gpus)
     seconds = steps * (step_seconds(work.pixels, mean) + exchange_seconds(mean, gpus, nodes))

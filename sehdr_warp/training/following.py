@@ -88,9 +88,7 @@ def several_ranks_notes(trainer: Trainer) -> Iterator[str]:
 def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
     """Run the steps of rank 0's training on another rank until it ends; return the trainer.
 
-    Args:
-        ranks: The ranks.
-        path: Where the photos are on this node; None for where they are on that of rank 0.
+    `path` says where the photos are on this node; by default they are where they are on that of rank 0.
     """
     reads = ranks.info.node > 0 and ranks.info.leads_node
     scene = None

@@ -104,11 +104,7 @@ def device_of_rank(rank: int, device: str | None) -> torch.device:
 
 
 def open_store(info: RankInfo, patience: float) -> dist.Store:
-    """Return the store of the ranks: a file of --gpus, or torchrun's server.
-
-    Args:
-        info: Of this process.
-        patience: Seconds to wait for the server.
+    """Return the store of the ranks: a file of --gpus, or torchrun's server, for which it waits `patience` seconds.
 
     Raises:
         SehdrError: If there is no server, naming its address.
@@ -136,13 +132,7 @@ def open_store(info: RankInfo, patience: float) -> dist.Store:
 def launch(count: int, run: Callable[[list[str]], None], words: list[str]) -> None:
     """Run a command line in `count` processes, one per rank, and exit with their status.
 
-    Args:
-        count: Number of ranks.
-        run: Function that runs a command line in a process.
-        words: The command line.
-
-    Raises:
-        SehdrError: If a rank is killed.
+    `run` runs a command line in a process; raises SehdrError if a rank is killed.
     """
     for name in ("torch.multiprocessing.spawn", "torch.multiprocessing"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # Silence its lines about the processes it ends.

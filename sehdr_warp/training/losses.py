@@ -264,10 +264,7 @@ def largest_hdr_truth(scene: Scene, loss: LossConfig) -> float:
 def check_hdr_truth(scene: str, views: Sequence[tuple[str, bool]], loss: LossConfig) -> None:
     """Raise InputError, with scene and field, if HDR truth that the loss needs is missing.
 
-    Args:
-        scene: Name of the scene.
-        views: For each training view its name and whether it has HDR truth.
-        loss: The loss.
+    `views` has the name of each training view, and whether it has HDR truth.
     """
     if not loss.uses_hdr:
         return
@@ -292,9 +289,7 @@ def check_scene_truth(scene: Scene, loss: LossConfig) -> None:
 def check_dataset_truth(data: Mapping[str, Any], config: Config) -> None:
     """Raise InputError if a dataset lacks HDR truth that the loss needs, before its photos are read.
 
-    Args:
-        data: Arguments of load_scene().
-        config: Config before the plan.
+    `data` are arguments of load_scene(), `config` is the config before the plan.
     """
     from ..scene.load import parse_dataset
     from ..scene.names import unique_names

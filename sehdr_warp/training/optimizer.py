@@ -30,13 +30,8 @@ SH_INTERVAL_FROM = 4000  # Steps of the shortest training to which SH_UPDATE_INT
 def make_optimizer(field: RadianceField, config: Config, extent: float, batch: int = 1) -> Adam:
     """Create an optimizer with a named group for each parameter of the Gaussians, the fusion and a learned response.
 
-    On a GPU, counters and learning rates are tensors on the device, so that steps can be captured as CUDA graphs.
-
-    Args:
-        field: The field to train.
-        config: Options of the training.
-        extent: Extent of the scene, in whose units the learning rate of the means is.
-        batch: Photos in a step.
+    On a GPU, counters and learning rates are tensors on the device, so that steps can be captured as CUDA graphs. The
+    learning rate of the means is in units of the scene's `extent`; a step has `batch` photos.
     """
     device = field.gaussians.means.device
     rates = {name: getattr(config.optimizer, name) for name in PARAMETER_NAMES}
@@ -113,14 +108,7 @@ class FlatGradients:
     """
 
     def __init__(self, optimizer: Adam, rank: int, count: int, *, factored: bool):
-        """Allocate the buffer.
-
-        Args:
-            optimizer: The optimizer.
-            rank: Number of this rank.
-            count: Number of ranks.
-            factored: Whether gradients of the harmonics are exchanged in factored form.
-        """
+        """Allocate the buffer of rank `rank` of `count`; if `factored`, harmonics are exchanged in factored form."""
         groups = {group["name"]: group["params"] for group in optimizer.param_groups}
         self.all = _parameters(optimizer)
         self.parameters = [

@@ -32,12 +32,9 @@ def fits_device(source: PhotoSource, device: torch.device) -> bool:
 def make_view_source(
     source: PhotoSource, where: str, use_cuda_graph: bool
 ) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
-    """Return the views of a source in the form that steps take.
+    """Return the views of a source in the form that steps take, captured as CUDA graphs or not.
 
-    Args:
-        source: The photos.
-        where: Value of schedule.photo_cache.
-        use_cuda_graph: Whether steps are captured as CUDA graphs.
+    `where` is the value of schedule.photo_cache.
     """
     device = torch.device(source.device)
     if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.

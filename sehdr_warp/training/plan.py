@@ -175,15 +175,7 @@ def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Conf
 
 
 def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: torch.device) -> str:
-    """Return a log line about the expected speed of a training on several ranks.
-
-    Args:
-        count: Number of ranks.
-        gaussians: Number of Gaussians.
-        pixels: Pixels of a photo.
-        photos: Iterations of the training.
-        device: Device of this rank.
-    """
+    """Return a log line about the expected speed of a training of `photos` iterations on `count` ranks."""
     if device.type == "cpu":
         shared = f"{count} processes share this machine's {thread_count() * count} threads"
         return f"plan: ranks: {shared}: no faster than one"

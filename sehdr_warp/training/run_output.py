@@ -97,12 +97,7 @@ class RunOutput:
         self.folder.write_checkpoint(tensors, values | {"seconds": trainer.seconds}, keep=keep)
 
     def finish(self, trainer: TrainingState, *, complete: bool) -> None:
-        """Write the last checkpoint and the summary.
-
-        Args:
-            trainer: The trainer.
-            complete: Whether to measure confidence and report residual regions, too.
-        """
+        """Write the last checkpoint and the summary; if complete, also the confidence and the residual regions."""
         evidence = None
         if trainer.iteration >= trainer.total and trainer.iteration > trainer.first_iteration:
             evidence = remove_unseen(trainer)
@@ -212,11 +207,7 @@ def format_scores(scores: Mapping[str, float]) -> str:
 
 
 def warn_of_overfitting(metrics: Sequence[dict]) -> None:
-    """Warn if held-out photos scored better earlier in the training.
-
-    Args:
-        metrics: The lines of metrics.jsonl.
-    """
+    """Warn if held-out photos scored better earlier in the training, by the lines of metrics.jsonl."""
     scores = [(line["psnr_ldr"], line["iteration"]) for line in metrics if "psnr_ldr" in line]
     if scores and (best := max(scores))[0] > scores[-1][0] + OVERFITTING_DB:
         log.warning(

@@ -159,11 +159,7 @@ class GraphCapacity:
         return skipped, True
 
     def rescale(self, growth: float, *, keep: bool) -> bool:
-        """Adapt the capacity after densification changed the count by the factor `growth`.
-
-        Args:
-            growth: New count divided by the old one.
-            keep: Keep the current capacity if it suffices.
+        """Adapt the capacity after densification changed the count by `growth`; with `keep` it stays if it suffices.
 
         Returns:
             True if the current capacity, and with it the captured graphs, can be kept.

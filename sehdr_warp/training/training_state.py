@@ -52,14 +52,7 @@ class PhotoOrder:
     """The order of `count` photos; all ranks draw the same order, and each takes its own photo of a step."""
 
     def __init__(self, count: int, seed: int, rank: int = 0, ranks: int = 1):
-        """Create an order.
-
-        Args:
-            count: Number of photos.
-            seed: Seed of the order.
-            rank: Number of this process.
-            ranks: Number of processes that train together.
-        """
+        """Create an order of `count` photos for process `rank` of `ranks`."""
         self._count, self._rank, self._ranks = count, rank, ranks
         self._remaining: list[int] = []
         self._generator = torch.Generator().manual_seed(seed)

@@ -28,11 +28,8 @@ def make_strategy(
 ) -> AdcStrategy | McmcStrategy:
     """Create the strategy that config.densification.strategy names.
 
-    Args:
-        config: The config of the training.
-        extent: Extent of the scene, units of the Gaussians' coordinates.
-        pixels: Number of pixels of all training photos.
-        camera_positions: [V, 3] positions of the training cameras.
+    The scene has `extent`, in units of the Gaussians' coordinates, and its training photos have `pixels` in all and
+    camera_positions [V, 3].
     """
     if config.densification.strategy == "adc":
         return AdcStrategy.from_config(config, extent)
