@@ -20,6 +20,7 @@ _MAGIC, _VERSION = 0x5053474E, 3
 _HEADER = struct.Struct("<IIIBBBB")
 _COLOR_SCALE = 0.15  # Of the constant harmonic before it becomes a byte
 _MOST = 50_000_000  # Gaussians of a file that is read
+_LARGEST = 2.0**23  # Of a coordinate: 24 bits with a sign
 _DAMAGED = "export it again"
 _TO_FILE = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -29,6 +30,9 @@ def write_spz(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     gaussians = gaussians.transformed(_TO_FILE)
     gaussians = gaussians.rows(morton_order(gaussians.means))
     largest = float(np.abs(gaussians.means).max())
+    if largest >= _LARGEST:
+        problem = f"holds positions below {_LARGEST:.0f}, and these reach {largest:.4g}"
+        raise InputError(path, f"SPZ {problem}", "write another format, or leave out what is far (--crop)")
     fraction = int(np.clip(22 - np.ceil(np.log2(max(largest, 1e-6))), 0, 24))
     fixed = np.rint(gaussians.means.astype(np.float64) * 2.0**fraction).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 3, 4)[:, :, :3]

@@ -118,6 +118,14 @@ def test_linear_colors_are_refused(tmp_path):
             write_gaussians(tmp_path / f"a{suffix}", gaussians(color_model="linear"))
 
 
+def test_positions_that_24_bits_do_not_hold_are_refused(tmp_path):
+    far = natural()
+    far.means[7, 0] = 9e6
+    with pytest.raises(InputError, match="positions below 8388608, and these reach 9e.06"):
+        write_gaussians(tmp_path / "a.spz", far)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_damage_and_other_versions_are_one_line(tmp_path):
     given = natural(64)
     for suffix in LOSSY_SUFFIXES:
