@@ -67,4 +67,4 @@ def run_view(args: View) -> None:
             log.info("the viewer has ended")
         watch.stop()
         for run in watch.shown:  # What is being rendered is waited for: kernels must not outlive Python.
-            run.lock.acquire(timeout=30)
+            run.lock.close(timeout=30)

@@ -1,7 +1,6 @@
 """Answers of a run to the page: float frames of a camera, and the facts that it draws with."""
 
 import json
-import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
@@ -18,26 +17,27 @@ from ..output.light_unit import luminance_of_one
 from ..output.splat_edits import SplatEdits
 from ..output.world_transform import world_transform
 from .edits import EditedOpacities, LightGains
+from .scene_lock import SceneLock
 
 MOST_PIXELS = 4096 * 2304
 _HALF_MOST = 65504.0
 
 
 class ViewerScene:
-    """A run that several threads may render from, one at a time; other attributes are the run's.
+    """A run that several threads may render from; other attributes are the run's.
 
     Attributes:
         run: The scene that is shown.
         name: Its path, as on the command line.
         clipped: [N] share of photographed values that were clipped, for each Gaussian; None if unknown.
-        lock: Held while the scene is rendered.
+        lock: Held while the scene is rendered or changed.
         version: Counts replacements.
     """
 
     def __init__(self, run: Any, name: str, clipped: Tensor | None = None):
         """Show a run under a name."""
         self.run, self.name, self.clipped = run, name, clipped
-        self.lock, self.version = threading.Lock(), 0
+        self.lock, self.version = SceneLock(), 0
         self.opacities, self.shown_count = EditedOpacities(), None
         self._start_lights()
 
@@ -48,7 +48,7 @@ class ViewerScene:
 
     def replace(self, run: Any, clipped: Tensor | None) -> None:
         """Show another run from now on."""
-        with self.lock:
+        with self.lock.changing():
             self.run, self.clipped = run, clipped
             self.opacities, self.shown_count = EditedOpacities(), None
             self._start_lights()
@@ -56,7 +56,7 @@ class ViewerScene:
 
     def lights(self) -> list[Light]:
         """Return the lights of the scene, found at the first call; none if it does not state what clipped."""
-        with self.lock:
+        with self.lock.changing():
             if self._lights is None:
                 self._lights = [] if self.clipped is None else self.run.find_lights()
             return self._lights
@@ -64,7 +64,7 @@ class ViewerScene:
     def set_gain(self, light: int, stops: float) -> None:
         """Show a light brighter by so many stops than it was trained; see LightGains.apply."""
         lights = self.lights()
-        with self.lock:
+        with self.lock.changing():
             gains = {index: value for index, value in (self._stops | {light: stops}).items() if value != 0}
             self.light_gains.apply(self.run, lights, gains)
             self._stops = gains
@@ -89,7 +89,7 @@ class ViewerScene:
 
     def edit(self, edits: SplatEdits | None) -> None:
         """Show what edits leave of the scene, or all of it for None; see EditedOpacities.apply."""
-        with self.lock:
+        with self.lock.changing():
             count = self.opacities.apply(self.run, edits)
             self.shown_count = None if edits is None else count
             self.version += 1
@@ -103,13 +103,13 @@ class ViewerScene:
         return getattr(self.run, name)
 
     def render(self, camera: Camera):
-        """Render a camera while no other thread does."""
-        with self.lock:
+        """Render a camera while no other thread changes the scene."""
+        with self.lock.rendering():
             return self.run.render(camera)
 
     def render_confidence(self, camera: Camera) -> Tensor | None:
-        """Render confidence while no other thread renders."""
-        with self.lock:
+        """Render confidence while no other thread changes the scene."""
+        with self.lock.rendering():
             return self.run.render_confidence(camera)
 
     def frame(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> memoryview:
@@ -140,7 +140,7 @@ class ViewerScene:
                 return
             with torch.no_grad():
                 if part == "clipped":
-                    with self.lock:
+                    with self.lock.rendering():
                         frame[5].copy_(run.model.render_mean(camera, shares)).clamp_(0, _HALF_MOST)
                 elif (confidence := self.render_confidence(camera)) is not None:
                     picture[..., 3] = torch.as_tensor(confidence)

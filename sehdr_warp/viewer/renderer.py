@@ -1,29 +1,40 @@
-"""The thread that makes the viewer's pictures, and the order in which it does."""
+"""The threads that make the viewer's pictures, and the order in which they do."""
 
-import heapq
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 _PIXELS_PER_SECOND = 1_000_000
 """A picture waits as if it had been asked for later by its pixels over these."""
+_SMALL = 640 * 480
+"""Pixels of a picture that need not wait for the end of a large one, which takes seconds on a CPU."""
 
 
 class Renderer:
     """One thread for all pictures, because memory that libraries keep for each thread would add up.
 
-    A small picture goes before large ones that wait, and these get their turn all the same.
+    A small picture goes before large ones that wait, and these get their turn all the same. A second thread may make
+    small pictures beside a large one.
     """
 
-    def __init__(self) -> None:
-        """Start the thread."""
-        self._waiting: list[tuple[float, int, Future[Any], Callable[[], Any]]] = []
+    def __init__(self, beside: bool = False) -> None:
+        """Start the threads.
+
+        Args:
+            beside: Make small pictures beside large ones as well: on a CPU, where a large picture takes seconds.
+        """
+        self._waiting: list[_Picture] = []
         self._changed, self._closed, self._numbers = threading.Condition(), False, count()
-        self._thread = threading.Thread(target=self._run, name="sehdr-warp viewer renders", daemon=True)
-        self._thread.start()
+        names = ["sehdr-warp viewer renders", *["sehdr-warp viewer renders small"] * beside]
+        self._threads = [
+            threading.Thread(target=self._run, args=(number > 0,), name=name, daemon=True)
+            for number, name in enumerate(names)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def call(self, make: Callable[[], Any], pixels: int = 0) -> Any:
         """Return what `make` returns on the thread.
@@ -40,29 +51,47 @@ class Renderer:
             if self._closed:
                 raise RuntimeError("the renderer has ended")
             turn = time.monotonic() + pixels / _PIXELS_PER_SECOND
-            heapq.heappush(self._waiting, (turn, next(self._numbers), future, make))
-            self._changed.notify()
+            self._waiting.append(_Picture(turn, next(self._numbers), pixels, future, make))
+            self._changed.notify_all()
         return future.result()
 
     def close(self) -> None:
-        """End the thread after the picture that it makes, and wait for it; those that wait are not made."""
+        """End the threads after the pictures that they make, and wait for them; those that wait are not made."""
         with self._changed:
             self._closed = True
-            for _, _, future, _ in self._waiting:
-                future.set_exception(RuntimeError("the renderer has ended"))
+            for picture in self._waiting:
+                picture.future.set_exception(RuntimeError("the renderer has ended"))
             self._waiting.clear()
-            self._changed.notify()
-        self._thread.join()
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
 
-    def _run(self) -> None:
+    def _next(self, small: bool) -> "_Picture | None":
+        """Return the picture whose turn it is, of small ones alone if asked for, and None if none waits."""
+        fitting = [each for each in self._waiting if not small or 0 < each.pixels <= _SMALL]
+        return min(fitting, default=None)
+
+    def _run(self, small: bool) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._closed)
+                self._changed.wait_for(lambda: self._next(small) or self._closed)
                 if self._closed:
                     return
-                _, _, future, make = heapq.heappop(self._waiting)
+                picture = self._next(small)
+                assert picture is not None
+                self._waiting.remove(picture)
             try:
-                future.set_result(make())
+                picture.future.set_result(picture.make())
             except BaseException as error:  # noqa: BLE001 - It is raised where the result is waited for.
-                future.set_exception(error)
-            del future, make
+                picture.future.set_exception(error)
+            del picture
+
+
+class _Picture(NamedTuple):
+    """A picture that waits, in the order of the turns."""
+
+    turn: float
+    number: int
+    pixels: int
+    future: Future[Any]
+    make: Callable[[], Any]

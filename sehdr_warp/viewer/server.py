@@ -68,7 +68,8 @@ class Viewer:
         """
         self.runs, self.training, self.saving = list(runs), training, ""
         self._photos, self._reading, self._saving = photos, threading.Lock(), threading.Lock()
-        self._renderer = Renderer()
+        devices = {str(getattr(run.run, "device", "cpu")) for run in self.runs}
+        self._renderer = Renderer(beside=training is None and devices <= {"cpu"})
         self._closed = threading.Event()
         page = Path(__file__).parent / "page"
         self.files = {

@@ -243,4 +243,4 @@ def test_a_viewer_among_silent_and_deaf_clients(prepared, record_property):
     print(f"{lasts:.0f} s, {len(waits)} requests: {parts}, longest {waits[-1]:.3f} s, "
           f"{largest:.0f} MiB at most")  # fmt: skip
     assert "Traceback" not in told and largest < 600
-    assert waits[len(waits) * 95 // 100] < 1, waits[-9:]
+    assert waits[len(waits) * 99 // 100] < 1, waits[-9:]

@@ -26,3 +26,19 @@ def test_small_pictures_go_first_and_large_ones_get_their_turn():
     renderer.close()
     with pytest.raises(RuntimeError, match="has ended"):
         renderer.call(list)
+
+
+def test_a_small_picture_is_made_beside_a_large_one():
+    renderer, begun, end = Renderer(beside=True), threading.Event(), threading.Event()
+
+    def large():
+        begun.set()
+        assert end.wait(10)
+
+    thread = threading.Thread(target=renderer.call, args=(large, 2_000_000))
+    thread.start()
+    assert begun.wait(10) and renderer.call(lambda: "small", 640 * 480) == "small"
+    assert thread.is_alive(), "the small picture waited for the large one"
+    end.set()
+    thread.join(10)
+    renderer.close()
