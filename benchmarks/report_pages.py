@@ -34,7 +34,8 @@ def write_reports(folder: Path) -> list[Path]:
         parts = [f"# {page['title']}", page["text"], f"```sh\n{result['command']}\n```"]
         parts += [f"Measure again: `python -m benchmarks.measure {name}`."] if "command" in page else []
         parts += [machine_line(result) + "."]
-        if name in PLOTS:
+        # Trainings whose times include compiling have no tests over time.
+        if name in PLOTS and any(row.get("tests", True) for row in result["rows"]):
             pages.append(folder / f"{name}.png")
             with atomic_path(pages[-1], internal=True) as temporary:
                 PLOTS[name](result, temporary)
