@@ -38,7 +38,7 @@ class Timed(Output):
 
     def timing(self) -> dict:
         """Return the device and the number of repetitions."""
-        from sehdr_warp.runs.device import pick_device
+        from sehdr_warp.runs.open import pick_device
 
         return {"device": pick_device(self.device), "repetitions": require_positive("--repetitions", self.repetitions)}
 

@@ -15,6 +15,12 @@ def usable(folder: Path) -> bool:
         return False
 
 
+def cache_folder(named: Path | str | None = None) -> Path | None:
+    """Return the folder of results: the one that is named, $SEHDR_CACHE or the user's; None if there is none."""
+    folder = named or os.environ.get("SEHDR_CACHE")
+    return user_cache("sehdr-warp") if folder is None else Path(folder)
+
+
 def user_cache(name: str) -> Path | None:
     """Return the user's folder for what the program can make again; None if there is no home."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")

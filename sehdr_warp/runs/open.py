@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError, SehdrError
 
 if TYPE_CHECKING:
+    import torch
+
     from ..response import Response
     from ..scene import Scene
     from .config import Config
@@ -23,6 +25,30 @@ log = logging.getLogger(__name__)
 
 LOAD_OPTIONS = ("exposure_index", "max_size", "holdout")
 """Arguments of load_scene, besides path and response, that a run saves so that its photos can be loaded again."""
+
+
+def pick_device(device: str | torch.device | None) -> torch.device:
+    """Return the device that a user names, by default the first GPU, or the CPU if there is none.
+
+    Args:
+        device: "cpu", "cuda", "cuda:N", a torch device, or None.
+
+    Raises:
+        InputError: If torch cannot use the device.
+    """
+    import torch
+
+    if device is None:
+        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    if not str(device).startswith(("cpu", "cuda")):
+        raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
+    try:
+        result = torch.device(device)
+        torch.empty(0, device=result)
+    except (RuntimeError, AssertionError) as error:
+        problem = f"cannot be used ({str(error).splitlines()[0]})"
+        raise InputError(f"device {device}", problem, "use cpu, or cuda:N of a GPU that torch sees") from None
+    return torch.device("cuda", result.index or 0) if result.type == "cuda" else result
 
 
 def open_run(path: Path, device: str | None) -> Run:
@@ -35,7 +61,6 @@ def open_run(path: Path, device: str | None) -> Run:
     Raises:
         InputError: If the folder is not a run, or the device is missing.
     """
-    from .device import pick_device
     from .run import load_run
 
     return load_run(path, device=pick_device(device))
@@ -44,7 +69,6 @@ def open_run(path: Path, device: str | None) -> Run:
 def open_scene(path: Path, device: str | None) -> Run | Splats:
     """Load the run in a folder, or the Gaussians in a file of one of splats.SUFFIXES; arguments as of open_run."""
     from ..splats import SUFFIXES
-    from .device import pick_device
     from .run import load_splats
 
     if path.is_file() or path.suffix.lower() in SUFFIXES:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..caches import usable, user_cache
+from ..caches import cache_folder, usable
 from ..errors import InputError
 from ..limits import memory_left
 from .types import View
@@ -217,8 +217,7 @@ def available_memory() -> int:
 
 
 def _folder() -> Path:
-    cache_folder = os.environ.get("SEHDR_CACHE")
-    folder = user_cache("sehdr-warp") if cache_folder is None else Path(cache_folder)
+    folder = cache_folder()
     if folder is None or not usable(folder):
         return Path(tempfile.gettempdir())
     folder.mkdir(parents=True, exist_ok=True)

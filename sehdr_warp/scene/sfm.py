@@ -10,7 +10,6 @@ import itertools
 import json
 import logging
 import math
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..caches import usable, user_cache
+from ..caches import cache_folder, usable
 from ..errors import InputError, SehdrError
 from ..files import atomic_folder
 from ..own_files import is_sealed
@@ -153,8 +152,7 @@ def cached_result(cache: Path | str | None, name: str, solve: Callable[[Path, Pa
     is temporary; a damaged result is computed again. A cache that the caller names must be writable.
     """
     with contextlib.ExitStack() as stack:
-        cache_folder = cache or os.environ.get("SEHDR_CACHE")
-        folder = user_cache("sehdr-warp") if cache_folder is None else Path(cache_folder)
+        folder = cache_folder(cache)
         place = (folder or Path()) / name
         if folder and place.is_dir() and not is_sealed(place):
             _log.warning("%s is damaged and is made again", place)

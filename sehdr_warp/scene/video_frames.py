@@ -3,7 +3,6 @@
 import json
 import logging
 import math
-import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..caches import usable, user_cache
+from ..caches import cache_folder, usable
 from ..errors import InputError, SehdrError
 from ..files import atomic_folder
 from ..own_files import is_sealed
@@ -147,8 +146,7 @@ def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
             process if that cannot be written.
     """
     name = f"video-{file_digest(clip.path)[:16]}-{_VERSION}"
-    cache_folder = cache or os.environ.get("SEHDR_CACHE")
-    folder = user_cache("sehdr-warp") if cache_folder is None else Path(cache_folder)
+    folder = cache_folder(cache)
     if folder is None or not usable(folder):
         if cache is not None:
             raise InputError(cache, "the frames cannot be kept there", "name a folder that can be written")

@@ -19,7 +19,7 @@ from tyro.conf import Positional
 from ..errors import InputError, SehdrError, UsageError
 from ..files import require_text
 from ..runs import config_files as configs
-from ..runs.open import LOAD_OPTIONS, load_photos
+from ..runs.open import LOAD_OPTIONS, load_photos, pick_device
 
 log = logging.getLogger(__name__)
 
@@ -152,7 +152,6 @@ def _run_as_rank(words: list[str]) -> None:
 
 def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, or print a plan, on this rank."""
-    from ..runs.device import pick_device
     from ..runs.run_writer import RunWriter
     from .losses import check_dataset_truth
 
@@ -250,7 +249,6 @@ def _train_blocks(args: Train) -> None:
     from ..arguments import parse_pairs
     from ..blocks.block_plan import BlockPlan
     from ..blocks.train import is_in_blocks, train_in_blocks
-    from ..runs.device import pick_device
     from .launch import device_of_rank
 
     output, machine = args.output, args.machine
