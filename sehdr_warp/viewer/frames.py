@@ -102,6 +102,11 @@ class ViewerScene:
         """Return an attribute of the run."""
         return getattr(self.run, name)
 
+    @property
+    def on_cpu(self) -> bool:
+        """Whether pictures are made on the CPU."""
+        return str(getattr(self.run, "device", "cpu")) == "cpu"
+
     def render(self, camera: Camera):
         """Render a camera while no other thread changes the scene."""
         with self.lock.rendering():

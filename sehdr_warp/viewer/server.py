@@ -68,8 +68,7 @@ class Viewer:
         """
         self.runs, self.training, self.saving = list(runs), training, ""
         self._photos, self._reading, self._saving = photos, threading.Lock(), threading.Lock()
-        devices = {str(getattr(run.run, "device", "cpu")) for run in self.runs}
-        self._renderer = Renderer(beside=training is None and devices <= {"cpu"})
+        self._renderer = Renderer(beside=training is None and all(run.on_cpu for run in self.runs))
         self._closed = threading.Event()
         page = Path(__file__).parent / "page"
         self.files = {
