@@ -104,7 +104,7 @@ class ViewerScene:
 
     @property
     def on_cpu(self) -> bool:
-        """Whether pictures are made on the CPU."""
+        """True if pictures are made on the CPU."""
         return str(getattr(self.run, "device", "cpu")) == "cpu"
 
     def render(self, camera: Camera):
