@@ -500,7 +500,7 @@ const counted = () => Math.max(2, Math.round(24 * (Number($("length").value) || 
 for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", async () => {
   const kind = button.dataset.save, film = kind === "film";
   if (film && state.path.length < 2) return answer("add two views or more first");
-  answer("rendering \u2026");
+  answer(kind === "page" ? "fitting colors for the page, up to a minute \u2026" : "rendering \u2026");
   let watch = film && setInterval(async () => {
     const told = await ask("saving").then(said => said.text(), () => "");
     if (told && watch) answer(told);
