@@ -40,6 +40,9 @@ FEWEST_FOUND = 50  # With fewer matches of these, the range is GUESS
 RANGE = 0.1, 30.0  # Range of depths to try for the probes, in units of the focus
 GUESS = 0.25, 8.0  # Range of depths without enough matches, in units of the focus
 SLACK = 0.6, 2.0  # Factors that extend the range of the matches
+MIDTONE, LEAST_EXPONENT = 0.3, 0.4
+"""Encoded value to which a power, at least LEAST_EXPONENT, brightens dark photos for matching. Costs are compared by
+absolute margins, so without it most depths of dark photos count as equally good."""
 ALIKE = 0.05  # Photos whose exposures differ by fewer stops are compared as they are
 CHUNK = 1 << 20  # Costs held at one time
 MAX_SEEDS = 500  # Gaussians per refinement
@@ -77,7 +80,8 @@ class Matcher:
             device: Torch device.
         """
         base = float(np.median([view.exposure_time for view in views]))
-        tables = [_exposure_table(view.exposure_time / base, response) for view in views]
+        self._exponent = brightening(views)
+        tables = [_code_table(view, view.exposure_time / base, response, self._exponent) for view in views]
         matchable = prefetch_map(lambda pair: _matchable(*pair), zip(views, tables, strict=True), len(views))
         self._images, cameras = zip(*matchable, strict=True)
         self._cameras, self._masks = cameras, [view.mask for view in views]
@@ -108,7 +112,8 @@ class Matcher:
         """
         side = max(1.0, (sum(image.shape[0] * image.shape[1] for image in self._images) / count) ** 0.5)
         photos = zip(self._images, self._masks, strict=True)
-        chances = prefetch_map(lambda photo: _probabilities(*photo), photos, len(self._images))
+        white = 255 * (WHITE / 255) ** self._exponent
+        chances = prefetch_map(lambda photo: _probabilities(*photo, white), photos, len(self._images))
         samples = [_sample_squares(chance, side, rng, index) for index, chance in enumerate(chances)]
         return torch.from_numpy(np.concatenate(samples).astype(np.int32)).to(self.device)
 
@@ -150,7 +155,8 @@ class Matcher:
 
     def _matches(self, pixels: Tensor, depth: Tensor) -> Matches:
         """Return the points of pixels [N, 3] at depths [N]."""
-        return Matches(*matched_points(self._photos, self._poses, pixels, depth), pixels[:, 0].long())
+        points, colors, footprints = matched_points(self._photos, self._poses, pixels, depth)
+        return Matches(points, colors ** (1 / self._exponent), footprints, pixels[:, 0].long())
 
     def _depth(self, pixels: Tensor) -> Tensor:
         """Return the depths [N] of pixels, between planes; 0 if none is reliable."""
@@ -158,11 +164,28 @@ class Matcher:
         return trusted_depths(costs, self._depths, worst=WORST_COST, margin=MARGIN, few=FEW, widest=WIDEST)
 
 
-def _exposure_table(ratio: float, response: Response) -> np.ndarray | None:
-    """Return the codes [256] that a photo would have at 1 / ratio of its exposure; None if nothing changes."""
-    if response.learnable or abs(np.log2(ratio)) <= ALIKE:
+def brightening(views: Sequence[View]) -> float:
+    """Return the exponent in [LEAST_EXPONENT, 1] that takes the median encoded value of dark photos to MIDTONE."""
+    samples = []
+    for view in views:
+        step = max(1, min(view.codes.shape[:2]) // 64)
+        samples.append(view.codes[::step, ::step].reshape(-1).astype(np.float32) / view.levels)
+    median = float(np.clip(np.median(np.concatenate(samples)), 1e-3, 1.0))
+    return float(np.clip(np.log(MIDTONE) / np.log(median), LEAST_EXPONENT, 1.0)) if median < MIDTONE else 1.0
+
+
+def _code_table(view: View, ratio: float, response: Response, exponent: float) -> np.ndarray | None:
+    """Return the 8-bit codes [levels + 1] that a view's codes are matched as; None if they stay.
+
+    They are those of 1 / ratio of its exposure, brightened by an exponent.
+    """
+    values = np.linspace(0, 1, view.levels + 1)
+    is_alike = response.learnable or abs(np.log2(ratio)) <= ALIKE
+    if is_alike and exponent == 1:
         return None
-    return codes_of(response.encode(response.decode(np.linspace(0, 1, 256)) / ratio), 8)
+    if not is_alike:
+        values = np.asarray(response.encode(response.decode(values) / ratio))
+    return codes_of(np.clip(values, 0, 1) ** exponent, 8)
 
 
 def at_matching_size(view: View) -> View:
@@ -176,9 +199,10 @@ def at_matching_size(view: View) -> View:
 def _matchable(view: View, table: np.ndarray | None) -> tuple[np.ndarray, Camera]:
     """Return the codes of a photo in 8 bits at the size for matching, mapped by a table, and its camera."""
     codes, camera = view.codes, view.camera
-    if codes.dtype != np.uint8:
+    if table is not None:
+        codes = table[codes]
+    elif codes.dtype != np.uint8:
         codes = codes_of(view.image, 8)
-    codes = codes if table is None else table[codes]
     scale = min(1.0, LARGEST_SIDE / max(camera.width, camera.height))
     if scale < 1:
         size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
@@ -186,15 +210,18 @@ def _matchable(view: View, table: np.ndarray | None) -> tuple[np.ndarray, Camera
     return codes, camera
 
 
-def _probabilities(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """Return [H, W] the probability of each pixel to be chosen, up to a factor; 0 if it cannot be matched."""
+def _probabilities(image: np.ndarray, mask: np.ndarray | None, white: float = WHITE) -> np.ndarray:
+    """Return [H, W] the probability of each pixel to be chosen, up to a factor; 0 if it cannot be matched.
+
+    Codes count as white from `white` on.
+    """
     grey = image.astype(np.float32).mean(2)
     chance = np.zeros_like(grey)
     if min(grey.shape) < 2 * BORDER + 2:
         return chance
     steep = np.abs(np.gradient(grey)).sum(0)
     steep = np.minimum(steep / max(float(steep.mean()), 1e-6), STEEPEST) + FLAT
-    steep[image.max(2) >= WHITE] += STEEPEST
+    steep[image.max(2) >= white] += STEEPEST
     if mask is not None:
         size = grey.shape[1], grey.shape[0]
         steep *= np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX)) > 0.5

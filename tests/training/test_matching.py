@@ -37,6 +37,18 @@ def test_matched_points_lie_on_wall_and_lamp(device, times):
     np.testing.assert_allclose(found.footprints.cpu(), depth / 70, rtol=1e-4)
 
 
+def test_dark_photos_are_matched_as_bright_ones_are(device):
+    """Photos of 16 bits at a sixteenth of their values; colors of the points stay those of the photos."""
+    scene = wall_and_lamp()
+    dark = replace(scene, views=tuple(replace(v, codes=v.codes.astype(np.uint16) * 16) for v in scene.views))
+    bright, found = matched(scene, device), matched(dark, device)
+    assert len(found.points) > 0.8 * len(bright.points)
+    depth, colors = found.points[:, 2].cpu().numpy(), found.colors.cpu().numpy()
+    wall = colors.max(1) < 0.05
+    assert (np.abs(depth[wall] - WALL) < 0.1 * WALL).mean() > 0.9
+    assert colors.max() == pytest.approx(255 * 16 / 65535, abs=0.004)
+
+
 def test_points_that_mislead_do_no_harm(device):
     """Behind the cameras, all in one place, or far beyond: depths come from the photos."""
     scene, rng = wall_and_lamp(), np.random.default_rng(0)
