@@ -202,7 +202,7 @@ class Trainer(TrainingState):
             SehdrError: If more than MAX_SKIPPED steps were not finite, or ranks differ.
         """
         # The last step may have more photos than iterations are left.
-        self.step_batch = self.strategy.step_batch = min(self.batch, max(1, self.total - self.iteration))
+        self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
         views, gaussians = self._training_views(), self.field.gaussians
         index = self._view_index = self.order.next()
@@ -323,11 +323,12 @@ class Trainer(TrainingState):
     def _densify(self) -> None:
         """Refine the Gaussians if that is due; on several ranks, rank 0 does and the others receive the result."""
         gaussians, strategy, ranks = self.field.gaussians, self.strategy, self.ranks
-        if not strategy.is_due(self.iteration):
+        if not strategy.is_due(self.iteration, self.step_batch):
             return
         count, reallocations = gaussians.count, gaussians.reallocations
         propose = self._propose_gaussians if self.can_seed else None
-        refine = partial(strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, propose)
+        arguments = (self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch)
+        refine = partial(strategy.refine, *arguments)
         changed = refine() if ranks is None else ranks.refine_on_leader(refine, strategy, gaussians, self.optimizer)
         if changed and self.reserves_rows:
             self._reserve_rows()

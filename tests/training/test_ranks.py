@@ -169,8 +169,7 @@ def test_harmonics_go_as_their_factors():
 @pytest.mark.parametrize("photos", [1, 2, 3, 8])
 def test_each_change_happens_once_whatever_the_stride(photos):
     strategy = make_strategy(VARIANTS["default"], 1.0, 1000)
-    strategy.step_batch = photos
-    due = [n for n in range(photos, 91, photos) if strategy.is_due(n)]
+    due = [n for n in range(photos, 91, photos) if strategy.is_due(n, photos)]
     assert [n // 25 for n in due] == [1, 2, 3] and (strategy.schedule.start, strategy.schedule.stop) == (20, 80)
 
 

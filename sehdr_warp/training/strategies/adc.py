@@ -77,11 +77,12 @@ class AdcStrategy(Strategy):
         optimizer: Optimizer | None,
         generator: torch.Generator,
         propose: Propose | None = None,
+        photos: int = 1,
     ) -> bool:
         """Duplicate, split and remove Gaussians, and reset opacities, if this iteration is due."""
         changed = False
         total, count = self.gradient_sum, self.visible_count
-        if self.schedule.is_due(iteration, self.step_batch) and total is not None and count is not None:
+        if self.schedule.is_due(iteration, photos) and total is not None and count is not None:
             changed = True
             small, large = self._select(gaussians, (total / count.clamp_min(1))[: gaussians.count])
             added = [self.duplicate(gaussians, small), *self.split(gaussians, large, generator)]
@@ -90,19 +91,19 @@ class AdcStrategy(Strategy):
             # In place, because captured steps add to these tensors.
             total.zero_()
             count.zero_()
-        if self._resets(iteration):
+        if self._resets(iteration, photos):
             self.reset_opacities(gaussians, optimizer)
         return changed
 
-    def is_due(self, iteration: int) -> bool:
-        """Return whether this iteration refines or resets opacities."""
-        return self.schedule.is_due(iteration, self.step_batch) or self._resets(iteration)
+    def is_due(self, iteration: int, photos: int = 1) -> bool:
+        """Return whether a step of `photos` iterations that ends at `iteration` refines or resets opacities."""
+        return self.schedule.is_due(iteration, photos) or self._resets(iteration, photos)
 
-    def _resets(self, iteration: int) -> bool:
-        """Return whether opacities are reset at this iteration."""
+    def _resets(self, iteration: int, photos: int) -> bool:
+        """Return whether opacities are reset after this step."""
         past = iteration % self.reset_every
         before_stop = iteration - past < self.schedule.stop
-        return past < self.step_batch and before_stop and self.reset_every >= MIN_RESET_INTERVAL
+        return past < photos and before_stop and self.reset_every >= MIN_RESET_INTERVAL
 
     def _select(self, gaussians: Gaussians, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Return masks [N] of the Gaussians to duplicate and of those to split, by their mean gradient [N].

@@ -74,13 +74,11 @@ class Strategy:
         schedule: When to refine.
         cap_max: Largest number of Gaussians.
         prune_opacity: Gaussians below this opacity are relocated or removed.
-        step_batch: Photos of the current step, one for each rank; each counts as an iteration.
     """
 
     schedule: Schedule
     cap_max: int
     prune_opacity: float
-    step_batch: int = 1
 
     def needs_gradients(self, iteration: int) -> bool:
         """Return whether accumulate() needs the gradients of the projected means at this iteration."""
@@ -99,9 +97,9 @@ class Strategy:
             usable: Scalar tensor; 0 ignores the step.
         """
 
-    def is_due(self, iteration: int) -> bool:
-        """Return whether refine() does anything at this iteration."""
-        return self.schedule.is_due(iteration, self.step_batch)
+    def is_due(self, iteration: int, photos: int = 1) -> bool:
+        """Return whether refine() does anything after a step of `photos` iterations that ends at `iteration`."""
+        return self.schedule.is_due(iteration, photos)
 
     def refine(
         self,
@@ -110,6 +108,7 @@ class Strategy:
         optimizer: Optimizer | None,
         generator: torch.Generator,
         propose: Propose | None = None,
+        photos: int = 1,
     ) -> bool:
         """Change the Gaussians and their optimizer state if this iteration is due.
 
@@ -119,6 +118,7 @@ class Strategy:
             optimizer: Their optimizer.
             generator: Source of random numbers, on the Gaussians' device.
             propose: Returns new Gaussians where photos are reproduced worst.
+            photos: Photos of the step, one for each rank; each counts as an iteration.
 
         Returns:
             True if the number of Gaussians, or any parameter tensor, changed.
