@@ -28,7 +28,7 @@ def test_layout_on_disk(tmp_path, logged):
         f"brackets/{v}/{v}_b{i}_ev{ev}.exr" for v in ("t_0", "t_1") for i, ev in enumerate(("-2.0", "+0.0", "+2.0"))
     ]
     assert tree(tmp_path / "out") == sorted(expected) == sorted(str(f.relative_to(tmp_path / "out")) for f in files)
-    assert logged == ["rendering views: 2"]
+    assert logged[-1] == "rendering views: 2"
 
 
 def test_brackets_cost_no_render(tmp_path):
