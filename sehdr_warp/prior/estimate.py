@@ -15,6 +15,12 @@ from .network import LightNetwork, network_input
 WEIGHTS = Path(__file__).with_name("clipped_light.safetensors")
 LARGEST = 160  # Pixels of the longer side that the network sees; larger photos are averaged down
 MOST_BYTES = 3_000_000  # Of a weights file
+HELD_DEVIATION = 1.5
+"""Standard deviation, stops, with which an estimate of light as bright as white holds a training."""
+HELD_POWER = 0.5
+"""Power of the expected light to which the estimates of several photos weigh. Photos disagree about a lamp by a factor,
+which is about log-normal with a deviation s. Logarithms that weigh by the root of the light then have the mean + s^2/2,
+which is the logarithm of the mean light: the mean of expected light has no bias, whatever errors photos share."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,8 @@ def combined_estimates(
     prior: LightPrior | None,
     stated: Tensor | None = None,
     stated_deviation: float = 0.0,
+    *,
+    holding: bool = False,
 ) -> Tensor:
     """Return what is known of a photo's clipped light, from the prior and from what its file states.
 
@@ -82,15 +90,16 @@ def combined_estimates(
         prior: None leaves it out.
         stated: [H, W, 3], light in multiples of white, at least 1 where it is known, as View.light_above_white has it.
         stated_deviation: standard deviation of its natural logarithm.
+        holding: for the loss of a training: estimates of the prior weigh by their light, not by their deviations.
 
     Returns:
         [h, w, 6] float16 at the size of `coarse_size`: for each channel the natural logarithm of the expected light
-        over white, and then 1 / the deviation of the logarithm; 0 where nothing is clipped or known. Two estimates of
-        a value are averaged by their precisions.
+        over white, and then 1 / the deviation of the logarithm (or the root of the weight, if holding); 0 where nothing
+        is clipped or known. Two estimates of a value are averaged by their precisions.
     """
     size = coarse_size(*exposure.shape[:2])
     total = exposure.new_zeros(*size, 3)
-    precision = torch.zeros_like(total)
+    precision, stated_precision = torch.zeros_like(total), torch.zeros_like(total)
     if prior is not None:
         estimate = prior.estimate(exposure, clipped)
         deviation = estimate.deviation * math.log(2)
@@ -102,11 +111,13 @@ def combined_estimates(
         share, light = (
             _averaged(values, size) for values in (has_value, has_value * stated.to(exposure).clamp_min(1).log())
         )
-        weight = (share > 0).to(exposure) / stated_deviation**2
-        total += weight * light / share.clamp_min(1e-6)
-        precision += weight
+        stated_precision = (share > 0).to(exposure) / stated_deviation**2
+        total += stated_precision * light / share.clamp_min(1e-6)
+        precision += stated_precision
     some = _averaged(clipped.to(exposure), size) > 0
     mean = torch.where(some, total / precision.clamp_min(1e-12), 0)
+    if holding and prior is not None:
+        precision = stated_precision + torch.exp(HELD_POWER * mean) / (HELD_DEVIATION * math.log(2)) ** 2
     return torch.cat([mean, torch.where(some, precision.sqrt(), 0)], 2).half()
 
 

@@ -13,7 +13,12 @@ from .config import LossConfig
 
 @torch.no_grad()
 def light_estimates(
-    views: Sequence[View], response: Response | None, config: LossConfig, device: torch.device
+    views: Sequence[View],
+    response: Response | None,
+    config: LossConfig,
+    device: torch.device,
+    *,
+    holding: bool = False,
 ) -> list[Tensor] | None:
     """Return what is known of each view's clipped light, on the CPU, as clipped_light_energy() takes it.
 
@@ -25,6 +30,7 @@ def light_estimates(
         response: the curve by which exposures are compared; None where they are not.
         config: of the loss.
         device: on which the prior runs.
+        holding: as in combined_estimates().
 
     Raises:
         InputError: if the weights of the prior cannot be read.
@@ -44,6 +50,7 @@ def light_estimates(
         exposure = response.decode(torch.from_numpy(view.image).to(device)).float() / response.white
         evidence = view.light_above_white
         evidence = None if evidence is None else torch.from_numpy(evidence).to(device).float()
-        estimates = combined_estimates(exposure, mask.to(device), prior, evidence, view.light_above_white_deviation)
+        deviation = view.light_above_white_deviation
+        estimates = combined_estimates(exposure, mask.to(device), prior, evidence, deviation, holding=holding)
         result.append(estimates.cpu())
     return result

@@ -295,7 +295,7 @@ class TrainingState:
         if self._source is None:
             loss = self.config.loss
             light = self.field.response if compares_exposures(loss, self.field) else None
-            estimates = light_estimates(self._views, light, loss, self.device)
+            estimates = light_estimates(self._views, light, loss, self.device, holding=True)
             options = {"clipping": loss.clipping, "light": light, "estimates": estimates, "truth": loss.uses_hdr}
             source = photo_source(self._views, self.field.base_time, self.device, **options)
             self._source = make_view_source(source, self.config.schedule.photo_cache, self.graphs.enabled)

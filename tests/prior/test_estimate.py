@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.prior import LightPrior, coarse_size, combined_estimates, load_prior
-from sehdr_warp.prior.estimate import WEIGHTS
+from sehdr_warp.prior.estimate import HELD_DEVIATION, WEIGHTS, LightEstimate
 from sehdr_warp.prior.network import LightNetwork
 
 
@@ -61,6 +61,42 @@ def test_what_a_file_states_counts_by_its_precision():
     sure, unsure = (combined_estimates(exposure, clipped, small_prior(), stated, d)[6, 12, 0] for d in (0.01, 100.0))
     assert sure == pytest.approx(math.log(8), abs=1e-2)
     assert unsure == pytest.approx(float(combined_estimates(exposure, clipped, small_prior())[6, 12, 0]), rel=1e-2)
+
+
+class FixedPrior:
+    """A prior that is least sure of what it finds brightest."""
+
+    def __init__(self, expected):
+        self.expected = expected
+
+    def estimate(self, exposure, clipped):
+        deviation = 0.3 + self.expected / 4
+        return LightEstimate(self.expected - deviation**2 * math.log(2) / 2, deviation)
+
+
+def test_photos_that_hold_a_light_agree_on_the_mean_of_their_expected_light():
+    # Each pixel is what another photo expects of one lamp: 16 times white, within a factor of four.
+    stops = 4 + 2 * torch.randn(100, 100, 3, generator=torch.Generator().manual_seed(0)).clamp(-2, 2)
+    clipped = torch.ones(100, 100, 3, dtype=torch.bool)
+    estimates = combined_estimates(clipped.float(), clipped, FixedPrior(stops.clamp_min(0)), holding=True).double()
+    weight = estimates[..., 3:].square()
+    agreed = float((weight * estimates[..., :3]).sum() / weight.sum()) / math.log(2)
+    assert agreed == pytest.approx(math.log2(torch.exp2(stops.clamp_min(0)).mean()), abs=0.25)
+    # Weights by deviations would lose two stops of it.
+    usual = combined_estimates(clipped.float(), clipped, FixedPrior(stops.clamp_min(0))).double()
+    weight = usual[..., 3:].square()
+    assert float((weight * usual[..., :3]).sum() / weight.sum()) / math.log(2) < agreed - 2
+
+
+def test_what_a_file_states_holds_by_its_deviation_beside_the_prior():
+    exposure, clipped = photo()
+    stated = torch.where(clipped, 8.0, 0.0)
+    alone, both = (
+        combined_estimates(exposure, clipped, p, stated, 0.05, holding=True)[6, 12] for p in (None, small_prior())
+    )
+    assert alone[3] == pytest.approx(20, rel=1e-2) and both[0] == pytest.approx(math.log(8), abs=0.02)
+    weight = 20**2 + math.sqrt(8) / (HELD_DEVIATION * math.log(2)) ** 2
+    assert both[3] == pytest.approx(math.sqrt(weight), rel=1e-2)
 
 
 def test_nothing_known_is_precision_zero():
