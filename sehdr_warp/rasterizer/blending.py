@@ -364,7 +364,7 @@ def pad_features(features: Tensor) -> Tensor:
 
 
 def gather_by_gaussian(emit_order: EmitOrder, grad_intersections: Tensor) -> Tensor:
-    """Return [N, columns]: for each Gaussian the sum of its rows of grad_intersections, first tile to last_contributor.
+    """Return [N, columns]: for each Gaussian the sum of its rows of grad_intersections, in the order of tiles.
 
     grad_intersections: rows in the order of intersections before the sort by tile.
     """

@@ -49,7 +49,7 @@ def norms(gradients: Sequence[Tensor]) -> Tensor:
     """[K] float32, finite where all the gradients are: on a CPU their norms, on a GPU one number, 0 or infinity."""
     if gradients[0].device.type == "cuda":
         return _nonfinite_by_kernel(gradients)
-    with torch_threads(gradients[0].device):  # They are sums, but nobody asks how large.
+    with torch_threads(gradients[0].device):  # Threads change the last bits, but only finiteness counts.
         result = torch._foreach_norm(list(gradients))  # pyright: ignore[reportPrivateImportUsage]
     return torch.stack(result)
 
@@ -66,7 +66,7 @@ def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
 
 
 def differentiate(loss: Tensor) -> None:
-    """loss.backward(), for whose gradient torch would make a 1 that everything is multiplied by."""
+    """Call loss.backward() with a shared 1, by which the backward functions that know it do not multiply."""
     _ByOne.apply(loss).backward()
 
 

@@ -272,7 +272,7 @@ def _highlights(shares: np.ndarray, fine: np.ndarray) -> np.ndarray:
 
 
 def _span(shares: np.ndarray, logs: np.ndarray) -> np.ndarray:
-    """Return log likelihoods by the spread of ln exposure, which is similar in most scenes.
+    """Return minus log likelihoods by the spread of ln exposure, which is similar in most scenes.
 
     A wrong curve stretches or compresses it. The standard deviation is log-normal; its weight is the share of values
     between black and white.

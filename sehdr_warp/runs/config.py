@@ -272,7 +272,7 @@ class Config(_Table):
         return max(1, round(iteration * self.schedule.iterations / REFERENCE_ITERATIONS))
 
     def degree_at(self, iteration: int) -> int:
-        """Return the SH degree that the step after `iteration` steps uses: one more every sh_degree_interval."""
+        """Return the SH degree of step `iteration`, counted from 1: one more every sh_degree_interval."""
         return min(self.model.sh_degree, iteration // self.scaled(self.schedule.sh_degree_interval))
 
 

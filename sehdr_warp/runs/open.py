@@ -107,7 +107,7 @@ def load_run_photos(run: Run, data: str | None) -> Scene:
     place = data or run.data.get("path")
     if place is None:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
-    if data is None and not is_embedded(place) and not Path(place).is_dir():
+    if data is None and not is_embedded(place) and not Path(place).exists():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
     return load_photos({**run.data, "path": place}, response=response_for_loading(run.config, run.response))
 

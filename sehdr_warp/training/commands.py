@@ -51,7 +51,7 @@ class TrainingOptions:
     blocks: str | None = None
     """Train in N blocks of space, merged; auto chooses N."""
     plan_only: bool = False
-    """Print what the scene does not need; train nothing."""
+    """Print the plan: steps, Gaussians, what is left out, time; train nothing."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,10 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     if _in_blocks(args):
         if info is not None:
             raise UsageError("--blocks starts its own processes; leave torchrun out")
-        _train_blocks(args)
-    elif info is None and gpus > 1 and not args.training.plan_only:
+        if _train_blocks(args):
+            return
+        argv = _without_blocks(argv)
+    if info is None and gpus > 1 and not args.training.plan_only:
         from .launch import launch
 
         device_of_rank(gpus - 1, args.machine.device)
@@ -244,8 +246,17 @@ def _in_blocks(args: Train) -> bool:
     return output.resume
 
 
-def _train_blocks(args: Train) -> None:
-    """Train or resume a run in blocks, or one training if the number is `auto` and one training does."""
+def _without_blocks(argv: Sequence[str]) -> list[str]:
+    """Return the words of a command line without --blocks and its value."""
+    words = [word for word in argv if not word.startswith("--blocks=")]
+    if "--blocks" in words:
+        at = words.index("--blocks")
+        del words[at : at + 2]
+    return words
+
+
+def _train_blocks(args: Train) -> bool:
+    """Train or resume a run in blocks; return False, having begun nothing, if `auto` finds that one training does."""
     from ..arguments import parse_pairs
     from ..blocks.block_plan import BlockPlan
     from ..blocks.train import is_in_blocks, train_in_blocks
@@ -276,10 +287,9 @@ def _train_blocks(args: Train) -> None:
         overwrite=output.overwrite,
         photos=_photo_storage(config),
     )
-    if run is None:
-        _train(args)
-    else:
+    if run is not None:
         _print_result(args, run)
+    return run is not None
 
 
 def _precompiling(config):

@@ -69,7 +69,9 @@ class PhotoStream:
         first = source[0]
         kinds = {(v.camera.width, v.camera.height, source.truth and v.hdr is not None) for v in views}
         if len(kinds) > 1 or first.camera.directions is not None:
-            raise ValueError("photos of several sizes, or only some with truth, or of panoramas have no common place")
+            raise ValueError(
+                "photos differ in size, only some have HDR truth, or some are panoramas: no stack holds them"
+            )
         self._device = first.target.codes.device
         self._cuda = self._device.type == "cuda"
         masked = any(view.mask is not None for view in views)

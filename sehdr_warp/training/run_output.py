@@ -52,13 +52,14 @@ class RunOutput:
         return self._run
 
     def after_step(self, trainer: TrainingState) -> None:
-        """Evaluate held-out views, write a checkpoint and log, each if it is due."""
+        """Evaluate held-out views, write a checkpoint and log, each if it is due; after the last step finish() does."""
         iteration = trainer.iteration
         evaluate = not self._evaluate_at.isdisjoint(range(iteration - trainer.step_batch + 1, iteration + 1))
+        evaluate &= iteration < trainer.total
         save = trainer.came_to(self._checkpoint_every)
         if evaluate or save:
             trainer.synchronize()
-        if evaluate and trainer.scene.test_views:
+        if evaluate:
             self.evaluate(trainer)
         if save:
             trainer.gather()
@@ -69,7 +70,9 @@ class RunOutput:
             self._log(trainer, "train", figures | {"gaussians": trainer.field.gaussians.count})
 
     def evaluate(self, trainer: TrainingState) -> None:
-        """Score the held-out views and append the scores to metrics.jsonl."""
+        """Score the held-out views, if there are any, and append the scores to metrics.jsonl."""
+        if not trainer.scene.test_views:
+            return
         scores = evaluate_views(trainer.field, trainer.scene.test_views, trainer.degree)
         line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3), "split": "test"}
         line |= {name: round(value, 4) for name, value in scores.items()}
@@ -93,14 +96,19 @@ class RunOutput:
             message = "iteration %d: the loss is %s; no checkpoint is written, the last one stays"
             log.warning(message, trainer.iteration, loss)
             return
+        self._run = None  # A run that was loaded before is older.
         keep = trainer.config.schedule.keep_checkpoints
         self.folder.write_checkpoint(tensors, values | {"seconds": trainer.seconds}, keep=keep)
 
     def finish(self, trainer: TrainingState, *, complete: bool) -> None:
-        """Write the last checkpoint and the summary; if complete, also the confidence and the residual regions."""
+        """Write the last checkpoint and the summary; if complete, also the confidence and the residual regions.
+
+        After the last step, Gaussians that no photo shows are removed before, and the rest is evaluated.
+        """
         evidence = None
         if trainer.iteration >= trainer.total and trainer.iteration > trainer.first_iteration:
             evidence = remove_unseen(trainer)
+            self.evaluate(trainer)
         self.checkpoint(trainer)
         if trainer.ranks is not None:
             trainer.ranks.shutdown()
@@ -110,7 +118,6 @@ class RunOutput:
             self._writer.close()
         if not complete:
             return
-        self._run = None
         run = self.run(trainer.device)
         evidence = evidence or run.measure_confidence(trainer.scene)
         run.model.confidence = evidence.confidence()

@@ -193,8 +193,8 @@ def _check_same_config(config: Config, saved: Config, folder: RunWriter) -> None
         config = override_config(config, fields | {"plan.enabled": False})
     for path, _ in config_fields():
         old, new = attrgetter(path)(saved), attrgetter(path)(config)
-        if path == "schedule.iterations" and new > old:
-            continue  # The training goes on with a longer schedule.
+        if path == "plan.keep" or (path == "schedule.iterations" and new > old):
+            continue  # The values that the plan kept are compared; a longer schedule goes on.
         if old != new:
             problem = f"{path} = {old!r}, but {new!r} was asked for"
             raise InputError(folder.config, problem, "resume with the run's own config, or train anew")

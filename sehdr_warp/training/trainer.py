@@ -144,9 +144,9 @@ class Trainer(TrainingState):
                 self._agree_to_continue()
                 self._finish(complete=False)
                 raise
-            if interrupted := self.interrupted.is_set() and self.iteration < self.total:
+            if self.iteration < self.total and self.output is not None:
                 log.info("stopped at iteration %d; continue with --resume", self.iteration)
-            self._finish(complete=not interrupted)
+            self._finish(complete=self.iteration >= self.total)
 
     @contextmanager
     def _session(self) -> Iterator[None]:

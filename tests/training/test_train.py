@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import load_run
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import codes_of
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.run_output import evaluate_views
@@ -316,8 +317,26 @@ def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path)
     training = create_trainer(scene, tmp_path / "run", device="cpu", resume=True)
     for step in training:
         if step.iteration == 20:
+            before = training.run.iterations
             training.stop()
+    assert before == 12, "a checkpoint every 30 iterations"
     assert load_run(tmp_path / "run").iterations == training.run.iterations == 20
+    assert not RunFolder(tmp_path / "run").confidence.exists(), "that of an earlier checkpoint would not fit"
+
+
+def test_the_last_score_is_that_of_the_saved_gaussians(scene, tmp_path):
+    run = train(scene, tmp_path / "run", quick(), device="cpu")
+    last = [line for line in run.metrics() if line["iteration"] == run.iterations]
+    assert len(last) == 1 and last[0]["gaussians"] == run.gaussian_count
+    scores = evaluate_views(run.model, scene.test_views, run.degree)
+    assert last[0]["psnr_ldr"] == pytest.approx(scores["psnr_ldr"], abs=1e-3)
+
+
+def test_resuming_names_other_fields_that_have_the_same_values(scene, tmp_path):
+    first = load_config("demo", {"schedule.iterations": 3, "plan.keep": ["schedule.iterations"]})
+    train(scene, tmp_path / "run", first, device="cpu")
+    again = load_config("demo", {"schedule.iterations": 5, "plan.keep": ["schedule.iterations", "seed"]})
+    assert train(scene, tmp_path / "run", again, device="cpu", resume=True).iterations == 5
 
 
 @pytest.mark.parametrize("config", ["demo", {"schedule.iterations": 3, "response.name": "srgb"}, 7])

@@ -1,0 +1,23 @@
+"""Photos of a run are found again where the run says that they are: a folder, or the file of a video."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.runs import open as opening
+from sehdr_warp.runs.config import Config
+
+
+@pytest.mark.parametrize("name", ["photos", "clip.mp4"])
+def test_photos_of_a_folder_and_of_a_video_are_loaded_again(monkeypatch, tmp_path, name):
+    place = tmp_path / name
+    run = SimpleNamespace(data={"path": str(place)}, path=tmp_path / "run", config=Config(), response=None)
+    with pytest.raises(InputError, match="no longer there|no longer here"):
+        opening.load_run_photos(run, None)
+    if name == "clip.mp4":
+        place.write_bytes(b"")
+    else:
+        place.mkdir()
+    monkeypatch.setattr(opening, "load_photos", lambda data, **_: data["path"])
+    assert opening.load_run_photos(run, None) == str(place)
