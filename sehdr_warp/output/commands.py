@@ -17,6 +17,7 @@ from .options import WorldOptions, changed_flags
 
 log = logging.getLogger(__name__)
 
+_PICTURE_VIEWS, _FILM_VIEWS = 60, 144  # Of a path without --count
 _MOST_STOPS = 30
 
 
@@ -82,8 +83,8 @@ class Render:
     """test, train, all, orbit, interpolate, or your cameras: OpenUSD, .chan, JSON, or a COLMAP model's folder."""
     camera: str | None = None
     """Only this camera of a file of several, by its name there."""
-    count: int = 60
-    """Views of an orbit or interpolation."""
+    count: int | None = None
+    """Views of an orbit or interpolation; by default 60, or 144 for a film alone, which are six seconds."""
     size: str | None = None
     """Width and height in pixels, such as 1920x1080; by default the cameras' own."""
     overwrite: bool = False
@@ -254,7 +255,7 @@ def run_render(args: Render) -> None:
     if args.out is None and (flags := changed_flags(args.pictures)):
         raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
     check_cameras(args.cameras)
-    if args.count != Render.count and args.cameras not in PATHS:
+    if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
     files, ramp, summary = [], _ramp(args.film.ev_ramp), ""
     if args.video is not None:
@@ -264,7 +265,8 @@ def run_render(args: Render) -> None:
         film_format(args.video)
         check_absent(args.video, args.overwrite)
     run = open_scene(args.run, args.device)
-    path = {"cameras": args.cameras, "camera": args.camera, "count": args.count}
+    usual = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
+    path = {"cameras": args.cameras, "camera": args.camera, "count": usual if args.count is None else args.count}
     if args.out is not None:
         files = render_views(
             run, args.out, **path, size=args.size, overwrite=args.overwrite, **vars(args.world), **vars(args.pictures)
