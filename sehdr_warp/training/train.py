@@ -158,6 +158,7 @@ def _resumed_trainer(
     info, saved = folder.read_info(), folder.read_config()
     extended = None
     if config is not None:
+        config = _with_decisions(config, folder)
         _check_same_config(config, saved, folder)
         if config.schedule.iterations > saved.schedule.iterations:
             extended = override_config(saved, {"schedule.iterations": config.schedule.iterations})
@@ -185,12 +186,20 @@ def _resumed_trainer(
     return trainer
 
 
+def _with_decisions(config: Config, folder: RunWriter) -> Config:
+    """Return a config with the decisions of a run's plan in place of a plan of its own; fields in plan.keep stay.
+
+    On another machine, the same config may be planned differently.
+    """
+    if not config.plan.enabled:
+        return config
+    fields = {path: value for decision in folder.read_decisions() for path, value in decision["fields"].items()}
+    decided = {path: value for path, value in fields.items() if path not in config.plan.keep}
+    return override_config(config, decided | {"plan.enabled": False})
+
+
 def _check_same_config(config: Config, saved: Config, folder: RunWriter) -> None:
-    """Raise InputError if a config, after the plan of the run, differs from that of the run."""
-    if config.plan.enabled:
-        # The decisions of the run: on another machine the same config may be planned differently.
-        fields = {path: value for decision in folder.read_decisions() for path, value in decision["fields"].items()}
-        config = override_config(config, fields | {"plan.enabled": False})
+    """Raise InputError if a config differs from that of the run, but for a longer schedule and for plan.keep."""
     for path, _ in config_fields():
         old, new = attrgetter(path)(saved), attrgetter(path)(config)
         if path == "plan.keep" or (path == "schedule.iterations" and new > old):

@@ -332,6 +332,22 @@ def test_the_last_score_is_that_of_the_saved_gaussians(scene, tmp_path):
     assert last[0]["psnr_ldr"] == pytest.approx(scores["psnr_ldr"], abs=1e-3)
 
 
+def test_resuming_with_the_same_config_keeps_the_planned_length(scene, tmp_path):
+    config = load_config("default", {"model.initial_density": 4.0, "mcmc.cap_density": 4.0})
+    trainer = create_trainer(scene, tmp_path / "run", config, device="cpu")
+    planned = trainer.total
+    assert planned < config.schedule.iterations
+    for _ in trainer:
+        break
+    again = create_trainer(scene, tmp_path / "run", config, device="cpu", resume=True)
+    assert again.total == planned
+    again.output.folder.unlock()
+    named = override_config(config, {"schedule.iterations": planned + 50, "plan.keep": ["schedule.iterations"]})
+    longer = create_trainer(scene, tmp_path / "run", named, device="cpu", resume=True)
+    assert longer.total == planned + 50
+    longer.output.folder.unlock()
+
+
 def test_resuming_names_other_fields_that_have_the_same_values(scene, tmp_path):
     first = load_config("demo", {"schedule.iterations": 3, "plan.keep": ["schedule.iterations"]})
     train(scene, tmp_path / "run", first, device="cpu")
