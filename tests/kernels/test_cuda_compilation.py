@@ -72,8 +72,10 @@ def warp_modules(made: Any) -> list[Any]:
 
 @pytest.mark.skipif(not ARCHITECTURES, reason="this build of Warp has no compiler for CUDA")
 @pytest.mark.parametrize("name", KERNELS)
-def test_kernels_compile_for_cuda(tmp_path, name):
+def test_kernels_compile_for_cuda(tmp_path, name, monkeypatch):
+    monkeypatch.setattr(wp.config, "optimization_level", 0)  # Whether they compile does not depend on it.
     for number, module in enumerate(warp_modules(KERNELS[name]())):
         folder = tmp_path / str(number)
         [path] = wp.compile_aot_module(module, arch=min(ARCHITECTURES), module_dir=folder, use_ptx=True)
         assert ".entry" in path.read_text()
+        module.mark_modified()  # Its hash, which names its compiled code, had this level.

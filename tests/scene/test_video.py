@@ -29,15 +29,14 @@ def still(value=None, height=48, width=64):
     return [frame if value is None else np.full((height, width, 3), value)] * 3
 
 
-@pytest.mark.parametrize("tags, metadata, curve, response", [
-    ((18, 9, 9), {}, "HLG", "colour:ITU-R BT.2100 HLG"),
-    ((16, 9, 9), {}, "PQ", "colour:ST 2084"),
-    ((2, 9, 9), {"com.apple.quicktime.make": "Apple"}, "Apple Log Profile", "colour:Apple Log Profile"),
-    ((2, 9, 9), {"comment": "Apple Log"}, "Apple Log Profile", "colour:Apple Log Profile"),
-    ((1, 1, 1), {"comment": "S-Log3"}, "S-Log3", "colour:S-Log3"),
-    ((1, 1, 1), {}, "Rec.709", None),
+@pytest.mark.parametrize("full, tags, metadata, curve, response", [
+    (False, (18, 9, 9), {}, "HLG", "colour:ITU-R BT.2100 HLG"),
+    (True, (16, 9, 9), {}, "PQ", "colour:ST 2084"),
+    (False, (2, 9, 9), {"com.apple.quicktime.make": "Apple"}, "Apple Log Profile", "colour:Apple Log Profile"),
+    (True, (2, 9, 9), {"comment": "Apple Log"}, "Apple Log Profile", "colour:Apple Log Profile"),
+    (False, (1, 1, 1), {"comment": "S-Log3"}, "S-Log3", "colour:S-Log3"),
+    (True, (1, 1, 1), {}, "Rec.709", None),
 ])  # fmt: skip
-@pytest.mark.parametrize("full", [False, True])
 def test_ten_bits_and_the_curve_that_a_stream_states(tmp_path, tags, metadata, curve, response, full):
     file, frames = tmp_path / "a.mov", still()
     write_clip(file, frames, tags=tags, metadata=metadata, full=full)
