@@ -121,13 +121,13 @@ def _blocks(study: Study, plan: BlockPlan, name: str, at_once: int) -> float:
 
 def _render_copies(study: Study, run: Run) -> None:
     """Render copies of the scene side by side, COPIES Gaussians in all, at 1920 x 1080."""
-    tensors, count = run.model.gaussians.tensors(), run.gaussian_count
+    tensors, count = run.field.gaussians.tensors(), run.gaussian_count
     copies = -(-COPIES // count)
     span = tensors["means"].quantile(0.98, dim=0) if count < 10**7 else tensors["means"].amax(0)
     places = [torch.tensor([k % 4 - 1.5, k // 4 - 1.5, 0.0], device=run.device) * span for k in range(copies)]
     many = {name: torch.cat([tensors[name]] * copies)[:COPIES] for name in PARAMETER_NAMES if name != "means"}
     means = torch.cat([tensors["means"] + place for place in places])[:COPIES]
-    run.model.gaussians, run.model.confidence = Gaussians(means, **many), None
+    run.field.gaussians, run.field.confidence = Gaussians(means, **many), None
     del tensors, many, means
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()

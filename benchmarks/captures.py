@@ -109,11 +109,11 @@ def compare(
 @torch.no_grad()
 def photographed(run: Run, view: View) -> Tensor:
     """Return [H, W, 3] encoded: the scene as the camera shows it, with the exposure and vignetting of that photo."""
-    light = run.model.render(view.camera, degree=run.degree).hdr * view.exposure_time
+    light = run.field.render(view.camera, degree=run.degree).hdr * view.exposure_time
     compensation = run.exposure_compensation
     if compensation is not None:
         light = light * torch.tensor(compensation.light(view), device=light.device, dtype=light.dtype)
-    return run.model.response.encode_extended(light)
+    return run.field.response.encode_extended(light)
 
 
 def figures(image: Tensor, view: View, response: Response, metric, device: str) -> dict[str, float]:

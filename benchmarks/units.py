@@ -62,7 +62,7 @@ def measure(scene: Scene, world: World, iterations: int, device: str) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         moved = in_world(scene, world)
         run = train(moved, Path(folder) / "run", load_config("default", fields), device=device)
-        last, distances = run.metrics()[-1], run.model.gaussians.means.norm(dim=1)
+        last, distances = run.metrics()[-1], run.field.gaussians.means.norm(dim=1)
     row = {"world": world.name, "photos": last["psnr_ldr"], "hdr": last["psnr_mu"], "gaussians": run.gaussian_count}
     row |= {"far": float((distances > FAR).float().mean()), "farthest": float(distances.max())}
     LOG.info("%s", row)

@@ -100,7 +100,7 @@ def export(
         upright = world_transform(run, axes, up=up, scale=scale)
         to_file = file_transform(upright, path) if axes == "upright" else upright
     time = run.base_time if exposure_time is None else float(exposure_time)
-    radiance = file_model or ("linear" if run.model.color_model.name == "linear" else "log")
+    radiance = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
     color_model = "display" if kind == "ldr" else radiance
     whole, parts = [], []
     for scene in (run, *merge):
@@ -139,9 +139,9 @@ def _gaussians_in_colors(run: "LoadedScene", color_model: str, time: float) -> G
     photos = training_cameras(run)
     positions = np.array([camera.position for camera in photos]).reshape(-1, 3)
     if color_model != "display":
-        return gaussians_of(run.model, color_model, positions, color_matrix=run.color_matrix)
-    gaussians = gaussians_of(run.model, "display", positions, time, run.color_matrix)
-    if gaussians.color_model != run.model.color_model.name:
+        return gaussians_of(run.field, color_model, positions, color_matrix=run.color_matrix)
+    gaussians = gaussians_of(run.field, "display", positions, time, run.color_matrix)
+    if gaussians.color_model != run.field.color_model.name:
         return refine(gaussians, _photo_renderer(run, time), photos)
     return gaussians
 

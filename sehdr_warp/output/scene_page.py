@@ -53,7 +53,7 @@ def write_scene_page(
         raise InputError(path, "the scene has no cameras to look from", "export the run, or put cameras.json beside it")
     cameras = training_cameras(run) or [e.camera for e in run.cameras]
     gaussians = gaussians_of(
-        run.model, "linear", np.array([camera.position for camera in cameras]), color_matrix=run.color_matrix
+        run.field, "linear", np.array([camera.position for camera in cameras]), color_matrix=run.color_matrix
     )
     transform = world_transform(run)
     edits = edits or SplatEdits()

@@ -130,11 +130,11 @@ class SplatEdits:
             cameras = training_cameras(run)
             if not cameras:
                 raise SehdrError(f"{run.path}: has no training cameras to count views of; leave min_views out")
-            views = count_views(run.model, cameras).cpu().numpy()
+            views = count_views(run.field, cameras).cpu().numpy()
             steps[f"shown by fewer than {self.min_views} cameras"] = views < self.min_views
         if self.mask_views is not None:
             masked = [view for view in self.mask_views if view.mask is not None]
-            steps["outside of the masks"] = mask_shares(run.model, masked).cpu().numpy() < _LEAST_SHARE
+            steps["outside of the masks"] = mask_shares(run.field, masked).cpu().numpy() < _LEAST_SHARE
         mask = np.ones(len(opacities), bool)
         for reason, goes in steps.items():
             mask &= ~goes
@@ -158,7 +158,7 @@ def most_visible(mask: np.ndarray, count: int, run: "LoadedScene") -> np.ndarray
     cameras = training_cameras(run)
     if not cameras:
         raise SehdrError(f"{run.path}: has no training cameras that tell what contributes; leave max_gaussians out")
-    share = np.where(mask, contributions(run.model, cameras).cpu().numpy(), -1)
+    share = np.where(mask, contributions(run.field, cameras).cpu().numpy(), -1)
     largest = np.zeros(len(mask), bool)
     largest[np.argsort(-share, kind="stable")[:count]] = True
     removed_rows = mask & ~largest

@@ -45,7 +45,7 @@ class LoadedScene:
         scene_name: Name of the scene.
         cameras: Views of the scene.
         iterations: Iterations of the training; None if it is not known.
-        model: The radiance field.
+        field: The radiance field.
         response: Camera response.
         degree: SH degree to render with.
         base_time: Exposure time of the photos, seconds.
@@ -58,7 +58,7 @@ class LoadedScene:
     scene_name: str
     cameras: tuple[CameraEntry, ...]
     iterations: int | None = None
-    model: RadianceField
+    field: RadianceField
     response: Response
     degree: int
     base_time: float
@@ -67,16 +67,21 @@ class LoadedScene:
     exposure_compensation: ExposureCompensation | None = None
 
     @property
+    def model(self) -> RadianceField:
+        """Former name of `field`."""
+        return self.field
+
+    @property
     def device(self) -> torch.device:
         """Device that pictures are rendered on."""
-        return self.model.render_device
+        return self.field.render_device
 
     def normalize_photos(self, scene: Scene) -> Scene:
         """Return a scene with the exposure compensation that the run was trained with."""
         return (
             scene
             if self.exposure_compensation is None
-            else self.exposure_compensation.normalize_photos(scene, self.model.response)
+            else self.exposure_compensation.normalize_photos(scene, self.field.response)
         )
 
     def __repr__(self) -> str:
@@ -87,11 +92,11 @@ class LoadedScene:
     @property
     def gaussian_count(self) -> int:
         """Number of Gaussians."""
-        return self.model.gaussians.count
+        return self.field.gaussians.count
 
     def render(self, camera: Camera) -> RenderedView:
         """Render HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
-        return as_rec709(self.model.render(camera, degree=self.degree), self.color_matrix, self.base_time)
+        return as_rec709(self.field.render(camera, degree=self.degree), self.color_matrix, self.base_time)
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float, **more: Any
@@ -99,7 +104,7 @@ class LoadedScene:
         """Render along unit directions [H, W, 3] from a position [3]; see RadianceField.render_directions."""
         rays = torch.tensor(directions, dtype=torch.float32, device=self.device)
         options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree, **more}
-        surroundings = self.model.render_directions(position, rays, **options)
+        surroundings = self.field.render_directions(position, rays, **options)
         return replace(surroundings, hdr=self.in_rec709(surroundings.hdr))
 
     def in_rec709(self, hdr: Tensor) -> Tensor:
@@ -108,11 +113,11 @@ class LoadedScene:
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:
         """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base exposure."""
-        return self.model.render_ldr(camera, exposure_time, degree=self.degree)
+        return self.field.render_ldr(camera, exposure_time, degree=self.degree)
 
     def render_confidence(self, camera: Camera) -> Tensor | None:
         """Render the confidence [H, W] in [0, 1] of what a camera sees; None if it was not measured."""
-        return self.model.render_confidence(camera)
+        return self.field.render_confidence(camera)
 
     def clipped_share(self) -> Tensor | None:
         """Return the fraction [N] of clipped values that show each Gaussian; None if it was not measured."""
@@ -121,7 +126,7 @@ class LoadedScene:
     def render_clipped(self, camera: Camera) -> Tensor | None:
         """Render the fraction [H, W] of clipped values behind what a camera sees; None if it was not measured."""
         share = self.clipped_share()
-        return None if share is None else self.model.render_mean(camera, share)
+        return None if share is None else self.field.render_mean(camera, share)
 
 
 class Splats(LoadedScene):
@@ -129,7 +134,7 @@ class Splats(LoadedScene):
 
     Attributes:
         path: The file.
-        model: The radiance field.
+        field: The radiance field.
         base_time: Exposure time that the file states, seconds; else 1.
         cameras: Views listed in a `<stem>.cameras.json` beside the file, as export writes it, or in a cameras.json, as
             the reference release of 3D Gaussian Splatting writes it; else none.
@@ -138,13 +143,13 @@ class Splats(LoadedScene):
     def __init__(
         self,
         path: Path,
-        model: RadianceField,
+        field: RadianceField,
         cameras: tuple[CameraEntry, ...],
         world_matrix: np.ndarray | None = None,
     ):
         """Wrap a field; load_splats() reads files."""
-        self.path, self.model, self.cameras, self.world_matrix = path, model, cameras, world_matrix
-        self.response, self.base_time, self.degree = model.response, model.base_time, model.gaussians.degree
+        self.path, self.field, self.cameras, self.world_matrix = path, field, cameras, world_matrix
+        self.response, self.base_time, self.degree = field.response, field.base_time, field.gaussians.degree
         self.scene_name = path.stem
 
 
@@ -180,7 +185,7 @@ class Run(LoadedScene):
         path: The run folder.
         folder: The same as a RunFolder.
         config: Options of the training.
-        model: The radiance field, on `device`.
+        field: The radiance field, on `device`.
         cameras: Views of the scene, in its order.
         response: Camera response.
         base_time: Exposure time of the photos, seconds.
@@ -191,12 +196,12 @@ class Run(LoadedScene):
         data: Arguments of load_scene() for the photos; may be empty.
     """
 
-    def __init__(self, folder: RunFolder, config: Config, model: RadianceField, info: dict, values: dict):
+    def __init__(self, folder: RunFolder, config: Config, field: RadianceField, info: dict, values: dict):
         """Wrap the parts of a run; load_run() reads them."""
         self.folder, self.path = folder, folder.path
-        self.config, self.model = config, model
-        self.response: Response = model.response
-        self.base_time = model.base_time
+        self.config, self.field = config, field
+        self.response: Response = field.response
+        self.base_time = field.base_time
         self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
         self.iterations: int = values["iteration"]
         self.degree = config.degree_at(self.iterations)
@@ -216,7 +221,7 @@ class Run(LoadedScene):
 
     def clipped_share(self) -> Tensor | None:
         """Return the fraction [N] of clipped values that show each Gaussian; None if it was not measured."""
-        if self.model.confidence is None:
+        if self.field.confidence is None:
             return None
         clipped = self.folder.read_clipped()
         return None if clipped is None else clipped.to(self.device)
@@ -234,7 +239,7 @@ class Run(LoadedScene):
             problem = "holds no record of what the photos clipped"
             raise SehdrError(f"{self.path}: {problem}; lights are found in the folder of a run")
         views = [(entry.camera, entry.exposure_time) for entry in self.cameras if entry.split == "train"]
-        lights = find_lights(self.model, clipped, views, degree=self.degree)
+        lights = find_lights(self.field, clipped, views, degree=self.degree)
         if self.color_matrix is None:
             return lights
         colors = [[light.radiance, light.lower_bound] for light in lights]
@@ -259,17 +264,17 @@ class Run(LoadedScene):
         return self.folder.read_decisions()
 
     def measure_confidence(self, scene: Scene) -> Evidence:
-        """Measure the confidence of the Gaussians' light on the training photos of a scene, and set it in the model.
+        """Measure the confidence of the Gaussians' light on the training photos of a scene, and set it in the field.
 
         HDR truth of the photos counts only if the run was trained on it.
         """
         truth = self.config.loss.uses_hdr
         views = self.normalize_photos(scene).train_views
         estimates = None
-        if not (truth or self.model.color_model.encoded):
-            estimates = light_estimates(views, self.model.response, self.config.loss, self.device)
-        evidence = gather_evidence(self.model, views, degree=self.degree, truth=truth, estimates=estimates)
-        self.model.confidence = evidence.confidence()
+        if not (truth or self.field.color_model.encoded):
+            estimates = light_estimates(views, self.field.response, self.config.loss, self.device)
+        evidence = gather_evidence(self.field, views, degree=self.degree, truth=truth, estimates=estimates)
+        self.field.confidence = evidence.confidence()
         return evidence
 
 
@@ -369,7 +374,7 @@ def assemble_field(
 
 def ensure_confidence(run: Run, scene: Scene) -> None:
     """Measure the confidence of a run that has none, and save it if the folder can be written to."""
-    if run.model.confidence is not None or not scene.train_views:
+    if run.field.confidence is not None or not scene.train_views:
         return
     evidence = run.measure_confidence(scene)
     try:

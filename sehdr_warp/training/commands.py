@@ -325,12 +325,12 @@ def _path_of(args: Train) -> str | None:
     return path
 
 
-def _data(args: Train, known: Mapping | None) -> dict:
+def _data(args: Train, saved: Mapping | None) -> dict:
     """Return the arguments of load_scene() of the command line, or else those of the run that is resumed."""
     options: dict = {"path": _path_of(args)} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
-    if known is not None:
-        options = {name: known.get(name) if value is None else value for name, value in options.items()}
-        options |= {"views": known["views"]} if known.get("views") else {}
+    if saved is not None:
+        options = {name: saved.get(name) if value is None else value for name, value in options.items()}
+        options |= {"views": saved["views"]} if saved.get("views") else {}
     if options["path"] is None and args.output.resume:
         raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
     if options["path"] is None:
@@ -342,14 +342,14 @@ def _config(args: Train, saved):
     """Return the config of the preset, or that of the run that is resumed, with the fields of the command line."""
     options = args.training
     shortcuts = {"response.name": args.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}
-    named = {path: value for path, value in shortcuts.items() if value is not None}
+    overrides = {path: value for path, value in shortcuts.items() if value is not None}
     flags = {"response.name": "--response", "schedule.iterations": "--iterations", "seed": "--seed"}
     for path, text in configs.named_fields(args.fields).items():
-        named[path], flags[path] = configs.value_of(path, text), configs.flag_of(path)
+        overrides[path], flags[path] = configs.value_of(path, text), configs.flag_of(path)
     if saved is not None and options.preset is None:
-        return configs.override_config(saved, named, flags=flags)
-    config = configs.load_config(options.preset or "default", named, flags)
-    user_fields = {*config.plan.keep, *(path for path in named if not path.startswith("plan."))}
+        return configs.override_config(saved, overrides, flags=flags)
+    config = configs.load_config(options.preset or "default", overrides, flags)
+    user_fields = {*config.plan.keep, *(path for path in overrides if not path.startswith("plan."))}
     return configs.override_config(config, {"plan.keep": sorted(user_fields)})
 
 

@@ -46,7 +46,7 @@ class RunOutput:
         self._writer: Any = None  # Created at the first log, when the run folder has been begun.
         self._run: Run | None = None
 
-    def run(self, device: torch.device) -> Run:
+    def load_run(self, device: torch.device) -> Run:
         """Return the run as of the newest checkpoint; it is loaded once."""
         self._run = self._run or load_run(self.folder.path, device=device)
         return self._run
@@ -118,9 +118,9 @@ class RunOutput:
             self._writer.close()
         if not complete:
             return
-        run = self.run(trainer.device)
+        run = self.load_run(trainer.device)
         evidence = evidence or run.measure_confidence(trainer.scene)
-        run.model.confidence = evidence.confidence()
+        run.field.confidence = evidence.confidence()
         write_confidence(self.folder, evidence, run.checkpoint_hash)
         self._report_residuals(run, trainer)
 
@@ -141,7 +141,7 @@ class RunOutput:
     def _report_residuals(self, run: Run, trainer: TrainingState) -> None:
         """Compare the training photos with the scene, and list the regions that differ in summary and log."""
         views = trainer.scene.train_views
-        regions, offsets = compare_photos(run.model, views, degree=run.degree)
+        regions, offsets = compare_photos(run.field, views, degree=run.degree)
         unexplained = {"unexplained": regions_to_dict(regions), "brightness_offsets": offsets}
         self.folder.write_summary(run.summary() | unexplained)
         if regions:

@@ -361,7 +361,7 @@ class Trainer(TrainingState):
     def run(self) -> Run:
         """The trained run, from the newest checkpoint."""
         assert self.output is not None, "this trainer saves no run"
-        return self.output.run(self.device)
+        return self.output.load_run(self.device)
 
     @property
     def ending(self) -> bool:

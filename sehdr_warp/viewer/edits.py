@@ -36,12 +36,12 @@ class EditedOpacities:
         Raises:
             SehdrError: If nothing is left; the scene then stays as it was.
         """
-        logits = run.model.gaussians.opacity_logits
+        logits = run.field.gaussians.opacity_logits
         original = logits.detach().clone() if self.original is None else self.original
         if edits is None:
             mask = np.ones(len(original), bool)
         else:
-            means = run.model.gaussians.means.detach().cpu().numpy()
+            means = run.field.gaussians.means.detach().cpu().numpy()
             opacities = torch.sigmoid(original).cpu().numpy()
             mask = edits.mask(opacities, world_transform(run).points(means), run)
         with torch.no_grad():
@@ -72,7 +72,7 @@ class LightGains:
         Raises:
             SehdrError: For a gain that cannot be, or a model whose lights cannot be scaled.
         """
-        model = run.model
+        model = run.field
         if model.color_model.encoded or model.fusion is not None:
             raise SehdrError("gains need radiance without fusion, such as that of the default preset")
         for index, gain in stops.items():

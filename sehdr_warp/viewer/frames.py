@@ -146,7 +146,7 @@ class ViewerScene:
             with torch.no_grad():
                 if part == "clipped":
                     with self.lock.rendering():
-                        frame[5].copy_(run.model.render_mean(camera, shares)).clamp_(0, _HALF_MOST)
+                        frame[5].copy_(run.field.render_mean(camera, shares)).clamp_(0, _HALF_MOST)
                 elif (confidence := self.render_confidence(camera)) is not None:
                     picture[..., 3] = torch.as_tensor(confidence)
         if frame.is_cuda:  # Into pages that the device writes to itself: several times as fast

@@ -98,23 +98,23 @@ def test_the_merged_run_is_as_good_as_one_training(merged, survey, tmp_path):
 
 def test_each_place_has_the_gaussians_of_one_block(merged):
     plan, run = BlockPlan.read(merged), load_run(merged)
-    means = run.model.normalization.scene_points(run.model.gaussians.means.numpy())
+    means = run.field.normalization.scene_points(run.field.gaussians.means.numpy())
     owner, start = plan.division.block_of(means), 0
     for index in range(2):
         block = load_run(folder_of(merged, plan, index))
         assert block.base_time == run.base_time and block.response.to_dict() == run.response.to_dict()
-        own = block.model.normalization.scene_points(block.model.gaussians.means.numpy())
+        own = block.field.normalization.scene_points(block.field.gaussians.means.numpy())
         inside = plan.division.block_of(own) == index
         mine = owner == index
         assert 0 < inside.sum() < len(own), "Gaussians beyond the border are dropped"
         assert abs(int(mine.sum()) - int(inside.sum())) <= 2 and np.allclose(mine.nonzero()[0].min(), start, atol=2)
         sizes, merged_sizes = (
             np.sort((each.gaussians.log_scales.numpy()[rows] + np.log(each.normalization.unit)).ravel())
-            for each, rows in ((block.model, inside), (run.model, mine))
+            for each, rows in ((block.field, inside), (run.field, mine))
         )
         assert np.quantile(sizes, 0.5) == pytest.approx(np.quantile(merged_sizes, 0.5), abs=1e-3)
         start += int(mine.sum())
-    assert run.model.confidence is not None and len(run.model.confidence) == run.gaussian_count
+    assert run.field.confidence is not None and len(run.field.confidence) == run.gaussian_count
     assert torch.equal(run.clipped_share() >= 0, torch.ones(run.gaussian_count, dtype=torch.bool))
 
 

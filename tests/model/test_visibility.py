@@ -11,7 +11,7 @@ from sehdr_warp.scene.normalization import Normalization
 def test_gaussians_of_a_trained_run_are_counted_in_its_own_coordinates(embedded_run):
     """The same Gaussians and cameras in other coordinates: as many cameras show each Gaussian."""
     run = load_run(embedded_run, device="cpu")
-    field, cameras = run.model, [entry.camera for entry in run.cameras if entry.split == "train"][::3]
+    field, cameras = run.field, [entry.camera for entry in run.cameras if entry.split == "train"][::3]
     assert not field.normalization.is_identity
     plain = copy(field)
     plain.normalization = Normalization()

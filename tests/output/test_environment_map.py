@@ -163,7 +163,7 @@ def test_openexrs_converter_and_openimageio_see_the_same(tmp_path, run):
     shape = np.full((60, 3), -1.0, np.float32), random.normal(size=(60, 4)).astype(np.float32)
     colors = random.uniform(0, 3, (60, 1, 3)).astype(np.float32)
     places *= 3 / np.linalg.norm(places, axis=1, keepdims=True)
-    run.model = field_of(GaussianArrays(places, *shape, np.ones(60, np.float32), colors, "linear", 0.5))
+    run.field = field_of(GaussianArrays(places, *shape, np.ones(60, np.float32), colors, "linear", 0.5))
     options = {"at": (0, 0, 0), "axes": "scene", "pixel": "float"}
     write_environment_map(run, tmp_path / "env.exr", size=512, **options)
     write_environment_map(run, tmp_path / "cube.exr", size=128, layout="cube", **options)
@@ -232,7 +232,7 @@ def test_points_and_options_that_cannot_be(tmp_path, run, logged):
 
 def test_a_point_inside_of_something_is_warned_of(tmp_path, run, logged):
     """Lamps as wide as they are far, at a five hundredth of what the cameras went."""
-    run.model = field_of(lamps(1.5))
+    run.field = field_of(lamps(1.5))
     run.cameras = tuple(Entry(str(x), "train", camera(position=(x, 0, 0), target=(x, 0, 9))) for x in (-2e3, 2e3))
     write_environment_map(run, tmp_path / "a.exr", at=(0, 0, 0), size=64)
     assert any("inside of something" in line for line in logged)
@@ -266,7 +266,7 @@ def test_beyond_leaves_out_what_is_nearer(tmp_path, run):
 def test_a_walk_around_something_is_seen_from_its_middle_without_it(tmp_path, run, caplog):
     caplog.set_level("INFO")
     cameras = tuple(Entry(str(i), "train", each) for i, each in enumerate(around()))
-    scene = Splats(tmp_path / "run", run.model, cameras)
+    scene = Splats(tmp_path / "run", run.field, cameras)
     write_environment_map(scene, tmp_path / "env.exr", size=64)
     header = read(tmp_path / "env.exr")[2]
     assert np.abs(json.loads(header["sehdr:position"])).max() < 0.1

@@ -173,7 +173,7 @@ def test_upright_files_have_their_up_where_readers_expect_it(tmp_path):
     for name in ("a.ply", "a.glb", "a.usdc"):
         export(run, tmp_path / name)
         heights[name] = read_gaussians(tmp_path / name).means[:, 1]
-    z = run.model.gaussians.means[:, 2].numpy()
+    z = run.field.gaussians.means[:, 2].numpy()
     np.testing.assert_allclose(heights["a.glb"] - heights["a.glb"].mean(), z - z.mean(), atol=1e-3)
     np.testing.assert_allclose(heights["a.usdc"], heights["a.glb"], atol=1e-4)
     np.testing.assert_allclose(heights["a.ply"], -heights["a.glb"], atol=1e-4)

@@ -30,7 +30,7 @@ def run(trained, tmp_path):
 
 def test_a_training_leaves_its_confidence(trained, scene):
     confidence = load_run(trained.path).model.confidence
-    assert torch.equal(confidence, trained.model.confidence)
+    assert torch.equal(confidence, trained.field.confidence)
     assert confidence.shape == (trained.gaussian_count,) and 0 <= confidence.min() < confidence.max() <= 1
     kept = load_file(trained.folder.confidence)
     assert sorted(kept) == ["clipped", "confidence", "peak", "seen", "stops"]
@@ -39,13 +39,13 @@ def test_a_training_leaves_its_confidence(trained, scene):
 
 
 def test_an_older_run_gets_it_on_demand(run, scene, caplog):
-    expected = run.model.confidence
+    expected = run.field.confidence
     run.folder.confidence.unlink()
     run = load_run(run.path)
-    assert run.model.confidence is None and run.render_confidence(scene.test_views[0].camera) is None
+    assert run.field.confidence is None and run.render_confidence(scene.test_views[0].camera) is None
     caplog.set_level("INFO")
     ensure_confidence(run, scene)
-    torch.testing.assert_close(run.model.confidence, expected)
+    torch.testing.assert_close(run.field.confidence, expected)
     torch.testing.assert_close(load_run(run.path).model.confidence, expected)
     ensure_confidence(run, scene)
     assert caplog.text.count("measuring confidence") == 1
@@ -53,7 +53,7 @@ def test_an_older_run_gets_it_on_demand(run, scene, caplog):
 
 def test_that_of_another_checkpoint_does_not_count(run):
     metadata = {"sehdr_warp": json.dumps(confidence_metadata("0" * 64))}
-    save_file({"confidence": run.model.confidence}, run.folder.confidence, metadata)
+    save_file({"confidence": run.field.confidence}, run.folder.confidence, metadata)
     assert load_run(run.path).model.confidence is None
 
 
@@ -67,7 +67,7 @@ def test_damage_is_one_line(run, confidence, problem):
     if isinstance(confidence, bytes):
         run.folder.confidence.write_bytes(confidence)
     else:
-        values = torch.full_like(run.model.confidence, torch.nan) if confidence is None else confidence
+        values = torch.full_like(run.field.confidence, torch.nan) if confidence is None else confidence
         stored = load_file(run.folder.confidence)
         save_file(stored | {"confidence": values}, run.folder.confidence, metadata)
     with pytest.raises(InputError, match=problem) as error:

@@ -40,7 +40,7 @@ def test_a_state_that_is_not_finite_is_never_saved_and_resume_goes_back(scene, t
             train(scene, tmp_path / "run", config(), device="cpu")
     assert RunFolder(tmp_path / "run").newest_checkpoint().values["iteration"] == 10
     run = train(scene, tmp_path / "run", device="cpu", resume=True)
-    assert torch.equal(run.model.gaussians.means, whole.model.gaussians.means)
+    assert torch.equal(run.field.gaussians.means, whole.field.gaussians.means)
 
 
 def test_while_the_loss_is_not_finite_the_last_checkpoint_stays(scene, tmp_path, monkeypatch, caplog):

@@ -84,9 +84,9 @@ def test_a_training_that_stops_in_between_ends_in_the_same_bits(scene, tmp_path)
     resumed = train(scene, tmp_path / "parts", device="cpu", resume=True)
     last = load_unscaled("default", AVERAGED | {"schedule.ema_window": 0})
     plain = train(scene, tmp_path / "plain", last, device="cpu")
-    for name, values in whole.model.gaussians.tensors().items():
-        assert torch.equal(values, resumed.model.gaussians.tensors()[name]), name
+    for name, values in whole.field.gaussians.tensors().items():
+        assert torch.equal(values, resumed.field.gaussians.tensors()[name]), name
     differs = [
-        not torch.equal(a, b) for a, b in zip(whole.model.gaussians.parameters(), plain.model.gaussians.parameters())
+        not torch.equal(a, b) for a, b in zip(whole.field.gaussians.parameters(), plain.field.gaussians.parameters())
     ]
     assert all(differs)

@@ -37,7 +37,7 @@ def test_resume_is_exact(scene, trained, tmp_path, variant):
     assert [line["iteration"] for line in run.metrics()] == [10, run.iterations], "each evaluation once"
     # Of a finished run nothing changes.
     again = train(blind, tmp_path / "killed", VARIANTS[variant], device="cpu", resume=True)
-    assert torch.equal(run.model.gaussians.means, again.model.gaussians.means) and run.metrics() == again.metrics()
+    assert torch.equal(run.field.gaussians.means, again.field.gaussians.means) and run.metrics() == again.metrics()
 
 
 def test_a_run_begins_with_a_checkpoint_of_its_start(scene, trained, tmp_path):
@@ -48,7 +48,7 @@ def test_a_run_begins_with_a_checkpoint_of_its_start(scene, trained, tmp_path):
         train(scene, tmp_path / "cut", device="cpu", resume=True)
     del begun
     again, whole = train(scene, tmp_path / "cut", device="cpu", resume=True), load_run(trained("adc"))
-    assert torch.equal(whole.model.gaussians.means, again.model.gaussians.means)
+    assert torch.equal(whole.field.gaussians.means, again.field.gaussians.means)
     assert len(again.metrics()) == len(whole.metrics())
 
 
@@ -91,7 +91,7 @@ def test_a_run_is_replaced_whole_or_not_at_all(scene, trained, tmp_path, monkeyp
             run = load_run(copy)
             assert run.config.seed == 5
         ends.append((run.config.seed, run.iterations))
-        assert run.config.seed == 5 or torch.equal(run.model.gaussians.means, old.model.gaussians.means)
+        assert run.config.seed == 5 or torch.equal(run.field.gaussians.means, old.field.gaussians.means)
         assert [(copy / name).read_text() for name in others] == ["mine", "mine"]
         if place % 12 == 5:
             # A new run that is complete but not in place yet is put there by the training that resumes.

@@ -36,7 +36,7 @@ def test_every_variant_learns_and_loads_as_it_was_trained(scene, trained, varian
     assert last["seconds"] > first["seconds"] > 0
     assert run.base_time == EXPOSURE_TIME and run.gaussian_count == run.summary()["gaussians"]
     assert run.summary()["finished"] and run.summary()["skipped_steps"] == 0
-    again = evaluate_views(run.model, scene.test_views, run.config.model.sh_degree)
+    again = evaluate_views(run.field, scene.test_views, run.config.model.sh_degree)
     assert again["psnr_ldr"] == pytest.approx(last["psnr_ldr"], abs=1e-4)
     assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
 
@@ -149,7 +149,7 @@ def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
     for index, seed in enumerate((0, 0, 1)):
         torch.manual_seed(index)
         run = train(scene, tmp_path / str(index), override_config(config, {"seed": seed}), device="cpu")
-        results.append(run.model.gaussians.means)
+        results.append(run.field.gaussians.means)
     assert torch.equal(results[0], results[1])
     assert results[2].shape != results[0].shape or not torch.equal(results[0], results[2])
 
@@ -328,7 +328,7 @@ def test_the_last_score_is_that_of_the_saved_gaussians(scene, tmp_path):
     run = train(scene, tmp_path / "run", quick(), device="cpu")
     last = [line for line in run.metrics() if line["iteration"] == run.iterations]
     assert len(last) == 1 and last[0]["gaussians"] == run.gaussian_count
-    scores = evaluate_views(run.model, scene.test_views, run.degree)
+    scores = evaluate_views(run.field, scene.test_views, run.degree)
     assert last[0]["psnr_ldr"] == pytest.approx(scores["psnr_ldr"], abs=1e-3)
 
 

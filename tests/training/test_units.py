@@ -41,7 +41,7 @@ def test_unit_and_origin_do_not_matter(tmp_path, scale, shift):
         torch.testing.assert_close(two.depth, one.depth * scale, rtol=1e-3, atol=1e-3 * scale)
         np.testing.assert_allclose(run.cameras[0].camera.position, other.views[0].camera.position)
     # What is exported is in the coordinates of the scene.
-    ours, theirs = (gaussians_of(r.model, "linear", np.zeros((0, 3))) for r in (plain, run))
+    ours, theirs = (gaussians_of(r.field, "linear", np.zeros((0, 3))) for r in (plain, run))
     spread = np.abs(scale * ours.means + shift - theirs.means).max()
     assert spread < 1e-4 * scale + 1e-6 * np.abs(shift).max()
     np.testing.assert_allclose(theirs.log_scales, ours.log_scales + np.log(scale), atol=1e-3)
@@ -54,7 +54,7 @@ def test_far_coordinates_are_exported_relative_to_the_scene(tmp_path, caplog):
     assert "too large for the float32" not in caplog.text
     assert np.abs(read_gaussians(tmp_path / "upright.ply").means).max() < 1000
     # Gaussians in the coordinates of the set keep what float32 would lose.
-    gaussians = gaussians_of(run.model, "linear", np.zeros((0, 3)))
+    gaussians = gaussians_of(run.field, "linear", np.zeros((0, 3)))
     camera = scene.test_views[0].camera
     shown = field_of(gaussians).render(camera).hdr
     torch.testing.assert_close(shown, run.render(camera).hdr, rtol=0.1, atol=0.02)

@@ -20,7 +20,7 @@ def serve(tmp_path):
 
     def start(count=1, **options):
         run, scene = make(tmp_path)
-        run.model = SimpleNamespace(render_mean=lambda camera, values: torch.full((camera.height, camera.width), 0.25))
+        run.field = SimpleNamespace(render_mean=lambda camera, values: torch.full((camera.height, camera.width), 0.25))
         runs = [run, AnalyticRun()][:count]
         shown = [ViewerScene(each, f"run {i}", torch.ones(1) if i == 0 else None) for i, each in enumerate(runs)]
         viewer = Viewer(shown, lambda index: {view.name: view for view in scene.views}, **options)

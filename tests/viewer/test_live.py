@@ -86,7 +86,7 @@ def test_a_sensors_colors_are_shown_in_rec709_as_the_run_shows_them(tmp_path, lo
     camera, run = scene.views[1].camera, training.run
     shown = training.render(camera).hdr.detach()
     np.testing.assert_allclose(shown, run.render(camera).hdr, atol=1e-5)
-    assert (shown - run.model.render(camera, degree=run.degree).hdr).abs().max() > 0.1
+    assert (shown - run.field.render(camera, degree=run.degree).hdr).abs().max() > 0.1
     assert status == 200
     np.testing.assert_array_equal(Image.open(io.BytesIO(photo)), quantize(shown_photo(run, scene.views[1])))
 
