@@ -102,7 +102,8 @@ class SplatEdits:
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise SehdrError(f"max_gaussians {self.max_gaussians} leaves nothing; give 1 or more")
         if self.mask_views is not None and all(view.mask is None for view in self.mask_views):
-            raise SehdrError("no photo has a mask; paint masks/PHOTO.png beside the photos, white where the object is")
+            remedy = "paint masks/PHOTO.png beside the photos, white where the object is"
+            raise SehdrError(f"no photo has a mask that leaves out pixels; {remedy}")
 
     @property
     def changes_pictures(self) -> bool:

@@ -128,7 +128,7 @@ def test_what_masks_show_is_kept(tmp_path, run, logged):
     views = [View(str(i), codes, photo, 1.0, "train", mask if i else None) for i in range(2)]
     assert export_means(run, tmp_path / "a.ply", mask_views=views) == [(0, 0, 0)]
     assert any("outside of the masks" in line for line in logged)
-    with pytest.raises(SehdrError, match="no photo has a mask; paint masks/PHOTO.png"):
+    with pytest.raises(SehdrError, match="no photo has a mask that leaves out pixels; paint masks/PHOTO.png"):
         SplatEdits(mask_views=views[:1])
 
 

@@ -1,6 +1,7 @@
 import json
 import os
 import subprocess
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -124,6 +125,20 @@ def test_positions_that_24_bits_do_not_hold_are_refused(tmp_path):
     with pytest.raises(InputError, match="positions below 8388608, and these reach 9e.06"):
         write_gaussians(tmp_path / "a.spz", far)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_bounds_beyond_all_numbers_are_one_line_without_warnings(tmp_path):
+    write_gaussians(tmp_path / "a.sog", natural())
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files["meta.json"])
+    meta["means"] |= {"mins": [1e308] * 3, "maxs": [-1e308] * 3}
+    with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
+        for name, data in (files | {"meta.json": json.dumps(meta).encode()}).items():
+            archive.writestr(name, data)
+    with warnings.catch_warnings(), pytest.raises(InputError, match="all of its Gaussians have values that are not"):
+        warnings.simplefilter("error")
+        read_gaussians(tmp_path / "b.sog")
 
 
 def test_damage_and_other_versions_are_one_line(tmp_path):
