@@ -140,9 +140,9 @@ def _chunks(low: np.ndarray, voxel: float, shape: tuple[int, ...]) -> Iterator[t
 def zero_surface(distance: np.ndarray, has_depth: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [V, 3], from the first voxel, and faces [F, 3] of the zero of a distance field."""
     try:
-        surface = marching_cubes_function()(
-            distance, 0.0, spacing=(voxel,) * 3, mask=has_depth, gradient_direction="descent"
-        )
+        # Renderers compute no normals for triangles without area.
+        options = {"mask": has_depth, "gradient_direction": "descent", "allow_degenerate": False}
+        surface = marching_cubes_function()(distance, 0.0, spacing=(voxel,) * 3, **options)
     except (ValueError, RuntimeError):  # Nothing of the field is measured, or it has no zero.
         raise SehdrError("there is no surface to mesh; take another --crop, or train longer") from None
     vertices, faces = surface[:2]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.depth_fusion import zero_surface
 from sehdr_warp.output.proxy_mesh import find_ground, mesh_depth, proxy_mesh, write_proxy_mesh
 from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.scene import Camera, look_at
@@ -62,6 +63,15 @@ def test_vertices_lie_on_the_surfaces(mesh):
     assert (normals[level, 1] > 0).mean() > 0.99, "faces look outwards"
     on_top = np.linalg.norm(mesh.vertices - (0, RADIUS, 0), axis=1) < 0.3
     np.testing.assert_allclose(np.median(mesh.radiance[on_top], axis=0), RED, rtol=1e-3)
+
+
+def test_no_triangle_is_without_area():
+    """A distance that is exactly 0 at voxels gives marching cubes triangles of one corner."""
+    grid = np.arange(24.0) - 11.5
+    distance = np.rint(np.sqrt(sum(side**2 for side in np.meshgrid(grid, grid, grid))) - 7)
+    vertices, faces = zero_surface(distance, np.ones(distance.shape, bool), 1.0)
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    assert len(faces) > 500 and np.linalg.norm(np.cross(second - first, third - first), axis=1).min() > 1e-6
 
 
 def test_the_floor_is_found_and_a_tilt_of_it(mesh):
