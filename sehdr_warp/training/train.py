@@ -94,9 +94,10 @@ def create_trainer(
             if resumes:
                 trainer = _resumed_trainer(scene, folder, config, device, ranks, tensorboard)
             else:
-                config = config or Config()
-                options = (ranks, tensorboard, data or {}, shared)
-                trainer = _new_trainer(scene, folder, config, device, *options, overwrite=overwrite)
+                config, data = config or Config(), data or {}
+                trainer = _new_trainer(
+                    scene, folder, config, device, ranks, tensorboard, data, shared, overwrite=overwrite
+                )
             if ranks is not None:
                 send_training(ranks, trainer, exposure_compensation(folder.read_info()))
         except BaseException:

@@ -327,8 +327,8 @@ class Trainer(TrainingState):
             return
         count, reallocations = gaussians.count, gaussians.reallocations
         propose = self._propose_gaussians if self.can_seed else None
-        arguments = (self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch)
-        refine = partial(strategy.refine, *arguments)
+        randomness, photos = self.generator, self.step_batch
+        refine = partial(strategy.refine, self.iteration, gaussians, self.optimizer, randomness, propose, photos)
         changed = refine() if ranks is None else ranks.refine_on_leader(refine, strategy, gaussians, self.optimizer)
         if changed and self.reserves_rows:
             self._reserve_rows()
