@@ -114,16 +114,15 @@ def write_environment_map(
     cameras = {entry.name: entry.camera for entry in run.cameras}
     photos = training_cameras(run)
     position = _point(at, cameras, photos)
+    clearance = 0.0
+    if isinstance(at, str) and at == "center":
+        position, clearance = map_center(photos)
     if beyond is None:
-        beyond = 0.0
-        if isinstance(at, str) and at == "center":
-            position, beyond = map_center(photos)
-            if beyond:
-                place = ", ".join(f"{value:.4g}" for value in position)
-                text = (
-                    "the photos walk around (%s): the map is what surrounds that point beyond %.3g; --beyond changes it"
-                )
-                log.info(text, place, beyond)
+        beyond = clearance
+        if beyond:
+            place = ", ".join(f"{value:.4g}" for value in position)
+            text = "the photos walk around (%s): the map is what surrounds that point beyond %.3g; --beyond changes it"
+            log.info(text, place, beyond)
     to_world = transform.rotation.T
     directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in photos])) if photos else 0.0

@@ -274,6 +274,16 @@ def test_a_walk_around_something_is_seen_from_its_middle_without_it(tmp_path, ru
     assert "walk around" in caplog.text and "--beyond" in caplog.text
 
 
+def test_beyond_changes_the_distance_and_not_the_center(tmp_path, run):
+    cameras = [camera(position=(*each.position[[0]], 2, *each.position[[2]]), target=(0, 0, 0)) for each in around()]
+    scene = Splats(tmp_path / "run", run.model, tuple(Entry(str(i), "train", c) for i, c in enumerate(cameras)))
+    for name, beyond in (("plain", None), ("other", 1.5)):
+        write_environment_map(scene, tmp_path / f"{name}.exr", size=64, beyond=beyond)
+    plain, other = (read(tmp_path / f"{name}.exr")[2] for name in ("plain", "other"))
+    assert np.abs(json.loads(plain["sehdr:position"])).max() < 0.1
+    assert other["sehdr:position"] == plain["sehdr:position"] and float(other["sehdr:beyond"]) == 1.5
+
+
 def test_cameras_that_look_outward_or_stand_on_one_side_walk_around_nothing():
     turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     outward = [camera(position=(0, 0, 0.1 * t), target=(np.sin(t), 0, 5 * np.cos(t))) for t in turns]
