@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..scene import Camera, View
+from ..scene.wide_camera import painted_mask
 from ..subsets import every_nth
 from .radiance_field import RadianceField
 
@@ -41,13 +42,15 @@ def contributions(field: RadianceField, cameras: Sequence[Camera]) -> Tensor:
 def mask_shares(field: RadianceField, views: Sequence[View]) -> Tensor:
     """Return [N], the share of each Gaussian's blending weights that the masks of views, in scene coordinates, keep.
 
-    It is 0 if no view shows the Gaussian.
+    It is 0 if no view shows the Gaussian. A view without a mask keeps everything.
     """
     device = field.gaussians.means.device
     sums = torch.zeros((field.gaussians.count, 2), device=device)
     for view in every_nth(views, MOST_VIEWS):
         small = view.camera.within(VIEW_SIZE)
-        mask = torch.as_tensor(view.mask, dtype=torch.float32, device=device)[None, None]
+        painted = painted_mask(view)
+        painted = np.ones((view.camera.height, view.camera.width)) if painted is None else painted
+        mask = torch.as_tensor(painted, dtype=torch.float32, device=device)[None, None]
         mask = torch.nn.functional.interpolate(mask, (small.height, small.width), mode="area")[0, 0]
         images = torch.stack([torch.ones_like(mask), mask], dim=2)
         sums += field.weighted_sums(field.camera_tensors(small), images)

@@ -11,6 +11,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera, View
 
 from ..model.visibility import contributions, count_views, mask_shares
+from ..scene.wide_camera import painted_mask
 from ..splats import GaussianArrays
 from .camera_paths import common_focus, training_cameras
 
@@ -101,7 +102,7 @@ class SplatEdits:
             raise SehdrError(f"min_views {self.min_views} is negative; 2 leaves out what a single camera shows")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise SehdrError(f"max_gaussians {self.max_gaussians} leaves nothing; give 1 or more")
-        if self.mask_views is not None and all(view.mask is None for view in self.mask_views):
+        if self.mask_views is not None and all(painted_mask(view) is None for view in self.mask_views):
             remedy = "paint masks/PHOTO.png beside the photos, white where the object is"
             raise SehdrError(f"no photo has a mask that leaves out pixels; {remedy}")
 
@@ -134,7 +135,7 @@ class SplatEdits:
             views = count_views(run.field, cameras).cpu().numpy()
             steps[f"shown by fewer than {self.min_views} cameras"] = views < self.min_views
         if self.mask_views is not None:
-            masked = [view for view in self.mask_views if view.mask is not None]
+            masked = [view for view in self.mask_views if painted_mask(view) is not None]
             steps["outside of the masks"] = mask_shares(run.field, masked).cpu().numpy() < _LEAST_SHARE
         mask = np.ones(len(opacities), bool)
         for reason, goes in steps.items():

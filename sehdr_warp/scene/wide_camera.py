@@ -99,6 +99,18 @@ def pixels_of_directions(directions: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where(inside[..., None], np.stack([row, column], axis=-1), np.nan)
 
 
+def painted_mask(view: View) -> np.ndarray | None:
+    """Return the mask [H, W] in [0, 1] that a photo came with, without the solid angles of a wide camera's pixels.
+
+    None if the photo has none. What the lens does not show is 1.
+    """
+    if view.mask is None or view.camera.is_pinhole:
+        return view.mask
+    angles = solid_angles(view.camera)
+    mask = np.where(angles > 1e-6, np.clip(view.mask / np.maximum(angles, 1e-6), 0, 1), 1).astype(np.float32)
+    return None if mask.min() > 1 - 1e-3 else mask
+
+
 def perspective_views(views: Sequence[View], size: int | None = None) -> tuple[View, ...]:
     """Return pinhole views for what needs them: pinholes as they are, others cut into faces of FACE_ANGLE degrees.
 
@@ -117,7 +129,7 @@ def faces_of(view: View, size: int | None = None) -> list[View]:
     count = size or max(16, round(2 * camera.fx * np.tan(np.radians(FACE_ANGLE / 2))))
     focal = count / 2 / np.tan(np.radians(FACE_ANGLE / 2))
     image, faces = view.image, []
-    mask = None if view.mask is None else np.clip(view.mask / np.maximum(solid_angles(camera), 1e-6), 0, 1)
+    mask = painted_mask(view)
     for number, turn in enumerate(face_rotations()):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turn, 0

@@ -5,11 +5,13 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.model.visibility import mask_shares
 from sehdr_warp.output.export import export
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.splat_edits import Box, Sphere, SplatEdits, read_region, without_strays
 from sehdr_warp.runs.run import load_splats
-from sehdr_warp.scene import View
+from sehdr_warp.scene import Camera, View
+from sehdr_warp.scene.wide_camera import solid_angles
 from sehdr_warp.splats import GaussianArrays, read_gaussians, write_gaussians
 
 from .helpers import Entry, camera
@@ -130,6 +132,21 @@ def test_what_masks_show_is_kept(tmp_path, run, logged):
     assert any("outside of the masks" in line for line in logged)
     with pytest.raises(SehdrError, match="no photo has a mask that leaves out pixels; paint masks/PHOTO.png"):
         SplatEdits(mask_views=views[:1])
+
+
+def test_the_pixels_of_a_panorama_are_no_mask(tmp_path):
+    """They count by solid angle; what lies overhead or below stays unless a painted mask leaves it out."""
+    places = [(0, 5, 0), (0, -5, 0), (5, 0, 0), (0, 0, -5)]
+    scene = run_of(tmp_path, splats(places, [0.98] * 4, scale=0.5))
+    lens = Camera(128, 64, 20.4, 20.4, 64.0, 32.0, np.eye(4), "equirectangular")
+    angles = solid_angles(lens)
+    photo = View("a", np.zeros((64, 128, 3), np.uint8), lens, 1.0, "train", angles)
+    with pytest.raises(SehdrError, match="no photo has a mask"):
+        SplatEdits(mask_views=[photo])
+    ahead = np.float32(np.arange(128) >= 64)  # Right of the axis
+    painted = replace(photo, mask=angles * np.maximum(ahead, np.float32(np.arange(64) < 16)[:, None]))
+    # Up is -y of the camera, and behind is half left of the axis.
+    np.testing.assert_allclose(mask_shares(scene.field, [painted]), [0.5, 1, 1, 0.5], atol=0.05)
 
 
 def test_edits_that_leave_nothing_say_where_the_scene_is(tmp_path, run):
