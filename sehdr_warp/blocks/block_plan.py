@@ -267,7 +267,7 @@ def _check(config: Config, data: Mapping[str, Any]) -> None:
     if config.response.name == "learned":
         problem = "each block would learn a response of its own, and colors would differ at borders"
         raise InputError(path, f"--blocks with a learned response: {problem}", "use --response auto or a name")
-    if config.fusion.enabled and not config.plan.enabled:
+    if config.fusion.enabled and (not config.plan.enabled or "fusion.enabled" in config.plan.keep):
         problem = "--blocks with fusion.enabled: each block would train a fusion of its own"
         raise InputError(path, problem, "leave the fusion out, or train without --blocks")
     if config.model.init_file:

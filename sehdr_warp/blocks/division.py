@@ -112,7 +112,7 @@ def divide(name: str, cameras: Sequence[Camera], points: np.ndarray, count: int)
     middles = weights @ points
     middles[blind] = np.array([camera.position for camera in cameras]).reshape(-1, 3)[blind]
     axes = _principal_axes(middles)
-    cells = _split(middles @ axes.T, Cell(np.full(3, -np.inf), np.full(3, np.inf)), count)
+    cells = _split(name, middles @ axes.T, Cell(np.full(3, -np.inf), np.full(3, np.inf)), count)
     places = points @ axes.T
     low, high = np.quantile(places, [0.02, 0.98], axis=0)
     margins = np.stack([MARGIN * _extent(cell, low, high) for cell in cells])
@@ -151,22 +151,29 @@ def weights_of(camera: Camera, points: np.ndarray) -> np.ndarray:
 def _principal_axes(places: np.ndarray) -> np.ndarray:
     """Return the principal axes [3, 3] of places [N, 3] as rows, the longest first; a right-handed frame."""
     centered = places - np.median(places, axis=0)
-    axes = np.linalg.svd(centered, full_matrices=True)[2]
+    axes = np.linalg.eigh(centered.T @ centered).eigenvectors.T[::-1].copy()
     axes *= np.where(np.take_along_axis(axes, np.abs(axes).argmax(1)[:, None], 1) < 0, -1, 1)
     axes[2] = np.cross(axes[0], axes[1])
     return axes
 
 
-def _split(places: np.ndarray, cell: Cell, count: int) -> list[Cell]:
-    """Split a cell with places [N, 3] into `count` cells with about equal numbers of places."""
+def _split(name: str, places: np.ndarray, cell: Cell, count: int) -> list[Cell]:
+    """Split a cell with places [N, 3] into `count` cells with about equal numbers of places.
+
+    Raises:
+        InputError: If many places are the same.
+    """
     if count == 1:
         return [cell]
     low, high = np.quantile(places, [0.05, 0.95], axis=0)
     axis, first = int(np.argmax(high - low)), count // 2
     at = float(np.quantile(places[:, axis], first / count))
     below = places[:, axis] < at
-    parts = cell.halves(axis, at)
-    return _split(places[below], parts[0], first) + _split(places[~below], parts[1], count - first)
+    if below.sum() < first or (~below).sum() < count - first:
+        problem = f"{len(places)} training photos cannot be divided into {count} blocks: many show the same place"
+        raise InputError(name, problem, "use fewer blocks, or train without --blocks")
+    near, far = cell.halves(axis, at)
+    return _split(name, places[below], near, first) + _split(name, places[~below], far, count - first)
 
 
 def _extent(cell: Cell, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import logging
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -136,5 +137,6 @@ def _measure(run: Run, plan: BlockPlan, photos: str) -> SeamErrors | None:
     if not names:
         return None
     response = response_for_loading(plan.config, plan.response)
-    scene = run.normalize_photos(load_photos(plan.data | {"views": names}, response=response, photos=photos))
-    return measure_seams(run, scene.views, plan.division)
+    scene = load_photos(plan.data | {"views": names}, response=response, photos=photos)
+    views = tuple(replace(view, exposure_time=plan.exposure_times[view.name]) for view in scene.views)
+    return measure_seams(run, run.normalize_photos(replace(scene, views=views)).views, plan.division)

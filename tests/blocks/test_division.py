@@ -53,6 +53,13 @@ def test_photos_of_one_object_cannot_be_divided():
     assert largest_count("vase", cameras, points, 4) is None
 
 
+def test_photos_that_mostly_show_one_place_are_refused_for_many_blocks(ground):
+    cameras = street(18) + [street(18)[0]] * 30
+    with pytest.raises(InputError, match=r"training photos cannot be divided into \d blocks: many show the same place"):
+        divide("kiosk", cameras, ground, 4)
+    assert largest_count("kiosk", cameras, ground, 4) is None
+
+
 def test_blocks_need_photos(ground):
     with pytest.raises(InputError, match=r"20 training photos are too few for 4 blocks of at least 6; use --blocks 3"):
         divide("street", street(20), ground, 4)

