@@ -228,7 +228,8 @@ def test_a_block_that_cannot_be_trained_does_not_end_the_others(tmp_path, survey
     """One block's photos are gone when it begins; the other is trained, and --resume goes on once they are back."""
     out = tmp_path / "run"
     data = {"path": str(survey), "exposure_index": None, "max_size": None, "holdout": None}
-    config = override_config(Config(), {"response.name": "srgb", "schedule.iterations": 20})
+    little = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_prior": False}
+    config = override_config(Config(), {"response.name": "srgb", "schedule.iterations": 20} | little)
     plan = make_block_plan(data, config, torch.device("cpu"), 2)
     only = min(set(plan.blocks[0].views) - set(plan.blocks[1].views))
     out.mkdir()
