@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..scene import Camera
+from ..scene.wide_camera import pixels_of_directions, steradians
 from ..subsets import every_nth
 from .radiance_field import RadianceField
 
@@ -144,11 +145,8 @@ def _light_at(field: RadianceField, point: np.ndarray, cameras: Sequence[Camera]
 
 def _view_sums(field: RadianceField, camera: Camera, degree: int | None) -> tuple[Tensor, Tensor, Tensor]:
     """Return what a camera receives of each Gaussian: pixels [N], their solid angle [N], and light times it [N, 3]."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    angle = (1 + x[None] ** 2 + y[:, None] ** 2) ** -1.5 / (camera.fx * camera.fy)
     device = field.gaussians.means.device
-    angle = torch.tensor(angle, dtype=torch.float32, device=device)
+    angle = torch.tensor(steradians(camera), dtype=torch.float32, device=device)
     # Sums of small angles stay numbers of about 1.
     unit = float(angle.mean())
     images = torch.stack([torch.ones_like(angle), angle / unit], 2)
@@ -205,9 +203,15 @@ def _fitted(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]) 
 
 
 def _in_frame(camera: Camera, shape: LightShape) -> bool:
+    if camera.projection == "equirectangular":
+        return True
     place = camera.world_to_camera[:3, :3] @ shape.position + camera.world_to_camera[:3, 3]
-    if place[2] <= 0:
+    depth = place[2] if camera.is_pinhole else float(np.linalg.norm(place))
+    if depth <= 0:
         return False
-    u, v = camera.fx * place[0] / place[2] + camera.cx, camera.fy * place[1] / place[2] + camera.cy
-    margin = max(shape.size) / 2 * max(camera.fx, camera.fy) / place[2]
-    return margin <= u <= camera.width - margin and margin <= v <= camera.height - margin
+    if camera.is_pinhole:
+        u, v = camera.fx * place[0] / depth + camera.cx, camera.fy * place[1] / depth + camera.cy
+    else:
+        v, u = pixels_of_directions(place / depth, camera) + 0.5
+    margin = max(shape.size) / 2 * max(camera.fx, camera.fy) / depth
+    return bool(margin <= u <= camera.width - margin and margin <= v <= camera.height - margin)

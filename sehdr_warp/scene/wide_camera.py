@@ -70,13 +70,22 @@ def _radial_terms(projection: str, distortion: tuple) -> tuple[float, ...]:
 
 def solid_angles(camera: Camera) -> np.ndarray:
     """Return [H, W] float32 solid angles of the pixels, 1 for the largest; 0 where the lens shows nothing."""
+    angles = steradians(camera)
+    return (angles / max(float(angles.max()), 1e-12)).astype(np.float32)
+
+
+def steradians(camera: Camera) -> np.ndarray:
+    """Return [H, W] float64 solid angles of the pixels, steradians; 0 where the lens shows nothing."""
     if camera.projection == "equirectangular":
-        rows = np.sin((np.arange(camera.height) + 0.5) / camera.height * np.pi)
-        return np.repeat(rows[:, None] / rows.max(), camera.width, 1).astype(np.float32)
+        edges = np.cos(np.linspace(0, np.pi, camera.height + 1))
+        return np.repeat((edges[:-1] - edges[1:])[:, None] * 2 * np.pi / camera.width, camera.width, 1)
+    if camera.is_pinhole:
+        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+        return (1 + x[None] ** 2 + y[:, None] ** 2) ** -1.5 / (camera.fx * camera.fy)
     directions = pixel_directions(camera)
     across, down = np.gradient(directions, axis=1), np.gradient(directions, axis=0)
-    angles = np.nan_to_num(np.linalg.norm(np.cross(across, down), axis=2))
-    return (angles / max(float(angles.max()), 1e-12)).astype(np.float32)
+    return np.nan_to_num(np.linalg.norm(np.cross(across, down), axis=2))
 
 
 def pixels_of_directions(directions: np.ndarray, camera: Camera) -> np.ndarray:

@@ -55,10 +55,13 @@ def test_a_panel_is_found_with_its_place_size_direction_and_light():
     assert light.deviation is None and light.lower_bound == pytest.approx(np.ones(3), rel=0.01)
 
 
-def test_a_ball_is_a_sphere():
+def ball(at, radius=0.3):
     turns = np.random.default_rng(0).normal(size=(900, 3))
-    ball = 0.3 * turns / np.linalg.norm(turns, axis=1, keepdims=True) + [0.5, 0, 4]
-    scene = field(ball, RADIANCE, 0.03)
+    return radius * turns / np.linalg.norm(turns, axis=1, keepdims=True) + at
+
+
+def test_a_ball_is_a_sphere():
+    scene = field(ball((0.5, 0, 4)), RADIANCE, 0.03)
     (light,) = find_lights(scene, torch.ones(900), views((0.5, 0, 4)))
     assert light.shape.kind == "sphere" and light.shape.position == pytest.approx([0.5, 0, 3.9], abs=0.15)
     seen = light.radiance * light.shape.solid_angle(np.zeros(3))
@@ -81,3 +84,32 @@ def test_deviation_follows_the_confidence():
     scene.confidence = torch.full((scene.gaussians.count,), 0.5)
     (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views())
     assert light.deviation == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("target", [(0, 0, 4.0), (4.0, 0, 0), (0, 0, -4.0), (0.5, -3.5, 0)])
+def test_panoramas_show_lights_in_all_directions(target):
+    scene, clipped = field(ball(target), RADIANCE, 0.03), torch.ones(900)
+    places = [(x, y, 0.0) for x in (-0.5, 0, 0.5) for y in (-0.3, 0.3)]
+    up = (0, -1, 0) if target[2] or target[1] > -1 else (0, 0, 1)
+    poses = [look_at(place, np.add(place, (0, 0, 1)), up=(0, -1, 0)) for place in places]
+    wide = [(Camera(256, 128, 40.7, 40.7, 128.0, 64.0, pose, "equirectangular"), 1.0) for pose in poses]
+    # As fine as the panoramas: pixels blur small lights.
+    plain = [(Camera(64, 64, 40.7, 40.7, 32.0, 32.0, look_at(place, target, up=up)), 1.0) for place in places]
+    (seen,), (reference,) = find_lights(scene, clipped, wide), find_lights(scene, clipped, plain)
+    assert seen.shape.size == pytest.approx(reference.shape.size, rel=0.1)
+    assert seen.radiance == pytest.approx(reference.radiance, rel=0.1)
+    assert seen.share == pytest.approx(reference.share, rel=0.2)
+
+
+def test_a_fisheye_lens_shows_a_light_beside_it():
+    """At 100 degrees from the axis, where no pinhole shows anything."""
+    target = 4 * np.array([np.sin(np.radians(100)), 0, np.cos(np.radians(100))])
+    scene, clipped = field(ball(target), RADIANCE, 0.03), torch.ones(900)
+    poses = [look_at((0, y, 0), (0, y, 1), up=(0, -1, 0)) for y in (-0.3, 0, 0.3)]
+    lens = [(Camera(256, 256, 55.0, 55.0, 128.0, 128.0, pose, "OPENCV_FISHEYE", (0.0,) * 4), 1.0) for pose in poses]
+    (light,) = find_lights(scene, clipped, lens)
+    poses = [look_at(camera.position, target, up=(0, -1, 0)) for camera, _ in lens]
+    plain = [(Camera(128, 96, 120.0, 120.0, 64.0, 48.0, pose), 1.0) for pose in poses]
+    (reference,) = find_lights(scene, clipped, plain)
+    assert light.shape.size == pytest.approx(reference.shape.size, rel=0.1)
+    assert light.radiance == pytest.approx(reference.radiance, rel=0.1)
