@@ -10,6 +10,7 @@ import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.wide_camera import face_cameras, face_size
 
 from ..progress import tracked
 from .images import as_array
@@ -30,17 +31,32 @@ _CHUNK = 1 << 20  # Voxels at once
 
 @dataclass(frozen=True)
 class DepthView:
-    """A camera in the file's coordinates, with its depth [H, W] (0 where it is not known) and radiance [H, W, 3]."""
+    """A pinhole camera in the file's coordinates, its depth [H, W] (0 where it is not known) and radiance [H, W, 3]."""
 
     camera: Camera
     depth: torch.Tensor
     radiance: torch.Tensor
 
 
-def depth_view(run: "LoadedScene", camera: Camera, transform: WorldTransform) -> DepthView:
-    """Render a view; depth at edges and where little covers the pixel is 0."""
-    small = camera.within(_VIEW_SIZE)
-    rendered = run.render(small)
+def depth_views(
+    run: "LoadedScene", camera: Camera, transform: WorldTransform, size: int = _VIEW_SIZE
+) -> list[DepthView]:
+    """Render a camera's depth, at most `size` pixels long: one view of a pinhole, the faces of a wide camera.
+
+    Depth at edges, where little covers the pixel, and where a lens shows nothing is 0.
+    """
+    if camera.is_pinhole:
+        return [_depth_view(run, camera.within(size), transform)]
+    faces = face_cameras(camera, min(face_size(camera), max(size // 2, 16)))
+    views = [_depth_view(run, face.camera, transform) for face in faces]
+    return [
+        replace(view, depth=view.depth * torch.from_numpy(face.visible))
+        for view, face in zip(views, faces, strict=True)
+    ]
+
+
+def _depth_view(run: "LoadedScene", camera: Camera, transform: WorldTransform) -> DepthView:
+    rendered = run.render(camera)
     depth = np.where(as_array(rendered.alpha) > _LEAST_ALPHA, as_array(rendered.depth), 0) * transform.scale
     flat = np.ones(depth.shape, bool)
     for axis in (0, 1):
@@ -49,7 +65,7 @@ def depth_view(run: "LoadedScene", camera: Camera, transform: WorldTransform) ->
         before[axis], after[axis] = (0, 1), (1, 0)
         flat &= ~(np.pad(step, before) | np.pad(step, after))
     depth = torch.from_numpy(np.where(flat, depth, 0).astype(np.float32))
-    return DepthView(transform.camera(small), depth, torch.from_numpy(np.array(as_array(rendered.hdr))))
+    return DepthView(transform.camera(camera), depth, torch.from_numpy(np.array(as_array(rendered.hdr))))
 
 
 def _neighbors(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

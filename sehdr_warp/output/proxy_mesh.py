@@ -21,7 +21,7 @@ from ..splats.usd import pxr
 from .camera_paths import evenly, training_cameras
 from .depth_fusion import (
     MOST_VIEWS,
-    depth_view,
+    depth_views,
     fuse_depth,
     marching_cubes_function,
     mesh_bounds,
@@ -161,9 +161,9 @@ def proxy_mesh(
     cameras = training_cameras(run)
     if not cameras:
         raise SehdrError(f"{run.path}: has no training cameras whose depth could be fused")
-    views = [
-        depth_view(run, camera, transform) for _, camera in tracked("depth of views", evenly(cameras, MOST_VIEWS), log)
-    ]
+    cameras = evenly(cameras, MOST_VIEWS)
+    rendered = [depth_views(run, camera, transform) for _, camera in tracked("depth of views", cameras, log)]
+    views = [view for faces in rendered for view in faces]
     low, high = mesh_bounds(views, region)
     voxel = float((high - low).max()) / resolution
     shape = tuple(int(side) for side in np.maximum(np.ceil((high - low) / voxel), 2) + 1)
@@ -171,7 +171,7 @@ def proxy_mesh(
     if isinstance(region, Sphere):
         outside = ~region.contains(voxel_centers(low, voxel, shape).reshape(-1, 3)).reshape(shape)
         weight[outside] = 0
-    vertices, faces = zero_surface(distance, weight >= min(_FEWEST_VIEWS, len(views)), voxel)
+    vertices, faces = zero_surface(distance, weight >= min(_FEWEST_VIEWS, len(cameras)), voxel)
     colors = nearest_values(radiance, vertices / voxel)
     vertices, faces, colors = _large_parts(vertices + low, faces, colors)
     places = np.array([view.camera.position for view in views])
@@ -251,8 +251,8 @@ def _log_agreement(mesh: ProxyMesh, run: "LoadedScene", transform: WorldTransfor
     cameras = evenly(held_out or [entry.camera for entry in run.cameras], _CHECKED)
     low, high = mesh.vertices.min(0) - mesh.voxel, mesh.vertices.max(0) + mesh.voxel
     differences, total, covered = [], 0, 0
-    for camera in cameras:
-        view = depth_view(run, camera.within(120), transform)
+    views = [view for camera in cameras for view in depth_views(run, camera, transform, 120)]
+    for view in views:
         points, depth = surface_points(view), view.depth.numpy()
         rows, columns = np.nonzero(depth)
         inside = ((points >= low) & (points <= high)).all(axis=1)

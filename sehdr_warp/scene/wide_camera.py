@@ -8,6 +8,7 @@ that are cut from them.
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -135,22 +136,13 @@ def faces_of(view: View, size: int | None = None) -> list[View]:
     from scipy.ndimage import map_coordinates
 
     camera = view.camera
-    count = size or max(16, round(2 * camera.fx * np.tan(np.radians(FACE_ANGLE / 2))))
-    focal = count / 2 / np.tan(np.radians(FACE_ANGLE / 2))
     image, faces = view.image, []
     mask = painted_mask(view)
-    for number, turn in enumerate(face_rotations()):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = turn, 0
-        face = Camera(count, count, focal, focal, count / 2, count / 2, pose @ camera.world_to_camera)
-        # A face's axes are turn times the photo's.
-        places = pixels_of_directions(pixel_directions(face) @ turn, camera)
-        visible = np.isfinite(places).all(axis=2)
-        if visible.mean() < _LEAST_FILLED:
-            continue
+    for face in face_cameras(camera, size):
+        places, visible = face.places, face.visible
         wrap = camera.projection == "equirectangular"
         padded = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="wrap") if wrap else image
-        rows, columns = np.where(visible[..., None], places, 0).transpose(2, 0, 1)  # pyright: ignore[reportIndexIssue]
+        rows, columns = np.where(visible[..., None], places, 0).transpose(2, 0, 1)
         at = np.stack([rows, columns + wrap])
         codes = np.stack([map_coordinates(padded[..., c], at, order=1, mode="nearest") for c in range(3)], axis=2)
         weights = visible.astype(np.float32)
@@ -158,9 +150,49 @@ def faces_of(view: View, size: int | None = None) -> list[View]:
             weights *= map_coordinates(mask, np.stack([rows, columns]), order=0, mode="nearest")
         part = None if weights.min() >= 1 else weights
         codes = codes_of(codes, 8 if view.codes.dtype == np.uint8 else 16)
-        name = f"{view.name}_{number}"
-        faces.append(replace(view, name=name, codes=codes, camera=face, mask=part, hdr=None, light_above_white=None))
+        name = f"{view.name}_{face.number}"
+        faces.append(
+            replace(view, name=name, codes=codes, camera=face.camera, mask=part, hdr=None, light_above_white=None)
+        )
     return faces
+
+
+class Face(NamedTuple):
+    """A pinhole camera that shows a part of a wide one.
+
+    Attributes:
+        number: Of its rotation in face_rotations().
+        camera: The pinhole camera, FACE_ANGLE degrees wide.
+        places: [S, S, 2] rows and columns of the wide picture, the first center (0, 0); NaN outside of it.
+        visible: [S, S] bool, whether the wide picture shows a pixel.
+    """
+
+    number: int
+    camera: Camera
+    places: np.ndarray
+    visible: np.ndarray
+
+
+def face_cameras(camera: Camera, size: int | None = None) -> list[Face]:
+    """Return the faces of a wide camera that it shows enough of; `size` as in perspective_views()."""
+    count = size or face_size(camera)
+    focal = count / 2 / np.tan(np.radians(FACE_ANGLE / 2))
+    faces = []
+    for number, turn in enumerate(face_rotations()):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, 0
+        face = Camera(count, count, focal, focal, count / 2, count / 2, pose @ camera.world_to_camera)
+        # A face's axes are turn times the photo's.
+        places = np.asarray(pixels_of_directions(pixel_directions(face) @ turn, camera))
+        visible = np.isfinite(places).all(axis=2)
+        if visible.mean() >= _LEAST_FILLED:
+            faces.append(Face(number, face, places, visible))
+    return faces
+
+
+def face_size(camera: Camera) -> int:
+    """Return the pixels across a face that has the resolution of a wide camera at its axis."""
+    return max(16, round(2 * camera.fx * np.tan(np.radians(FACE_ANGLE / 2))))
 
 
 def face_rotations() -> np.ndarray:

@@ -1,13 +1,17 @@
 """A proxy mesh against surfaces that are known: a ball on a floor, seen from all around."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.depth_fusion import zero_surface
 from sehdr_warp.output.proxy_mesh import find_ground, mesh_depth, proxy_mesh, write_proxy_mesh
+from sehdr_warp.output.splat_edits import Box
 from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.scene.wide_camera import pixel_directions
 
 from .helpers import AnalyticRun, Entry, Rendered
 
@@ -33,8 +37,8 @@ class BallOnFloor(AnalyticRun):
 
     def render(self, view):
         """Intersect the rays of a camera with ball and floor."""
-        y, x = np.mgrid[: view.height, : view.width] + 0.5
-        local = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], axis=2)
+        local = pixel_directions(view)  # Of wide cameras depth is distance.
+        local = local / local[..., 2:] if view.is_pinhole else local
         rays, origin = local @ view.world_to_camera[:3, :3], view.position
         a, b = (rays**2).sum(2), (rays * origin).sum(2)
         root = b**2 - a * (origin @ origin - RADIUS**2)
@@ -63,6 +67,22 @@ def test_vertices_lie_on_the_surfaces(mesh):
     assert (normals[level, 1] > 0).mean() > 0.99, "faces look outwards"
     on_top = np.linalg.norm(mesh.vertices - (0, RADIUS, 0), axis=1) < 0.3
     np.testing.assert_allclose(np.median(mesh.radiance[on_top], axis=0), RED, rtol=1e-3)
+
+
+@pytest.mark.parametrize("projection", ["equirectangular", "OPENCV_FISHEYE"])
+def test_wide_cameras_show_the_same_surfaces(projection):
+    """A panorama's pixels hold distances, in directions that no plane has."""
+    run, width, distortion = BallOnFloor(), 256, (0.0,) * 4
+    if projection == "equirectangular":
+        width, distortion = 512, ()
+    lens = {"width": width, "height": 256, "fx": 81.5, "fy": 81.5, "cx": width / 2, "cy": 128.0}
+    lens |= {"projection": projection, "distortion": distortion}
+    run.cameras = [Entry(each.name, each.split, replace(each.camera, **lens)) for each in run.cameras[::2]]
+    region = Box(np.array([-1.0, -0.8, -1.0]), np.array([1.0, 0.8, 1.0]))
+    mesh = proxy_mesh(run, WorldTransform.identity(), resolution=48, region=region)
+    ball = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS)
+    error = np.minimum(ball, np.abs(mesh.vertices[:, 1] - FLOOR))
+    assert np.percentile(error, 90) < 0.5 * mesh.voxel and (ball < mesh.voxel).sum() > 500
 
 
 def test_no_triangle_is_without_area():
