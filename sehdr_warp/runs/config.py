@@ -108,8 +108,8 @@ class LossConfig(_Table):
     """weight of the squared difference between the log light of a clipped pixel and the mean around it; applies if
     exposures are compared"""
     clipped_estimate: Weight = 0.01
-    """weight of the squared distance between the log light of clipped pixels and its estimate, in standard deviations;
-    applies if exposures are compared; estimates come from the learned prior and from gain maps"""
+    """weight of the squared distance between the log light of clipped pixels and its estimate; applies if exposures are
+    compared. The unit is the estimate's deviation for gain maps, 1.5 stops for the learned prior"""
     light_prior: bool = True
     """estimate the light of clipped pixels from the rest of each photo by a learned prior; false: gain maps alone"""
     linear_weight: Weight = 0.0
