@@ -33,12 +33,18 @@ def with_estimated_times(scene: Scene, names: Collection[str], response: Respons
         time = float(np.clip(view.exposure_time * factor, SHORTEST, LONGEST))
         views.append(replace(view, exposure_time=time))
         source = f"by {shared} points that other photos show too" if shared else "by its brightness beside the others"
+        source = source if timed else "as a guess, because no photo beside it states one"
         notes.append(f"{view.name} states no exposure time: {shutter(time)} {source}")
     return replace(scene, views=tuple(views), notes=(*scene.notes, *notes))
 
 
 def _factor(view: View, timed: list[View], points: np.ndarray, response: Response) -> tuple[float, int]:
-    """Return the factor on a view's time, and the number of points that it is by; 0 if it is by brightness alone."""
+    """Return the factor on a view's time, and the number of points that it is by; 0 if it is by brightness alone.
+
+    The factor is 1 without a photo to compare with.
+    """
+    if not timed:
+        return 1.0, 0
     timed = every_nth(timed, _MOST_VIEWS)
     points = points[:: max(1, len(points) // _MOST)]
     if len(points):

@@ -1,0 +1,33 @@
+"""Exposure times of photos that state none."""
+
+import numpy as np
+import pytest
+
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import Camera, Scene, View
+from sehdr_warp.scene.exposure_estimate import with_estimated_times
+
+
+def scene_of(levels, times):
+    """Views `0`, `1`, ... of one grey level each, without points."""
+    camera = Camera(16, 12, 15.0, 15.0, 8.0, 6.0, np.eye(4))
+    views = tuple(
+        View(str(i), np.full((12, 16, 3), level, np.uint8), camera, time, "test", None, None, None)
+        for i, (level, time) in enumerate(zip(levels, times, strict=True))
+    )
+    none = np.zeros((0, 3))
+    return Scene("s", "f", views, none, none, True, (), response=response_by_name("srgb"))
+
+
+def test_views_without_a_timed_one_beside_them_keep_their_guess():
+    scene = with_estimated_times(scene_of([128, 60], [0.5, 0.25]), {"0", "1"}, response_by_name("srgb"))
+    assert [view.exposure_time for view in scene.views] == [0.5, 0.25]
+    assert len(scene.notes) == 2 and "0 states no exposure time" in scene.notes[0]
+    assert all("as a guess, because no photo beside it states one" in note for note in scene.notes)
+
+
+def test_a_view_gets_the_time_by_its_brightness_beside_a_timed_one():
+    response = response_by_name("linear")
+    scene = with_estimated_times(scene_of([120, 60], [0.5, 0.5]), {"1"}, response)
+    assert scene.views[1].exposure_time == pytest.approx(0.25, rel=0.02)
+    assert "by its brightness beside the others" in scene.notes[0]
