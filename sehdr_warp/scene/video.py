@@ -248,9 +248,13 @@ def _luma_and_chroma(frame: Any, color: VideoColor) -> tuple[np.ndarray, np.ndar
     # FFmpeg interpolates chroma of other sizes, such as a quarter of the width.
     layout = {(False, True): "yuv422p16le", (True, True): "yuv420p16le"}.get((rows, columns), "yuv444p16le")
     y, u, v = _planes(_reformatted(frame, layout, color))
-    top = np.float32((2**color.bits - 1) << (16 - color.bits))  # The largest code, as it stands in 16 bits
-    low, luma, chroma = (0, top, top) if color.full_range else (16 * 256, 219 * 256, 224 * 256)
-    y, uv = (y - np.float32(low)) / np.float32(luma), (np.stack([u, v], axis=2) - 32768) / np.float32(chroma)
+    top, step = 2**color.bits - 1, np.float32(1 << (16 - color.bits))
+    if color.full_range:
+        # Below the bits of luma, FFmpeg repeats the highest ones (white is 65535) or, by layout, puts zeros.
+        y, chroma = np.floor(y / step) / np.float32(top), top * step
+    else:
+        y, chroma = (y - np.float32(16 * 256)) / np.float32(219 * 256), 224 * 256
+    uv = (np.stack([u, v], axis=2) - 32768) / np.float32(chroma)
     if uv.shape[:2] == y.shape:
         return y, uv
     down, right = _chroma_places(frame, layout)

@@ -13,7 +13,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, load_scene, look_at
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.names import list_images
-from sehdr_warp.scene.video import codes, decode, is_video, open_clip
+from sehdr_warp.scene.video import VideoColor, codes, decode, is_video, open_clip
 from sehdr_warp.scene.video_frames import choose_frames, frames_folder
 
 from .clips import pan, write_clip
@@ -67,6 +67,27 @@ def test_eight_bits_stay_eight(tmp_path):
     found = codes(next(decode(clip))[1], clip.color)
     assert found.dtype == np.uint8
     assert np.abs(found[10, 4:-4] / 255 - still()[0][10, 4:-4]).max() < 0.015
+
+
+@pytest.mark.parametrize("layout, bits, shift", [
+    ("yuvj420p", 8, 0), ("yuvj422p", 8, 0), ("yuvj444p", 8, 0), ("nv12", 8, 0), ("yuv411p", 8, 0), ("gray", 8, 0),
+    ("yuv420p10le", 10, 0), ("yuv444p10le", 10, 0), ("p010le", 10, 6), ("yuv420p12le", 12, 0),
+])  # fmt: skip
+def test_greys_of_full_range_keep_their_codes(layout, bits, shift):
+    """FFmpeg widens the samples of some layouts so that white is 65535, and shifts those of others."""
+    import av
+
+    frame, kind = av.VideoFrame(256, 64, layout), np.dtype("u1" if bits == 8 else "<u2")
+    top = 2**bits - 1
+    values = np.rint(np.linspace(0, top, 256)).astype(int)
+    for number, plane in enumerate(frame.planes):
+        samples = np.full((plane.height, plane.line_size // kind.itemsize), 1 << (bits - 1 + shift), kind)
+        if number == 0:
+            samples[:, :256] = values << shift
+        plane.update(samples.tobytes())
+    found = codes(frame, VideoColor("Rec.709", None, None, (0.2126, 0.0722), True, bits))[32]
+    expected = values if bits == 8 else np.rint(values / top * 65535)
+    assert np.abs(found - expected[:, None]).max() <= (0 if bits == 8 else 1)
 
 
 def test_frames_are_upright(tmp_path):
