@@ -120,9 +120,10 @@ def gather_evidence(
             misfit is the whole uncertainty.
         estimates: Of the views' clipped light, as clipped_light_energy() takes them.
     """
-    device = field.gaussians.means.device
-    total = torch.zeros(field.gaussians.count, 3, device=device)
-    peak = torch.zeros(field.gaussians.count, device=device)
+    # Of a paged field, pictures are on a GPU and Gaussians are not.
+    device, home = field.render_device, field.gaussians.means.device
+    total = torch.zeros(field.gaussians.count, 3, device=home)
+    peak = torch.zeros(field.gaussians.count, device=home)
     every = -(-len(views) // MAX_VIEWS) or 1
     for index, view in tracked("measuring confidence on photos", views, log):
         if index % every:
@@ -141,7 +142,7 @@ def gather_evidence(
             weight = weight + (RESIDUAL_WEIGHT - 1) * high_residual_mask(view, exposure, field.response)
         if view.mask is not None:
             weight = weight * torch.tensor(view.mask, device=device)
-        images = torch.stack([weight, weight * stops, weight * clipped], dim=2)
+        images = torch.stack([weight, weight * stops, weight * clipped], dim=2).to(home)
         sums = field.weighted_sums(field.camera_tensors(view.camera), images)
         total += sums
         peak = torch.maximum(peak, sums[:, 0])

@@ -84,7 +84,7 @@ def find_lights(
 
     Args:
         field: a trained scene.
-        clipped: [N] in [0, 1], which share of the values that show a Gaussian was clipped.
+        clipped: [N] in [0, 1], which share of the values that show a Gaussian was clipped; on any device.
         views: training cameras in the scene's coordinates, with their exposure times in seconds.
         degree: of the harmonics; by default all.
     """
@@ -97,7 +97,7 @@ def find_lights(
     sums = [_view_sums(field, camera, degree) for camera in cameras]
     pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
     mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]
-    member = (clipped > CLIPPED) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
+    member = (clipped.to(mean.device) > CLIPPED) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
     members = member.nonzero()[:, 0]
     if not len(members):
         return []
@@ -105,7 +105,7 @@ def find_lights(
     positions = field.normalization.scene_points(gaussians.means[members].cpu().numpy())
     widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
-    confidence = None if field.confidence is None else field.confidence[members].cpu().numpy()
+    confidence = None if field.confidence is None else field.confidence.to(members.device)[members].cpu().numpy()
     covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
     total = max(_light_at(field, middle, cameras, degree), 1e-30)
     lights = []
@@ -138,7 +138,7 @@ def _light_at(field: RadianceField, point: np.ndarray, cameras: Sequence[Camera]
     longitude = angle * (np.arange(2 * rows) + 0.5)
     up = np.broadcast_to(np.sin(latitude), (rows, 2 * rows))
     directions = np.stack([np.cos(latitude) * np.sin(longitude), up, np.cos(latitude) * np.cos(longitude)], axis=2)
-    rays = torch.tensor(directions, dtype=torch.float32, device=field.gaussians.means.device)
+    rays = torch.tensor(directions, dtype=torch.float32, device=field.render_device)
     visible = field.render_directions(point, rays, focal_length=focal, pixel_angle=angle, degree=degree)
     return float(angle**2 * (visible.hdr.mean(2) * torch.tensor(np.cos(latitude)).to(visible.hdr)).sum())
 

@@ -115,6 +115,12 @@ class PagedField(RadianceField):
             options["shares"] = options["shares"].cpu()[self._rows(levels)].to(self.render_device)
         return self._part(levels).render_directions(position, directions, **options)
 
+    def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
+        """Return radiance on the CPU, as RadianceField.radiance_towards; cells are computed one after the other."""
+        cells = range(len(self._low))
+        parts = [self._part([(cell, 0)]).radiance_towards(position, degree=degree) for cell in cells]
+        return torch.cat([part.to(self.gaussians.means.device) for part in parts])
+
     def _part(self, levels: list[tuple[int, int]]) -> RadianceField:
         """Return the field of some cells, on the device."""
         # An edit of the Gaussians, such as a gain of a light, makes the copies out of date.

@@ -9,12 +9,14 @@ import torch
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.evaluation.metrics import psnr
 from sehdr_warp.model import paged_field
+from sehdr_warp.model.confidence import gather_evidence
 from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.model.lights import find_lights
 from sehdr_warp.model.paged_field import PagedField, boxes_in_view
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import on_device
-from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.scene import Camera, View, look_at
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.splats.packing import compact_order
 
@@ -128,3 +130,22 @@ def test_boxes_in_view():
     high = np.array([[1, 1, 0], [51, 1, 1], [1, 1, 21], [1e3, 1e3, 1e3]], float)
     seen = boxes_in_view(Camera(40, 40, 40.0, 40.0, 20.0, 20.0, look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0))), low, high)
     assert seen.tolist() == [True, False, False, True]
+
+
+def test_lights_and_confidence_are_those_of_the_whole(street, device):
+    """What clipped lies on the device of pictures, and the Gaussians on the CPU."""
+    street.gaussians.harmonics_dc.data += 3
+    paged = PagedField(street, torch.device(device), budget=10**9)
+    places = [camera(x) for x in (3, 12, 21)]
+    views = [(place, 10.0) for place in places]
+    clipped = torch.ones(4000)
+    whole, parts = find_lights(street, clipped, views), find_lights(paged, clipped.to(device), views)
+    assert whole and len(parts) == len(whole)
+    for one, other in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(other.radiance, one.radiance, rtol=1e-3)
+        assert other.share == pytest.approx(one.share, rel=1e-3) and torch.equal(other.members, one.members)
+    codes = np.full((32, 48, 3), 128, np.uint8)
+    photos = [View(str(i), codes, place, 0.1, "train") for i, place in enumerate(places)]
+    one, other = (gather_evidence(model, photos).confidence() for model in (street, paged))
+    assert one.max() > 0 and other.device == CPU
+    torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-4)
