@@ -99,16 +99,16 @@ def mesh_bounds(views: Sequence[DepthView], region: Box | Sphere | None) -> tupl
     return low - margin, high + margin
 
 
-def voxel_centers(low: np.ndarray, voxel: float, shape: Sequence[int]) -> np.ndarray:
-    """Return the centers of all voxels, [X, Y, Z, 3]."""
-    axes = [low[axis] + voxel * np.arange(count) for axis, count in enumerate(shape)]
+def voxel_centers(low: np.ndarray, voxel: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Return the centers of all voxels, [X, Y, Z, 3]; `voxel` are the sides [3] of one."""
+    axes = [low[axis] + voxel[axis] * np.arange(count) for axis, count in enumerate(shape)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
 def fuse_depth(
-    views: Sequence[DepthView], low: np.ndarray, voxel: float, shape: tuple[int, ...]
+    views: Sequence[DepthView], low: np.ndarray, voxel: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fuse the views' depth.
+    """Fuse the views' depth, in voxels with sides [3] whose first center is `low` [3].
 
     Returns:
         Signed distance to the surface in truncation lengths, in [-1, 1] and positive outside; number of views that
@@ -117,7 +117,7 @@ def fuse_depth(
     count = int(np.prod(shape))
     distance, weight = torch.zeros(count), torch.zeros(count)
     light, near = torch.zeros(count, 3), torch.zeros(count)
-    reach = _TRUNCATION * voxel
+    reach = _TRUNCATION * float(voxel.max())
     for _, view in tracked("fusing depth of views", views, log):
         camera = view.camera
         turn = torch.tensor(camera.world_to_camera, dtype=torch.float32)
@@ -143,22 +143,22 @@ def fuse_depth(
     return mean.reshape(shape).numpy(), weight.reshape(shape).numpy(), colors.reshape(*shape, 3).numpy()
 
 
-def _chunks(low: np.ndarray, voxel: float, shape: tuple[int, ...]) -> Iterator[tuple[int, torch.Tensor]]:
+def _chunks(low: np.ndarray, voxel: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[int, torch.Tensor]]:
     """Yield the first index and the centers [N, 3] of slabs of voxels."""
     slab = shape[1] * shape[2]
     step = max(1, _CHUNK // slab)
     for first in range(0, shape[0], step):
         part = (min(step, shape[0] - first), *shape[1:])
-        origin = low + np.array([first * voxel, 0, 0])
+        origin = low + np.array([first * voxel[0], 0, 0])
         yield first * slab, torch.from_numpy(voxel_centers(origin, voxel, part).reshape(-1, 3)).float()
 
 
-def zero_surface(distance: np.ndarray, has_depth: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+def zero_surface(distance: np.ndarray, has_depth: np.ndarray, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [V, 3], from the first voxel, and faces [F, 3] of the zero of a distance field."""
     try:
         # Renderers compute no normals for triangles without area.
         options = {"mask": has_depth, "gradient_direction": "descent", "allow_degenerate": False}
-        surface = marching_cubes_function()(distance, 0.0, spacing=(voxel,) * 3, **options)
+        surface = marching_cubes_function()(distance, 0.0, spacing=tuple(voxel), **options)
     except (ValueError, RuntimeError):  # Nothing of the field is measured, or it has no zero.
         raise SehdrError("there is no surface to mesh; take another --crop, or train longer") from None
     vertices, faces = surface[:2]

@@ -80,7 +80,7 @@ class ProxyMesh:
         vertices: [V, 3] float32.
         faces: [F, 3] int32, counterclockwise as seen from outside.
         radiance: [V, 3] float32, scene-linear Rec.709.
-        voxel: Side of a voxel.
+        voxel: Longest side of a voxel.
         ground: The floor, if one was found.
     """
 
@@ -165,8 +165,10 @@ def proxy_mesh(
     rendered = [depth_views(run, camera, transform) for _, camera in tracked("depth of views", cameras, log)]
     views = [view for faces in rendered for view in faces]
     low, high = mesh_bounds(views, region)
-    voxel = float((high - low).max()) / resolution
-    shape = tuple(int(side) for side in np.maximum(np.ceil((high - low) / voxel), 2) + 1)
+    longest = float((high - low).max()) / resolution
+    # The last voxels end at the box, so along the shorter sides they are a little narrower.
+    counts = np.maximum(np.ceil((high - low) / longest - 1e-9), 2).astype(int)
+    voxel, shape = (high - low) / counts, tuple((counts + 1).tolist())
     distance, weight, radiance = fuse_depth(views, low, voxel, shape)
     if isinstance(region, Sphere):
         outside = ~region.contains(voxel_centers(low, voxel, shape).reshape(-1, 3)).reshape(shape)
@@ -175,8 +177,8 @@ def proxy_mesh(
     colors = nearest_values(radiance, vertices / voxel)
     vertices, faces, colors = _large_parts(vertices + low, faces, colors)
     places = np.array([view.camera.position for view in views])
-    ground = find_ground(vertices, faces, places, voxel)
-    return ProxyMesh(vertices.astype(np.float32), faces.astype(np.int32), colors.astype(np.float32), voxel, ground)
+    ground = find_ground(vertices, faces, places, longest)
+    return ProxyMesh(vertices.astype(np.float32), faces.astype(np.int32), colors.astype(np.float32), longest, ground)
 
 
 def _large_parts(

@@ -85,11 +85,21 @@ def test_wide_cameras_show_the_same_surfaces(projection):
     assert np.percentile(error, 90) < 0.5 * mesh.voxel and (ball < mesh.voxel).sum() > 500
 
 
+def test_a_crop_ends_at_its_box():
+    """No side is a whole number of the longest one's voxels; the floor goes on behind all of them."""
+    low, high = np.array([-0.9, -0.71, -0.83]), np.array([0.9, 0.53, 0.77])
+    mesh = proxy_mesh(BallOnFloor(), WorldTransform.identity(), resolution=24, region=Box(low, high))
+    assert (mesh.vertices >= low - 1e-6).all() and (mesh.vertices <= high + 1e-6).all()
+    np.testing.assert_allclose(mesh.vertices.max(0)[[0, 2]], high[[0, 2]], atol=1e-6)
+    ball = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS)
+    assert np.percentile(np.minimum(ball, np.abs(mesh.vertices[:, 1] - FLOOR)), 90) < 0.5 * mesh.voxel
+
+
 def test_no_triangle_is_without_area():
     """A distance that is exactly 0 at voxels gives marching cubes triangles of one corner."""
     grid = np.arange(24.0) - 11.5
     distance = np.rint(np.sqrt(sum(side**2 for side in np.meshgrid(grid, grid, grid))) - 7)
-    vertices, faces = zero_surface(distance, np.ones(distance.shape, bool), 1.0)
+    vertices, faces = zero_surface(distance, np.ones(distance.shape, bool), np.ones(3))
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     assert len(faces) > 500 and np.linalg.norm(np.cross(second - first, third - first), axis=1).min() > 1e-6
 
