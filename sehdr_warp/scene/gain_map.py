@@ -167,6 +167,7 @@ def _further_pictures(image: Image.Image, path: Path) -> Iterator[Image.Image]:
     """
     if image.format == "MPO":
         for number in range(1, getattr(image, "n_frames", 1)):
+            image.info.pop("xmp", None)  # Pillow keeps that of the picture before for one without.
             image.seek(number)
             yield image
         return

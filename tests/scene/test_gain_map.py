@@ -166,6 +166,16 @@ def test_photos_without_a_gain_map(tmp_path):
         assert not has_gain_map(tmp_path / name) and read_gain_map(tmp_path / name) is None
 
 
+def test_a_second_picture_without_metadata_is_no_gain_map(tmp_path):
+    """As a depth map or preview: the photo's own XMP, which announces a gain map, does not describe it."""
+    _, base, gain = pair()
+    xmp = hdrgm()[1].partition(b"\0")[2].replace(b" hdrgm:Version", b"\nhdrgm:Version")
+    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [], xmp=xmp)
+    with Image.open(tmp_path / "a.jpg") as image:
+        assert image.format == "MPO" and b"hdrgm:" in image.info["xmp"]
+    assert read_gain_map(tmp_path / "a.jpg") is None
+
+
 @pytest.mark.parametrize("segment", [
     (0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0" + iso_metadata(STOPS)[:20]),
     (0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0\0\7" + iso_metadata(STOPS)[2:]),
