@@ -14,6 +14,7 @@ from .names import bases_of, natural_key, sibling, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
 _MOST_NAMED = 3
+_MATERIAL = 0.5  # Range of alpha that is a mask beside color that varies, too
 _REMEDY = "name each like its photo, such as masks/IMG_1.png or masks/IMG_1.jpg.png"
 
 
@@ -69,6 +70,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
 def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
     """Read a mask of grey, of color (its mean) or of transparency (its alpha) values.
 
+    Transparency counts if it varies by more than half, or if the color is the same everywhere.
+
     Masks of two values, one of which is 0, count as COLMAP counts them: every value above 0 keeps the pixel. This
     covers 0 and 1, label colors and palettes. Others are weights relative to white.
 
@@ -83,7 +86,8 @@ def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
         InputError: as read_ldr raises it.
     """
     image = read_ldr(path, oriented=oriented, mask=True)
-    if image.alpha is not None:
+    # A few pixels that are not quite opaque do not make alpha the mask.
+    if image.alpha is not None and (np.ptp(image.alpha) > _MATERIAL or (image.pixels == image.pixels[0, 0]).all()):
         values = image.alpha * np.float32(image.levels)
     else:
         values = image.pixels.mean(axis=2, dtype=np.float32)

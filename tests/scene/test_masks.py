@@ -137,6 +137,16 @@ def test_two_values_are_read_as_colmap_reads_them(tmp_path, mask):
     np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), HALF / 255)
 
 
+def test_color_counts_where_alpha_hardly_varies(tmp_path):
+    mask = np.dstack([HALF, HALF, HALF, np.full_like(HALF, 255)])
+    mask[0, 3, 3] = 254
+    write_mask(tmp_path / "mask.png", mask)
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), HALF / 255)
+    cut_out = np.dstack([pattern(64, 48, 0).astype(np.uint8), HALF])
+    write_mask(tmp_path / "cut_out.png", cut_out)
+    np.testing.assert_array_equal(read_mask(tmp_path / "cut_out.png"), HALF / 255)
+
+
 def test_weights_and_masks_of_one_value(tmp_path):
     for values, expected in (([0, 51, 255], [0, 0.2, 1]), ([51, 255, 255], [0.2, 1, 1]), ([0] * 3, [0] * 3),
                              ([1] * 3, [1] * 3), ([255] * 3, [1] * 3), ([102] * 3, [0.4] * 3)):  # fmt: skip
