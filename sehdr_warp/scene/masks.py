@@ -14,6 +14,8 @@ from .names import bases_of, natural_key, sibling, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
 _MOST_NAMED = 3
+_MOST_LABELS = 31  # Larger values are weights relative to white
+_LOSSY = (".jpg", ".jpeg")  # Their dark pixels may be noise
 _MATERIAL = 0.5  # Range of alpha that is a mask beside color that varies, too
 _REMEDY = "name each like its photo, such as masks/IMG_1.png or masks/IMG_1.jpg.png"
 
@@ -67,17 +69,19 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     return masked, notes
 
 
-def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
+def read_mask(path: Path, *, oriented: bool = False, labeled: set[Path] | None = None) -> np.ndarray:
     """Read a mask of grey, of color (its mean) or of transparency (its alpha) values.
 
     Transparency counts if it varies by more than half, or if the color is the same everywhere.
 
     Masks of two values, one of which is 0, count as COLMAP counts them: every value above 0 keeps the pixel. This
-    covers 0 and 1, label colors and palettes. Others are weights relative to white.
+    covers 0 and 1, label colors and palettes. So do masks of labels, such as 0, 1 and 2, whose values are at most 31
+    and which are stored without loss. Others are weights relative to white.
 
     Args:
         path: the file.
         oriented: turn the pixels as the EXIF orientation says.
+        labeled: set to which a mask of several labels is added.
 
     Returns:
         [H, W] float32 in [0, 1]; 1 keeps the pixel.
@@ -94,20 +98,28 @@ def read_mask(path: Path, *, oriented: bool = False) -> np.ndarray:
     largest, two = float(values.max()), (values == 0) | (values == values.max())
     if largest <= 1 or (float(values.min()) == 0 and two.all()):
         return (values > 0).astype(np.float32)
+    if largest <= _MOST_LABELS and float(values.min()) < largest and path.suffix.lower() not in _LOSSY:
+        if labeled is not None:
+            labeled.add(path)
+        return (values > 0).astype(np.float32)
     white = 255 if largest <= 255 else image.levels  # Also of 8-bit values in a 16-bit file.
     return values / np.float32(white)
 
 
-def mask_note(shares: Sequence[float | None]) -> list[str]:
+def mask_note(shares: Sequence[float | None], labeled: int = 0) -> list[str]:
     """Describe how many photos have a mask and what share of their pixels is left out: one line, or none without masks.
 
-    `shares` has the mean of each photo's mask, None for a photo without one.
+    `shares` has the mean of each photo's mask, None for a photo without one. `labeled` of the masks hold labels, which
+    a second line says.
     """
     masked = [share for share in shares if share is not None]
     if not masked:
         return []
     out = 100 * (1 - sum(masked) / len(masked))
-    return [f"masks: {len(masked)} of {len(shares)} photos have one; they leave out {out:.1f} % of their pixels"]
+    lines = [f"masks: {len(masked)} of {len(shares)} photos have one; they leave out {out:.1f} % of their pixels"]
+    if labeled:
+        lines.append(f"masks: {labeled} hold labels up to {_MOST_LABELS}; every label above 0 keeps its pixels")
+    return lines
 
 
 def _photo_keys(record: ImageRecord, bases: Sequence[Path], shared: Counter) -> list[str]:

@@ -74,7 +74,7 @@ def preprocess(
     damaged = left_out(problems, len(names))
     training = [view for view in views if view.split == "train"] or views
     deque(require_content(((view.codes, view.mask) for view in training), dataset.folder), maxlen=0)
-    masks = mask_note(list(preprocessor.mask_shares.values()))
+    masks = mask_note(list(preprocessor.mask_shares.values()), len(preprocessor.labeled_masks))
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
     times_known = dataset.times_known
@@ -140,6 +140,7 @@ class _Preprocessor:
         self._tables: dict[int, np.ndarray] = {}
         self._last: tuple[Lens, Undistortion] | None = None
         self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
+        self.labeled_masks: set[Path] = set()
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
 
     def view_or_error(self, record: ImageRecord, name: str) -> View | InputError:
@@ -178,7 +179,7 @@ class _Preprocessor:
         if hdr is not None and record.hdr == record.image:
             hdr *= np.float32(record.light_scale)
         time, split = record.seconds, record.split or "train"
-        stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented)
+        stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented, self.labeled_masks)
         self.mask_shares[name] = None if stored is None else float(stored.mean())
         if record.derived and hdr is not None:  # Compute HDR-NeRF's photo from the truth at the final size.
             mask = _weighted(None if stored is None else warped(stored), camera)
@@ -267,8 +268,8 @@ def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarra
     return read_hdr(path)
 
 
-def _fitted_mask(path: Path, lens: Lens, oriented: bool) -> np.ndarray:
-    mask = read_mask(path, oriented=oriented)
+def _fitted_mask(path: Path, lens: Lens, oriented: bool, labeled: set[Path]) -> np.ndarray:
+    mask = read_mask(path, oriented=oriented, labeled=labeled)
     height, width = mask.shape
     if width >= lens.width and height >= lens.height and _same_aspect((width, height), (lens.width, lens.height)):
         return _shrunk(mask, lens)

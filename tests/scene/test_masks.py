@@ -147,6 +147,18 @@ def test_color_counts_where_alpha_hardly_varies(tmp_path):
     np.testing.assert_array_equal(read_mask(tmp_path / "cut_out.png"), HALF / 255)
 
 
+def test_labels_keep_their_pixels_and_are_named(tmp_path):
+    labels = HALF // 255
+    labels[30:] = 2
+    write_colmap(tmp_path)
+    for i in range(2):
+        write_mask(tmp_path / "masks" / f"{i:03d}.png", labels)
+    np.testing.assert_array_equal(read_mask(tmp_path / "masks" / "000.png"), HALF / 255)
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == [0.5] * 2 + [1.0] * 4
+    assert masks_said(scene)[1] == "masks: 2 hold labels up to 31; every label above 0 keeps its pixels"
+
+
 def test_weights_and_masks_of_one_value(tmp_path):
     for values, expected in (([0, 51, 255], [0, 0.2, 1]), ([51, 255, 255], [0.2, 1, 1]), ([0] * 3, [0] * 3),
                              ([1] * 3, [1] * 3), ([255] * 3, [1] * 3), ([102] * 3, [0.4] * 3)):  # fmt: skip
