@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from ..errors import InputError, SehdrError
 from ..sandbox import read_sandboxed
@@ -116,10 +117,11 @@ class Clip:
 
     Attributes:
         path: the file.
-        size: (width, height) of a frame, upright.
+        size: (width, height) of a frame, upright, in square pixels.
         seconds: its length as the file states it; 0 if it does not.
         color: what the stream states.
         interlaced: whether even and odd rows of a frame are of two moments.
+        anamorphic: whether the stored pixels are not square.
     """
 
     path: Path
@@ -127,6 +129,7 @@ class Clip:
     seconds: float
     color: VideoColor
     interlaced: bool = False
+    anamorphic: bool = False
 
 
 def is_video(path: Path) -> bool:
@@ -149,12 +152,15 @@ def open_clip(path: Path) -> Clip:
         stream = _stream(container, path)
         frame = _first_frame(container, stream, path)
         width, height = frame.width, frame.height
+        aspect = float(stream.sample_aspect_ratio or 1)
+        aspect = aspect if 0.25 <= aspect <= 4 else 1.0
+        width, height = round(width * max(aspect, 1)), round(height / min(aspect, 1))  # So that no pixel is lost
         check_size(path, width, height)
         if min(width, height) < _SMALLEST:
             raise InputError(path, f"its frames have {width} x {height} pixels", f"give {_SMALLEST} and more a side")
         size = (height, width) if _rotation(frame) % 180 else (width, height)
         seconds = float(container.duration or 0) / 1e6
-        return Clip(path, size, seconds, _color(container, stream, frame), bool(frame.interlaced_frame))
+        return Clip(path, size, seconds, _color(container, stream, frame), bool(frame.interlaced_frame), aspect != 1)
 
 
 def first_frame_size(path: Path) -> dict[str, np.ndarray]:
@@ -238,6 +244,15 @@ def codes(frame: Any, color: VideoColor) -> np.ndarray:
     levels, kind = (255, np.uint8) if color.bits == 8 else (65535, np.uint16)
     upright = np.rot90(rgb, _rotation(frame) // 90)
     return np.ascontiguousarray(np.rint(np.clip(upright, 0, 1) * levels).astype(kind))
+
+
+def in_square_pixels(pixels: np.ndarray, clip: Clip) -> np.ndarray:
+    """Return the codes of a frame [H, W, 3] at the clip's size: anamorphic pixels are interpolated, others stay."""
+    if not clip.anamorphic:
+        return pixels
+    planes = [Image.fromarray(pixels[..., i].astype(np.float32)) for i in range(3)]
+    resized = [np.asarray(plane.resize(clip.size, Image.Resampling.BILINEAR)) for plane in planes]
+    return np.rint(np.stack(resized, axis=2)).astype(pixels.dtype)
 
 
 def _luma_and_chroma(frame: Any, color: VideoColor) -> tuple[np.ndarray, np.ndarray]:

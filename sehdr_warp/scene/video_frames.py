@@ -23,11 +23,11 @@ from .images import png16
 from .names import list_images
 from .read_folders import find_photos
 from .sfm import file_digest
-from .video import Clip, codes, decode, grey, open_clip
+from .video import Clip, codes, decode, grey, in_square_pixels, open_clip
 
 _log = logging.getLogger("sehdr_warp.scene")
 
-_VERSION = 2
+_VERSION = 3
 _STEP = 0.08
 """Movement between two frames in parts of the width: neighbors overlap by more than nine tenths."""
 _FEWEST, _MOST = 24, 240  # Frames of a clip
@@ -182,7 +182,7 @@ def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
     numbers = frozenset(choice.numbers)
     with stage("keeping frames", len(numbers), _log) as progress:
         for count, (number, frame) in enumerate(decode(clip, numbers), start=1):
-            pixels, file = codes(frame, clip.color), folder / f"frame_{number:06d}.png"
+            pixels, file = in_square_pixels(codes(frame, clip.color), clip), folder / f"frame_{number:06d}.png"
             if pixels.dtype == np.uint8:
                 Image.fromarray(pixels).save(file, compress_level=1)
             else:
@@ -208,11 +208,12 @@ def read_video(path: Path, cache: Path | str | None = None) -> DataparserOutputs
     note = (
         f"video: the sharpest {count} of {facts['total']} frames are used; its curve is {color.curve}: {response_note}"
     )
+    squared = (f"its pixels are not square: frames are resampled to {clip.size[0]} x {clip.size[1]} square pixels",)
     interlaced = ("its frames are interlaced, rows of two moments each: deinterlace the clip for sharp edges",)
     return replace(
         dataset,
         format="video",
-        notes=(note, *interlaced * clip.interlaced, *dataset.notes),
+        notes=(note, *squared * clip.anamorphic, *interlaced * clip.interlaced, *dataset.notes),
         folder=folder,
         stated_response=color.response,
         color_matrix=color.to_rec709(),

@@ -21,7 +21,7 @@ def pan(count=40, height=96, width=128, step=4, blur=()):
 
 
 def write_clip(path: Path, frames, *, tags=(1, 1, 1), codec="libx265", pixels="yuv444p10le", metadata=None, rotation=0,
-               times=None, full=False, lossless=False) -> None:  # fmt: skip
+               times=None, full=False, lossless=False, aspect=1) -> None:  # fmt: skip
     """tags: transfer, primaries, matrix (ITU-T H.273). frames: [H, W, 3] codes in [0, 1]. times: in thirtieths."""
     av = pytest.importorskip("av")
     transfer, primaries, matrix = tags
@@ -41,6 +41,7 @@ def write_clip(path: Path, frames, *, tags=(1, 1, 1), codec="libx265", pixels="y
                 context = stream.codec_context
                 context.color_trc, context.color_primaries, context.colorspace = transfer, primaries, matrix
                 context.color_range = 2 if full else 1
+                context.sample_aspect_ratio = aspect
                 if rotation:
                     stream.set_display_rotation(rotation)
             y = kr * rgb[..., 0] + (1 - kr - kb) * rgb[..., 1] + kb * rgb[..., 2]

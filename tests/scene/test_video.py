@@ -3,6 +3,7 @@
 import logging
 import resource
 import struct
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from sehdr_warp.scene import Camera, load_scene, look_at
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.names import list_images
 from sehdr_warp.scene.video import VideoColor, codes, decode, is_video, open_clip
-from sehdr_warp.scene.video_frames import choose_frames, frames_folder
+from sehdr_warp.scene.video_frames import choose_frames, frames_folder, read_video
 
 from .clips import pan, write_clip
 from .panorama_room import light, walls
@@ -114,6 +115,18 @@ def test_a_resting_camera_gives_no_frames(tmp_path):
     write_clip(tmp_path / "a.mp4", frames[:15] + [frames[15]] * 60 + frames[15:], codec="libx264", pixels="yuv420p")
     choice = choose_frames(open_clip(tmp_path / "a.mp4"))
     assert sum(17 <= number <= 73 for number in choice.numbers) <= 2
+
+
+@pytest.mark.parametrize("aspect, rotation, size", [("4/3", 0, (171, 96)), ("1/2", 0, (128, 192)),
+                                                    ("4/3", 90, (96, 171))])  # fmt: skip
+def test_anamorphic_pixels_become_square(tmp_path, aspect, rotation, size):
+    write_clip(
+        tmp_path / "a.mp4", pan(30), codec="libx264", pixels="yuv420p", aspect=Fraction(aspect), rotation=rotation
+    )
+    assert open_clip(tmp_path / "a.mp4").size == size
+    dataset = read_video(tmp_path / "a.mp4", tmp_path / "cache")
+    assert f"its pixels are not square: frames are resampled to {size[0]} x {size[1]} square" in " ".join(dataset.notes)
+    assert read_ldr(dataset.records[0].image).pixels.shape == (size[1], size[0], 3)
 
 
 def test_frames_are_kept_in_the_cache(tmp_path, caplog):
