@@ -50,21 +50,21 @@ def exposures_backward_kernel(dtype):
 def opacities_kernel(dtype):
     """Return the kernel of sigmoids and of the shares of `weight` times their mean, launched over T threads.
 
-    opacities: [N] sigmoids of the logits. shares: [T], each thread's part of the weighted mean. live: [1] number of
-    Gaussians that the mean counts, of which those behind have an opacity of 0; None for all.
+    opacities: [N] sigmoids of the logits. shares: [T], each thread's part of the weighted mean. active_count: [1]
+    number of Gaussians that the mean counts, of which those behind have an opacity of 0; None for all.
     """
     real = dtype
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def activate_opacities(
         first: int,
-        logits: wp.array(dtype=real), weight: real, live: wp.array(dtype=wp.int32),
+        logits: wp.array(dtype=real), weight: real, active_count: wp.array(dtype=wp.int32),
         opacities: wp.array(dtype=real), shares: wp.array(dtype=real),
     ):
         thread = first + wp.tid()
         part = weight / real(logits.shape[0])
-        if live:
-            part = weight / real(live[0])
+        if active_count:
+            part = weight / real(active_count[0])
         total = real(0.0)
         for i in range(thread, logits.shape[0], shares.shape[0]):
             opacity = real(1.0) / (real(1.0) + wp.exp(-logits[i]))
@@ -79,15 +79,15 @@ def opacities_kernel(dtype):
 def opacities_backward_kernel(dtype):
     """Return the backward pass of opacities_kernel(), launched over N threads.
 
-    logit_gradients: [N] from opacity_gradients [N] and mean_gradient [1], either of which may be None. live: as of
-    opacities_kernel().
+    logit_gradients: [N] from opacity_gradients [N] and mean_gradient [1], either of which may be None. active_count: as
+    of opacities_kernel().
     """
     real = dtype
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def activate_opacities_backward(
         first: int,
-        opacities: wp.array(dtype=real), weight: real, live: wp.array(dtype=wp.int32),
+        opacities: wp.array(dtype=real), weight: real, active_count: wp.array(dtype=wp.int32),
         opacity_gradients: wp.array(dtype=real), mean_gradient: wp.array(dtype=real),
         logit_gradients: wp.array(dtype=real),
     ):
@@ -97,8 +97,8 @@ def opacities_backward_kernel(dtype):
             gradient = opacity_gradients[i]
         if mean_gradient:
             part = weight / real(opacities.shape[0])
-            if live:
-                part = weight / real(live[0])
+            if active_count:
+                part = weight / real(active_count[0])
             gradient += part * mean_gradient[0]
         opacity = opacities[i]
         logit_gradients[i] = gradient * opacity * (real(1.0) - opacity)

@@ -13,11 +13,11 @@ from .constants import LOG_SCALE_MAX
 from .geometry import geometry, vector
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
-AT_ONCE = 4  # Parameters of one launch of Adam
-CHECKED_AT_ONCE = 12  # Tensors of one launch that looks for what is not finite
-NUMBERS = 4  # That one thread of the harmonics' Adam takes
-TURN = 1024  # Coefficients side by side that step together, where they step in turn
-NOTHING = 16.0  # The exponent from which on a Gaussian's noise is a ten-millionth, and is not drawn
+PARAMETERS_PER_LAUNCH = 4  # Parameters of one launch of Adam
+TENSORS_PER_CHECK = 12  # Tensors of one launch that looks for what is not finite
+VALUES_PER_THREAD = 4  # That one thread of the harmonics' Adam takes
+SH_BLOCK = 1024  # Coefficients side by side that are updated in one turn, where they take turns
+NOISE_CUTOFF = 16.0  # Exponent from which on a Gaussian's noise is below a ten-millionth, and is left out
 
 _g = geometry(wp.float32)
 _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
@@ -26,13 +26,14 @@ _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def check_finite(
     loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), incomplete: wp.array(dtype=wp.bool),
-    tally: wp.array(dtype=wp.int64), pairs: wp.array(dtype=wp.int64), step_flags: wp.array(dtype=wp.float32),
+    step_counters: wp.array(dtype=wp.int64), intersections: wp.array(dtype=wp.int64),
+    step_flags: wp.array(dtype=wp.float32),
 ):
     """Decide whether a step is skipped because its loss or a gradient is not finite; one thread.
 
     step_flags: [2], 1 or 0: skipped, not skipped. norms: [K] of the gradients. incomplete: [1], or [0] if no step can
-    be. tally: [3] or [0], counts steps that are not finite and, with pairs ([1] or [0]), holds the most intersections
-    and counts the incomplete steps.
+    be. step_counters: [3] or [0], counts steps that are not finite and, with intersections ([1] or [0]), holds the most
+    intersections and counts the incomplete steps.
     """
     finite = wp.isfinite(loss[0])
     for i in range(norms.shape[0]):
@@ -40,13 +41,13 @@ def check_finite(
     whole = bool(True)
     if incomplete.shape[0] > 0:
         whole = not incomplete[0]
-    if tally.shape[0] > 0:
+    if step_counters.shape[0] > 0:
         if not finite:
-            tally[0] = tally[0] + wp.int64(1)
-        if pairs.shape[0] > 0:
-            tally[1] = wp.max(tally[1], pairs[0])
+            step_counters[0] = step_counters[0] + wp.int64(1)
+        if intersections.shape[0] > 0:
+            step_counters[1] = wp.max(step_counters[1], intersections[0])
             if not whole:
-                tally[2] = tally[2] + wp.int64(1)
+                step_counters[2] = step_counters[2] + wp.int64(1)
     step_flags[0] = wp.where(finite and whole, 0.0, 1.0)
     step_flags[1] = 1.0 - step_flags[0]
 
@@ -81,48 +82,48 @@ _floats = wp.array(dtype=wp.float32)
 
 
 @wp.func
-def live_numbers(parameters: _floats, live: wp.array(dtype=wp.int32), width: int) -> int:
-    """Return how many numbers to update: those of the first live[0] rows of `width`, or all without live."""
+def active_values(parameters: _floats, active_count: wp.array(dtype=wp.int32), width: int) -> int:
+    """Return how many numbers to update: those of the first active_count[0] rows of `width`, or all if it is empty."""
     count = parameters.shape[0]
-    if live.shape[0] > 0 and width > 0:
-        count = wp.min(count, live[0] * width)
+    if active_count.shape[0] > 0 and width > 0:
+        count = wp.min(count, active_count[0] * width)
     return count
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def update_by_adam(
     first: int,
-    skipped: _floats, live: wp.array(dtype=wp.int32), width_a: int, width_b: int, width_c: int, width_d: int,
+    skipped: _floats, active_count: wp.array(dtype=wp.int32), width_a: int, width_b: int, width_c: int, width_d: int,
     first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
     gradients_a: _floats, step_a: _floats, rate_a: _floats, parameters_a: _floats, means_a: _floats, squares_a: _floats,
     gradients_b: _floats, step_b: _floats, rate_b: _floats, parameters_b: _floats, means_b: _floats, squares_b: _floats,
     gradients_c: _floats, step_c: _floats, rate_c: _floats, parameters_c: _floats, means_c: _floats, squares_c: _floats,
     gradients_d: _floats, step_d: _floats, rate_d: _floats, parameters_d: _floats, means_d: _floats, squares_d: _floats,
 ):
-    """Update every number of AT_ONCE parameters by Adam, in place; none if skipped[0] is not 0.
+    """Update every number of PARAMETERS_PER_LAUNCH parameters by Adam, in place; none if skipped[0] is not 0.
 
     Launched over the longest parameter. step: [1], already counted up; rate: [1]; all of length 0 for an absent
     parameter. *_decay_log: logarithms of the decays; *_gain: 1 - decay, not as float32 would round it. means, squares:
-    the moments. live, width_*: as of live_numbers().
+    the moments. active_count, width_*: as of active_values().
     """
     i = first + wp.tid()
     if skipped[0] == 0.0:
-        if i < live_numbers(parameters_a, live, width_a):
+        if i < active_values(parameters_a, active_count, width_a):
             step_by_adam(
                 i, gradients_a[i], step_a[0], rate_a[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_a, means_a, squares_a,
             )  # fmt: skip
-        if i < live_numbers(parameters_b, live, width_b):
+        if i < active_values(parameters_b, active_count, width_b):
             step_by_adam(
                 i, gradients_b[i], step_b[0], rate_b[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_b, means_b, squares_b,
             )  # fmt: skip
-        if i < live_numbers(parameters_c, live, width_c):
+        if i < active_values(parameters_c, active_count, width_c):
             step_by_adam(
                 i, gradients_c[i], step_c[0], rate_c[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_c, means_c, squares_c,
             )  # fmt: skip
-        if i < live_numbers(parameters_d, live, width_d):
+        if i < active_values(parameters_d, active_count, width_d):
             step_by_adam(
                 i, gradients_d[i], step_d[0], rate_d[0], first_gain, second_gain, first_decay_log, second_decay_log,
                 epsilon, parameters_d, means_d, squares_d,
@@ -169,19 +170,19 @@ def find_nonfinite(
 
 @wp.func
 def place_in_turn(k: int, turn: int, turns: int) -> int:
-    """Return the index of the k-th number that is updated in a turn; numbers take turns in blocks of TURN."""
-    return k + (k // wp.static(TURN) * (turns - 1) + turn) * wp.static(TURN)
+    """Return the index of the k-th number that is updated in a turn; numbers take turns in blocks of SH_BLOCK."""
+    return k + (k // wp.static(SH_BLOCK) * (turns - 1) + turn) * wp.static(SH_BLOCK)
 
 
 @cache
 def harmonics_adam_kernel(count: int):
     """Return update_by_adam() for coefficients of harmonics [3 N count] whose gradients are not stored.
 
-    They are computed as by harmonics.coefficient_backward_kernel(). Blocks of TURN coefficients are updated in `turns`
-    turns. Launched over `stride` threads: a thread takes NUMBERS coefficients, `stride` apart, and requests the memory
-    of all before it waits for any.
+    They are computed as by harmonics.coefficient_backward_kernel(). Blocks of SH_BLOCK coefficients are updated in
+    `turns` turns. Launched over `stride` threads: a thread takes VALUES_PER_THREAD coefficients, `stride` apart, and
+    requests the memory of all before it waits for any.
     """
-    numbers, whole_numbers = vector(NUMBERS, wp.float32), vector(NUMBERS, wp.int32)
+    numbers, whole_numbers = vector(VALUES_PER_THREAD, wp.float32), vector(VALUES_PER_THREAD, wp.int32)
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def update_harmonics_by_adam(
@@ -189,14 +190,14 @@ def harmonics_adam_kernel(count: int):
         basis: wp.array3d(dtype=wp.float32), grad_colors: wp.array3d(dtype=wp.float32), start: int, stride: int,
         turns: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
-        live: wp.array(dtype=wp.int32),
+        active_count: wp.array(dtype=wp.int32),
         first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
         parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
         second_moments: wp.array(dtype=wp.float32),
     ):
         thread = first + wp.tid()
         turn = int(step[0]) % turns
-        final = live_numbers(parameters, live, wp.static(3 * count)) - 1
+        final = active_values(parameters, active_count, wp.static(3 * count)) - 1
         if skipped[0] == 0.0 and place_in_turn(thread, turn, turns) <= final:
             owners = whole_numbers()
             rows = whole_numbers()
@@ -205,7 +206,7 @@ def harmonics_adam_kernel(count: int):
             means = numbers()
             squares = numbers()
             values = numbers()
-            for k in range(wp.static(NUMBERS)):
+            for k in range(wp.static(VALUES_PER_THREAD)):
                 i = wp.min(place_in_turn(thread + k * stride, turn, turns), final)
                 means[k] = first_moments[i]
                 squares[k] = second_moments[i]
@@ -216,14 +217,14 @@ def harmonics_adam_kernel(count: int):
                 channels[k] = rest % 3
             degrees = basis.shape[1]
             for view in range(basis.shape[0]):
-                for k in range(wp.static(NUMBERS)):
+                for k in range(wp.static(VALUES_PER_THREAD)):
                     basis_value = basis[view, wp.min(rows[k], degrees - 1), owners[k]]
                     grad_color = grad_colors[view, owners[k], channels[k]]
                     gradients[k] += wp.where(rows[k] < degrees, basis_value, 0.0) * grad_color
             turn_count = wp.ceil(step[0] / float(turns))
             length = rate[0] / bias_correction(first_decay_log, turn_count)
             enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, turn_count))
-            for k in range(wp.static(NUMBERS)):
+            for k in range(wp.static(VALUES_PER_THREAD)):
                 mean = means[k] + first_gain * (gradients[k] - means[k])
                 square = squares[k] + second_gain * (gradients[k] * gradients[k] - squares[k])
                 i = place_in_turn(thread + k * stride, turn, turns)
@@ -276,7 +277,7 @@ def add_position_noise(
     i = first + wp.tid()
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[i]))
     above = SHARPNESS * (opacity - (1.0 - CENTRE))
-    if above > NOTHING:
+    if above > NOISE_CUTOFF:
         return
     faintness = 1.0 / (1.0 + wp.exp(above))
     state = wp.rand_init(seed, i)

@@ -57,9 +57,9 @@ def norms(gradients: Sequence[Tensor]) -> Tensor:
 def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
     result = gradients[0].new_zeros(1)
     flat = [gradient.reshape(-1) for gradient in gradients if gradient.numel()]
-    for start in range(0, len(flat), kernels.CHECKED_AT_ONCE):
-        group = flat[start : start + kernels.CHECKED_AT_ONCE]
-        empty = [result[:0]] * (kernels.CHECKED_AT_ONCE - len(group))
+    for start in range(0, len(flat), kernels.TENSORS_PER_CHECK):
+        group = flat[start : start + kernels.TENSORS_PER_CHECK]
+        empty = [result[:0]] * (kernels.TENSORS_PER_CHECK - len(group))
         arguments = group + empty
         launch(kernels.find_nonfinite, max(map(len, group)), *arguments, result)
     return result
@@ -143,15 +143,15 @@ def adam_steps(
 
 def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, active_count=None) -> None:
     nothing, active_count = [skipped.view(1)[:0]] * 6, _active_count(active_count, skipped)
-    for start in range(0, len(steps), kernels.AT_ONCE):
-        group = steps[start : start + kernels.AT_ONCE]
+    for start in range(0, len(steps), kernels.PARAMETERS_PER_LAUNCH):
+        group = steps[start : start + kernels.PARAMETERS_PER_LAUNCH]
         arguments = []
         for parameter, gradient, first_moment, second_moment, step, rate, _ in group:
             flat = (tensor.view(-1) for tensor in (parameter, first_moment, second_moment))
             arguments += [gradient.view(-1), step.view(1), _rate(rate, skipped).view(1), *flat]
-        arguments += nothing * (kernels.AT_ONCE - len(group))
+        arguments += nothing * (kernels.PARAMETERS_PER_LAUNCH - len(group))
         most = max(step.parameter.numel() for step in group)
-        widths = [step.width for step in group] + [0] * (kernels.AT_ONCE - len(group))
+        widths = [step.width for step in group] + [0] * (kernels.PARAMETERS_PER_LAUNCH - len(group))
         numbers = *widths, *_decays(betas), epsilon
         arguments = [*numbers, *arguments]
         launch(kernels.update_by_adam, most, skipped.view(1), active_count, *arguments)
@@ -183,8 +183,10 @@ def harmonics_adam_step(
     options = step, _rate(rate, skipped), skipped, _active_count(active_count, skipped), *_decays(betas), epsilon
     values = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
-    in_turn = parameter.numel() if turns == 1 else -(-parameter.numel() // (kernels.TURN * turns)) * kernels.TURN
-    stride = -(-in_turn // kernels.NUMBERS)
+    in_turn = (
+        parameter.numel() if turns == 1 else -(-parameter.numel() // (kernels.SH_BLOCK * turns)) * kernels.SH_BLOCK
+    )
+    stride = -(-in_turn // kernels.VALUES_PER_THREAD)
     arguments = gradients.basis, gradients.grad_colors, start, stride, turns, *options, *values
     launch(kernel, stride, *arguments)
 

@@ -218,6 +218,7 @@ class Trainer(TrainingState):
         # Small counts use other kernels: a sort in a single pass, and an exact learned response.
         small = gaussians.reserved < EXACT_BELOW, gaussians.reserved <= MAX_SINGLE_SORT
         graph_key = (self.degree, needs_means2d_grad, self.opacity_weight > 0, *small)
+        # Display colors are rendered at the photo's exposure by a branch of the host, so that time must be a number.
         fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
         if fixed_time and self.graphs.can_capture(views, graph_key, has_counts=self.capacity.has_counts):
             self._index.fill_(index)
