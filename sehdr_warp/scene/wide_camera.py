@@ -184,7 +184,7 @@ def face_cameras(camera: Camera, size: int | None = None) -> list[Face]:
         face = Camera(count, count, focal, focal, count / 2, count / 2, pose @ camera.world_to_camera)
         # A face's axes are turn times the photo's.
         places = np.asarray(pixels_of_directions(pixel_directions(face) @ turn, camera))
-        visible = np.isfinite(places).all(axis=2)
+        visible = np.asarray(np.isfinite(places).all(axis=2))
         if visible.mean() >= _LEAST_FILLED:
             faces.append(Face(number, face, places, visible))
     return faces
