@@ -51,7 +51,7 @@ class TrainingOptions:
     blocks: str | None = None
     """Train in N blocks of space, merged; auto chooses N."""
     plan_only: bool = False
-    """Print the plan: steps, Gaussians, what is left out, time; train nothing."""
+    """Print the plan and its cost; train nothing."""
 
 
 @dataclass(frozen=True)

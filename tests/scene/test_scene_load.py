@@ -131,7 +131,7 @@ def test_the_response_is_chosen_from_codes_as_photographed(monkeypatch):
 
     def select(photos, candidates, **options):
         judged.append([photo.shape for photo in photos])
-        return SimpleNamespace(response=response_by_name("camera"), uncertainty=0.0)
+        return SimpleNamespace(response=response_by_name("camera"), uncertainty=0.0, note=None)
 
     monkeypatch.setattr(selection, "select_response", select)
     scenes = [load_scene("embedded", max_size=size, candidates=("srgb", "camera")) for size in (None, 40)]

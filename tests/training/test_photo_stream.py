@@ -41,7 +41,7 @@ def test_what_is_brought_is_the_view(device, truth):
 
 def test_photos_of_several_sizes_have_no_common_place(device):
     views = toy_scene().train_views + toy_scene(size=16).train_views
-    with pytest.raises(ValueError, match="several sizes"):
+    with pytest.raises(ValueError, match="photos differ in size"):
         PhotoStream(photo_source(views, EXPOSURE_TIME, device, truth=False))
 
 
