@@ -43,6 +43,7 @@ WAITS = """
 import atexit, ctypes, os, signal, sys, threading, time
 from sehdr_warp.parallel import run_interruptibly
 from sehdr_warp.process import prepare
+signal.signal(getattr(signal, sys.argv[1]), signal.SIG_DFL)  # nohup has SIGHUP ignored.
 prepare()
 atexit.register(print, "Python ends while native code runs")
 threading.Timer(0.3, lambda: os.kill(os.getpid(), getattr(signal, sys.argv[1]))).start()
