@@ -98,7 +98,7 @@ def test_interrupted_training_can_be_used(tmp_path, capfd):
 
 
 def test_kill_while_a_checkpoint_is_written(embedded_run, tmp_path):
-    """What a killed process leaves beside a checkpoint is not taken for one, and is cleared by the next."""
+    """Remains of a killed process beside a checkpoint are not taken for one, and are cleared by the next."""
     out = tmp_path / "run"
     shutil.copytree(embedded_run, out)
     whole = checkpoint_of(out)

@@ -133,7 +133,7 @@ def test_boxes_in_view():
 
 
 def test_lights_and_confidence_are_those_of_the_whole(street, device):
-    """What clipped lies on the device of pictures, and the Gaussians on the CPU."""
+    """Clipped shares lie on the device of pictures, the Gaussians on the CPU."""
     street.gaussians.harmonics_dc.data += 3
     paged = PagedField(street, torch.device(device), budget=10**9)
     places = [camera(x) for x in (3, 12, 21)]

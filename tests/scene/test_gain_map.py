@@ -167,7 +167,7 @@ def test_photos_without_a_gain_map(tmp_path):
 
 
 def test_a_second_picture_without_metadata_is_no_gain_map(tmp_path):
-    """As a depth map or preview: the photo's own XMP, which announces a gain map, does not describe it."""
+    """Depth maps and previews come so: the photo's own XMP, which announces a gain map, does not describe it."""
     _, base, gain = pair()
     xmp = hdrgm()[1].partition(b"\0")[2].replace(b" hdrgm:Version", b"\nhdrgm:Version")
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [], xmp=xmp)
@@ -191,7 +191,7 @@ def test_a_damaged_gain_map_is_named_and_the_photo_is_used(tmp_path, caplog, seg
 
 
 def test_a_map_of_more_pixels_than_its_photo_counts_as_none(tmp_path, caplog):
-    """As it is left behind where a photo was cut or scaled down."""
+    """A photo that was cut or scaled down leaves its map so."""
     _, base, gain = pair()
     write_jpeg_pair(tmp_path / "a.jpg", base[:8, :8], gain, [iso_segment()])
     with caplog.at_level(logging.WARNING, "sehdr_warp.scene"):

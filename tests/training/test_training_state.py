@@ -1,4 +1,4 @@
-"""What a training consists of: the order of its photos, and whether they are panoramas."""
+"""State of a training: the order of its photos, and whether they are panoramas."""
 
 import numpy as np
 import pytest
@@ -34,9 +34,9 @@ def test_what_follows_is_told_where_it_is_drawn():
     assert order.peek() is None
     for _ in range(7):
         order.next()
-        told = order.peek()
+        upcoming = order.peek()
         state = order.state()
-        assert told in (None, order.next())
+        assert upcoming in (None, order.next())
         order.load_state(*state)
 
 

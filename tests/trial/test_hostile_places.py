@@ -154,8 +154,8 @@ def test_locales(space, name):
     environment = {**os.environ, **LOCALES[name], "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-m", "sehdr_warp", "export", "Größe_İı_写真", "--out", "Süden.ply"]
     done = subprocess.run(command, cwd=space, env=environment, capture_output=True, timeout=LATEST, check=False)
-    told = done.stderr.decode(errors="replace")
-    assert done.returncode == 0 and "Traceback" not in told and (space / "Süden.ply").is_file(), told
+    errors = done.stderr.decode(errors="replace")
+    assert done.returncode == 0 and "Traceback" not in errors and (space / "Süden.ply").is_file(), errors
 
 
 OPENED = {
