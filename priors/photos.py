@@ -14,8 +14,12 @@ SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
 MOST_CLIPPED, LEAST_CLIPPED = 0.7, 5e-4  # Shares of a photo's pixels
 ROOM_SHARE = 0.35  # Of the photos of a training
 STRETCH_SHARE, MOST_STRETCH = 0.5, 2.2
-"""Share of photos whose light above white is raised to a random power, and the largest power. Panoramas of 512 columns
+"""Share of photos whose small lights are raised to a random power, and the largest power. Panoramas of 512 columns
 average small lamps with what surrounds them; photos resolve them."""
+LIGHT_WINDOW, MOST_LIGHT = 4, 0.004
+"""A light is small where at most a share MOST_LIGHT of the photo is above white within a square of 1 / LIGHT_WINDOW of
+its width around it. At twice the share nothing is raised: a window or a sky is as bright in a panorama as it is. A
+pixel of such a panorama is 0.7 degrees wide, and 3 x 3 of them cover up to 0.36 % of a photo."""
 PAGE_SHARE = 0.2  # Of the photos, those with a white surface that is no lamp
 PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
 LEVELS = 255
@@ -157,11 +161,13 @@ class Camera:
         return Photos(decoded, clipped, truth * clipped)
 
     def _stretch(self, exposure: Tensor) -> Tensor:
-        """Return exposures [B, 3, S, S], some with brighter light above white, of the same hue."""
+        """Return exposures [B, 3, S, S], some with brighter small lights, of the same hue."""
         count = len(exposure)
         power = self._uniform(count, 1, MOST_STRETCH)
         power = torch.where(self._uniform(count, 0, 1) < self.stretch_share, power, 1.0)
-        return exposure * exposure.amax(1, keepdim=True).clamp_min(1) ** (power - 1)
+        brightest = exposure.amax(1, keepdim=True)
+        power = 1 + (power - 1) * _smallness(brightest > 1)
+        return exposure * brightest.clamp_min(1) ** (power - 1)
 
     def _with_pages(self, exposure: Tensor) -> Tensor:
         """Return exposures [B, 3, S, S], some with a sheet, a wall or snow that is lit to about white, not a lamp."""
@@ -199,6 +205,13 @@ class Camera:
         decoded = torch.einsum("kc,bchw->bkhw", torch.linalg.inv(luma), blocks.reshape(count, 3, height, width))
         used = torch.rand(count, 1, 1, 1, generator=self.generator, device=self.device) < 0.6
         return torch.where(used, decoded.clamp(0, 1), encoded)
+
+
+def _smallness(above: Tensor) -> Tensor:
+    """Return [B, 1, S, S] in [0, 1] for pixels above white: 1 in a small light, 0 in a large area."""
+    wide = above.shape[-1] // LIGHT_WINDOW // 2 * 2 + 1
+    around = F.avg_pool2d(above.float(), wide, stride=1, padding=wide // 2, count_include_pad=True)
+    return (2 - around / (LIGHT_WINDOW**2 * MOST_LIGHT)).clamp(0, 1)
 
 
 def _interpolate(curves: Tensor, values: Tensor) -> Tensor:

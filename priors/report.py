@@ -21,7 +21,7 @@ _COLUMNS = {
 _SETS = {
     "plain": "sRGB, 8 bits, 0.2 to 20 % of the pixels at white",
     "camera": "random camera curves, white balance, noise, JPEG and exposures; the curve known to a fifth of a stop",
-    "bright lamps": "the same, light above white raised to a random power of up to 2.2",
+    "bright lamps": "the same, small lights raised to a random power of up to 2.2",
 }
 _AREAS = {"30": "up to 30", "300": "31 to 300", "3000": "301 to 3000", "27648": "more"}
 _TEXT = """# The prior for light above white

@@ -14,6 +14,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
+from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import STOPS, WIDTH, LightNetwork, network_input
 
 from .judge import judge
@@ -46,7 +47,18 @@ def pixel_loss(mean: Tensor, deviation: Tensor, photos: Photos) -> Tensor:
     return (likelihood + ENERGY_WEIGHT * energy * (clipped.sum((1, 2, 3)) >= LEAST_PIXELS)).mean()
 
 
-def train(pack: Pack, chosen: np.ndarray, *, steps: int, seconds: float, seed: int, device: str) -> LightNetwork:
+def train(
+    pack: Pack,
+    chosen: np.ndarray,
+    *,
+    steps: int,
+    seconds: float,
+    seed: int,
+    device: str,
+    begin: Path | None = None,
+    batch: int = BATCH,
+    rate: float = RATE,
+) -> LightNetwork:
     """Return a network trained on some panoramas and the rooms.
 
     Args:
@@ -56,14 +68,20 @@ def train(pack: Pack, chosen: np.ndarray, *, steps: int, seconds: float, seed: i
         seconds: most seconds; the cycle is over by then too. Only 0 (no bound) is reproducible.
         seed: of every random number.
         device: "cpu", "cuda:0" ...
+        begin: weights to go on from; None: random ones.
+        batch: photos of a step.
+        rate: the largest learning rate.
     """
     torch.manual_seed(seed)
-    network = LightNetwork(WIDTH).to(device)
+    network = LightNetwork(WIDTH) if begin is None else load_prior("cpu", begin).network
+    network = network.to(device).train().requires_grad_()
     camera = Camera(pack, device, chosen, rooms=True, seed=seed)
-    optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=1e-3)
+    optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-3)
+    decay = min(0.998, 1 - 10 / steps)
     average = torch.optim.swa_utils.AveragedModel(
-        network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.998)
+        network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(decay)
     )
+    warm_up = min(300, steps / 10)
     started = time.perf_counter()
     for step in range(steps):
         done = step / steps
@@ -71,18 +89,21 @@ def train(pack: Pack, chosen: np.ndarray, *, steps: int, seconds: float, seed: i
             done = max(done, (time.perf_counter() - started) / seconds)
         if done >= 1:
             break
-        rate = RATE * min(1.0, step / 300 + 0.05) * (0.5 + 0.5 * np.cos(np.pi * done))
         for group in optimizer.param_groups:
-            group["lr"] = rate
-        photos = camera.take(BATCH)
+            group["lr"] = rate * min(1.0, step / warm_up + 0.05) * (0.5 + 0.5 * np.cos(np.pi * done))
+        photos = camera.take(batch)
         loss = pixel_loss(*network(network_input(photos.exposure, photos.clipped)), photos)
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
         average.update_parameters(network)
-        if step % 200 == 0:
-            line = {"step": step, "loss": round(float(loss), 4), "seconds": round(time.perf_counter() - started, 1)}
+        if step % 200 == 0 or step % (steps // 10) == 0:
+            line = {
+                "step": step,
+                "loss": round(float(loss.detach()), 4),
+                "seconds": round(time.perf_counter() - started, 1),
+            }
             print(json.dumps(line), flush=True)
     return average.module
 
@@ -108,13 +129,17 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--begin", type=Path, help="go on from these weights")
+    parser.add_argument("--batch", type=int, default=BATCH, help="photos of a step")
+    parser.add_argument("--rate", type=float, default=RATE, help="largest learning rate")
     parser.add_argument("--judge", action="store_true", help="leave out the held-out panoramas and judge on them")
     parser.add_argument("--deviation-scale", type=float, default=1.0, help="of a judged run, for one on all panoramas")
     args = parser.parse_args()
     torch.use_deterministic_algorithms(True, warn_only=True)
     pack = read_pack(args.pack)
     chosen = np.flatnonzero(~pack.held_out) if args.judge else np.arange(len(pack.panoramas))
-    options = {"steps": args.steps, "seconds": args.seconds, "seed": args.seed, "device": args.device}
+    names = "steps", "seconds", "seed", "device", "begin", "batch", "rate"
+    options = {name: getattr(args, name) for name in names}
     network = train(pack, chosen, **options).eval()
     scale, unseen = args.deviation_scale, np.flatnonzero(pack.held_out)
     if args.judge:

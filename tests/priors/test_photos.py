@@ -49,12 +49,31 @@ def test_every_source_has_a_licence_and_some_are_held_out():
     assert sum(source.held_out for source in sources) == 10
 
 
-def test_brighter_lamps_are_brighter_where_they_clip_alone(pack):
-    usual, stretched = (
-        Camera(pack, "cpu", np.array([0]), rooms=False, seed=5, stretch_share=share).take(8, 64) for share in (0.0, 1.0)
+def lamp_and_window(tmp_path, brighter: str) -> Pack:
+    """Return a pack of a dim panorama in which a lamp of 2 x 2 or a window of 40 x 60 pixels is brighter."""
+    panoramas = np.float32(np.random.default_rng(0).uniform(0.1, 0.3, (1, 128, 256, 1))) * np.ones(3, np.float32)
+    rows, columns = {"lamp": (slice(60, 62), slice(100, 102)), "window": (slice(40, 80), slice(100, 160))}[brighter]
+    panoramas[:, rows, columns] = 40.0
+    return Pack(
+        panoramas, np.array([False]), ["a"], np.zeros((0, 1, 8, 8, 3), np.float32), curves(tmp_path / "none.mat")
     )
-    lamps = (usual.truth > 1) & (stretched.clipped > 0)
-    assert lamps.any() and (stretched.truth[lamps] > usual.truth[lamps]).float().mean() > 0.95
-    assert stretched.truth.max() <= 2.2 * usual.truth.max()
+
+
+@pytest.mark.parametrize(("brighter", "raised"), [("lamp", True), ("window", False)])
+def test_small_lights_alone_are_made_brighter(tmp_path, brighter, raised):
+    pack = lamp_and_window(tmp_path, brighter)
+    usual, stretched = (
+        Camera(pack, "cpu", np.array([0]), rooms=False, seed=5, stretch_share=share).take(96, 64)
+        for share in (0.0, 1.0)
+    )
+    lights = (usual.truth > 2) & (stretched.clipped > 0)
+    stops = (stretched.truth - usual.truth)[lights]
+    assert lights.sum() > 20
+    if raised:
+        # A page or a wall that clips around it makes it part of a large area.
+        assert (stops > 0.01).float().mean() > 0.5 and stretched.truth.max() <= 2.2 * usual.truth.max()
+    else:
+        # Corners of a window have little light around them.
+        assert (stops > 0.01).float().mean() < 0.1
     # A channel below white may clip with its lamp, never the other way around.
     assert (stretched.clipped >= usual.clipped).float().mean() > 0.999
