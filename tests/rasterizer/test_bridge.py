@@ -80,8 +80,10 @@ def test_a_retained_graph_gives_the_same_gradients_again(device):
     loss = (2.0 * scaled + squared).sum()
     first = torch.autograd.grad(loss, (values, gain), retain_graph=True)
     second = torch.autograd.grad(loss, (values, gain))
+    # On a GPU, threads add to the gradient of the gain in any order.
+    tolerance = 1e-6 if device.startswith("cuda") else 0
     for one, other in zip(first, second, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=0)
+        torch.testing.assert_close(one, other, rtol=tolerance, atol=0)
     with pytest.raises(RuntimeError, match="second time"):
         loss.backward()
 
