@@ -251,7 +251,9 @@ def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float, tup
             primaries = ()
         if len(primaries) != 8:
             raise InputError(path, f"PRIMARIES = {line[1][:60]!r} are not eight numbers", _REMEDY)
-        primaries = REC709 if np.allclose(primaries, _RADIANCE, atol=0.002) else primaries
+        # Photoshop writes eight zeros for none.
+        stated = any(primaries) and not np.allclose(primaries, _RADIANCE, atol=0.002)
+        primaries = primaries if stated else REC709
     return int(size[2]), int(size[1]), size.end(), exposure, primaries
 
 

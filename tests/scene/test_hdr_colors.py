@@ -126,6 +126,8 @@ def test_primaries_of_radiance(tmp_path):
     plain = read_hdr(radiance(tmp_path / "a.hdr", b"FORMAT=32-bit_rle_rgbe"))
     default = b"FORMAT=32-bit_rle_rgbe\nPRIMARIES=0.64 0.33 0.29 0.60 0.15 0.06 0.333 0.333"
     np.testing.assert_array_equal(read_hdr(radiance(tmp_path / "b.hdr", default)), plain)
+    photoshop = b"GAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\nFORMAT=32-bit_rle_rgbe"
+    np.testing.assert_array_equal(read_hdr(radiance(tmp_path / "f.hdr", photoshop)), plain)
     p3 = b"FORMAT=32-bit_rle_rgbe\nPRIMARIES= .680 .320 .265 .690 .150 .060 .3127 .3290"
     np.testing.assert_allclose(
         read_hdr(radiance(tmp_path / "c.hdr", p3))[0, 0], rec709("Display P3", plain[0, 0]), rtol=2e-3
