@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Protocol
 
 import torch
 import torch.nn.functional as F
@@ -47,6 +48,10 @@ class LightPrior:
         """
         self.network, self.deviation_scale = network.eval(), deviation_scale
 
+    def size(self, height: int, width: int) -> tuple[int, int]:
+        """Return the size of an estimate of a photo, `coarse_size`."""
+        return coarse_size(height, width)
+
     @torch.no_grad()
     def estimate(self, exposure: Tensor, clipped: Tensor) -> LightEstimate:
         """Estimate the light of a photo's clipped values.
@@ -66,6 +71,18 @@ class LightPrior:
         return LightEstimate(mean, deviation * self.deviation_scale)
 
 
+class Prior(Protocol):
+    """An estimator of clipped light: LightPrior, or another for photos of cameras that are no pinholes."""
+
+    def size(self, height: int, width: int) -> tuple[int, int]:
+        """Return the size of an estimate of a photo."""
+        ...
+
+    def estimate(self, exposure: Tensor, clipped: Tensor) -> LightEstimate:
+        """Estimate the light of a photo's clipped values, as LightPrior does."""
+        ...
+
+
 def coarse_size(height: int, width: int) -> tuple[int, int]:
     """Return the size at which the network sees a photo: the photo's own up to LARGEST, else averaged down to it."""
     part = min(1.0, LARGEST / max(height, width))
@@ -76,7 +93,7 @@ def coarse_size(height: int, width: int) -> tuple[int, int]:
 def combined_estimates(
     exposure: Tensor,
     clipped: Tensor,
-    prior: LightPrior | None,
+    prior: Prior | None,
     stated: Tensor | None = None,
     stated_deviation: float = 0.0,
     *,
@@ -87,21 +104,22 @@ def combined_estimates(
     Args:
         exposure: [H, W, 3], as of LightPrior.estimate.
         clipped: [H, W, 3] bool.
-        prior: None leaves it out.
+        prior: LightPrior, or another for a photo by a camera that is no pinhole; None leaves it out.
         stated: [H, W, 3], light in multiples of white, at least 1 where it is known, as View.light_above_white has it.
         stated_deviation: standard deviation of its natural logarithm.
         holding: for the loss of a training: estimates of the prior weigh by their light, not by their deviations.
 
     Returns:
-        [h, w, 6] float16 at the size of `coarse_size`: for each channel the natural logarithm of the expected light
-        over white, and then 1 / the deviation of the logarithm (or the root of the weight, if holding); 0 where nothing
-        is clipped or known. Two estimates of a value are averaged by their precisions.
+        [h, w, 6] float16 at the size of the prior's estimate, or of `coarse_size`: for each channel the natural
+        logarithm of the expected light over white, and then 1 / the deviation of the logarithm (or the root of the
+        weight, if holding); 0 where nothing is clipped or known. Two estimates of a value are averaged by their
+        precisions.
     """
-    size = coarse_size(*exposure.shape[:2])
+    estimate = None if prior is None else prior.estimate(exposure, clipped)
+    size = coarse_size(*exposure.shape[:2]) if estimate is None else (estimate.mean.shape[0], estimate.mean.shape[1])
     total = exposure.new_zeros(*size, 3)
     precision, stated_precision = torch.zeros_like(total), torch.zeros_like(total)
-    if prior is not None:
-        estimate = prior.estimate(exposure, clipped)
+    if estimate is not None:
         deviation = estimate.deviation * math.log(2)
         precision += deviation**-2
         # The mean of light, not of its logarithm: lamps then have their energy in the mean.

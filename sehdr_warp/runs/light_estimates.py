@@ -9,6 +9,7 @@ from ..prior import coarse_size, combined_estimates, load_prior
 from ..response import Response
 from ..scene import View
 from .config import LossConfig
+from .wide_prior import WidePrior
 
 
 @torch.no_grad()
@@ -42,15 +43,20 @@ def light_estimates(
     if not any(some and bool(mask.any()) for some, mask in zip(has_estimate, masks, strict=True)):
         return None
     prior = load_prior(device) if config.light_prior else None
-    result = []
+    result, wide = [], None
     for view, mask in zip(views, masks, strict=True):
+        seeing = prior
+        if prior is not None and not view.camera.is_pinhole:
+            wide = wide if wide is not None and wide.fits(view.camera) else WidePrior(prior, view.camera)
+            seeing = wide
         if not bool(mask.any()):
-            result.append(torch.zeros(*coarse_size(*mask.shape[:2]), 6, dtype=torch.float16))
+            size = (coarse_size if seeing is None else seeing.size)(*mask.shape[:2])
+            result.append(torch.zeros(*size, 6, dtype=torch.float16))
             continue
         exposure = response.decode(torch.from_numpy(view.image).to(device)).float() / response.white
         evidence = view.light_above_white
         evidence = None if evidence is None else torch.from_numpy(evidence).to(device).float()
         deviation = view.light_above_white_deviation
-        estimates = combined_estimates(exposure, mask.to(device), prior, evidence, deviation, holding=holding)
+        estimates = combined_estimates(exposure, mask.to(device), seeing, evidence, deviation, holding=holding)
         result.append(estimates.cpu())
     return result

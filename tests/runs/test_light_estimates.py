@@ -53,3 +53,17 @@ def test_targets_carry_the_estimates():
 def test_the_prior_estimates_photos_that_clip_alone():
     first, second = light_estimates([view(255), view(100)], SRGB, LossConfig(), CPU)
     assert (first[..., 3:] > 0).all() and (first[..., :3] >= 0).all() and (second == 0).all()
+
+
+def test_panoramas_are_seen_by_perspective_faces():
+    """A face of 90 degrees has a quarter of the circle, so a panorama keeps more pixels than a photo of its size."""
+    scale = 640 / (2 * np.pi)
+    camera = Camera(640, 320, scale, scale, 320, 160, np.eye(4), "equirectangular")
+    codes = np.full((320, 640, 3), 90, np.uint8)
+    codes[150:170, 310:330] = 255
+    photo = replace(view(0), codes=codes, camera=camera)
+    first, second = light_estimates([photo, replace(photo, codes=codes // 2)], SRGB, LossConfig(), CPU)
+    assert first.shape == second.shape and first.shape[0] > 200
+    known = first[..., 3] > 0
+    assert 0 < known.float().mean() < 0.01 and known[first.shape[0] // 2, first.shape[1] // 2]
+    assert (second == 0).all()
