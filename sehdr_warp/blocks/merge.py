@@ -80,6 +80,9 @@ def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
     info |= {"scene": plan.scene, "data": plan.data, "normalization": plan.normalization.to_dict()}
     info |= {"color_matrix": matrix} if (matrix := blocks[0].info.get("color_matrix")) else {}
     info |= {"exposure_compensation": gains.to_dict()} if (gains := plan.shared.gains) else {}
+    if all(block.info.get("up") for block in blocks):  # Each block found its own from its photos.
+        direction = np.mean([block.info["up"]["direction"] for block in blocks], axis=0)
+        info |= {"up": {"direction": direction.tolist(), "source": blocks[0].info["up"]["source"]}}
     seconds = sum(block.values["seconds"] for block in blocks)
     arrays = {f"gaussians.{name}": tensor for name, tensor in tensors.items()}
     state = arrays, {"iteration": iterations, "seconds": seconds}

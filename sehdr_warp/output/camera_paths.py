@@ -1,4 +1,4 @@
-"""Camera paths for films: an orbit about what the photos look at, and a smooth way through the photos' places."""
+"""Camera paths for films: around what the photos look at, along a walk, or a smooth way through the photos' places."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,6 +8,7 @@ import numpy as np
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.gravity import looks_down, up_direction
 
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
@@ -21,15 +22,11 @@ _ROUND_GAP = np.radians(120)
 # Mean squared sine between optical axes below which they are parallel in effect: where they meet is then chance, as of
 # photos from the air that look down (6 degrees).
 _PARALLEL = np.sin(np.radians(6)) ** 2
-
-# Weight of the mean up of the pictures beside the horizon of the cameras. Cameras that all look one way say nothing of
-# their pitch by their horizon; then the pictures' mean decides. Where they look around, it moves up by less than 1/10
-# of the cameras' mean pitch.
-_MEAN_UP_WEIGHT = 0.005
-# Middle eigenvalue of the level axes' products, below which cameras look one way: the mean squared sine of 6 degrees.
-_ONE_WAY = np.sin(np.radians(6)) ** 2
-_CANCELED, _ALIKE = 0.3, 0.7  # Length of the mean up of pictures, and of the mean viewing direction
-_DOWN = 0.2  # Mean of the pictures' up along the common up below which the viewing directions decide its sign
+# Cosine between the step from a photo to the next and their optical axes. A walk ahead has a median near 1, walks
+# around something, along it and flights 0 to 0.3.
+_AHEAD, _ASIDE = 0.7, 0.3
+_LEAP = 5.0  # Steps this many times as long as the median are breaks of a walk: cameras that were placed wrongly.
+_SMOOTH, _SMOOTH_UP = 1.2, 4.0  # Standard deviations, in photos, of what evens places and axes of a walk, and its up
 
 
 def evenly(items: Sequence[Item], count: int) -> list[Item]:
@@ -59,7 +56,7 @@ def middle_index(cameras: Sequence[Camera]) -> int:
     return int(np.argmin(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
 
 
-def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[Camera]:
+def orbit(cameras: Sequence[Camera], count: int, focus_distance: float, up: np.ndarray | None = None) -> list[Camera]:
     """Return a closed path of cameras around the common focus of a set, upright, all looking at the focus.
 
     If the set surrounds the focus, the path is a circle of the set's mean radius and height. Otherwise it is an oval
@@ -70,6 +67,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
         cameras: The set, usually the training cameras.
         count: Number of cameras on the path.
         focus_distance: Distance of the focus if the optical axes are parallel; world units, positive.
+        up: [3] unit vector; None takes that of the poses.
 
     Raises:
         SehdrError: Without cameras, or for a count outside 1 to 100 000.
@@ -79,7 +77,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
     middle = cameras[int(np.argmin(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
     if focus is None:
         focus = middle.position + focus_distance * middle.world_to_camera[2, :3]
-    up = up_direction(cameras)
+    up = up_direction(cameras) if up is None else up
     back = _unit(np.mean(positions, axis=0) - focus, fallback=-middle.world_to_camera[2, :3])
     back = _unit(back - up * (back @ up), fallback=np.linalg.svd(up[None])[2][1])
     right = np.cross(up, back)
@@ -99,14 +97,66 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float) -> list[
         distance = _along(azimuths, np.linalg.norm(offsets, axis=1), azimuth)[0]
         ring, height = distance * np.cos(elevation), distance * np.sin(elevation)
     directions = np.cos(azimuth)[:, None] * back + np.sin(azimuth)[:, None] * right
-    return [
-        _moved(middle, look_at_pose(p, focus, up)) for p in focus + ring[:, None] * directions + height[:, None] * up
-    ]
+    # From the air the pictures keep their heading: they would spin with the azimuth.
+    above = -middle.world_to_camera[1, :3] if looks_down(cameras, up) else up
+    places = focus + ring[:, None] * directions + height[:, None] * up
+    return [_moved(middle, look_at_pose(place, focus, above)) for place in places]
 
 
-def surround(cameras: Sequence[Camera], focus: np.ndarray) -> bool:
+def walk(cameras: Sequence[Camera]) -> list[Camera]:
+    """Return the longest unbroken part of a set that was photographed while walking ahead; else an empty list.
+
+    Args:
+        cameras: In the order of the photos.
+    """
+    if len(cameras) < 4:
+        return []
+    positions, forward = _positions(cameras), _axes(cameras, 2)
+    steps, axes = np.diff(positions, axis=0), forward[1:] + forward[:-1]
+    lengths = np.linalg.norm(steps, axis=1)
+    ahead = np.sum(steps * axes, axis=1) / np.maximum(lengths * np.linalg.norm(axes, axis=1), 1e-12)
+    if np.median(ahead) < _AHEAD:
+        return []
+    breaks = np.flatnonzero((lengths > _LEAP * np.median(lengths)) | (ahead < _ASIDE)) + 1
+    parts = np.split(np.arange(len(cameras)), breaks)
+    longest = max(parts, key=lambda part: (len(part), lengths[part[:-1]].sum()))
+    return [cameras[index] for index in longest] if len(longest) >= 4 else []
+
+
+def walk_path(cameras: Sequence[Camera], count: int) -> list[Camera]:
+    """Return `count` cameras along a walk, evenly spaced, with the sway of hands taken out.
+
+    Their up is that of the photos around them: structure from motion bends long walks, so that none is up everywhere.
+
+    Args:
+        cameras: From walk.
+        count: Number of cameras on the path.
+
+    Raises:
+        SehdrError: Without cameras, or for a count outside 1 to 100 000.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    _check(cameras, count)
+    positions = _positions(cameras)
+    lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
+    samples = 16 * len(cameras)
+    at, fine = np.linspace(0, lengths[-1], count), np.linspace(0, lengths[-1], samples)
+
+    def smooth(values: np.ndarray, deviation: float) -> np.ndarray:
+        sampled = np.stack([np.interp(fine, lengths, column) for column in values.T], axis=1)
+        sampled = gaussian_filter1d(sampled, deviation * 16, axis=0, mode="nearest")
+        return np.stack([np.interp(at, fine, column) for column in sampled.T], axis=1)
+
+    places, forward = smooth(positions, _SMOOTH), smooth(_axes(cameras, 2), _SMOOTH)
+    up = smooth(-_axes(cameras, 1), _SMOOTH_UP)
+    rows = zip(places, forward, up, strict=True)
+    return [_moved(cameras[0], look_at_pose(place, place + ahead, above)) for place, ahead, above in rows]
+
+
+def surround(cameras: Sequence[Camera], focus: np.ndarray, up: np.ndarray | None = None) -> bool:
     """Return whether cameras stand all around a point, as seen from above."""
-    up = up_direction(cameras)
+    up = up_direction(cameras) if up is None else up
     east = np.linalg.svd(up[None])[2][1]
     offsets = _positions(cameras) - focus
     return _go_round(np.arctan2(offsets @ np.cross(up, east), offsets @ east))
@@ -126,57 +176,6 @@ def _along(azimuths: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np
     degree = min(2, (len(values) - 1) // 3) if np.ptp(azimuths) > 1e-6 else 0
     course = np.polynomial.Polynomial.fit(azimuths, values, degree)
     return np.clip(course(at), values.min(), values.max()), float(np.std(values - course(azimuths)))
-
-
-def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the unit vector [3] against gravity that the poses of photos show.
-
-    People hold cameras level: the horizontal axis of a picture, or the vertical one of a picture taken with the camera
-    turned by a quarter, is horizontal. Up is the direction nearest to orthogonal to all of them (least squares).
-    """
-    axes = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
-    mean_up, forward = -axes[:, 1].mean(axis=0), axes[:, 2].mean(axis=0)
-    if np.linalg.norm(mean_up) < _CANCELED < _ALIKE < np.linalg.norm(forward):
-        # Photos from the air look down with any heading: both axes of all pictures are level.
-        level = np.concatenate([axes[:, 0], axes[:, 1]])
-        up = np.linalg.eigh(level.T @ level)[1][:, 0]
-        return up if up @ forward < 0 else -up
-    anchor = mean_up if np.linalg.norm(mean_up) > 1e-6 else -axes[0, 1]
-    up = anchor / np.linalg.norm(anchor)
-    pull = _MEAN_UP_WEIGHT * np.outer(mean_up, mean_up)
-    for _ in range(4):
-        level = _level_axes(axes, up)
-        spread = (level[:, :, None] * level[:, None, :]).mean(axis=0)
-        candidate = np.linalg.eigh(spread - pull)[1][:, 0]
-        up = candidate if candidate @ up >= 0 else -candidate
-    along = float(mean_up @ up)
-    if abs(along) < _DOWN and abs(forward @ up) > _DOWN:  # Photos from the air look down.
-        up = -np.sign(forward @ up) * up
-    elif along < 0:
-        up = -up
-    return up
-
-
-def typical_roll(cameras: Sequence[Camera], up: np.ndarray) -> float:
-    """Return the median angle, in radians, between the level axes of pictures and the horizon of an up direction."""
-    level = _level_axes(np.stack([camera.world_to_camera[:3, :3] for camera in cameras]), up)
-    return float(np.median(np.arcsin(np.clip(np.abs(level @ up), 0, 1))))
-
-
-def is_pitch_known(cameras: Sequence[Camera], up: np.ndarray) -> bool:
-    """Return whether cameras turn enough for their level axes to tell the horizon, not only its direction along one.
-
-    Cameras that all look one way are level along their common axis; how far they are pitched, their poses do not say.
-    """
-    axes = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
-    level = _level_axes(axes, up)
-    looks_down = abs(float(axes[:, 1].mean(axis=0) @ up)) < _DOWN  # From the air: the axes of view tell up.
-    return looks_down or bool(np.linalg.eigvalsh(level.T @ level / len(level))[1] > _ONE_WAY)
-
-
-def _level_axes(axes: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return [n, 3], of the axes [n, 3, 3] of each camera that of the picture which is nearer to the horizon."""
-    return np.where((np.abs(axes[:, 0] @ up) <= np.abs(axes[:, 1] @ up))[:, None], axes[:, 0], axes[:, 1])
 
 
 def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
@@ -212,7 +211,7 @@ def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
     """Return what a page needs to fly through a scene, as plain values.
 
     `up` and `focus` are [3] (focus may be None), `size` is the extent of the camera positions, `views` lists name,
-    split and camera, and `first` is the index of the view in the middle, which a page opens with.
+    split and camera, and `first` is the index of the view in the middle.
     """
     cameras = [entry.camera for entry in entries]
     focus, up, size = None, np.array([0.0, -1.0, 0.0]), 0.0

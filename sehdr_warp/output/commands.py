@@ -276,7 +276,7 @@ def run_render(args: Render) -> None:
         from .film import write_film
 
         transform = world_transform(run, **vars(args.world))
-        cameras = [camera for _, camera in select_cameras(run, **path, transform=transform)]
+        cameras = [camera for _, camera in select_cameras(run, **path, transform=transform, up=args.world.up)]
         if args.size is not None:
             cameras = [framed(camera, *read_size(args.size)) for camera in cameras]
         film = {"fps": require_positive("--fps", args.film.fps), "transfer": args.film.transfer, "ev_ramp": ramp}

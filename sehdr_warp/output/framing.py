@@ -10,8 +10,9 @@ import numpy as np
 
 from sehdr_warp.scene import Camera
 
-from .camera_paths import common_focus, evenly, look_at_pose, surround
+from .camera_paths import common_focus, evenly, look_at_pose, orbit, surround, training_cameras, walk, walk_path
 from .images import as_array
+from .world_transform import scene_up
 
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
@@ -25,6 +26,13 @@ _MARGIN = 1.25  # Of the picture around the subject, whose surface is thick
 _VIEWS, _SIZE = 12, 96  # Renders that the subject is found on; longest side of these and of the checks for obstacles
 _REACH = 0.7  # Surfaces within this part of the cameras' distance from the focus are the subject
 _EXTENT = 90  # Percentile of their distances from the focus that the picture holds
+_OPENINGS, _WITNESSES = 16, 32  # Photos among which an opening view is chosen, and those that may show what it shows
+_SEVERAL = 3  # Photos that show a point which an opening view should show
+_CLOSER = 0.6  # Tangent of the field of view of an opening view, at least this part of its photo's
+# Parts of the picture that an opening view may show less if it is nearer to the middle of the photos by their extent,
+# if it looks as most of them do by a right angle, and if it holds the whole subject instead of nothing of it.
+_ASIDE, _TURNED, _WHOLE = 0.4, 0.4, 0.8
+_STEEP = 0.9  # Sine of the pitch from which a camera looks down, and level is no direction of its picture
 _NEAR, _BLOCKED = 0.3, 10  # A view is blocked if this per cent of its middle is nearer than this part of the distance
 
 
@@ -49,10 +57,94 @@ def subject_radius(run: "LoadedScene", photos: Sequence[Camera], focus: np.ndarr
 def film_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:
     """Return a camera of a path in film_size that shows no more at the sides than the photos do."""
     width, height = film_size(photos)
+    if not camera.is_pinhole:
+        focal = height / 2 / math.tan(_WIDEST / 2)
+        return Camera(width, height, focal, focal, width / 2, height / 2, camera.world_to_camera)
     scale = max(width / camera.width, height / camera.height)
     shift = np.array([camera.cx / camera.width - 0.5, camera.cy / camera.height - 0.5])
     cx, cy = width / 2 + shift[0] * camera.width * scale, height / 2 + shift[1] * camera.height * scale
     return replace(camera, width=width, height=height, fx=camera.fx * scale, fy=camera.fy * scale, cx=cx, cy=cy)
+
+
+def default_path(run: "LoadedScene", count: int, up: str | Sequence[float] | None = None) -> list[Camera]:
+    """Return the path of `--cameras orbit`: around what the photos look at, or along them if they walk ahead.
+
+    Args:
+        run: The scene; its training cameras show what a path may show.
+        count: Number of cameras on the path.
+        up: As in world_transform.
+
+    Raises:
+        SehdrError: Without training cameras, or for a count outside 1 to 100 000.
+    """
+    photos = training_cameras(run)
+    if way := walk(photos):
+        log.info("the photos walk ahead, so the path goes along %d of %d of them", len(way), len(photos))
+        return [film_camera(camera, photos) for camera in walk_path(way, count)]
+    path = orbit(photos, count, _focus_distance(run, photos), scene_up(run, up))
+    return frame_subject(run, [film_camera(camera, photos) for camera in path], photos)
+
+
+def opening_view(run: "LoadedScene") -> Camera | None:
+    """Return the camera that pages and the viewer open with; None without pinhole cameras.
+
+    It stands where a photo was taken, in 16:9 and level, and looks at the middle of what the photos look at, with a
+    lens that holds the subject: wider than of a close-up, narrower than of a photo from afar. Of several photos that is
+    taken whose picture shows most of what at least three photos show. A walk ahead is opened at its start.
+    """
+    photos = training_cameras(run) or [entry.camera for entry in run.cameras]
+    photos = [camera for camera in photos if camera.is_pinhole]
+    if not photos:
+        return None
+    if way := walk(photos):
+        return film_camera(way[0], photos)
+    up, focus = scene_up(run), common_focus(photos)
+    radius = None if focus is None else subject_radius(run, photos, focus)
+    positions = np.stack([camera.position for camera in photos])
+    middle, extent = np.median(positions, axis=0), max(float(np.linalg.norm(np.ptp(positions, axis=0))), 1e-12)
+    common = np.mean([camera.world_to_camera[2, :3] for camera in photos], axis=0)
+    witnesses = evenly(photos, _WITNESSES)
+
+    def score(camera: Camera) -> float:
+        shown = _share_shown(run, camera.within(_SIZE), witnesses)
+        aside = float(np.linalg.norm(camera.position - middle)) / extent
+        held = 1.0
+        if focus is not None and radius is not None:
+            distance = float(np.linalg.norm(focus - camera.position))
+            held = min(1.0, camera.height / 2 / camera.fy * distance / radius)
+        return shown - _ASIDE * aside + _TURNED * float(camera.world_to_camera[2, :3] @ common) + _WHOLE * held
+
+    return max((_opening_of(camera, photos, up, focus, radius) for camera in evenly(photos, _OPENINGS)), key=score)
+
+
+def _opening_of(
+    photo: Camera, photos: Sequence[Camera], up: np.ndarray, focus: np.ndarray | None, radius: float | None
+) -> Camera:
+    """Return the opening view from a photo's place; see opening_view."""
+    camera = film_camera(photo, photos)
+    ahead = photo.world_to_camera[2, :3] if focus is None else focus - photo.position
+    distance = float(np.linalg.norm(ahead))
+    if abs(ahead @ up) < _STEEP * distance:
+        pose = look_at_pose(photo.position, photo.position + ahead, up)
+        camera = replace(camera, world_to_camera=np.linalg.inv(pose))
+    if focus is None or radius is None:
+        return camera
+    present = camera.height / 2 / camera.fy
+    needed = math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
+    most = _MOST_ZOOM * present if surround(photos, focus, up) else max(photo.height / 2 / photo.fy, present)
+    zoom = present / max(min(needed, most), _CLOSER * present)
+    return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
+
+
+def _share_shown(run: "LoadedScene", camera: Camera, witnesses: Sequence[Camera]) -> float:
+    """Return the share of a picture whose surface several other cameras have in their pictures."""
+    points = _surface(run, camera)
+    if not len(points):
+        return 0.0
+    counts = np.zeros(len(points))
+    for witness in witnesses:
+        counts += witness.project(points).inside
+    return float((counts >= min(_SEVERAL, len(witnesses))).sum() / (camera.width * camera.height))
 
 
 def frame_subject(run: "LoadedScene", path: Sequence[Camera], photos: Sequence[Camera]) -> list[Camera]:
@@ -60,21 +152,35 @@ def frame_subject(run: "LoadedScene", path: Sequence[Camera], photos: Sequence[C
 
     The lens opens until the sphere of subject_radius fits, to at most 75 degrees: up to twice the picture if photos
     surround the focus, else up to their height, because wider pictures would show what no photo does. Cameras behind
-    a wall or in a floater come forward, smoothly along the path. `photos` are the training cameras.
+    a wall or in a floater come forward, smoothly along the path. Those too near for the subject step back, as far as
+    the median of the photos. `photos` are the training cameras.
     """
     focus = common_focus(photos)
     radius = None if focus is None else subject_radius(run, photos, focus)
     if focus is None or radius is None:
         return list(path)
     cleared = _in_front_of_obstacles(run, path, focus, radius)
-    distance = min(float(np.linalg.norm(camera.position - focus)) for camera in cleared)
     # Tangents of half the vertical fields of view
     present = path[0].height / 2 / path[0].fy
-    needed = math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
     photo = float(np.median([camera.height / 2 / camera.fy for camera in photos]))
     most = _MOST_ZOOM * present if surround(photos, focus) else max(photo, present)
+    cleared = _far_enough(cleared, photos, focus, _MARGIN * radius / math.sin(math.atan(most)))
+    distance = min(float(np.linalg.norm(camera.position - focus)) for camera in cleared)
+    needed = math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
     zoom = present / min(max(present, needed), most)
     return [replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom) for camera in cleared]
+
+
+def _far_enough(path: Sequence[Camera], photos: Sequence[Camera], focus: np.ndarray, distance: float) -> list[Camera]:
+    """Return the cameras, at least `distance` from the focus, or the median distance of the photos if that is less."""
+    least = min(distance, float(np.percentile([np.linalg.norm(each.position - focus) for each in photos], 50)))
+    moved = []
+    for camera in path:
+        offset = camera.position - focus
+        pose = camera.camera_to_world.copy()
+        pose[:3, 3] = focus + offset * max(1.0, least / max(float(np.linalg.norm(offset)), 1e-12))
+        moved.append(replace(camera, world_to_camera=np.linalg.inv(pose)))
+    return moved
 
 
 def _in_front_of_obstacles(
@@ -106,6 +212,15 @@ def _in_front_of_obstacles(
     positions = [camera.position + part * (focus - camera.position) for camera, part in zip(path, parts, strict=True)]
     poses = [look_at_pose(place, focus, direction) for place, direction in zip(positions, up, strict=True)]
     return [replace(camera, world_to_camera=np.linalg.inv(pose)) for camera, pose in zip(path, poses, strict=True)]
+
+
+def _focus_distance(run: "LoadedScene", cameras: Sequence[Camera]) -> float:
+    """Return the median depth in a small render of the middle camera; 1 if it is empty."""
+    if not cameras:
+        return 1.0
+    depth = as_array(run.render(cameras[len(cameras) // 2].within(_SIZE)).depth)
+    depth = depth[depth > 0]
+    return float(np.median(depth)) if depth.size else 1.0
 
 
 def _surface(run: "LoadedScene", camera: Camera) -> np.ndarray:

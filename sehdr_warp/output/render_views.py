@@ -22,10 +22,10 @@ from ..progress import tracked
 from .aovs import ViewData, data_parts, read_aovs
 from .brackets import Brackets, bracket_exposures
 from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
-from .camera_paths import evenly, interpolate, orbit, training_cameras
+from .camera_paths import evenly, interpolate, training_cameras
 from .colorspace import from_rec709
 from .exr import Part, rgb_channels, write_multipart_exr
-from .framing import film_camera, frame_subject
+from .framing import default_path, film_camera
 from .images import as_array, quantize, safe_names, write_picture
 from .light_pictures import exposure_of_white
 from .light_unit import luminance_of_one, read_light_unit
@@ -128,7 +128,7 @@ def render_views(
     look = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
     aovs = read_aovs(aovs) if aovs else ()
     transform = world_transform(run, axes, up=up, scale=scale)
-    views = select_cameras(run, cameras, camera=camera, count=count, transform=transform)
+    views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
     if size is not None:
         width, height = read_size(size)
         views = [(name, framed(camera, width, height)) for name, camera in views]
@@ -232,6 +232,7 @@ def select_cameras(
     camera: str | None = None,
     count: int = 60,
     transform: WorldTransform | None = None,
+    up: str | Sequence[float] | None = None,
 ) -> list[tuple[str, Camera]]:
     """Return named cameras in the scene's own coordinates; the names are safe for files and all different.
 
@@ -242,6 +243,7 @@ def select_cameras(
         count: Views of an orbit or interpolation.
         transform: From the scene's coordinates to those of camera files that other programs write (OpenUSD, .chan); by
             default that to upright coordinates.
+        up: As in world_transform, for an orbit.
 
     Raises:
         SehdrError: If there are none, or `cameras` is neither a known name nor a file.
@@ -256,11 +258,7 @@ def select_cameras(
             others = choices.replace(f"{text}, ", "")
             raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
     elif text in PATHS:
-        photos = training_cameras(run)
-        orbiting = text == "orbit"
-        path = orbit(photos, count, _focus_distance(run, photos)) if orbiting else interpolate(photos, count)
-        path = [film_camera(camera, photos) for camera in path]
-        path = frame_subject(run, path, photos) if orbiting else path
+        path = default_path(run, count, up) if text == "orbit" else _through_photos(run, count)
         digits = max(3, len(str(count - 1)))
         return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
     else:
@@ -275,6 +273,12 @@ def select_cameras(
             if not views:
                 raise SehdrError(f"{cameras}: has no camera {camera!r}{did_you_mean(camera, names)}")
     return list(zip(safe_names([name for name, _ in views]), [camera for _, camera in views], strict=True))
+
+
+def _through_photos(run: "LoadedScene", count: int) -> list[Camera]:
+    """Return a path through the training cameras."""
+    photos = training_cameras(run)
+    return [film_camera(camera, photos) for camera in interpolate(photos, count)]
 
 
 def _from_file(run: "LoadedScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
@@ -297,12 +301,3 @@ def provenance(run: "LoadedScene") -> dict[str, str]:
     values = {"scene": run.scene_name, "iterations": run.iterations, "units": str(unit or "relative radiance")}
     values["response"] = getattr(run.response, "name", None)
     return {key: str(value) for key, value in values.items() if value not in (None, "")}
-
-
-def _focus_distance(run: "LoadedScene", cameras: Sequence[Camera]) -> float:
-    """Return the median depth in a small render of the middle camera; 1 if it is empty."""
-    if not cameras:
-        return 1.0
-    depth = as_array(run.render(cameras[len(cameras) // 2].within(_FIT_SIZE)).depth)
-    depth = depth[depth > 0]
-    return float(np.median(depth)) if depth.size else 1.0

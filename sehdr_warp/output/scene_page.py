@@ -18,6 +18,7 @@ from ..files import atomic_path, check_absent
 from ..model.baking import gaussians_of
 from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras, training_cameras
+from .framing import opening_view
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
 from .light_pictures import curve_table, display_gain
 from .splat_edits import SplatEdits, most_visible, without_strays
@@ -74,6 +75,7 @@ def write_scene_page(
     values = np.stack(list(columns.values()))
     facts = facts_of_cameras(run.cameras) | {
         "up": transform.rotation[1].tolist(),
+        "opening": None if (opening := opening_view(run)) is None else opening.to_dict(),
         "columns": list(columns),
         "base_time": run.base_time,
         "grey": display_gain(run.response),

@@ -17,10 +17,11 @@ import numpy as np
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.gravity import is_pitch_known, typical_roll, up_direction
 
 from ..files import read_json, write_json
 from ..splats import STREAMED_SOG
-from .camera_paths import common_focus, is_pitch_known, middle_index, training_cameras, typical_roll, up_direction
+from .camera_paths import common_focus, middle_index, training_cameras
 
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
@@ -111,8 +112,8 @@ def world_transform(
         run: From load_run, train or load_splats.
         axes: "upright" or "scene", the scene's own coordinates.
         up: The scene's up direction in its own coordinates, as "x,y,z", three numbers, or an axis such as "-y"; None
-            for the one kept with the run, or else gravity as the cameras show it.
-        scale: Meters for each unit of the scene; None for the one kept with the run, or else 1.
+            for the one kept with the run, or else gravity as photos and cameras show it.
+        scale: Meters for each unit of the scene; None for the one kept with the run, that of the photos' GPS, or 1.
 
     Raises:
         SehdrError: For values that cannot be, or options that exclude each other.
@@ -127,8 +128,9 @@ def world_transform(
         factor = _checked_scale(scale)
         back = WorldTransform.identity() if matrix is None else WorldTransform.from_matrix(matrix).inverse()
         return WorldTransform(back.rotation, factor * back.translation, factor * back.scale)
-    factor = _checked_scale(orientation.scale if scale is None else scale)
-    direction = read_direction(up) if up is not None else orientation.up
+    by_gps = None if run.up is None else run.up.unit
+    factor = _checked_scale(next((each for each in (scale, orientation.scale, by_gps) if each is not None), None))
+    direction = _known_up(run, up, orientation)
     cameras = training_cameras(run) or [e.camera for e in run.cameras]
     if direction is None and (matrix is not None or not cameras):
         # Turned about the axis of view, so that what is ahead stays ahead.
@@ -150,6 +152,23 @@ def world_transform(
         focus = common_focus(cameras)
         origin = np.mean([camera.position for camera in cameras], axis=0) if focus is None else focus
     return WorldTransform(rotation, -factor * (rotation @ origin), factor)
+
+
+def scene_up(run: "LoadedScene", up: str | Sequence[float] | None = None) -> np.ndarray:
+    """Return the up direction [3] in the scene's own coordinates, as world_transform takes it; says nothing."""
+    direction = _known_up(run, up, read_orientation(run))
+    if direction is None and run.world_matrix is None and (cameras := training_cameras(run)):
+        direction = up_direction(cameras)
+    return world_transform(run).rotation[1] if direction is None else direction
+
+
+def _known_up(run: "LoadedScene", up: str | Sequence[float] | None, orientation: "Orientation") -> np.ndarray | None:
+    """Return the up direction that is stated, kept with a run or was found at its training; None if there is none."""
+    if up is not None:
+        return read_direction(up)
+    if orientation.up is not None or run.up is None or run.up.source == "cameras":
+        return orientation.up
+    return run.up.direction
 
 
 def is_y_down(path: Path | str) -> bool:

@@ -22,6 +22,7 @@ from ..model.radiance_field import RadianceField, RenderedView, Surroundings
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.gravity import UpDirection
 from ..scene.normalization import Normalization
 from ..splats import read_gaussians
 from .checkpoint import Checkpoint, under
@@ -52,6 +53,7 @@ class LoadedScene:
         color_matrix: [3, 3] from the field's colors to linear Rec.709, if it was trained on sensor RGB; else None.
         world_matrix: [4, 4] from the scene's own coordinates to those of its file of Gaussians, if stated; else None.
         exposure_compensation: Exposure compensation of the training photos, if there was one.
+        up: Up direction that photos and poses show; None if it was not looked for.
     """
 
     path: Path
@@ -65,6 +67,7 @@ class LoadedScene:
     color_matrix: np.ndarray | None = None
     world_matrix: np.ndarray | None = None
     exposure_compensation: ExposureCompensation | None = None
+    up: UpDirection | None = None
 
     @property
     def model(self) -> RadianceField:
@@ -212,6 +215,7 @@ class Run(LoadedScene):
         if info.get("color_matrix"):
             self.color_matrix = np.array(info["color_matrix"], np.float64)
         self.exposure_compensation = exposure_compensation(info)
+        self.up = UpDirection.from_dict(info.get("up"))
 
     def _repr_html_(self) -> str:
         """Return HTML for notebooks."""

@@ -23,6 +23,7 @@ from ..model.confidence import Evidence
 from ..model.radiance_field import RadianceField
 from ..scene import Scene
 from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.gravity import find_up
 from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
 from .config import Config
 from .run_folder import EVIDENCE_TENSORS, NEW, READY, RunFolder, confidence_metadata, describe_scene
@@ -141,6 +142,7 @@ class RunWriter(RunFolder):
             info["color_matrix"] = scene.color_matrix.tolist()
         if gains is not None:
             info["exposure_compensation"] = gains.to_dict()
+        info["up"] = find_up(scene).to_dict()
         self.begin_described(describe_scene(scene), info, config, plan, state)
 
     def begin_described(

@@ -65,6 +65,14 @@ class NormalizationValues(Values):
     unit: Annotated[float, Field(gt=0)]
 
 
+class UpValues(Values):
+    """The up direction that photos and poses show; see scene.gravity.UpDirection."""
+
+    direction: _Row
+    source: Text
+    unit: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
+
+
 class RunValues(Values):
     """The object in run.json."""
 
@@ -76,6 +84,7 @@ class RunValues(Values):
     normalization: NormalizationValues | None = None
     color_matrix: Annotated[list[_Row], _Three] | None = None
     exposure_compensation: GainValues | None = None
+    up: UpValues | None = None
 
 
 class CheckpointValues(Values):

@@ -12,6 +12,7 @@ from sehdr_warp.scene import Camera
 
 from ..model.lights import Light
 from ..output.camera_paths import facts_of_cameras
+from ..output.framing import opening_view
 from ..output.light_pictures import curve_table, display_gain
 from ..output.light_unit import luminance_of_one
 from ..output.splat_edits import SplatEdits
@@ -39,6 +40,7 @@ class ViewerScene:
         self.run, self.name, self.clipped = run, name, clipped
         self.lock, self.version = SceneLock(), 0
         self.opacities, self.shown_count = EditedOpacities(), None
+        self._opened: list[dict[str, Any] | None] = []
         self._start_lights()
 
     def _start_lights(self) -> None:
@@ -153,10 +155,23 @@ class ViewerScene:
             frame = torch.empty(frame.shape, dtype=frame.dtype, pin_memory=True).copy_(frame)
         yield frame.numpy().data.cast("B")
 
+    def _opening(self) -> dict[str, Any] | None:
+        """Return the camera that the page opens with, found at the first call; see opening_view."""
+        if not self._opened:
+            camera = opening_view(cast(Any, self))
+            self._opened = [None if camera is None else camera.to_dict()]
+        return self._opened[0]
+
     def facts(self) -> dict[str, Any]:
         """Return what the page knows of the run, as plain values."""
-        transform = world_transform(cast(Any, self)) if hasattr(self, "path") else None  # A training has no folder yet.
-        own = {} if transform is None else {"up": transform.rotation[1].tolist(), "upright": transform.matrix.tolist()}
+        own = {}
+        if hasattr(self, "path"):  # A training has no folder yet.
+            transform = world_transform(cast(Any, self))
+            own = {
+                "up": transform.rotation[1].tolist(),
+                "upright": transform.matrix.tolist(),
+                "opening": self._opening(),
+            }
         facts = {
             "name": self.name,
             "version": self.version,

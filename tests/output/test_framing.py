@@ -1,13 +1,20 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.output.camera_paths import orbit
-from sehdr_warp.output.framing import film_camera, film_size, frame_subject, subject_radius
+from sehdr_warp.output.camera_paths import orbit, walk, walk_path
+from sehdr_warp.output.framing import (
+    default_path,
+    film_camera,
+    film_size,
+    frame_subject,
+    opening_view,
+    subject_radius,
+)
 from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.splats import write_gaussians
 
-from .helpers import AnalyticRun, camera
+from .helpers import AnalyticRun, Entry, camera
 from .test_splat_edits import splats
 
 
@@ -82,3 +89,57 @@ def test_a_scene_without_a_focus_keeps_its_path():
     photos = [camera(position=(i, 0, 0), target=(i, 0, 5)) for i in range(4)]
     path = orbit(photos, 4, 2.0)
     assert frame_subject(run, path, photos) == path
+
+
+def street(count=12, bend=0.0, leap=None):
+    """Cameras of somebody who walks ahead along +Z with -Y up, sways, and may be placed wrongly from `leap` on."""
+    random, cameras = np.random.default_rng(0), []
+    for index in range(count):
+        place = np.array([0.03 * random.normal(), 0.02 * random.normal(), 0.5 * index])
+        place = place + (np.array([8.0, 0, 0]) if leap is not None and index >= leap else 0)
+        up = (np.sin(bend * index) + 0.03 * random.normal(), -np.cos(bend * index), 0)
+        cameras.append(Camera(80, 60, 50, 50, 40, 30, look_at(place, np.add(place, (0, 0, 1)), up=up)))
+    return cameras
+
+
+def test_a_walk_ahead_is_followed_not_orbited():
+    photos = street()
+    broken = street(leap=4)
+    assert len(walk(photos)) == 12 and walk(photos[:3]) == []
+    assert all(found is photo for found, photo in zip(walk(broken), broken[4:], strict=True))
+    assert walk(around(24, 4)) == walk(around(24, 4, span=90)) == []
+    path = walk_path(photos, 30)
+    places = np.stack([each.position for each in path])
+    steps = np.diff(places, axis=0)
+    assert places[0] == pytest.approx(photos[0].position, abs=0.5) and places[-1, 2] > 5
+    sway = np.ptp([photo.position[:2] for photo in photos], axis=0)
+    assert (steps[:, 2] > 0).all() and (np.ptp(places[:, :2], axis=0) < 0.6 * sway).all()
+    assert all(each.world_to_camera[2, 2] > 0.99 for each in path)
+    # Structure from motion has bent this street: the picture stays level all along.
+    bent = street(bend=0.05)
+    for each, photo in zip(walk_path(bent, 12), bent, strict=True):
+        assert abs(each.world_to_camera[0, :3] @ photo.world_to_camera[1, :3]) < 0.15
+
+
+def test_the_path_of_a_walk_is_in_the_format_of_films(logged):
+    run = AnalyticRun()
+    run.cameras = [Entry(str(index), "train", each) for index, each in enumerate(street())]
+    path = default_path(run, 5)
+    assert len(path) == 5 and {(each.width, each.height) for each in path} == {(640, 360)}
+    assert any("the photos walk ahead" in line for line in logged)
+    assert opening_view(run).position == pytest.approx(run.cameras[0].camera.position)
+
+
+@pytest.mark.parametrize("distance, fov, change", [(2.2, 24, 2.0), (6, 60, 0.6)])
+def test_a_page_opens_nearer_than_photos_from_afar_and_farther_than_close_ups(tmp_path, distance, fov, change):
+    photos = around(12, distance, fov=fov)
+    run = ball(tmp_path)
+    run.cameras = tuple(Entry(str(index), "train", each) for index, each in enumerate(photos))
+    opening = opening_view(run)
+    assert opening is not None and (opening.width, opening.height) == (640, 360)
+    assert any(np.allclose(opening.position, photo.position) for photo in photos)
+    film = film_camera(photos[0], photos)
+    assert film.fx / opening.fx == pytest.approx(change, rel=0.02)
+    assert opening.world_to_camera[0, 1] == pytest.approx(0, abs=1e-9)
+    run.cameras = ()
+    assert opening_view(run) is None

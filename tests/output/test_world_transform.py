@@ -8,12 +8,13 @@ from scipy.spatial.transform import Rotation
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.camera_exchange import camera_path
-from sehdr_warp.output.camera_paths import is_pitch_known, orbit, up_direction
+from sehdr_warp.output.camera_paths import orbit
 from sehdr_warp.output.export import export
 from sehdr_warp.output.render_views import render_views, select_cameras
 from sehdr_warp.output.world_transform import WorldTransform, world_transform, write_orientation
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera, load_cameras, load_scene, look_at
+from sehdr_warp.scene.gravity import is_pitch_known, up_direction
 from sehdr_warp.splats import read_gaussians, write_gaussians
 
 from ..splats.test_splat_files import gaussians

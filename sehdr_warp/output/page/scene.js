@@ -38,7 +38,7 @@ async function start() {
   splat.gsplat.instance.sorter.on("updated", () => { sorted++; request(timer !== 0); });
   facts.views.forEach((view, i) => $("view").add(new Option(view.name, i)));
   new ResizeObserver(moved).observe(stage);
-  jump(facts.first);
+  jump(facts.opening || facts.views[facts.first].camera);
 }
 
 // The engine's Gaussians end early, are lifted to make up for it, and left out where small; ours end at the same opacity alone.
@@ -110,8 +110,8 @@ function paint() {
   $("stopsTold").textContent = `${stopsText(stops)} \u00b7 ${secondsText(facts.base_time * 2 ** stops)}`;
   if (light.frames.scene) light.draw({stops, tone: $("tone").value, grey: facts.grey});
 }
-function jump(index) {
-  const view = facts.views[index].camera, from = centerOf(view);
+function jump(view) {
+  const from = centerOf(view);
   const ahead = facts.focus ? dot(add(facts.focus, from, -1), view.world_to_camera[2].slice(0, 3)) : 0;
   camera.jump(view, ahead > 0 ? ahead : facts.size / 2);
   moved();
@@ -119,7 +119,7 @@ function jump(index) {
 
 $("stops").addEventListener("input", paint);
 $("tone").addEventListener("change", paint);
-$("view").addEventListener("change", () => $("view").value && jump(Number($("view").value)));
+$("view").addEventListener("change", () => $("view").value && jump(facts.views[$("view").value].camera));
 $("panel").addEventListener("submit", event => event.preventDefault());
 let drag = null;
 stage.addEventListener("pointerdown", event => { stage.setPointerCapture(event.pointerId); drag = [event.clientX, event.clientY]; });

@@ -36,7 +36,7 @@ async function start() {
   else setInterval(renew, 2000);
   useRun(0);
   new ResizeObserver(resize).observe(stage);
-  jump(facts.first);
+  jump(facts.first, facts.opening);
 }
 
 // Shows what a training of another process has written meanwhile.
@@ -73,12 +73,13 @@ function resize() {
   moved();
 }
 
-function jump(index) {
+// Takes the place of a photo, or another one near it.
+function jump(index, place) {
   const view = facts.views[index];
   if (!view) { camera.jump({width: 4, height: 3, fx: 3, fy: 3, cx: 2, cy: 1.5, world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, 1); return moved(); }
   $("view").value = index, $("zoom").value = 0;
-  const from = centerOf(view.camera), ahead = facts.focus ? dot(add(facts.focus, from, -1), view.camera.world_to_camera[2].slice(0, 3)) : 0;
-  camera.jump(view.camera, ahead > 0 ? ahead : facts.size / 2);
+  const seen = place || view.camera, ahead = facts.focus ? dot(add(facts.focus, centerOf(seen), -1), seen.world_to_camera[2].slice(0, 3)) : 0;
+  camera.jump(seen, ahead > 0 ? ahead : facts.size / 2);
   loadPhoto(index);
   moved();
 }

@@ -1,0 +1,107 @@
+"""Up by GPS, by vertical lines and by poses: of rendered rooms, whose Z is up, and of flights with places in EXIF."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import rotate
+from scipy.spatial.transform import Rotation
+
+from sehdr_warp.scene import Camera, Scene, View, load_scene, look_at
+from sehdr_warp.scene.gravity import UpDirection, find_up, up_direction, up_from_lines
+
+UP = np.array([0.0, 0, 1])
+
+
+def degrees(a, b=UP):
+    return np.degrees(np.arccos(np.clip(a @ b, -1, 1)))
+
+
+def scene(views):
+    return Scene("set", "photos", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+
+
+def room(name):
+    return load_scene(f"embedded:{name}", response="srgb")
+
+
+@pytest.mark.parametrize("name, by_poses", [("metal", 19), ("overcast", 9), ("window", 2)])
+def test_lines_tell_the_pitch_of_cameras_that_look_one_way(name, by_poses):
+    photos = room(name)
+    assert degrees(up_direction([view.camera for view in photos.train_views])) > by_poses
+    up = find_up(photos)
+    assert up.source == "lines" and degrees(up.direction) < 3.5
+
+
+@pytest.mark.parametrize("name", ["study", "sunlit", "room"])
+def test_lines_leave_what_poses_know(name):
+    up = find_up(room(name))
+    assert up.source == "lines" and degrees(up.direction) < 1.2
+
+
+def test_lines_right_cameras_that_are_rolled_alike():
+    """A camera is screwed onto its tripod askew, and looks one way."""
+    views = []
+    for view in room("window").train_views:
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_euler("z", 6, degrees=True).as_matrix()
+        codes = rotate(view.codes, -6, reshape=False, order=1)[20:-20, 20:-20]  # Without the corners that turned in
+        camera = replace(view.camera, world_to_camera=turn @ view.camera.world_to_camera)
+        camera = replace(camera, width=160, height=160, cx=camera.cx - 20, cy=camera.cy - 20)
+        views.append(View(view.name, codes, camera, view.exposure_time, "train"))
+    poses = up_direction([view.camera for view in views])
+    lines = up_from_lines(views, poses)
+    assert degrees(poses) == pytest.approx(6, abs=1) and lines is not None and degrees(lines) < 2
+
+
+def test_photos_without_lines_leave_the_up_of_their_poses():
+    random = np.random.default_rng(0)
+    views = []
+    for index, view in enumerate(room("study").train_views):
+        codes = random.integers(0, 256, (60, 80, 3), np.uint8)
+        views.append(View(str(index), codes, view.camera.resized(80, 60), 1.0, "train"))
+    up = find_up(scene(views))
+    assert up.source == "cameras" and up.direction == pytest.approx(up_direction([view.camera for view in views]))
+
+
+def flight(folder, noise=0.0, south=False):
+    """Photos straight down with one heading, 40 m above the ground, in a world of 7 m a unit that lies askew."""
+    random = np.random.default_rng(1)
+    turn = Rotation.from_euler("xyz", [40, 70, 110], degrees=True).as_matrix()
+    views = []
+    for index in range(12):
+        east, north = 15.0 * (index % 4), 12.0 * (index // 4)
+        place = np.array([east, north, 40.0])
+        pose = look_at(place / 7, place / 7 - UP, up=(0, 1, 0.0))
+        pose[:3, :3] = pose[:3, :3] @ turn.T
+        place = place + random.normal(0, noise, 3)
+        exif, meters = Image.Exif(), 6_371_000 * np.pi / 180
+        angles = (-48.0 if south else 48.0) + place[1] / meters, -16.0 + place[0] / meters / np.cos(np.radians(48))
+        table = exif.get_ifd(0x8825)
+        for tag, angle, names in ((1, angles[0], "NS"), (3, angles[1], "EW")):
+            table[tag], size = names[int(angle < 0)], abs(angle)
+            table[tag + 1] = (int(size), int(size * 60 % 60), size * 3600 % 60)
+        table[5], table[6] = b"\0", place[2] + 300
+        path = folder / f"{index}.jpg"
+        Image.new("RGB", (32, 24), (90, 90, 90)).save(path, exif=exif)
+        codes = np.zeros((24, 32, 3), np.uint8)
+        views.append(View(str(index), codes, Camera(32, 24, 30, 30, 16, 12, pose), 1.0, "train", source=path))
+    return scene(views), turn @ UP
+
+
+@pytest.mark.parametrize("south", [False, True])
+def test_places_in_exif_tell_up_and_the_unit(tmp_path, south):
+    photos, truth = flight(tmp_path, noise=0.2, south=south)
+    assert degrees(up_direction([view.camera for view in photos.views]), truth) > 20
+    up = find_up(photos)
+    assert up.source == "gps" and degrees(up.direction, truth) < 1 and up.unit == pytest.approx(7, rel=0.02)
+    again = UpDirection.from_dict(up.to_dict())
+    assert again is not None and again.direction == pytest.approx(up.direction) and again.unit == up.unit
+
+
+def test_places_that_do_not_fit_the_poses_are_not_used(tmp_path):
+    photos, _ = flight(tmp_path, noise=8.0)
+    assert find_up(photos).source == "cameras" and UpDirection.from_dict(None) is None
+    views = [replace(view, source=None) for view in flight(tmp_path)[0].views]
+    assert find_up(scene(views)).source == "cameras"
