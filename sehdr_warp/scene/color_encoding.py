@@ -10,7 +10,7 @@ import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ from PIL import Image
 from ..errors import InputError
 from .heif import read_items
 from .icc import read_profile, xyz_to_rec709
-from .icc_table import IccTable
+from .icc_table import IccTable, KnownColors
 from .images import PILLOW_ERRORS, EncodedImage, exif_of
-from .primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
+from .primaries import REC709, matrix_to_rec709, srgb_to_linear
+from .srgb_codes import encoded_in_bands
 
 _ADOBE_RGB = (0.640, 0.330, 0.210, 0.710, 0.150, 0.060, 0.3127, 0.3290)
 _ADOBE_GAMMA = 563 / 256
@@ -32,8 +33,8 @@ _UNSTATED = (0, 2, 3)  # Code points of ITU-T H.273 that state nothing
 _SAMPLES = 65_536  # Of curves: exact at all codes of 8 and 16 bits
 _PQ_WHITE = 1000.0  # cd/m2 of the code of white, BT.2100's nominal peak; what is brighter is light above white
 _SAME = 0.004  # Linear difference by which curves and primaries may differ and still be sRGB's
-_DEVIATION = 0.02  # Of the logarithm of light that conversion puts above white, by codes of 8 bits
-_BAND_ROWS = 256
+DEVIATION = 0.02
+"""Standard deviation of the logarithm of light that conversion puts above white, by codes of 8 bits."""
 _GREY = ("L", "LA", "La", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _INTEROP = 0xA005, 1  # EXIF's interoperability table, and its index
 _COLOR_SPACE = 0xA001
@@ -80,18 +81,43 @@ class ColorEncoding:
             [H, W, 3] float32, which may be negative or above 1 outside of Rec.709's gamut, and [H, W, 3] bool, which
             channels are clipped.
         """
-        white = np.iinfo(pixels.dtype).max
-        if self.table is not None:
-            light, clipped = xyz_to_rec709(self.table.to_xyz(pixels / white)).astype(np.float32), pixels == white
-            return light if above is None else np.where(above > 0, above, light), clipped
-        tables = _decoding_tables(self.curves or (srgb_to_linear(np.linspace(0, 1, _SAMPLES)),) * 3, int(white))
-        light = np.stack([table[pixels[..., channel]] for channel, table in enumerate(tables)], axis=-1)
-        clipped = pixels == white
+        clipped = pixels == np.iinfo(pixels.dtype).max
+        light = self._decoded(pixels) if self.table is None else self._light_by_table(pixels)
         if above is not None:
             light, clipped = np.where(above > 0, above, light), clipped & (above == 0)
         if self.to_rec709 is not None:
-            light = light @ self.to_rec709.T.astype(np.float32)
+            # A product with a transposed view is slower.
+            matrix = np.ascontiguousarray(self.to_rec709.T, np.float32)
+            light = (light.reshape(-1, 3) @ matrix).reshape(light.shape)
         return light, clipped
+
+    def _decoded(self, pixels: np.ndarray) -> np.ndarray:
+        """Return [H, W, 3] float32 light of codes by the curves, in the primaries of the codes."""
+        levels = int(np.iinfo(pixels.dtype).max)
+        if levels not in self._decoders:
+            self._decoders[levels] = _decoding_tables(self.curves or (_srgb_curve(_SAMPLES),), levels)
+        decoders = self._decoders[levels]
+        if len(decoders) == 1:
+            return decoders[0][pixels]
+        return np.stack([decoder[pixels[..., channel]] for channel, decoder in enumerate(decoders)], axis=-1)
+
+    def _light_by_table(self, pixels: np.ndarray) -> np.ndarray:
+        """Return [H, W, 3] float32 linear Rec.709 of codes by the profile's table."""
+        return self._known_colors.light(pixels) if pixels.dtype == np.uint8 else self._converted(pixels)
+
+    def _converted(self, pixels: np.ndarray) -> np.ndarray:
+        assert self.table is not None
+        values = pixels / np.float32(np.iinfo(pixels.dtype).max)
+        return xyz_to_rec709(self.table.to_xyz(values)).astype(np.float32)
+
+    @cached_property
+    def _decoders(self) -> dict[int, list[np.ndarray]]:
+        """Decoded values of all codes, by the largest code; one array if all channels share it."""
+        return {}
+
+    @cached_property
+    def _known_colors(self) -> KnownColors:
+        return KnownColors(self._converted)
 
     def convert(self, image: EncodedImage) -> EncodedImage:
         """Return a photo as the codes of a photo in sRGB, of 16 bits if they change.
@@ -104,37 +130,7 @@ class ColorEncoding:
         codes, brighter = encoded_in_bands(image.pixels, above, self.to_linear)
         if brighter is None:
             return EncodedImage(codes, alpha)
-        return EncodedImage(codes, alpha, brighter, max(_DEVIATION, deviation))
-
-
-def encoded_in_bands(
-    pixels: np.ndarray,
-    above: np.ndarray | None,
-    to_linear: Callable[[np.ndarray, np.ndarray | None], tuple[np.ndarray, np.ndarray]],
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Encode linear Rec.709 as 16-bit sRGB codes.
-
-    Args:
-        pixels: [H, W, 3] codes; a few rows are converted at a time, because floats take much memory.
-        above: [H, W, 3] light above white that is known beside them, or None.
-        to_linear: returns linear Rec.709 and clipped channels of rows.
-
-    Returns:
-        Codes, white where a channel is clipped, and [H, W, 3] float16 light of unclipped pixels above white, 0
-        elsewhere; None if there is none.
-    """
-    codes, brighter = np.empty(pixels.shape, np.uint16), None
-    for top in range(0, len(pixels), _BAND_ROWS):
-        rows = slice(top, top + _BAND_ROWS)
-        light, clipped = to_linear(pixels[rows], None if above is None else above[rows])
-        encoded = np.rint(65535 * np.clip(linear_to_srgb(light), 0, 1)).astype(np.uint16)
-        encoded[clipped] = 65535
-        codes[rows] = encoded
-        measurable = (light > 1) & ~clipped
-        if measurable.any():
-            brighter = np.zeros(pixels.shape, np.float16) if brighter is None else brighter
-            brighter[rows] = np.where(measurable, light, 0)
-    return codes, brighter
+        return EncodedImage(codes, alpha, brighter, max(DEVIATION, deviation))
 
 
 def stated_encoding(image: Image.Image) -> ColorEncoding | None:
@@ -227,9 +223,8 @@ def _simplified(name: str, matrix: np.ndarray | None, curves: tuple[np.ndarray, 
 
 def _decoding_tables(curves: tuple[np.ndarray, ...], white: int) -> list[np.ndarray]:
     codes = np.linspace(0, 1, white + 1)
-    same = all(curve is curves[0] for curve in curves)
-    tables = [np.interp(codes, np.linspace(0, 1, len(c)), c).astype(np.float32) for c in curves[: 1 if same else 3]]
-    return tables * 3 if same else tables
+    count = 1 if all(curve is curves[0] for curve in curves) else 3
+    return [np.interp(codes, np.linspace(0, 1, len(c)), c).astype(np.float32) for c in curves[:count]]
 
 
 def _png_cicp(path: Path) -> tuple[int, int, int] | None:

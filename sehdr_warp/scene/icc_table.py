@@ -12,6 +12,7 @@ import numpy as np
 
 _D50 = np.array([0.9642, 1.0, 0.8249])  # White of the profile connection space, ICC.1:2022, 7.2.16
 _MOST_ENTRIES = 1 << 22  # Of a table, 128 to each side and three channels are 6 million numbers
+_AT_ONCE = 1 << 14  # Colors that are converted at a time, whose floats stay in the caches of a processor
 _EPSILON, _KAPPA = 216 / 24389, 24389 / 27
 _ReadCurve = Callable[[bytes], np.ndarray]
 
@@ -54,6 +55,31 @@ class IccTable:
         cubes = roots * roots * roots
         light = np.where(cubes > _EPSILON, cubes, (116 * roots - 16) / np.float32(_KAPPA))
         return light * _D50.astype(np.float32)
+
+
+class KnownColors:
+    """The light of codes of 8 bits by a slow conversion: each color is converted when a photo shows it first."""
+
+    def __init__(self, convert: Callable[[np.ndarray], np.ndarray]):
+        """Prepare for colors.
+
+        Args:
+            convert: returns the light [N, 3] of codes [N, 3] uint8.
+        """
+        self._convert = convert
+        # The system gives memory to pages that are written alone: photos show a small part of all colors.
+        self._known, self._light = np.zeros(1 << 24, bool), np.zeros((1 << 24, 3), np.float32)
+
+    def light(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the light [H, W, 3] float32 of codes [H, W, 3] uint8. Threads may call it at the same time."""
+        red, green, blue = (pixels[..., channel].astype(np.int32) for channel in range(3))
+        numbers = red | green << 8 | blue << 16
+        if len(new := np.unique(numbers[~self._known[numbers]])):
+            for some in np.array_split(new, 1 + len(new) // _AT_ONCE):
+                codes = np.stack([some & 255, some >> 8 & 255, some >> 16], axis=1).astype(np.uint8)
+                self._light[some] = self._convert(codes)
+            self._known[new] = True  # After their light, which another thread may read now
+        return self._light[numbers]
 
 
 def read_table(tag: bytes, space: str, read_curve: _ReadCurve) -> IccTable:

@@ -28,7 +28,7 @@ _NEUTRAL_AT_ZERO = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPE
 _SPHERE = "EQUIRECTANGULAR"
 _SKEW = 0.01  # Part of its width by which a panorama may differ from twice its height
 _MAX_SIDE = 1 << 16
-_BAND_VALUES = 1 << 24  # Values that are averaged at one time, 64 MB
+_BAND_VALUES = 1 << 20  # Values that are averaged at one time: 4 MB, which caches hold
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class Undistortion:
 
 
 def area_average(
-    image: np.ndarray, width: int, height: int, values: Callable[[slice], np.ndarray] | None = None
+    image: np.ndarray, width: int, height: int, values: Callable[[slice], np.ndarray | None] | None = None
 ) -> np.ndarray:
     """Downsample [H, W] or [H, W, C] to float32 [height, width(, C)], each pixel the exact mean of the area it covers.
 
@@ -195,7 +195,7 @@ def area_average(
         width: not larger than the image's.
         height: not larger than the image's.
         values: returns the float32 values of a slice of rows, by default the pixels; it is called for few rows at a
-            time, because a photo may be too large to be converted to floats as a whole.
+            time, because a photo may be too large to be converted to floats as a whole. None stands for rows of 0.
     """
     values = values or (lambda rows: image[rows].astype(np.float32, copy=False))
     count = image.shape[0]
@@ -205,11 +205,14 @@ def area_average(
         for start in range(0, height, step):
             part = shares[start : start + step]
             first, last = int(part.indices.min()), int(part.indices.max()) + 1
-            lines = values(slice(first, last))
-            means.append((part[:, first:last] @ lines.reshape(len(lines), -1)).reshape(-1, *lines.shape[1:]))
+            if (lines := values(slice(first, last))) is None:
+                means.append(np.zeros((min(step, height - start), *image.shape[1:]), np.float32))
+            else:
+                means.append((part[:, first:last] @ lines.reshape(len(lines), -1)).reshape(-1, *lines.shape[1:]))
         image = np.concatenate(means)
     else:
-        image = values(slice(None))
+        lines = values(slice(0, count))
+        image = np.zeros(image.shape, np.float32) if lines is None else lines
     if image.shape[1] != width:
         lines = np.moveaxis(image, 1, 0)
         mean = _overlaps(len(lines), width) @ lines.reshape(len(lines), -1)

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -15,8 +15,9 @@ from ..errors import InputError
 from ..parallel import prefetch_map
 from ..progress import tracked
 from .camera import Camera
-from .color_encoding import ColorEncoding
+from .color_encoding import DEVIATION, ColorEncoding
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
+from .float_table import FloatTable
 from .gain_map import has_gain_map, light_of, read_gain_map, with_light_above_white
 from .hdr_files import hdr_size, read_hdr
 from .images import EncodedImage
@@ -26,6 +27,8 @@ from .masks import mask_note, read_mask
 from .names import unique_names
 from .photo_file import PhotoKeeper
 from .photos import fitted_lens, left_out, read_photo
+from .primaries import linear_to_srgb
+from .srgb_codes import bands_of
 from .types import Scene, View, codes_of
 from .wide_camera import solid_angles
 
@@ -115,29 +118,49 @@ def read_codes(record: ImageRecord, *, oriented: bool = False) -> EncodedImage:
 
     `oriented` turns the pixels as the EXIF orientation says.
     """
-    if not record.derived and kind_of(record.image) == "float":
-        return EncodedImage(float_codes(read_hdr(record.image) * record.light_scale, record.seconds), None)
-    if not record.derived:
-        photo = read_photo(record.image, oriented=oriented)
-        encoding = record.encoding or ColorEncoding("sRGB")
-        if record.gain_map or (kind_of(record.image) == "encoded" and not record.linear and has_gain_map(record.image)):
-            gain_map = read_gain_map(record.image, oriented=oriented)
-            if record.gain_map:
-                photo = light_of(photo, gain_map, record.light_scale)
-                encoding = replace(encoding, curves=(), table=None)  # The light is in sRGB's curve already
-            elif gain_map is not None:
-                photo = with_light_above_white(photo, gain_map)
-        elif record.linear and encoding.light is None:
-            photo = EncodedImage(linear_codes(photo.pixels / photo.levels), photo.alpha)
-            encoding = replace(encoding, curves=(), table=None)
-        return encoding.convert(photo)
-    return EncodedImage(codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8), None)
+    stored = _read_stored(record, oriented=oriented)
+    return stored.encoding.convert(stored.photo)
+
+
+class _StoredPhoto(NamedTuple):
+    """A photo whose codes are not converted to sRGB's yet.
+
+    Attributes:
+        photo: its codes.
+        encoding: of the codes.
+    """
+
+    photo: EncodedImage
+    encoding: ColorEncoding
+
+
+def _read_stored(record: ImageRecord, *, oriented: bool) -> _StoredPhoto:
+    srgb, kind = ColorEncoding("sRGB"), kind_of(record.image)
+    if record.derived:
+        codes = codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8)
+        return _StoredPhoto(EncodedImage(codes, None), srgb)
+    if kind == "float":
+        codes = float_codes(read_hdr(record.image) * record.light_scale, record.seconds)
+        return _StoredPhoto(EncodedImage(codes, None), srgb)
+    photo, encoding = read_photo(record.image, oriented=oriented), record.encoding or srgb
+    if record.gain_map or (kind == "encoded" and not record.linear and has_gain_map(record.image)):
+        gain_map = read_gain_map(record.image, oriented=oriented)
+        if record.gain_map:
+            photo = light_of(photo, gain_map, record.light_scale)
+            encoding = replace(encoding, curves=(), table=None)  # The light is in sRGB's curve already
+        elif gain_map is not None:
+            photo = with_light_above_white(photo, gain_map)
+    elif record.linear and encoding.light is None:
+        photo = EncodedImage(linear_codes(photo.pixels / photo.levels), photo.alpha)
+        encoding = replace(encoding, curves=(), table=None)
+    return _StoredPhoto(photo, encoding)
 
 
 class _Preprocessor:
     def __init__(self, max_size: int | None, response: "Response", alpha: str):
         self.max_size, self.response, self.alpha = max_size, response, alpha
         self._tables: dict[int, np.ndarray] = {}
+        self._light_of_srgb: FloatTable | None = None  # Of photos whose colors are converted
         self._last: tuple[Lens, Undistortion] | None = None
         self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
         self.labeled_masks: set[Path] = set()
@@ -169,7 +192,7 @@ class _Preprocessor:
             full = undistortion.camera(record.world_to_camera)
         camera = full.within(self.max_size)
 
-        def warped(image: np.ndarray, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:
+        def warped(image: np.ndarray, values: Callable[[slice], np.ndarray | None] | None = None) -> np.ndarray:
             """Undistort and average [H, W] or [H, W, C] from the photo's size to the camera's; see area_average."""
             if not undistortion:
                 return _shrunk(image, camera, values)
@@ -185,65 +208,87 @@ class _Preprocessor:
             mask = _weighted(None if stored is None else warped(stored), camera)
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
-        encoded = read_codes(record, oriented=oriented)
-        codes, alpha, above = encoded.pixels, encoded.alpha, encoded.above_white
+        photo, encoding = _read_stored(record, oriented=oriented)
+        alpha, resized = photo.alpha, (camera.width, camera.height) != (lens.width, lens.height)
+        averaged = undistortion is not None or resized or (alpha is not None and self.alpha != "mask")
         to_shared = getattr(self.response, "to_shared", None)  # Of a response whose channels differ
-        codes = codes if to_shared is None else to_shared(codes)
+        if to_shared is not None or not averaged:
+            photo, encoding = encoding.convert(photo), ColorEncoding("sRGB")
+        photo = photo if to_shared is None else replace(photo, pixels=to_shared(photo.pixels))
         masks = [] if undistortion is None or undistortion.inside is None else [_shrunk(undistortion.inside, camera)]
         if stored is not None:
             masks.append(warped(stored))
         if alpha is not None and self.alpha == "mask":
             masks.append(warped(alpha))
             alpha = None
-        if undistortion or alpha is not None or (camera.width, camera.height) != (lens.width, lens.height):
-            codes, above = self._averaged(codes, alpha, above, warped)
+        photo = self._averaged(replace(photo, alpha=alpha), encoding, warped) if averaged else photo
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _weighted(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         return View(
             name,
-            codes,
+            photo.pixels,
             camera,
             time,
             split,
             mask,
             hdr,
             source=record.image,
-            light_above_white=above,
-            light_above_white_deviation=encoded.above_white_deviation,
+            light_above_white=photo.above_white,
+            light_above_white_deviation=photo.above_white_deviation,
         )
 
-    def _averaged(
-        self, codes: np.ndarray, alpha: np.ndarray | None, above: np.ndarray | None, warped: Callable
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the codes of the mean light, and the light above white that is left of `above` in it."""
-        levels = int(np.iinfo(codes.dtype).max)
+    def _averaged(self, photo: EncodedImage, encoding: ColorEncoding, warped: Callable) -> EncodedImage:
+        """Return the codes of the mean light, and the light above white that is left in it.
+
+        Colors that are not sRGB's are converted on the way, because codes of all pixels would take time and memory.
+        """
+        codes, alpha, above, levels = photo.pixels, photo.alpha, photo.above_white, photo.levels
         with self._alone:
             if levels not in self._tables:
                 light = self.response.decode(np.arange(levels + 1, dtype=np.float64) / levels)
                 self._tables[levels] = np.maximum(light, 0.0).astype(np.float32)
+            if not encoding.is_srgb and self._light_of_srgb is None:
+                self._light_of_srgb = FloatTable(self._decoded_srgb)
+        white = self._tables[levels][levels]
 
-        def weighted(values: np.ndarray, rows: slice) -> np.ndarray:
-            return values if alpha is None else values * alpha[rows, :, None]
+        def weighted(values: np.ndarray | None, rows: slice) -> np.ndarray | None:
+            return values if alpha is None or values is None else values * alpha[rows, :, None]
+
+        def converted(rows: slice) -> np.ndarray:
+            assert self._light_of_srgb is not None
+            light, clipped = encoding.to_linear(codes[rows], None if above is None else above[rows])
+            if clipped.any():
+                light[clipped] = 1
+            return self._light_of_srgb(light)
 
         def light_of(rows: slice) -> np.ndarray:
+            if not encoding.is_srgb:
+                return np.concatenate([converted(band) for band in bands_of(rows, codes.shape[1])])
             light = self._tables[levels][codes[rows]]
             return light if above is None else np.where(above[rows] > 0, above[rows] * white, light)
 
-        def clipped_in(rows: slice) -> np.ndarray:
+        def clipped_in(rows: slice) -> np.ndarray | None:
             clipped = codes[rows] == levels
-            return (clipped if above is None else clipped & (above[rows] == 0)).astype(np.float32)
+            clipped = clipped if above is None else clipped & (above[rows] == 0)
+            return clipped.astype(np.float32) if clipped.any() else None
 
-        white = self._tables[levels][levels]
         light = warped(codes, lambda rows: weighted(light_of(rows), rows))
         clipped = warped(codes, lambda rows: weighted(clipped_in(rows), rows))
         with self._alone:
             encoded = self.response.encode(light)
         # A mean over clipped samples is a lower bound, so a pixel counts as clipped if half of its area is.
         averaged = codes_of(np.where(clipped >= 0.5, np.float32(1.0), encoded), 16)
-        if above is not None:
-            overflow = (averaged == 65535) & (clipped < _LEAST_CLIPPED)
-            above = np.where(overflow, np.maximum(light / white, 1), 0).astype(np.float16) if overflow.any() else None
-        return averaged, above
+        if above is None and encoding.is_srgb:
+            return EncodedImage(averaged, None)
+        overflow = (averaged == 65535) & (clipped < _LEAST_CLIPPED)
+        brighter = np.where(overflow, np.maximum(light / white, 1), 0).astype(np.float16) if overflow.any() else None
+        deviation = photo.above_white_deviation if encoding.is_srgb else max(DEVIATION, photo.above_white_deviation)
+        return EncodedImage(averaged, None, brighter, 0.0 if brighter is None else deviation)
+
+    def _decoded_srgb(self, light: np.ndarray) -> np.ndarray:
+        """Return what the response decodes codes of sRGB to, by their linear light, 1 at white."""
+        decoded = np.maximum(self.response.decode(linear_to_srgb(np.minimum(light, 1))), 0)
+        return np.where(light > 1, light * float(self.response.decode(np.ones(1))[0]), decoded)
 
 
 def _weighted(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
@@ -254,7 +299,9 @@ def _weighted(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
     return weights if mask is None else weights * mask
 
 
-def _shrunk(image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.ndarray] | None = None) -> np.ndarray:
+def _shrunk(
+    image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.ndarray | None] | None = None
+) -> np.ndarray:
     return area_average(image, to.width, to.height, values)
 
 

@@ -10,8 +10,10 @@ import pytest
 from PIL import Image, ImageCms
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color_encoding import encoding_of_cicp, encoding_of_profile, stated_encoding
+from sehdr_warp.scene.icc import xyz_to_rec709
 from sehdr_warp.scene.images import EncodedImage, open_image, read_ldr
 from sehdr_warp.scene.primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
 from tests.make_scenes import load, pattern, write_colmap
@@ -147,6 +149,42 @@ def test_colors_beyond_the_gamut_keep_their_light_above_white():
     assert clipped == (65535, 0), "a clipped channel has no known light"
     assert (image.pixels[0, 2] == 65535).all() and not image.above_white[0, 2:].any()
     assert np.ptp(image.pixels[0, 3]) <= 16
+
+
+@pytest.mark.parametrize("space", ["Display P3", "ProPhoto RGB"])
+def test_colors_beyond_the_gamut_agree_with_littlecms_in_floating_point(space):
+    imagecodecs = pytest.importorskip("imagecodecs")
+    profile = icc_profile(space, *([1.8] if space == "ProPhoto RGB" else []))
+    codes = np.random.default_rng(0).integers(0, 256, (50, 60, 3), dtype=np.uint8)
+    xyz = imagecodecs.cms_transform(
+        codes,
+        profile,
+        imagecodecs.cms_profile("xyz"),
+        colorspace="rgb",
+        outcolorspace="xyz",
+        outdtype="float64",
+        intent=1,
+    )
+    expected = xyz_to_rec709(xyz)
+    light, _ = encoding_of_profile(profile).to_linear(codes)
+    assert expected.min() < -0.1 and expected.max() > 1.1
+    assert (np.abs(light - expected) <= 0.005 * np.abs(expected).max(-1, keepdims=True) + 1e-4).all()
+
+
+@pytest.mark.parametrize("kind", ["jpg", "tif 16"])
+@pytest.mark.parametrize("response", ["srgb", "hdr-nerf"])
+def test_photos_that_are_reduced_have_the_mean_light_of_their_converted_pixels(tmp_path, kind, response):
+    folder = write_set(tmp_path, save_as(kind, icc_profile("Display P3", name="P3")))
+    whole, half = (load(folder, response, holdout=0, max_size=size).views[0] for size in (None, 32))
+    curve = response_by_name(response)
+    light = curve.decode(whole.image.astype(np.float64))
+    above = 0 if whole.light_above_white is None else whole.light_above_white.astype(np.float64)
+    light = np.where(above > 0, above * curve.decode(1.0), light)
+    clipped = ((whole.codes == 65535) & (above == 0)).reshape(24, 2, 32, 2, 3).mean((1, 3))
+    expected = np.asarray(curve.encode(light.reshape(24, 2, 32, 2, 3).mean((1, 3)))) * 65535
+    below = (clipped == 0) & (expected < 65000)
+    assert below.mean() > 0.5 and np.abs(half.codes - expected)[below].max() <= 0.002 * 65535
+    assert (half.codes[clipped >= 0.5] == 65535).all()
 
 
 def test_photos_of_one_light_agree_in_srgb_and_in_display_p3():

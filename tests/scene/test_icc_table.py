@@ -6,6 +6,7 @@ import colour
 import numpy as np
 import pytest
 
+from sehdr_warp.scene.color_encoding import encoding_of_profile
 from sehdr_warp.scene.icc import read_profile, xyz_to_rec709
 from sehdr_warp.scene.images import read_ldr
 from tests.make_scenes import load
@@ -120,6 +121,17 @@ def test_photos_with_a_table_keep_their_bits(tmp_path, kind):
     assert (error <= 0.005 * expected.max(-1, keepdims=True) + 1e-4)[(photo.pixels < photo.levels).all(-1)].all()
     assert scene.views[0].codes.dtype == np.uint16
     assert any("are in scanner (ICC profile) and are converted to Rec.709" in note for note in scene.notes)
+
+
+def test_colors_that_were_converted_before_are_the_same_again():
+    encoding = encoding_of_profile(profile_of("mft2 Lab"))
+    table = read_profile(profile_of("mft2 Lab")).table
+    random = np.random.default_rng(0)
+    for _ in range(2):
+        codes = random.integers(100, 120, (30, 40, 3), dtype=np.uint8)  # Half of the colors occur in both
+        light, clipped = encoding.to_linear(codes)
+        np.testing.assert_allclose(light, xyz_to_rec709(table.to_xyz(codes / 255)), atol=1e-5)
+        assert not clipped.any()
 
 
 @pytest.mark.parametrize("damage", ["cut", "grid", "channels", "kind"])
