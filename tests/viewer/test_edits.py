@@ -140,6 +140,23 @@ def test_a_page_to_share_is_saved(server):
     assert (status, kind) == (200, "text/html") and b"</html>" in page
 
 
+def test_the_button_saves_a_page_that_opens_with_the_same_view(server, tmp_path):
+    with browser() as chromium:
+        with page_of(chromium, server.url) as page:
+            page.wait_for_selector("#stage[data-frame=full]")
+            assert page.text_content("#share") == "Page to share"
+            place = page.evaluate("window.viewer.camera()")["world_to_camera"]
+            with page.expect_download() as download:
+                page.click("#share")
+            name = download.value.suggested_filename
+            download.value.save_as(tmp_path / "shared.html")
+            page.locator("#saved", has_text="saved by your browser").wait_for()
+            assert name == f"{page.evaluate('facts.scene')}.html"
+        with page_of(chromium, (tmp_path / "shared.html").as_uri(), 240, 200) as page:
+            page.wait_for_selector("#stage[data-frame=full]")
+            np.testing.assert_allclose(page.evaluate("stage.seen.world_to_camera"), place, atol=1e-6)
+
+
 def test_undo_goes_back_one_edit_at_a_time(server):
     """And lengths are in units until the scale is set, then in meters."""
     with browser() as chromium, page_of(chromium, server.url) as page:
