@@ -13,7 +13,7 @@ from .blending import gather_by_gaussian
 from .checks import check_opacities, check_tensors
 from .memory import oom_context
 from .projection import launch_projection
-from .tile_lists import EmitOrder, check_intersection_count, depth_order, lists_by_tile
+from .tile_lists import EmitOrder, check_intersection_count, depth_order, lists_by_tile, tile_grid
 from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import even_ranges
@@ -138,7 +138,7 @@ class _Lists:
 def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_order: bool) -> _Lists:
     """List for each tile the Gaussians whose cap meets the tile's own, by distance."""
     count, (height, width) = len(caps), directions.shape[:2]
-    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    columns, rows = tile_grid(width, height)
     tile_caps, block_caps = (caps_of(directions, side * TILE_SIZE) for side in (1, BLOCK_TILES))
     kernel = sphere_kernels(warp_scalar(caps.dtype), 1).list_tiles
     order = depth_order(distances, caps[:, 3:].expand(-1, 2).contiguous())

@@ -38,6 +38,18 @@ class PackedSplats(NamedTuple):
     counts: Tensor
 
 
+class TileGrid(NamedTuple):
+    """Tiles across and down an image."""
+
+    columns: int
+    rows: int
+
+
+def tile_grid(width: int, height: int) -> TileGrid:
+    """Return how many tiles cover an image of `width` x `height` pixels."""
+    return TileGrid(-(-width // TILE_SIZE), -(-height // TILE_SIZE))
+
+
 class IntersectionOffsets(NamedTuple):
     """The order in which Gaussians emit intersections, and where each one's end.
 
@@ -93,12 +105,12 @@ class TileLists:
     @property
     def columns(self) -> int:
         """Tiles across."""
-        return -(-self.width // TILE_SIZE)
+        return tile_grid(self.width, self.height).columns
 
     @property
     def rows(self) -> int:
         """Tiles down."""
-        return -(-self.height // TILE_SIZE)
+        return tile_grid(self.width, self.height).rows
 
     @property
     def intersection_count(self) -> int:
@@ -127,8 +139,7 @@ def pack_splats(inputs: RasterInputs, alpha_threshold: float, width: int, height
         features,
         features.shape[1],
         alpha_threshold,
-        -(-width // TILE_SIZE),
-        -(-height // TILE_SIZE),
+        *tile_grid(width, height),
         extents,
         *packed,
     )
@@ -184,7 +195,7 @@ def build_tile_lists(
     Raises:
         SehdrError: if there are more than MAX_INTERSECTIONS.
     """
-    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    columns, rows = tile_grid(width, height)
     order, cumulative_counts = offsets
     count = len(depths)
     total = cumulative_counts[-1] if count else cumulative_counts.new_zeros(())
