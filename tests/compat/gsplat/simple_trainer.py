@@ -1,10 +1,10 @@
 """gsplat's examples/simple_trainer.py (1.5.3) with its rasterizer and strategies replaced, on the embedded scene.
 
-python -m tests.compat.gsplat.simple_trainer EXAMPLES STRATEGY STEPS [--device cuda] [--engine gsplat]
+python -m tests.compat.gsplat.simple_trainer EXAMPLES STRATEGY STEPS [--device cuda] [--engine gsplat] [--seeds 0 1 2]
 
 EXAMPLES is the folder `examples` of a checkout of gsplat. Its file is read as it is; only the name of its device is
 another on the CPU. What it imports beside gsplat (a viewer, TensorBoard, metrics, the reader of COLMAP sets) is small
-here. The last line of the output is JSON: PSNR of the held-out views, and how many Gaussians there are.
+here. The output has a line of JSON for each seed: PSNR of the held-out views, and how many Gaussians there are.
 """
 
 import argparse
@@ -133,13 +133,16 @@ class Dataset(torch.utils.data.Dataset):
     """Every eighth view is held out, as there."""
 
     def __init__(self, parser: Any, split: str = "train", **_: Any) -> None:
-        self.views = [view for place, view in enumerate(parser.views) if (place % 8 == 0) == (split == "val")]
+        views = [view for place, view in enumerate(parser.views) if (place % 8 == 0) == (split == "val")]
+        self.items = [self._item(place, view) for place, view in enumerate(views)]
 
     def __len__(self) -> int:
-        return len(self.views)
+        return len(self.items)
 
     def __getitem__(self, place: int) -> dict[str, Any]:
-        view = self.views[place]
+        return self.items[place]
+
+    def _item(self, place: int, view: sw.View) -> dict[str, Any]:
         camera = view.camera
         matrix = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
         pose, image = torch.from_numpy(camera_to_world(view)).float(), torch.from_numpy(view.image * 255)
@@ -207,6 +210,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", default="sehdr", choices=["sehdr", "gsplat"])
     parser.add_argument("--max-size", type=int, default=200)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     args = parser.parse_args()
     put_modules(sw.load_scene("embedded", max_size=args.max_size), args.engine)
     names, steps = read_trainer(args.examples, args.device), args.steps
@@ -215,9 +219,19 @@ def main() -> None:
     own: dict[str, Any] = {"cap_max": 20_000} if args.strategy == "mcmc" else {"reset_every": 10 * steps}
     # As the file's own command "mcmc" has them.
     more = {"init_opa": 0.5, "init_scale": 0.1, "opacity_reg": 0.01, "scale_reg": 0.01}
+    seed_with = names["set_random_seed"]
+    for seed in args.seeds:
+        names["set_random_seed"] = lambda rank, seed=seed: seed_with(rank + seed)
+        strategy = kinds[args.strategy](**refine, **own)
+        result = train(names, strategy, steps, more if args.strategy == "mcmc" else {})
+        print(json.dumps(vars(args) | {"examples": None, "seeds": None, "seed": seed} | result), flush=True)
+
+
+def train(names: dict[str, Any], strategy: Any, steps: int, more: dict[str, float]) -> dict[str, float]:
+    """Train as simple_trainer.py does; return what its evaluation says."""
     with tempfile.TemporaryDirectory() as folder:
         config = names["Config"](
-            strategy=kinds[args.strategy](**refine, **own),
+            strategy=strategy,
             disable_viewer=True,
             disable_video=True,
             result_dir=folder,
@@ -226,14 +240,14 @@ def main() -> None:
             save_steps=[],
             tb_every=0,
             sh_degree_interval=max(steps // 5, 1),
-            **(more if args.strategy == "mcmc" else {}),
+            **more,
         )
         runner = names["Runner"](0, 0, 1, config)
         began = time.perf_counter()
         runner.train()
         seconds = time.perf_counter() - began
         result = json.loads(Path(runner.stats_dir, f"val_step{steps - 1:04d}.json").read_text())
-    print(json.dumps(vars(args) | result | {"examples": None, "seconds": seconds}))
+    return result | {"seconds": seconds}
 
 
 if __name__ == "__main__":
