@@ -14,6 +14,7 @@ import threading
 import time
 import warnings
 from contextlib import suppress
+from types import FrameType
 from typing import Any, TextIO
 
 from .errors import SehdrError
@@ -21,7 +22,11 @@ from .errors import SehdrError
 _SOON = 3.0  # Seconds within which another Ctrl-C says nothing new
 _LIBRARIES = 400_000  # About as many objects as torch's and Warp's modules are
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of malloc.h
+_IMPORTS = "<frozen importlib._bootstrap>"  # File of the frames of an import
+_LONGEST_IMPORT = 10.0  # Seconds that a signal waits for an import, before it ends the process as it is
+_LOOK_EVERY = 0.02
 _interrupted = -_SOON
+_resender: threading.Thread | None = None
 _collects_late = False
 
 
@@ -139,15 +144,63 @@ def interrupted() -> bool:
     return time.monotonic() - _interrupted < _SOON
 
 
-def _interrupt(*_) -> None:
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, unless it was raised a moment ago or modules are being imported."""
     global _interrupted
-    if not interrupted():
+    if not interrupted() and not _postpone(number, frame):
         _interrupted = time.monotonic()
         raise KeyboardInterrupt
 
 
-def _end(number: int, _) -> None:
-    raise SystemExit(128 + number)
+def _end(number: int, frame: FrameType | None) -> None:
+    """Raise SystemExit, unless modules are being imported."""
+    if not _postpone(number, frame):
+        raise SystemExit(128 + number)
+
+
+def _postpone(number: int, frame: FrameType | None) -> bool:
+    """Return whether modules are being imported in `frame`; the signal then comes again once they are complete.
+
+    An exception in the middle of an import can be lost, because native code clears it (torch does while it imports
+    NumPy), and leaves half a module, which fails later.
+    """
+    global _resender
+    if not _imports(frame):
+        return False
+    if _resender is None or not _resender.is_alive():
+        _resender = threading.Thread(target=_resend, args=(number,), name="sehdr-warp signal", daemon=True)
+        try:
+            _resender.start()
+        except RuntimeError:  # No thread can be started: better now than never.
+            return False
+    return True
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Return whether a frame, or one that called it, imports a module."""
+    while frame is not None and frame.f_code.co_filename != _IMPORTS:
+        frame = frame.f_back
+    return frame is not None
+
+
+def _resend(number: int) -> None:
+    """Send a signal to the main thread when it imports nothing, or end the process after _LONGEST_IMPORT seconds."""
+    main = threading.main_thread().ident
+    assert main is not None
+    end = time.monotonic() + _LONGEST_IMPORT
+    while time.monotonic() < end:
+        time.sleep(_LOOK_EVERY)
+        if not _imports(sys._current_frames().get(main)):
+            global _resender
+            _resender = None  # The signal may come while the next module is imported, and has to wait again then.
+            if hasattr(signal, "pthread_kill"):
+                signal.pthread_kill(main, number)
+            else:
+                signal.raise_signal(number)
+            return
+    if number == signal.SIGINT:
+        os.write(2, b"sehdr-warp: interrupted\n")
+    os._exit(128 + number)
 
 
 def _lead_nowhere(number: int, mode: int) -> None:

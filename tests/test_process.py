@@ -108,6 +108,41 @@ def test_the_first_signal_waits_for_the_end_of_the_block_and_the_second_does_not
     assert reached == [True, False]
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("kind", ["complete", "that clears errors", "without an end"])
+def test_a_signal_waits_for_the_end_of_an_import(tmp_path, kind, number):
+    """Nothing is raised into a module, which would be half made afterwards, or lose the signal."""
+    waits = 60 if kind == "without an end" else 1
+    body = f"import os, time\nos.write(1, b'begun')\ntime.sleep({waits})"
+    if kind == "that clears errors":
+        body = "\n".join(["try:", *[f"    {line}" for line in body.splitlines()], "except BaseException: pass"])
+    (tmp_path / "slow.py").write_text(f"{body}\nos.write(1, b' complete')\n")
+    program = """
+import sys, time
+from sehdr_warp import process
+process.prepare()
+process._LONGEST_IMPORT = 3.0
+try:
+    import slow
+    time.sleep(60)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+    child = subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(["", *filter(None, sys.path)])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert child.stdout is not None and os.read(child.stdout.fileno(), 5) == b"begun"
+    child.send_signal(number)
+    output, errors = child.communicate(timeout=50)
+    assert child.returncode == 128 + number and b"Traceback" not in errors
+    assert output == (b"" if kind == "without an end" else b" complete")
+
+
 @pytest.mark.parametrize(
     "error, told",
     [

@@ -1,6 +1,7 @@
 """What strangers ask a viewer, and a viewer among many who never read, never ask or never end to."""
 
 import json
+import math
 import os
 import re
 import select
@@ -37,21 +38,22 @@ def served(prepared):
 def answer_to(port: int, data: bytes, seconds: float = 20.0, ends: bool = False) -> bytes:
     """What a server says to bytes, until it has said its length or closes. ends: the client says no more, of which the
     server takes it that it has gone."""
-    said = b""
+    said, length = bytearray(), None
     with socket.create_connection(("127.0.0.1", port), timeout=seconds) as client:
         try:
             client.sendall(data)
             if ends:
                 client.shutdown(socket.SHUT_WR)
-            while True:
-                part = client.recv(1 << 16)
+            while part := client.recv(1 << 16):
                 said += part
-                head, _, body = said.partition(b"\r\n\r\n")
-                length = re.search(rb"Content-Length: (\d+)", head)
-                if not part or (length and len(body) >= int(length[1])):
-                    return said
+                if length is None and (end := said.find(b"\r\n\r\n")) >= 0:
+                    stated = re.search(rb"Content-Length: (\d+)", said[:end])
+                    length = end + 4 + int(stated[1]) if stated else math.inf
+                if length is not None and len(said) >= length:
+                    break
         except OSError:  # The server has closed it.
-            return said
+            pass
+    return bytes(said)
 
 
 def posted(path: str, body, host="localhost", **headers) -> bytes:
