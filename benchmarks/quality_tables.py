@@ -26,8 +26,8 @@ def quality_tables(result: dict) -> Iterable[str]:
     yield from _energy_tables(known_rows)
     for curve, response in groups([row for row in rows if row["response"] != LEARNED], "curve", "response"):
         members = [row for row in rows if row["curve"] == curve and row["response"] in (response, LEARNED)]
-        table = []
-        for (method,), mine in groups(members, "method").items():
+        table, common = [], _rows_of_all_methods(members)
+        for (method,), mine in groups(common, "method").items():
             line = {"method": method, "n": len(mine), "worst": min(row["gt_max"] for row in mine)}
             line |= {name: sum(row[name] for row in mine) for name in ("lights_count", "lights_lost")}
             seeds = [[row["gt_max"] for row in here] for here in groups(mine, "scene", "exposure").values()]
@@ -38,6 +38,8 @@ def quality_tables(result: dict) -> Iterable[str]:
                 line |= {field: fmean(values)} if values else {}
             table.append(line)
         yield f"## Curve {curve}, response {response}"
+        if len(common) < len(members):
+            yield "Means are over the scenes and exposures at which every method was trained."
         yield markdown_table(table, columns)
         yield "gt-max by scene and exposure, mean over seeds, dB:"
         fields = ("scene", "exposure", "method")
@@ -50,6 +52,14 @@ def quality_tables(result: dict) -> Iterable[str]:
     shared = max(row["shared_by"] for row in rows)
     if shared > 1:
         yield f"{shared} trainings shared a device: seconds and renders / s are those of a shared one."
+
+
+def _rows_of_all_methods(rows: Sequence[Mapping]) -> Sequence[Mapping]:
+    """Return the rows of the scenes and exposures that every method has; all, if there are none."""
+    places = ("scene", "exposure")
+    by_method = [groups(mine, *places).keys() for mine in groups(rows, "method").values()]
+    shared = set.intersection(*map(set, by_method))
+    return [row for row in rows if tuple(row[field] for field in places) in shared] or rows
 
 
 def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:

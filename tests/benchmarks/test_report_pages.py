@@ -99,3 +99,23 @@ def test_means_over_the_whole_are_told_by_seed(tmp_path):
         ["default", "1", "30.00", "-"],
         ["truth", "0", "32.50", "-"],
     ]
+
+
+def test_methods_are_compared_where_all_were_trained(tmp_path):
+    rows = []
+    for method, exposures, decibels in (("default", (1, 2, 3), (30, 28, 20)), ("3dgs", (2,), (26,))):
+        made = plan_jobs(["embedded"], [method], exposures=exposures, responses=("known",), iterations=10)
+        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(made, decibels, strict=True)]
+    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
+    result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
+    write_reports(tmp_path)
+    table = (tmp_path / "quality.md").read_text().split("response known")[1]
+    assert "at which every method was trained" in table
+    cells = {
+        line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:5]]
+        for line in table.splitlines()[:12]
+        if "|" in line
+    }
+    assert cells["default"] == ["1", "28.00", "28.00"] and cells["3dgs"] == ["1", "26.00", "26.00"]
