@@ -35,13 +35,18 @@ _HOMES = {
     "training.plan": ("Plan", "make_plan"),
     "runs.run": ("Run", "Splats", "load_run", "load_splats"),
     "training.train": ("create_trainer", "train"),
-    "training.trainer": ("Step", "Trainer"),
+    "training.trainer": ("Trainer",),
+    "training.training_progress": ("TrainingProgress",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)  # noqa: PLE0605 # pyright: ignore[reportUnsupportedDunderAll]
 
 
-_RENAMED = {"score_folder": "evaluate_folder", "write_panorama": "write_environment_map"}
+_RENAMED = {
+    "Step": "TrainingProgress",
+    "score_folder": "evaluate_folder",
+    "write_panorama": "write_environment_map",
+}
 
 
 def __getattr__(name: str):

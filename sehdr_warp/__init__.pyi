@@ -20,7 +20,8 @@ from .scene.stack import calibrate
 from .training.initialization import match_points
 from .training.plan import Plan, make_plan
 from .training.train import create_trainer, train
-from .training.trainer import Step, Trainer
+from .training.trainer import Trainer
+from .training.training_progress import TrainingProgress
 
 __all__ = [
     "Camera",
@@ -33,8 +34,8 @@ __all__ = [
     "Scene",
     "SehdrError",
     "Splats",
-    "Step",
     "Trainer",
+    "TrainingProgress",
     "View",
     "calibrate",
     "compare_runs",

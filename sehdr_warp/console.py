@@ -67,7 +67,7 @@ def follow(steps: Iterable[Any], total: int) -> None:
     """Run the steps of a training and show its progress, unless the log is quiet.
 
     Args:
-        steps: yields a Step after each iteration. Its loss, psnr and gaussians are read only to be shown.
+        steps: yields a TrainingProgress after each iteration. Its loss, psnr and gaussians are read only to be shown.
         total: number of iterations.
     """
     if not logging.getLogger("sehdr_warp").isEnabledFor(logging.INFO):

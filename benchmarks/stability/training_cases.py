@@ -19,6 +19,7 @@ from sehdr_warp.training.initialization import make_field
 from sehdr_warp.training.losses import data_loss, with_opacity_penalty
 from sehdr_warp.training.targets import photo_source
 from sehdr_warp.training.trainer import Trainer
+from sehdr_warp.training.training_state import state_of
 
 STEPS, SIZE = 40, 32
 RATES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
@@ -50,7 +51,7 @@ def _losses(trainer: Trainer, steps: int) -> list[float]:
 
 
 def _state_not_finite(trainer: Trainer) -> int:
-    return not_finite(*(tensor for tensor in trainer.state()[0].values() if tensor.is_floating_point()))
+    return not_finite(*(tensor for tensor in state_of(trainer).tensors.values() if tensor.is_floating_point()))
 
 
 def _learning_rates(device):

@@ -36,8 +36,6 @@ class TrainRender:
         rendering: Result of the rasterizer: alpha, projected means, radii.
         photo_exposure: Exposure of this photo, the input of the response; None if colors are encoded before they are
             composited.
-        harmonics_gradients: If gradients are factored, holds after a backward pass the gradient [N, 3] by the color
-            that each Gaussian's harmonics have in this direction.
         opacity_penalty: opacity_weight times the mean opacity, a scalar; None without a weight.
     """
 
@@ -46,7 +44,6 @@ class TrainRender:
     base: Tensor | None
     rendering: Rendering
     photo_exposure: Tensor | None = None
-    harmonics_gradients: tuple[Tensor, ...] | list[Tensor] = ()
     opacity_penalty: Tensor | None = None
 
 
@@ -150,7 +147,7 @@ class RadianceField(nn.Module):
         also: frozenset[str] = frozenset(),
         max_intersections: int | None = None,
         encode: bool = True,
-        factored: bool = False,
+        sh_gradient_hook: Callable[[Tensor], object] | None = None,
         opacity_weight: float = 0.0,
     ) -> TrainRender:
         """Render a training view, differentiably.
@@ -162,7 +159,8 @@ class RadianceField(nn.Module):
             also: Further images to render: any of "exposure" and "base".
             max_intersections: As in rasterize().
             encode: If False, `encoded` stays None if `photo_exposure` is available.
-            factored: Give the harmonics no gradient; the gradient by their sum is in harmonics_gradients.
+            sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
+                harmonics have in this direction; the harmonics themselves then get no gradient.
             opacity_weight: Weight of the mean opacity in opacity_penalty.
         """
         gaussians, opacities, penalty = self.gaussians, None, None
@@ -171,16 +169,15 @@ class RadianceField(nn.Module):
                 gaussians.opacity_logits, opacity_weight, gaussians.active_count
             )
         ratio = exposure_time / self.base_time
-        values = self._values(camera.position, degree, factored)
-        gradients: list[Tensor] = []
-        if factored:
-            values.register_hook(gradients.append)  # As retain_grad(), without a copy.
+        values = self._values(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
+        if sh_gradient_hook is not None:
+            values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.encoded:
             rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, opacities)
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-            return TrainRender(image, None, None, rendering, None, gradients, penalty)
+            return TrainRender(image, None, None, rendering, None, penalty)
         base, fused = self._exposures(values)
         color_sets = {"fused": fused}
         if self.tone_map == "gaussian":
@@ -202,9 +199,7 @@ class RadianceField(nn.Module):
             # Usually the ratio is 1.
             photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(photo_exposure) if encode else None
-        return TrainRender(
-            encoded, exposure, images.get("base", exposure), rendering, photo_exposure, gradients, penalty
-        )
+        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure, penalty)
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
@@ -329,12 +324,12 @@ class RadianceField(nn.Module):
             # The gradient of a scalar, because checking explicit gradients loads torch's compiler, two seconds.
             return torch.autograd.grad((blended * images).sum(), features)[0]
 
-    def _values(self, position: Tensor, degree: int | None, factored: bool = False) -> Tensor:
+    def _values(self, position: Tensor, degree: int | None, *, detach_harmonics: bool = False) -> Tensor:
         """Return the sums [N, 3] of the Gaussians' harmonics towards a position [3]."""
         gaussians = self.gaussians
         sh_degree = gaussians.degree if degree is None else min(degree, gaussians.degree)
         constant, rest = gaussians.harmonics_dc, gaussians.harmonics_rest
-        coefficients = (constant.detach(), rest.detach()) if factored else (constant, rest)
+        coefficients = (constant.detach(), rest.detach()) if detach_harmonics else (constant, rest)
         return spherical_harmonics(sh_degree, coefficients, gaussians.means, position)
 
     def _exposures(self, values: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,6 +22,7 @@ from .machine import interruptible, torch_settings
 from .plan import gain_of_ranks
 from .ranks import END, GO, WAIT, Ranks
 from .trainer import Trainer
+from .training_state import TrainingState, load_state, state_of
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class SharedTraining:
     Attributes:
         config: Options of the training, after the plan.
         info: Response, base time, normalization and exposure compensation, as in run.json.
-        layout: Shape and type of each tensor of TrainingState.state().
-        values: Values of TrainingState.state().
+        layout: Shape and type of each tensor of its TrainingState.
+        values: Values of its TrainingState.
         scene: Description of the training views, for nodes that read photos themselves; None on one node.
     """
 
@@ -60,8 +61,8 @@ def send_training(ranks: Ranks, trainer: Trainer, gains: ExposureCompensation | 
     """Send a training from rank 0 to the others, in the form of a checkpoint; gains: already taken from its photos."""
     if ranks.info.several_nodes and not ranks.photos_are_requested:
         raise SehdrError("ranks on several nodes read their own photos: train by the command line")
-    tensors, values = trainer.state()
-    tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+    state = state_of(trainer)
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in state.tensors.items()}
     field = trainer.field
     info = {"response": field.response.to_dict(), "base_time": field.base_time}
     info["normalization"] = field.normalization.to_dict()
@@ -70,7 +71,7 @@ def send_training(ranks: Ranks, trainer: Trainer, gains: ExposureCompensation | 
     layout = {name: (tensor.shape, tensor.dtype) for name, tensor in tensors.items()}
     scene = _training_part(trainer.scene)
     description = describe_scene(scene) if ranks.info.several_nodes else None
-    ranks.broadcast_object(SharedTraining(trainer.config, info, layout, values, description))
+    ranks.broadcast_object(SharedTraining(trainer.config, info, layout, state.values, description))
     ranks.broadcast_arrays(list(tensors.values()))
     ranks.share_photos(scene, _bytes_of(scene))
 
@@ -109,7 +110,7 @@ def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
     else:
         scene = ranks.receive_photos()
     trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks)
-    trainer.load_state(checkpoint.tensors, checkpoint.values)
+    load_state(trainer, TrainingState(checkpoint.tensors, checkpoint.values))
     del shared, checkpoint, tensors
 
     every = config.scaled(config.schedule.checkpoint_every)

@@ -107,19 +107,19 @@ class FlatGradients:
         buffer: The buffer.
     """
 
-    def __init__(self, optimizer: Adam, rank: int, count: int, *, factored: bool):
-        """Allocate the buffer of rank `rank` of `count`; if `factored`, harmonics are exchanged in factored form."""
+    def __init__(self, optimizer: Adam, rank: int, count: int, *, defer_sh: bool):
+        """Allocate the buffer of rank `rank` of `count`; if `defer_sh`, harmonics are exchanged in factored form."""
         groups = {group["name"]: group["params"] for group in optimizer.param_groups}
         self.all = _parameters(optimizer)
         self.parameters = [
             parameter
             for name, parameters in groups.items()
             for parameter in parameters
-            if not (factored and name in FIRST_HARMONIC)
+            if not (defer_sh and name in FIRST_HARMONIC)
         ]
         self._means, self._rank, self._count = groups["means"][0], rank, count
         shapes = [parameter.shape for parameter in self.parameters]
-        shapes += [(count, *self._means.shape), (count, 3)] if factored else []
+        shapes += [(count, *self._means.shape), (count, 3)] if defer_sh else []
         sizes = [math.prod(shape) for shape in shapes]
         self.buffer = torch.zeros(sum(sizes) + 2, device=self._means.device)
         *parts, self.numbers = self.buffer.split([*sizes, 2])

@@ -1,9 +1,11 @@
 """Evaluate held-out photos, and write scores, checkpoints, logs and the summary of a training to its run folder."""
 
+from __future__ import annotations
+
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -20,7 +22,10 @@ from ..runs.run import Run, load_run
 from ..runs.run_writer import RunWriter, write_confidence
 from ..scene import View
 from .machine import machine_figures, summary_writer
-from .training_state import TrainingState
+from .training_state import state_of
+
+if TYPE_CHECKING:
+    from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 CURVE_POINTS = 200  # Points of the curves in TensorBoard
@@ -51,7 +56,7 @@ class RunOutput:
         self._run = self._run or load_run(self.folder.path, device=device)
         return self._run
 
-    def after_step(self, trainer: TrainingState) -> None:
+    def after_step(self, trainer: Trainer) -> None:
         """Evaluate held-out views, write a checkpoint and log, each if it is due; after the last step finish() does."""
         iteration = trainer.iteration
         evaluate = not self._evaluate_at.isdisjoint(range(iteration - trainer.step_batch + 1, iteration + 1))
@@ -69,7 +74,7 @@ class RunOutput:
             figures = {"loss": trainer.timed(lambda: trainer.loss), "psnr": trainer.timed(trainer.psnr)}
             self._log(trainer, "train", figures | {"gaussians": trainer.field.gaussians.count})
 
-    def evaluate(self, trainer: TrainingState) -> None:
+    def evaluate(self, trainer: Trainer) -> None:
         """Score the held-out views, if there are any, and append the scores to metrics.jsonl."""
         if not trainer.scene.test_views:
             return
@@ -80,14 +85,14 @@ class RunOutput:
         self._log(trainer, "test", scores)
         log.info("iteration %d: %s, after %.1f s", trainer.iteration, format_scores(scores), trainer.seconds)
 
-    def checkpoint(self, trainer: TrainingState) -> None:
+    def checkpoint(self, trainer: Trainer) -> None:
         """Write a checkpoint, unless the training has diverged: the last good one then stays the newest.
 
         Raises:
             SehdrError: If a tensor is not finite.
         """
-        tensors, values = trainer.state()
-        if (name := first_not_finite(tensors)) is not None:
+        state = state_of(trainer)
+        if (name := first_not_finite(state.tensors)) is not None:
             raise SehdrError(
                 f"iteration {trainer.iteration}: {name} is not finite and was not saved; --resume goes back to "
                 "the last good checkpoint; if it happens again, lower the learning rates or check photos and cameras"
@@ -98,9 +103,9 @@ class RunOutput:
             return
         self._run = None  # A run that was loaded before is older.
         keep = trainer.config.schedule.keep_checkpoints
-        self.folder.write_checkpoint(tensors, values | {"seconds": trainer.seconds}, keep=keep)
+        self.folder.write_checkpoint(state.tensors, state.values | {"seconds": trainer.seconds}, keep=keep)
 
-    def finish(self, trainer: TrainingState, *, complete: bool) -> None:
+    def finish(self, trainer: Trainer, *, complete: bool) -> None:
         """Write the last checkpoint and the summary; if complete, also the confidence and the residual regions.
 
         After the last step, Gaussians that no photo shows are removed before, and the rest is evaluated.
@@ -124,7 +129,7 @@ class RunOutput:
         write_confidence(self.folder, evidence, run.checkpoint_hash)
         self._report_residuals(run, trainer)
 
-    def _write_summary(self, trainer: TrainingState) -> None:
+    def _write_summary(self, trainer: Trainer) -> None:
         """Write summary.json: times, memory and counts."""
         decisions = self.folder.read_decisions()
         summary = {
@@ -134,11 +139,11 @@ class RunOutput:
             "train_seconds": round(trainer.seconds, 3),
             "gaussians": trainer.field.gaussians.count,
             "skipped_steps": trainer.skipped_steps,
-            "overflowed_steps": trainer.overflowed_steps,
+            "overflowed_steps": trainer.capacity.overflows,
         }
         self.folder.write_summary(summary | machine_figures(trainer.device))
 
-    def _report_residuals(self, run: Run, trainer: TrainingState) -> None:
+    def _report_residuals(self, run: Run, trainer: Trainer) -> None:
         """Compare the training photos with the scene, and list the regions that differ in summary and log."""
         views = trainer.scene.train_views
         regions, offsets = compare_photos(run.field, views, degree=run.degree)
@@ -160,7 +165,7 @@ class RunOutput:
                 min(len(regions), MAX_LISTED),
             )
 
-    def _log(self, trainer: TrainingState, split: str, figures: dict[str, float]) -> None:
+    def _log(self, trainer: Trainer, split: str, figures: dict[str, float]) -> None:
         """Write figures to TensorBoard, if that is on."""
         if self._tensorboard:
             self._writer = self._writer or summary_writer()(str(self.folder.tensorboard))
@@ -168,7 +173,7 @@ class RunOutput:
                 self._writer.add_scalar(f"{split}/{name}", value, trainer.iteration)
 
 
-def remove_unseen(trainer: TrainingState) -> Evidence:
+def remove_unseen(trainer: Trainer) -> Evidence:
     """Remove the Gaussians that no training photo shows; return the evidence of the photos for the others."""
     views, truth = trainer.scene.train_views, trainer.config.loss.uses_hdr
     estimates, field = None, trainer.field

@@ -48,19 +48,18 @@ class StepGraphs:
         """The CUDA graph that the next step with the same key replays; None if there is none."""
         return None if self._first is None else self._first._graph
 
-    def can_capture(self, views: Any, graph_key: Hashable, *, has_counts: bool) -> TypeGuard[ViewStack | PhotoStream]:
+    def is_ready(self, views: Any, graph_key: Hashable) -> TypeGuard[ViewStack | PhotoStream]:
         """Return whether a step can be captured: photos of one size, after a step with this key was launched.
 
         Args:
             views: The training views, which a captured step selects by an index on the device.
             graph_key: Everything that changes which kernels a step launches; steps of one key share a graph.
-            has_counts: Whether the number of intersections of a step is known.
         """
-        if self._first is None or not isinstance(views, ViewStack | PhotoStream):
-            return False
-        ready = graph_key in self._launched and has_counts
+        return self._first is not None and isinstance(views, ViewStack | PhotoStream) and graph_key in self._launched
+
+    def mark_launched(self, graph_key: Hashable) -> None:
+        """Note that a step with this key has been launched kernel by kernel, so that the next one can be captured."""
         self._launched.add(graph_key)
-        return ready
 
     def on_capture_stream(self) -> AbstractContextManager[None]:
         """Return a context for launched work, which shares stream and memory with captured steps."""

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from ..model.camera_tensors import CameraTensors
 from ..rasterizer.code_residual import CodeScale, code_tensor
+from ..response import Response
 from ..scene import View
 from .losses import Target, code_scale, select_view
 
@@ -98,7 +99,14 @@ class ViewStack:
 
 
 def photo_source(
-    views, base_time: float, device, *, truth: bool, clipping=True, light=None, estimates: list[Tensor] | None = None
+    views: Sequence[View],
+    base_time: float,
+    device,
+    *,
+    truth: bool,
+    clipping: bool = True,
+    compare_by: Response | None = None,
+    estimates: list[Tensor] | None = None,
 ) -> "PhotoSource":
     """Return training views as a sequence that uploads each on access.
 
@@ -108,11 +116,11 @@ def photo_source(
         device: Torch device.
         truth: Also upload HDR truth.
         clipping: Treat clipped codes as intervals.
-        light: Response by which exposures are compared, None to compare encoded values.
+        compare_by: Response by which exposures are compared, None to compare encoded values.
         estimates: For each view estimates of the light of clipped pixels, as in Target.
     """
     deep = any(view.codes.dtype == np.uint16 for view in views)
-    scale = code_scale(65535 if deep else 255, light, device, clipping=clipping)
+    scale = code_scale(65535 if deep else 255, compare_by, device, clipping=clipping)
     return PhotoSource(views, base_time, device, truth, deep, scale, estimates)
 
 

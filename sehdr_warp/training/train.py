@@ -26,6 +26,7 @@ from .plan import apply_plan
 from .ranks import Ranks
 from .run_output import RunOutput
 from .trainer import Trainer
+from .training_state import TrainingState, load_state, state_of
 
 log = logging.getLogger(__name__)
 
@@ -137,8 +138,8 @@ def _new_trainer(
     if plan is not None and photos.decision is not None:
         plan = plan.with_decision(photos.decision)
     # The folder is begun last, when the scene is known to be usable.
-    tensors, values = trainer.state()
-    state = tensors, values | {"seconds": trainer.seconds}
+    state = state_of(trainer)
+    state.values["seconds"] = trainer.seconds
     plan_values = None if plan is None else plan.to_dict()
     folder.begin(scene, config, field, data, plan_values, state, gains=photos.gains, overwrite=overwrite)
     for line in plan.lines() if plan is not None else ():
@@ -174,7 +175,7 @@ def _resumed_trainer(
     output = RunOutput(folder, saved, tensorboard=tensorboard)
     trainer = Trainer(scene, saved, field, ranks=ranks, output=output)
     try:
-        trainer.load_state(checkpoint.tensors, checkpoint.values)
+        load_state(trainer, TrainingState(checkpoint.tensors, checkpoint.values))
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
         problem = f"its state does not fit ({error!r:.120})"
         raise InputError(checkpoint.path, problem, "remove it, or train again") from None

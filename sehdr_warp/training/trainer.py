@@ -1,99 +1,79 @@
 """The trainer: the loop of a training, and the step that it repeats.
 
-Read `Trainer.__iter__` for the loop and `Trainer.step` for a step: forward, loss, backward, optimizer step,
-densification, moving average. training_state.py has what a training consists of, train.py creates trainers, and
-run_output.py evaluates, logs and saves.
+Read `Trainer.__iter__` for the loop and `Trainer.step` for a step: gradient step, densification, moving average. The
+gradient step (forward, loss, backward, optimizer) is in gradient_step.py; run_output.py evaluates, logs and saves, and
+training_state.py lists what a checkpoint holds.
 """
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from functools import partial
+from functools import cache, partial
+from typing import TypeVar
 
+import torch
 from torch import Tensor
 
+from ..errors import SehdrError
 from ..model.radiance_field import RadianceField, RenderedView
-from ..rasterizer import HarmonicsGradients
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..rasterizer.tile_lists import MAX_SINGLE_SORT
-from ..rasterizer.training_step import differentiate
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..runs.run import Run, as_rec709
 from ..scene import Camera, Scene
-from .initialization import sizes_of
-from .losses import data_loss, extra_images, with_opacity_penalty
+from .gradient_step import Gradients, GradientStep, StepOptions, StepResult
+from .initialization import make_matcher, scene_extent, sizes_of
 from .machine import interruptible, torch_settings
 from .matching import Matcher, seed_gaussians
-from .optimizer import guarded_step, means_rate, set_means_rate
+from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
 from .photo_stream import PhotoStream
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
-from .strategies import SEED_STRIDE, Proposals
-from .targets import TrainingView, ViewStack
-from .training_state import Gradients, StepResult, TrainingState
+from .step_graphs import GraphCapacity, StepGraphs
+from .strategies import SEED_STRIDE, Proposals, make_strategy
+from .targets import ViewStack
+from .training_progress import Pace, TrainingProgress
+from .training_views import PhotoOrder, TrainingViews, has_wide_views
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 CHECK_EVERY = 20  # Iterations between checks of the counts that steps keep on the device
 COMPARE_EVERY = 500  # Iterations between checks that all ranks have the same Gaussians
+MAX_RESERVE = 1.5  # Largest number of reserved rows as a multiple of the count; they cost memory and a little time
+MAX_SKIPPED = 20  # More skipped steps than this end the training; a step is skipped if it is not finite
 
 
-class Step:
-    """Values of a training after a step.
-
-    `loss`, `psnr` and `gaussians` are read from the device when they are accessed, until the next step.
-
-    Attributes:
-        iteration: Iterations done.
-        total: Iterations in all.
-        seconds: Duration of the training so far.
-        seconds_left: Estimated time to the end; None after the first step.
-    """
-
-    def __init__(self, trainer: TrainingState):
-        """Take the values of a trainer after a step."""
-        self._trainer = trainer
-        self.iteration, self.total, self.seconds = trainer.iteration, trainer.total, trainer.seconds
-        self.seconds_left: float | None = None
-
-    def __repr__(self) -> str:
-        """Return iteration and time; nothing is read from the device."""
-        return f"Step({self.iteration} of {self.total}, {self.seconds:.1f} s)"
-
-    @property
-    def loss(self) -> float:
-        """Loss of the step."""
-        return self._trainer.timed(lambda: self._trainer.loss)
-
-    @property
-    def psnr(self) -> float:
-        """PSNR of the step's photo, dB."""
-        return self._trainer.timed(self._trainer.psnr)
-
-    @property
-    def gaussians(self) -> int:
-        """Number of Gaussians."""
-        return self._trainer.field.gaussians.count
-
-
-class Trainer(TrainingState):
+class Trainer:
     """Trains the radiance field of a scene.
 
         trainer = create_trainer(scene, "run", "fast")
-        for step in trainer:
-            if step.iteration % 100 == 0:
-                print(step.iteration, step.psnr, step.seconds_left)
+        for progress in trainer:
+            if progress.iteration % 100 == 0:
+                print(progress.iteration, progress.psnr, progress.seconds_left)
         run = trainer.run
 
     Leaving the loop, or stop(), ends the training: a checkpoint is written, from which it can be resumed. While the
     loop runs, torch uses one thread, and the first SIGINT, SIGTERM or SIGHUP ends the training after a step: it takes
     effect (KeyboardInterrupt) once the checkpoint is written. Until then no other training may use the folder.
 
-    Attributes, beside those of TrainingState:
+    Attributes:
+        scene: The scene, with compensated photos.
+        config: Options of the training.
+        field: The radiance field that is trained.
         output: Run folder to evaluate, log and save to; None to save nothing.
+        optimizer: Adam, over the field's parameters.
+        strategy: The densification strategy.
+        average: Moving average of the Gaussians.
+        iteration: Iterations done; a step on several ranks counts one for each photo.
+        first_iteration: Iterations done before this process.
+        total: Iterations in all.
+        step_batch: Photos of the last step, one for each rank; each counts as an iteration.
+        seconds: Duration so far, without evaluation and checkpoints.
     """
 
     def __init__(
@@ -116,10 +96,37 @@ class Trainer(TrainingState):
             ranks: Processes that train together.
             output: Run folder to evaluate, log and save to; None to save nothing.
         """
-        super().__init__(scene, config, field, matcher, ranks)
-        self.output = output
-        self.interrupted, self._stopped = threading.Event(), False
-        self._pace = 0.0  # Seconds per iteration, smoothed
+        self.scene, self.config, self.field, self.ranks, self.output = scene, config, field, ranks, output
+        self.rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)
+        self.device = field.gaussians.means.device
+        self.total = config.schedule.iterations
+        self.iteration, self.first_iteration, self.step_batch, self.seconds = 0, 0, 1, 0.0
+
+        normalized = field.normalization.scene(scene)
+        views = normalized.train_views
+        self.extent = scene_extent(normalized)
+        self.optimizer = make_optimizer(field, config, self.extent, self.batch)
+        pixels = sum(view.camera.width * view.camera.height for view in views)
+        positions = torch.tensor([view.camera.position.tolist() for view in views], device=self.device)
+        self.strategy = make_strategy(config, self.extent, pixels, positions)
+        self.average = MovingAverage(config, self.strategy.schedule.stop)
+        self.order = PhotoOrder(len(views), config.seed, self.rank, self.batch)
+        self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
+        self.can_seed = not has_wide_views(normalized, config)  # Seeding samples pixels of pinhole photos.
+        self._matcher = matcher or cache(partial(make_matcher, normalized, field.response, self.device))
+
+        self._result: StepResult | None = None
+        self._view_index = 0
+
+        self.graphs = StepGraphs(self.device, enabled=config.schedule.use_cuda_graph, several_ranks=ranks is not None)
+        self.capacity = GraphCapacity(self.device)
+        self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
+        self._device_index = torch.zeros(1, dtype=torch.int64, device=self.device)
+        # Captured steps run on reserved rows, so that the number of Gaussians can change without a new capture.
+        self.reserves_rows, self._rows = self.graphs.enabled and not config.deterministic, 0
+        field.gaussians.release()
+        self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, self.capacity, ranks)
+        self.interrupted, self._stopped, self._pace = threading.Event(), False, Pace()
 
     # The loop
 
@@ -129,16 +136,16 @@ class Trainer(TrainingState):
             pass
         return self.run
 
-    def __iter__(self) -> Iterator[Step]:
+    def __iter__(self) -> Iterator[TrainingProgress]:
         """Train step by step; yield after each step, after evaluation and checkpoint if they are due."""
         with self._session():
             try:
                 while self._agree_to_continue():
-                    started = self.seconds
+                    before = self.seconds
                     self.timed(self.step)
                     if self.output is not None:
                         self.output.after_step(self)
-                    yield self._step(started)
+                    yield TrainingProgress(self, self._pace.seconds_left(self, self.seconds - before))
             except GeneratorExit:  # The caller left the loop.
                 self.stop()
                 self._agree_to_continue()
@@ -181,18 +188,6 @@ class Trainer(TrainingState):
         elif self.ranks is not None:
             self.ranks.shutdown()
 
-    def _step(self, started: float) -> Step:
-        """Return the values of the last step, with the time left."""
-        step, steps_before = Step(self), self.iteration - self.first_iteration - self.step_batch
-        if steps_before == 0:  # The first step compiles kernels and says nothing of the pace.
-            return step
-        self._pace += ((self.seconds - started) / self.step_batch - self._pace) / min(steps_before, 100)
-        # With the largest number of Gaussians, a step takes about twice as long as at the start.
-        growing = self.field.gaussians.count < self.strategy.cap_max
-        ahead = max(0.0, 1 - self.iteration / self.strategy.schedule.stop) if growing else 0.0
-        step.seconds_left = self._pace * (1 + ahead) * (self.total - self.iteration)
-        return step
-
     # One step
 
     def step(self) -> None:
@@ -204,35 +199,35 @@ class Trainer(TrainingState):
         # The last step may have more photos than iterations are left.
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
-        views, gaussians = self._training_views(), self.field.gaussians
+        views, gaussians = self.views.at(self.iteration), self.field.gaussians
         index = self._view_index = self.order.next()
         means_lr = means_rate(self.config, self.extent, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
         if self.reserves_rows and not self._rows:
             self._reserve_rows()
-        needs_means2d_grad = self.strategy.needs_gradients(self.iteration)
-        if needs_means2d_grad:
+        step, options = self.gradient_step, self._step_options()
+        if options.needs_means2d_grad:
             self.strategy.prepare(gaussians.reserved, self.device)
 
-        # Forward, loss, backward, optimizer step; as a CUDA graph if a step with this key has been launched before.
-        # Small counts use other kernels: a sort in a single pass, and an exact learned response.
+        # Gradient step; as a CUDA graph if a step with this key has been launched before. Small counts use other
+        # kernels: a sort in a single pass, and an exact learned response.
         small = gaussians.reserved < EXACT_BELOW, gaussians.reserved <= MAX_SINGLE_SORT
-        graph_key = (self.degree, needs_means2d_grad, self.opacity_weight > 0, *small)
+        graph_key = (options.degree, options.needs_means2d_grad, options.opacity_weight > 0, *small)
         # Display colors are rendered at the photo's exposure by a branch of the host, so that time must be a number.
         fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
-        if fixed_time and self.graphs.can_capture(views, graph_key, has_counts=self.capacity.has_counts):
-            self._index.fill_(index)
+        if fixed_time and self.capacity.has_counts and self.graphs.is_ready(views, graph_key):
+            self._device_index.fill_(index)
             if isinstance(views, PhotoStream):
                 views.bring(index)
-            capacity = self.capacity.capacity()
-            compute = partial(self._compute_at_index, views, needs_means2d_grad, capacity)
-            self._result = self.graphs.run(graph_key, self._optimize, compute, self.apply_gradients, self.iteration)
+            compute = partial(self._compute_at_index, views, options, self.capacity.capacity())
+            self._result = self.graphs.run(graph_key, step.run, compute, step.apply_gradients, self.iteration)
             if isinstance(views, PhotoStream):
                 views.release(self.order.peek())
         else:
-            compute = partial(self.compute_gradients, views[index], needs_means2d_grad)
             with self.graphs.on_capture_stream():
-                self._result = self._optimize(compute, self.apply_gradients)
+                self._result = step.run(partial(step.compute_gradients, views[index], options), step.apply_gradients)
+            if fixed_time:
+                self.graphs.mark_launched(graph_key)
 
         # Densification.
         self.strategy.inject_noise(self.iteration, gaussians, means_lr)
@@ -244,82 +239,15 @@ class Trainer(TrainingState):
         if self.came_to(COMPARE_EVERY):
             self.gather()
 
-    def _optimize(self, compute: Callable[[], Gradients], apply: Callable[[Gradients], Tensor]) -> StepResult:
-        """Compute gradients, average them over the ranks, and apply them."""
-        with self.field.gaussians.all_rows(self.optimizer):
-            if self.ranks is not None:
-                self._flat_gradients()  # Allocated here, not in the memory of a CUDA graph.
-            gradients = compute()
-            if self.ranks is not None and self._flat is not None:
-                self.ranks.all_reduce_mean(self._flat.buffer)
-            return StepResult(apply(gradients), gradients.image)
+    def _step_options(self) -> StepOptions:
+        """Return the options of this iteration's gradient step; no opacity penalty once no refinement follows."""
+        refines = not self.strategy.schedule.is_over(self.iteration)
+        opacity_weight = self.config.loss.opacity_weight if refines else 0.0
+        return StepOptions(self.degree, opacity_weight, self.strategy.needs_gradients(self.iteration))
 
-    def _compute_at_index(self, views: ViewStack | PhotoStream, needs_means2d_grad: bool, capacity: int) -> Gradients:
+    def _compute_at_index(self, views: ViewStack | PhotoStream, options: StepOptions, capacity: int) -> Gradients:
         """Compute gradients of the view whose index is on the device, with a fixed intersection capacity."""
-        return self.compute_gradients(views.at(self._index), needs_means2d_grad, capacity)
-
-    def compute_gradients(
-        self, view: TrainingView, needs_means2d_grad: bool, max_intersections: int | None = None
-    ) -> Gradients:
-        """Render a view, compute the loss and differentiate it.
-
-        Args:
-            view: The training view.
-            needs_means2d_grad: Whether the strategy needs the gradients of the projected means.
-            max_intersections: Fixed capacity, with which nothing waits for the device.
-        """
-        target, camera, field, config = view.target, view.camera, self.field, self.config.loss
-        render = field.render_train_view(
-            camera,
-            view.exposure_time,
-            degree=self.degree,
-            also=extra_images(config, target.exposure_truth is not None),
-            max_intersections=max_intersections,
-            encode=self._encoded,
-            factored=self.factored,
-            opacity_weight=self.opacity_weight,
-        )
-        # Drop references to tensors that the backward pass does not need, so that their memory is reused in the step.
-        dropped = {"image", "transmittance", "depths"} | (set() if needs_means2d_grad else {"means2d", "extents"})
-        rendering = replace(render.rendering, **dict.fromkeys(dropped))
-        if needs_means2d_grad:
-            rendering.means2d.retain_grad()
-        loss = with_opacity_penalty(data_loss(field, render, target, config, self._largest_truth), render)
-        image = render.encoded if self._encoded else render.photo_exposure
-        harmonics_gradients = render.harmonics_gradients
-        assert image is not None
-        del render, target, view
-        differentiate(loss)
-        harmonics = None
-        if self.factored:
-            values = harmonics_gradients[0].contiguous()
-            harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, self.degree)
-        if self.ranks is not None:
-            self._flat_gradients().collect(loss, rendering.overflow, harmonics)
-        return Gradients(loss.detach(), image.detach(), rendering, needs_means2d_grad, harmonics)
-
-    def apply_gradients(self, gradients: Gradients) -> Tensor:
-        """Update the parameters, unless the step is not finite; return its loss. Does not wait for the device."""
-        rendering, loss, harmonics = gradients.rendering, gradients.loss, gradients.harmonics
-        incomplete = rendering.overflow
-        if self._flat is not None:
-            loss, incomplete, harmonics = self._flat.distribute()
-        applied = guarded_step(
-            self.optimizer,
-            loss,
-            incomplete,
-            harmonics,
-            step_counters=self.capacity.step_counters,
-            intersections=rendering.needed_intersections,
-            active_count=self.field.gaussians.active_count,
-        )
-        if gradients.needs_means2d_grad:
-            height, width, _ = gradients.image.shape
-            self.strategy.accumulate(rendering, width, height, applied)
-        self.optimizer.zero_grad()
-        if rendering.needed_intersections is None:
-            self.capacity.observe(rendering.intersection_count)
-        return loss
+        return self.gradient_step.compute_gradients(views.at(self._device_index), options, capacity)
 
     def _densify(self) -> None:
         """Refine the Gaussians if that is due; on several ranks, rank 0 does and the others receive the result."""
@@ -343,20 +271,87 @@ class Trainer(TrainingState):
     def _propose_gaussians(self, number: Tensor, bound: int) -> Proposals:
         """Propose new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
         random_seed = self.config.seed * SEED_STRIDE + self.iteration
-        view, result = self._training_views()[self._view_index], self._result
+        view, result = self.views.at(self.iteration)[self._view_index], self._result
         assert result is not None
         with self.graphs.on_capture_stream():
-            rendered = result.image if self._encoded else self.field.response.encode_extended(result.image)
+            image = result.image
+            rendered = image if self.gradient_step.needs_encoded else self.field.response.encode_extended(image)
             return seed_gaussians(
                 self.field, self._matcher(), rendered, view, self._view_index, number, bound, random_seed
             )
 
-    # Between steps
+    def _reserve_rows(self) -> None:
+        """Reserve rows for the Gaussians that refinements will add; the same number on all ranks."""
+        gaussians, count = self.field.gaussians, self.field.gaussians.count
+        rows = self.strategy.reserved_rows(self.iteration, count)
+        if rows == count or not count <= self._rows <= MAX_RESERVE * count:
+            self._rows = rows
+        if gaussians.reserved != self._rows:
+            gaussians.reserve(self._rows, self.optimizer)
 
     @property
-    def opacity_weight(self) -> float:
-        """Weight of the mean opacity in this step: 0 once no refinement follows."""
-        return 0.0 if self.strategy.schedule.is_over(self.iteration) else self.config.loss.opacity_weight
+    def degree(self) -> int:
+        """SH degree of this iteration."""
+        return self.config.degree_at(self.iteration)
+
+    # Between steps
+
+    def came_to(self, every: int) -> bool:
+        """Return whether the last step came to a multiple of a number of iterations, or past it."""
+        return self.iteration % every < self.step_batch
+
+    def check(self, *, wait: bool = True) -> None:
+        """Raise SehdrError if more than MAX_SKIPPED steps were skipped; raise the capacity if it was too small.
+
+        Args:
+            wait: If False, the latest steps are not considered.
+        """
+        skipped, overflowed = self.capacity.poll(wait=wait)
+        if skipped > MAX_SKIPPED:
+            raise SehdrError(
+                f"iteration {self.iteration}: {skipped} steps had a loss or gradient that is not finite, "
+                f"more than {MAX_SKIPPED}; lower the learning rates or check photos and cameras"
+            )
+        if overflowed:  # Those steps changed nothing; the next capture has the capacity that they needed.
+            self.graphs.invalidate()
+
+    def gather(self) -> None:
+        """Gather statistics on rank 0 for a checkpoint; raise SehdrError if the ranks' Gaussians differ."""
+        if self.ranks is not None:
+            self.ranks.reduce_to_leader(list(self.strategy.state(self.field.gaussians.count).values()))
+            self.ranks.check_equal(self.field.gaussians.tensors(), self.iteration)
+
+    def timed(self, function: Callable[[], T]) -> T:
+        """Call a function whose time, with what the device had left to do, counts as time of the training."""
+        started = time.perf_counter()
+        try:
+            return function()
+        finally:
+            self.seconds += time.perf_counter() - started
+
+    def synchronize(self) -> None:
+        """Wait for the device, as part of the training's time."""
+        if self.device.type == "cuda":
+            self.timed(lambda: torch.cuda.synchronize(self.device))
+
+    @property
+    def loss(self) -> float:
+        """Loss of the last step, read from the device; NaN before the first."""
+        return float("nan") if self._result is None else float(self._result.loss)
+
+    @torch.no_grad()
+    def psnr(self) -> float:
+        """Render the last step's view and return its PSNR against the photo inside the mask, dB."""
+        view = self.views.at(self.iteration)[self._view_index]
+        with self.graphs.on_capture_stream():
+            photo = self.field.render_train_view(view.camera, view.exposure_time, degree=self.degree).encoded
+        assert photo is not None
+        return view.target.psnr(photo)
+
+    @property
+    def skipped_steps(self) -> int:
+        """Number of steps that were skipped because the loss or a gradient was not finite."""
+        return int(self.capacity.step_counters[0])
 
     @property
     def run(self) -> Run:

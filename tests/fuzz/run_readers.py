@@ -19,6 +19,7 @@ from sehdr_warp.runs.run_writer import RunWriter, write_confidence
 from sehdr_warp.runs.values import FORMAT
 from sehdr_warp.training.train import create_trainer
 from sehdr_warp.training.trainer import Trainer
+from sehdr_warp.training.training_state import state_of
 from tests.training.toy import toy_scene
 
 from .reader import Reader, each
@@ -41,7 +42,7 @@ def make_run(folder: Path) -> None:
     scene = toy_scene(2, 8)
     field = assemble_field(gaussians, config, response_by_name("srgb"), 0.25)
     run = RunWriter(folder)
-    tensors, values = Trainer(scene, config, field).state()
+    tensors, values = state_of(Trainer(scene, config, field))
     run.begin(scene, config, field, {"path": "embedded"}, PLAN, (tensors, values | {"seconds": 1.0}))
     run.unlock()
     run.append_metrics({"iteration": 1, "seconds": 0.5, "psnr_ldr": 20.0})

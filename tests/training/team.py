@@ -30,6 +30,7 @@ def train_together(ranks, folder: Path, strategies: list[str], iterations: int) 
     """Trains the toy scene with each strategy; each rank saves its state as <strategy>.<rank>."""
     from sehdr_warp.training.following import follow_leader
     from sehdr_warp.training.train import create_trainer
+    from sehdr_warp.training.training_state import state_of
 
     from .toy import VARIANTS, toy_scene
 
@@ -45,7 +46,7 @@ def train_together(ranks, folder: Path, strategies: list[str], iterations: int) 
             trainer = follow_leader(ranks)
         ranks.all_reduce_min(2)
         assert "torch._dynamo" not in sys.modules, "two seconds of every start"
-        torch.save(trainer.state(), folder / f"{strategy}.{ranks.rank}")
+        torch.save(tuple(state_of(trainer)), folder / f"{strategy}.{ranks.rank}")
 
 
 def differ(ranks, folder: Path) -> None:

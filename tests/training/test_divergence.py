@@ -7,6 +7,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
+from sehdr_warp.training.training_state import state_of
 
 from .toy import load_unscaled
 
@@ -66,4 +67,6 @@ def test_huge_gradients_leave_finite_parameters(scene):
     before = field.gaussians.harmonics_dc.detach().clone()
     trainer.step()
     assert trainer.skipped_steps == 1 and not torch.equal(before, field.gaussians.harmonics_dc)
-    assert all(bool(tensor.isfinite().all()) for tensor in trainer.state()[0].values() if tensor.is_floating_point())
+    assert all(
+        bool(tensor.isfinite().all()) for tensor in state_of(trainer).tensors.values() if tensor.is_floating_point()
+    )

@@ -14,6 +14,7 @@ from sehdr_warp.training.photo_stream import PhotoStream
 from sehdr_warp.training.targets import photo_source
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
+from sehdr_warp.training.training_state import state_of
 
 from .toy import EXPOSURE_TIME, VARIANTS, toy_scene
 
@@ -63,7 +64,10 @@ def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
         trainer = Trainer(scene, chosen, make_field(scene, chosen, response_for_training(scene, chosen), "cuda:0"))
         for _ in range(60):
             trainer.step()
-        assert isinstance(trainer._source, PhotoStream) == (photos == "memory") and trainer.graphs.captured is not None
-        states.append(trainer.state()[0])
+        assert (
+            isinstance(trainer.views.at(60), PhotoStream) == (photos == "memory")
+            and trainer.graphs.captured is not None
+        )
+        states.append(state_of(trainer).tensors)
     for name, value in states[0].items():
         assert torch.equal(value, states[1][name]), name

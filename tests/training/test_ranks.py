@@ -136,7 +136,7 @@ def test_rates_and_decays_follow_the_batch():
 def test_gradients_go_through_one_buffer():
     field = toy_field()
     optimizer = make_optimizer(field, VARIANTS["adc"], 1.0)
-    flat, given = FlatGradients(optimizer, 0, 1, factored=False), {}
+    flat, given = FlatGradients(optimizer, 0, 1, defer_sh=False), {}
     for name in ("means", "opacity_logits"):
         parameter = getattr(field.gaussians, name)
         given[name] = parameter.grad = torch.randn_like(parameter)
@@ -154,7 +154,7 @@ def test_gradients_go_through_one_buffer():
 def test_harmonics_go_as_their_factors():
     field, count = toy_field(), 3
     optimizer, means = make_optimizer(field, VARIANTS["adc"], 1.0), field.gaussians.means
-    ranks = [FlatGradients(optimizer, place, count, factored=True) for place in range(count)]
+    ranks = [FlatGradients(optimizer, place, count, defer_sh=True) for place in range(count)]
     seen = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
     for flat, harmonics in zip(ranks, seen, strict=True):
         means.grad = torch.ones_like(means)

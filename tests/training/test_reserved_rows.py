@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training import step_graphs, training_state
+from sehdr_warp.training import step_graphs, trainer
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.strategies import base
 from sehdr_warp.training.trainer import Trainer
+from sehdr_warp.training.training_state import state_of
 
 from .toy import VARIANTS
 
@@ -27,12 +28,12 @@ def trained_steps(scene, config, device, reserves):
 @pytest.mark.parametrize("variant", ["default", "adc"])
 def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monkeypatch):
     monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)  # So few Gaussians become many at once.
-    monkeypatch.setattr(training_state, "MAX_RESERVE", 8.0)
+    monkeypatch.setattr(trainer, "MAX_RESERVE", 8.0)
     config = override_config(VARIANTS[variant], {"deterministic": True, "schedule.use_cuda_graph": False})
     (plain, all_moved), (roomy, moved) = (trained_steps(scene, config, device, reserves) for reserves in (False, True))
     assert all(all_moved) and not any(moved) and len(moved) == len(all_moved) > 1
     assert roomy.field.gaussians.reserved > roomy.field.gaussians.count
-    assert roomy.state()[1] == plain.state()[1]
+    assert state_of(roomy).values == state_of(plain).values
     for name, expected in plain.field.gaussians.tensors().items():
         # Not in every bit: torch takes the last of a tensor's numbers, and a GPU sums, otherwise.
         apart = (roomy.field.gaussians.tensors()[name] - expected).abs() > 1e-4 + 1e-3 * expected.abs()
@@ -42,7 +43,7 @@ def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monk
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch):
     monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)
-    monkeypatch.setattr(training_state, "MAX_RESERVE", 8.0)
+    monkeypatch.setattr(trainer, "MAX_RESERVE", 8.0)
     monkeypatch.setattr(step_graphs, "MIN_HEADROOM", 0.0)
     config = VARIANTS["default"]
     training = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cuda:0"))

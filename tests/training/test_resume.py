@@ -15,6 +15,7 @@ from sehdr_warp.runs.run_writer import RunWriter
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
+from sehdr_warp.training.training_state import TrainingState, load_state, state_of
 
 from .toy import VARIANTS, quick, without_truth
 
@@ -108,19 +109,19 @@ def test_a_trainer_continues_from_its_state(scene, variant):
     try:
         whole = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
         _steps(whole, 30)
-        tensors, values = whole.state()
+        tensors, values = state_of(whole)
         tensors = {name: value.clone() for name, value in tensors.items()}
         info = {"response": whole.field.response.to_dict(), "base_time": whole.field.base_time}
         info["normalization"] = whole.field.normalization.to_dict()
         field = field_from_checkpoint(Checkpoint(Path("memory"), tensors, values), config, info)
         resumed = Trainer(scene, config, field)
-        resumed.load_state(tensors, values)
+        load_state(resumed, TrainingState(tensors, values))
         for trainer in (whole, resumed):
             _steps(trainer, 25)
     finally:
         torch.set_num_threads(threads)
-    again = resumed.state()[0]
-    for name, value in whole.state()[0].items():
+    again = state_of(resumed).tensors
+    for name, value in state_of(whole).tensors.items():
         assert torch.equal(value, again[name]), name
 
 

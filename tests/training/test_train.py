@@ -160,8 +160,8 @@ def test_steps_that_compare_light_do_not_encode_it_and_report_the_same(scene):
         Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), torch.device("cpu")))
         for _ in range(2)
     ]
-    assert not trainers[0]._encoded
-    trainers[1]._encoded = True
+    assert not trainers[0].gradient_step.needs_encoded
+    trainers[1].gradient_step.needs_encoded = True
     for trainer in trainers:
         trainer.step()
         trainer.step()
@@ -177,7 +177,7 @@ def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
     widths = []
     for _ in range(20):
         trainer.step()
-        table = trainer._scale.table[1:-1]
+        table = trainer.views.scale.table[1:-1]
         widths.append(float((table[:, 2] - table[:, 1]).max()))
     assert max(widths[:17]) == 0 < min(widths[17:])
 
@@ -199,11 +199,11 @@ def test_opacities_are_not_pulled_down_once_none_are_relocated(scene):
 def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
     config = override_config(VARIANTS[variant], {"schedule.sh_degree_interval": 2})
     fields = [make_field(scene, config, response_for_training(scene, config), device) for _ in range(2)]
-    for field, factored in zip(fields, (True, False), strict=True):
+    for field, deferred in zip(fields, (True, False), strict=True):
         with torch.no_grad():  # How a ball is turned shows in no photo: its gradient would be rounding.
             field.gaussians.log_scales += torch.tensor([-0.5, 0.0, 0.5], device=device)
         trainer = Trainer(scene, config, field)
-        trainer.factored = factored
+        trainer.gradient_step.defer_sh_gradients = deferred
         for _ in range(6):
             trainer.step()
     for name, ours in fields[0].gaussians.tensors().items():
@@ -267,7 +267,7 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
     config = quick()
     trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
     trainer.graphs._first = BrokenRunner()
-    monkeypatch.setattr(trainer.graphs, "can_capture", lambda *_, **__: trainer.iteration > 1)
+    monkeypatch.setattr(trainer.graphs, "is_ready", lambda *_: trainer.iteration > 1)
     trainer.step()
     with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.use-cuda-graph=false"):
         trainer.step()

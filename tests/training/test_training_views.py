@@ -1,4 +1,4 @@
-"""State of a training: the order of its photos, and whether they are panoramas."""
+"""Training views: the order of photos, and whether they are panoramas."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from sehdr_warp.scene import Scene, View, codes_of
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.wide_camera import pixel_directions, solid_angles
 from sehdr_warp.training.train import train
-from sehdr_warp.training.training_state import PhotoOrder, has_wide_views
+from sehdr_warp.training.training_views import PhotoOrder, has_wide_views
 
 
 def test_every_photo_comes_once_before_any_comes_again():

@@ -1,0 +1,187 @@
+"""One gradient step on a photo: forward, loss, backward, average over the ranks, optimizer step.
+
+Nothing here waits for the device if the number of intersections has a fixed capacity, so that compute_gradients() and
+apply_gradients() can be captured as CUDA graphs.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from torch import Tensor
+
+from ..model.adam import Adam
+from ..model.radiance_field import RadianceField
+from ..rasterizer import HarmonicsGradients, Rendering
+from ..rasterizer.training_step import differentiate
+from ..runs.config import Config
+from ..scene import Scene
+from .losses import compares_exposures, data_loss, extra_images, largest_hdr_truth, with_opacity_penalty
+from .optimizer import FlatGradients, guarded_step
+from .ranks import Ranks
+from .step_graphs import GraphCapacity
+from .strategies import Strategy
+from .targets import TrainingView
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Options of a step that change in the course of a training.
+
+    Attributes:
+        degree: SH degree.
+        opacity_weight: Weight of the mean opacity in the loss.
+        needs_means2d_grad: Whether the strategy accumulates the gradients of the projected means.
+    """
+
+    degree: int
+    opacity_weight: float
+    needs_means2d_grad: bool
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Result of GradientStep.compute_gradients, beside the gradients that the parameters hold.
+
+    Attributes:
+        loss: Scalar loss of this rank's photo.
+        image: [H, W, 3] rendered image that was compared with the photo.
+        rendering: Result of the rasterizer, without tensors that nothing reads any more.
+        needs_means2d_grad: As in StepOptions.
+        harmonics: Gradients of the harmonics in factored form; None if the parameters hold them.
+    """
+
+    loss: Tensor
+    image: Tensor
+    rendering: Rendering
+    needs_means2d_grad: bool
+    harmonics: HarmonicsGradients | None
+
+
+class StepResult(NamedTuple):
+    """Loss of a step, mean over the ranks, and the image [H, W, 3] that was compared with this rank's photo."""
+
+    loss: Tensor
+    image: Tensor
+
+
+class GradientStep:
+    """Takes gradient steps on the parameters of a field.
+
+    Attributes:
+        needs_encoded: Whether the loss compares encoded photos; if it compares exposures, they are not computed.
+        defer_sh_gradients: Keep the gradients of the harmonics in factored form until the optimizer step: a gradient by
+            one color per Gaussian in place of 48 numbers.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: Config,
+        field: RadianceField,
+        optimizer: Adam,
+        strategy: Strategy,
+        capacity: GraphCapacity,
+        ranks: Ranks | None,
+    ):
+        """Prepare steps of a training.
+
+        Args:
+            scene: The scene; its HDR truth scales the HDR loss.
+            config: Options of the training.
+            field: The field.
+            optimizer: Adam over its parameters.
+            strategy: Densification strategy, which accumulates gradients of projected means.
+            capacity: Counts of intersections and of steps that were skipped.
+            ranks: Processes that train together.
+        """
+        self._field, self._optimizer, self._strategy = field, optimizer, strategy
+        self._loss, self._capacity, self._ranks = config.loss, capacity, ranks
+        self.needs_encoded = not compares_exposures(config.loss, field)
+        self.defer_sh_gradients = field.gaussians.means.device.type == "cuda"
+        self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
+        self._flat: FlatGradients | None = None
+
+    def run(self, compute: Callable[[], Gradients], apply: Callable[[Gradients], Tensor]) -> StepResult:
+        """Compute gradients, average them over the ranks, and apply them.
+
+        `compute` and `apply` are the two functions below, or replay their CUDA graphs.
+        """
+        with self._field.gaussians.all_rows(self._optimizer):
+            if self._ranks is not None:
+                self._flat_gradients(self._ranks)  # Allocated here, not in the memory of a CUDA graph.
+            gradients = compute()
+            if self._ranks is not None and self._flat is not None:
+                self._ranks.all_reduce_mean(self._flat.buffer)
+            return StepResult(apply(gradients), gradients.image)
+
+    def compute_gradients(
+        self, view: TrainingView, options: StepOptions, max_intersections: int | None = None
+    ) -> Gradients:
+        """Render a view, compute the loss and differentiate it.
+
+        Args:
+            view: The training view.
+            options: Options of the step.
+            max_intersections: Fixed capacity, with which nothing waits for the device.
+        """
+        target, camera, field = view.target, view.camera, self._field
+        sh_gradients: list[Tensor] = []
+        render = field.render_train_view(
+            camera,
+            view.exposure_time,
+            degree=options.degree,
+            also=extra_images(self._loss, target.exposure_truth is not None),
+            max_intersections=max_intersections,
+            encode=self.needs_encoded,
+            sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
+            opacity_weight=options.opacity_weight,
+        )
+        # Drop references to tensors that the backward pass does not need, so that their memory is reused in the step.
+        needs_means2d_grad = options.needs_means2d_grad
+        dropped = {"image", "transmittance", "depths"} | (set() if needs_means2d_grad else {"means2d", "extents"})
+        rendering = replace(render.rendering, **dict.fromkeys(dropped))
+        if needs_means2d_grad:
+            rendering.means2d.retain_grad()
+        loss = with_opacity_penalty(data_loss(field, render, target, self._loss, self._largest_truth), render)
+        image = render.encoded if self.needs_encoded else render.photo_exposure
+        assert image is not None
+        del render, target, view
+        differentiate(loss)
+        harmonics = None
+        if self.defer_sh_gradients:
+            values = sh_gradients[0].contiguous()
+            harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, options.degree)
+        if self._ranks is not None:
+            self._flat_gradients(self._ranks).collect(loss, rendering.overflow, harmonics)
+        return Gradients(loss.detach(), image.detach(), rendering, needs_means2d_grad, harmonics)
+
+    def apply_gradients(self, gradients: Gradients) -> Tensor:
+        """Update the parameters, unless the step is not finite; return its loss. Does not wait for the device."""
+        rendering, loss, harmonics = gradients.rendering, gradients.loss, gradients.harmonics
+        incomplete = rendering.overflow
+        if self._flat is not None:
+            loss, incomplete, harmonics = self._flat.distribute()
+        applied = guarded_step(
+            self._optimizer,
+            loss,
+            incomplete,
+            harmonics,
+            step_counters=self._capacity.step_counters,
+            intersections=rendering.needed_intersections,
+            active_count=self._field.gaussians.active_count,
+        )
+        if gradients.needs_means2d_grad:
+            height, width, _ = gradients.image.shape
+            self._strategy.accumulate(rendering, width, height, applied)
+        self._optimizer.zero_grad()
+        if rendering.needed_intersections is None:
+            self._capacity.observe(rendering.intersection_count)
+        return loss
+
+    def _flat_gradients(self, ranks: Ranks) -> FlatGradients:
+        """Return the buffer of all gradients, which ranks exchange; allocated anew when parameters change."""
+        if self._flat is None or not self._flat.fits(self._optimizer):
+            self._flat = None  # Freed first, because it is large.
+            self._flat = FlatGradients(self._optimizer, ranks.rank, ranks.count, defer_sh=self.defer_sh_gradients)
+        return self._flat
