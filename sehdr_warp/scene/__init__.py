@@ -2,7 +2,8 @@
 
 from .camera import Camera, look_at
 from .camera_files import load_cameras
-from .load import choose_response, embedded_folder, embedded_scenes, is_embedded, load_scene, parse_dataset
+from .load import load_scene
+from .parse import embedded_folder, embedded_scenes, is_embedded, parse_dataset
 from .preprocess import preprocess
 from .types import Scene, View, codes_of, encoded_values
 
@@ -10,7 +11,6 @@ __all__ = [
     "Camera",
     "Scene",
     "View",
-    "choose_response",
     "codes_of",
     "embedded_folder",
     "embedded_scenes",

@@ -18,8 +18,8 @@ from ..response import Response, ToneMapper, response_by_name
 from ..runs.config import Config
 from ..runs.run import assemble_field
 from ..scene import Scene, View
-from ..scene.load import sample_photos, select_response_for
 from ..scene.normalization import Normalization, normalization_of
+from ..scene.response_choice import select_for_views
 from ..scene.wide_camera import perspective_views
 from ..splats import read_gaussians
 from ..subsets import every_nth
@@ -50,8 +50,8 @@ def scene_extent(scene: Scene) -> float:
 def response_for_training(scene: Scene, config: Config) -> Response:
     """Return the response that the config names.
 
-    "learned" is a new ToneMapper. "auto" is the response of the scene, if it was selected as the config asks, else the
-    one that fits the photos best.
+    "learned" is a new ToneMapper. "auto" is the response that load_scene() chose, if it chose as the config asks; only
+    a scene that was loaded otherwise is judged here.
     """
     options = config.response
     if scene.light_known and scene.response is not None:
@@ -62,9 +62,7 @@ def response_for_training(scene: Scene, config: Config) -> Response:
         return response_by_name(options.name)
     if scene.response is not None and scene.chosen_by == (options.method, options.candidates):
         return scene.response
-    views = scene.train_views
-    codes = [view.codes for view in sample_photos(views, options.method)]
-    selection = select_response_for(codes, [view.source for view in views], options.method, options.candidates)
+    selection = select_for_views(scene.train_views, options.method, options.candidates)
     if selection.note:
         _log.info("%s", selection.note)
     return selection.response

@@ -291,7 +291,7 @@ def check_dataset_truth(data: Mapping[str, Any], config: Config) -> None:
 
     `data` are arguments of load_scene(), `config` is the config before the plan.
     """
-    from ..scene.load import parse_dataset
+    from ..scene.parse import parse_dataset
     from ..scene.names import unique_names
 
     # A plan removes the loss between brackets and truth that is missing.

@@ -9,7 +9,7 @@ from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response import selection as response_selection
 from sehdr_warp.response.selection import FINE, GRID, edge_facts, family_logs, select_response
 from sehdr_warp.response.table import TabulatedResponse
-from sehdr_warp.scene.load import select_response_for
+from sehdr_warp.scene.response_choice import select_for_codes
 
 CODES = np.arange(256) / 255
 
@@ -192,11 +192,11 @@ def test_uncertainty_is_small_with_edges_and_large_without():
 
 def test_a_guess_is_told():
     ramp = np.rint(255 * np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))).astype(np.uint8)
-    note = select_response_for([ramp], [None], "posterior", ()).note
+    note = select_for_codes([ramp], [None], "posterior", ()).note
     assert "is a guess: curves that explain the photos as well differ from it by" in note
     codes = [np.rint(255 * photograph("srgb", mosaic(seed))).astype(np.uint8) for seed in range(4)]
-    assert select_response_for(codes, [None] * 4, "posterior", ()).note is None
-    assert select_response_for(codes, [None] * 4, "paper", ()).note is None
+    assert select_for_codes(codes, [None] * 4, "posterior", ()).note is None
+    assert select_for_codes(codes, [None] * 4, "paper", ()).note is None
 
 
 def family_curve(draw: int) -> Response:
