@@ -291,8 +291,8 @@ def check_dataset_truth(data: Mapping[str, Any], config: Config) -> None:
 
     `data` are arguments of load_scene(), `config` is the config before the plan.
     """
-    from ..scene.parse import parse_dataset
     from ..scene.names import unique_names
+    from ..scene.parse import parse_dataset
 
     # A plan removes the loss between brackets and truth that is missing.
     removed = config.plan.enabled and not config.loss.hdr_weight

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.response import Response, response_by_name
-from sehdr_warp.response import selection as response_selection
-from sehdr_warp.response.selection import FINE, GRID, edge_facts, family_logs, select_response
+from sehdr_warp.response import Response, response_by_name, selection_scores
+from sehdr_warp.response.selection import select_response
+from sehdr_warp.response.selection_scores import FINE, GRID, edge_facts, family_curves
 from sehdr_warp.response.table import TabulatedResponse
 from sehdr_warp.scene.response_choice import select_for_codes
 
@@ -51,13 +51,13 @@ def test_papers_score_orders_by_range_and_smoothness():
 
 def test_candidates_are_compared_on_one_thread_of_torch(monkeypatch):
     """Between so many small operations further threads would spin."""
-    found, compare, before = set(), response_selection._mixture_surprise, torch.get_num_threads()
+    found, compare, before = set(), selection_scores._mixture_surprise, torch.get_num_threads()
 
     def noted(*given):
         found.add(torch.get_num_threads())
         return compare(*given)
 
-    monkeypatch.setattr(response_selection, "_mixture_surprise", noted)
+    monkeypatch.setattr(selection_scores, "_mixture_surprise", noted)
     torch.set_num_threads(2)
     try:
         select_response(photograph("srgb", mosaic()), named("srgb", "filmic"))
@@ -157,7 +157,7 @@ def test_edges_that_no_curve_explains_say_little(monkeypatch):
         return np.array([score.edges for score in select_response(spoilt, named("srgb", "hdr-nerf", "camera")).scores])
 
     found = costs()
-    monkeypatch.setattr(response_selection, "EDGE_MISFITS", np.array([1.0]))
+    monkeypatch.setattr(selection_scores, "EDGE_MISFITS", np.array([1.0]))
     as_rounding = costs()
     assert np.ptp(found) < 0.9 * np.ptp(as_rounding) and (found < as_rounding - 0.2).all()
 
@@ -201,7 +201,7 @@ def test_a_guess_is_told():
 
 def family_curve(draw: int) -> Response:
     """A member of the family that posterior photos are judged by."""
-    logs = family_logs()[0][:, ::FINE]
+    logs = family_curves()[0][:, ::FINE]
     return TabulatedResponse(f"member {draw}", np.concatenate([[0.0], np.exp(logs[draw, 1:])]), CODES)
 
 
@@ -210,7 +210,7 @@ def stops_off(response, truth) -> float:
 
 
 def test_family_is_increasing_and_holds_what_cameras_do():
-    logs, rises = family_logs()
+    logs, rises = family_curves()
     assert logs.shape == rises.shape == (512, len(GRID)) and (np.diff(logs[:, FINE:]) > 0).all()
     logs, rises = logs[:, ::FINE], rises[:, ::FINE]
     assert rises[:, 128] == pytest.approx((logs[:, 129] - logs[:, 127]) * 127.5, rel=1e-3)
