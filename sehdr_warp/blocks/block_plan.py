@@ -21,7 +21,7 @@ from ..files import read_json, refuse_links, write_json
 from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_from_dict, field_and_problem, override_config
-from ..runs.open import load_photos
+from ..runs.open import LoadArguments, load_photos
 from ..runs.values import DataValues, GainValues, NormalizationValues
 from ..scene import Scene
 from ..scene.exposure_compensation import ExposureCompensation
@@ -110,7 +110,7 @@ class BlockPlan:
     """
 
     scene: str
-    data: dict[str, Any]
+    data: LoadArguments
     response: Response
     normalization: Normalization
     shared: SharedDecisions
@@ -186,7 +186,7 @@ class BlockPlan:
 
 
 def make_block_plan(
-    data: dict[str, Any], config: Config, device: torch.device, count: int | None, **selection: Any
+    data: LoadArguments, config: Config, device: torch.device, count: int | None, **selection: Any
 ) -> BlockPlan | None:
     """Decide what all blocks of a set share, and divide the set.
 
@@ -261,7 +261,7 @@ def blocks_for(photos: int, pixels: float, config: Config) -> int:
     return max(1, math.ceil(max(by_photos, by_gaussians) - OVERLAP + 1))
 
 
-def _check(config: Config, data: Mapping[str, Any]) -> None:
+def _check(config: Config, data: LoadArguments) -> None:
     """Raise InputError for options whose networks would differ between blocks."""
     path = data.get("path") or "photos"
     if config.response.name == "learned":

@@ -5,14 +5,13 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from ..errors import InputError
 from ..files import make_parents, refuse_links, writing
 from ..runs.config import Config
-from ..runs.open import load_photos, response_for_loading
+from ..runs.open import LoadArguments, load_photos, response_for_loading
 from ..runs.run import Run, load_run
 from ..runs.run_writer import RunWriter
 from .block_plan import FILE, BlockPlan, make_block_plan
@@ -32,7 +31,7 @@ def is_in_blocks(out: Path) -> bool:
 
 
 def train_in_blocks(
-    data: dict[str, Any],
+    data: LoadArguments,
     out: Path,
     config: Config,
     count: int | None,
@@ -110,7 +109,7 @@ def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
     return False
 
 
-def _continued(out: Path, data: dict[str, Any], config: Config, count: int | None) -> BlockPlan:
+def _continued(out: Path, data: LoadArguments, config: Config, count: int | None) -> BlockPlan:
     """Return the plan of a training in blocks to continue; raise InputError if something else was asked for."""
     plan = BlockPlan.read(out)
     for index in range(len(plan.blocks)):

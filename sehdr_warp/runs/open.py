@@ -6,10 +6,9 @@ torch is imported when a function is called, so that the command line can import
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from ..errors import InputError, SehdrError
 
@@ -24,7 +23,25 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOAD_OPTIONS = ("exposure_index", "max_size", "holdout")
-"""Arguments of load_scene, besides path and response, that a run saves so that its photos can be loaded again."""
+"""Names of LoadArguments that are options of the command line."""
+
+
+class LoadArguments(TypedDict, total=False):
+    """Arguments of load_scene() that a run saves in run.json, so that its photos can be loaded again.
+
+    Attributes:
+        path: Where the photos are: a folder, a video, or "embedded"; None or left out if that is not known.
+        exposure_index: As in load_scene().
+        max_size: As in load_scene().
+        holdout: As in load_scene().
+        views: Names of the views to read, if only some are.
+    """
+
+    path: str | None
+    exposure_index: int | None
+    max_size: int | None
+    holdout: int | None
+    views: list[str]
 
 
 def pick_device(device: str | torch.device | None) -> torch.device:
@@ -76,16 +93,18 @@ def open_scene(path: Path, device: str | None) -> Run | Splats:
     return open_run(path, device)
 
 
-def load_photos(data: Mapping[str, Any], **options: Any) -> Scene:
-    """Load the scene that saved arguments of load_scene describe, and log its notes.
+def load_photos(data: LoadArguments, **options: Any) -> Scene:
+    """Load the scene that saved arguments describe, and log its notes.
 
     Args:
-        data: "path" and any of LOAD_OPTIONS, and "views" if only some views are to be read.
+        data: The arguments, with a path.
         options: Further arguments of load_scene, such as response.
     """
     from ..scene import load_scene
 
-    scene = load_scene(data["path"], **{name: data.get(name) for name in (*LOAD_OPTIONS, "views")}, **options)
+    path = data.get("path")
+    assert path is not None, "who has no path says so before"
+    scene = load_scene(path, **{name: data.get(name) for name in (*LOAD_OPTIONS, "views")}, **options)
     for note in scene.notes:
         log.info("%s", note)
     return scene
@@ -109,7 +128,7 @@ def load_run_photos(run: Run, data: str | None) -> Scene:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).exists():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    return load_photos({**run.data, "path": place}, response=response_for_loading(run.config, run.response))
+    return load_photos(run.data | {"path": place}, response=response_for_loading(run.config, run.response))
 
 
 def load_run_photos_with_confidence(run: Run, data: str | None) -> Scene:

@@ -28,6 +28,7 @@ from ..splats import read_gaussians
 from .checkpoint import Checkpoint, under
 from .config import Config
 from .light_estimates import light_estimates
+from .open import LoadArguments
 from .run_folder import CameraEntry, RunFolder
 from .run_writer import write_confidence
 
@@ -196,7 +197,7 @@ class Run(LoadedScene):
         train_seconds: Duration of the training.
         degree: SH degree.
         checkpoint_hash: Hash of the tensors.
-        data: Arguments of load_scene() for the photos; may be empty.
+        data: Arguments with which the photos were loaded; may be empty.
     """
 
     def __init__(self, folder: RunFolder, config: Config, field: RadianceField, info: dict, values: dict):
@@ -210,7 +211,7 @@ class Run(LoadedScene):
         self.degree = config.degree_at(self.iterations)
         self.train_seconds: float = values["seconds"]
         self.checkpoint_hash: str = values["sha256"]
-        self.data: dict = info["data"]
+        self.data: LoadArguments = info["data"]
         self.scene_name: str = info["scene"]
         if info.get("color_matrix"):
             self.color_matrix = np.array(info["color_matrix"], np.float64)

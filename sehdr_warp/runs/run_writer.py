@@ -26,6 +26,7 @@ from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.gravity import find_up
 from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
 from .config import Config
+from .open import LoadArguments
 from .run_folder import EVIDENCE_TENSORS, NEW, READY, RunFolder, confidence_metadata, describe_scene
 from .values import FORMAT, read_object, require_readable
 
@@ -119,7 +120,7 @@ class RunWriter(RunFolder):
         scene: Scene,
         config: Config,
         field: RadianceField,
-        data: dict,
+        data: LoadArguments,
         plan: dict | None,
         state: tuple[dict[str, Tensor], dict],
         *,

@@ -5,7 +5,7 @@ because a later version may write more.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -190,7 +190,7 @@ def read_values(path: Path, model: type[BaseModel], remedy: str = REMEDY) -> dic
     return values
 
 
-def require_readable(data: dict[str, Any]) -> None:
+def require_readable(data: Mapping[str, object]) -> None:
     """Raise InputError for arguments of load_scene that a reader of the run would refuse."""
     try:
         DataValues.model_validate(data)

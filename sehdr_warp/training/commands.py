@@ -19,7 +19,7 @@ from tyro.conf import Positional
 from ..errors import InputError, SehdrError, UsageError
 from ..files import require_text
 from ..runs import config_files as configs
-from ..runs.open import LOAD_OPTIONS, load_photos, pick_device
+from ..runs.open import LOAD_OPTIONS, LoadArguments, load_photos, pick_device
 
 log = logging.getLogger(__name__)
 
@@ -167,7 +167,7 @@ def _train(args: Train, ranks=None) -> None:
         resumed = folder
     elif output.resume:
         log.info("%s holds no run yet: a training begins there", out)
-    data = _data(args, None if resumed is None else resumed.read_info()["data"])
+    data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
     config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     options = config.response
@@ -269,11 +269,8 @@ def _train_blocks(args: Train) -> bool:
     if machine.gpus > 1:
         device_of_rank(machine.gpus - 1, machine.device)
     plan = BlockPlan.read(output.out) if output.resume and is_in_blocks(output.out) else None
-    data, config = (
-        (_data(args, None), _config(args, None))
-        if plan is None
-        else (_data(args, plan.data), _config(args, plan.config))
-    )
+    data = _load_arguments(args, None if plan is None else plan.data)
+    config = _config(args, None if plan is None else plan.config)
     blocks = args.training.blocks
     run = train_in_blocks(
         data,
@@ -325,8 +322,8 @@ def _path_of(args: Train) -> str | None:
     return path
 
 
-def _data(args: Train, saved: Mapping | None) -> dict:
-    """Return the arguments of load_scene() of the command line, or else those of the run that is resumed."""
+def _load_arguments(args: Train, saved: LoadArguments | None) -> LoadArguments:
+    """Return where the photos are and how they are loaded: by the command line, or else as in the run to resume."""
     options: dict = {"path": _path_of(args)} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
     if saved is not None:
         options = {name: saved.get(name) if value is None else value for name, value in options.items()}
@@ -335,7 +332,7 @@ def _data(args: Train, saved: Mapping | None) -> dict:
         raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
     if options["path"] is None:
         raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
-    return options
+    return LoadArguments(**options)
 
 
 def _config(args: Train, saved):

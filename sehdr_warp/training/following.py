@@ -12,7 +12,7 @@ from ..errors import InputError, SehdrError
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
-from ..runs.open import load_photos
+from ..runs.open import LoadArguments, load_photos
 from ..runs.run import exposure_compensation, field_from_checkpoint
 from ..runs.run_folder import describe_scene, scene_difference
 from ..scene import Scene, View
@@ -31,10 +31,10 @@ class PhotoRequest:
 
     Attributes:
         data: Arguments of load_scene() as a run saves them.
-        options: Its further arguments: response, method, candidates, photos.
+        options: Further arguments of load_scene(): response, method, candidates, photos.
     """
 
-    data: dict[str, Any]
+    data: LoadArguments
     options: dict[str, Any]
 
 
@@ -95,7 +95,8 @@ def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
     scene = None
     if reads:
         request: PhotoRequest = ranks.requested_photos()
-        scene = load_photos(request.data | ({} if path is None else {"path": path}), **request.options)
+        data = request.data if path is None else request.data | {"path": path}
+        scene = load_photos(data, **request.options)
     shared: SharedTraining = ranks.broadcast_object()
     config = shared.config
     tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in shared.layout.items()}

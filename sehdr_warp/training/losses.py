@@ -1,9 +1,8 @@
 """The loss of a training step, and the HDR truth that it needs: photos against renders, truth against exposures."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from ..rasterizer.photo_loss import photo_loss
 from ..rasterizer.ssim import image_distance, ssim
 from ..response import Response, ToneMapper
 from ..runs.config import Config, LossConfig
+from ..runs.open import LoadArguments
 from ..scene import Scene
 
 CODE = 1 / 255  # One step of an 8-bit photo
@@ -286,10 +286,10 @@ def check_scene_truth(scene: Scene, loss: LossConfig) -> None:
     check_hdr_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], loss)
 
 
-def check_dataset_truth(data: Mapping[str, Any], config: Config) -> None:
+def check_dataset_truth(data: LoadArguments, config: Config) -> None:
     """Raise InputError if a dataset lacks HDR truth that the loss needs, before its photos are read.
 
-    `data` are arguments of load_scene(), `config` is the config before the plan.
+    `data` names the photos, `config` is the config before the plan.
     """
     from ..scene.names import unique_names
     from ..scene.parse import parse_dataset
@@ -298,7 +298,9 @@ def check_dataset_truth(data: Mapping[str, Any], config: Config) -> None:
     removed = config.plan.enabled and not config.loss.hdr_weight
     if not config.loss.uses_hdr or removed:
         return
-    dataset = parse_dataset(data["path"], exposure_index=data.get("exposure_index"), holdout=data.get("holdout"))
+    path = data.get("path")
+    assert path is not None, "who has no path says so before"
+    dataset = parse_dataset(path, exposure_index=data.get("exposure_index"), holdout=data.get("holdout"))
     records = zip(unique_names(dataset.records), dataset.records, strict=True)
     views = [(name, record.hdr is not None) for name, record in records if record.split == "train"]
     check_hdr_truth(dataset.name, views, config.loss)

@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
-from ..runs.open import pick_device
+from ..runs.open import LoadArguments, pick_device
 from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
 from ..scene import Scene
@@ -62,7 +62,7 @@ def create_trainer(
     resume: bool = False,
     overwrite: bool = False,
     tensorboard: bool = False,
-    data: dict[str, Any] | None = None,
+    data: LoadArguments | None = None,
     ranks: Ranks | None = None,
     shared: SharedDecisions | None = None,
 ) -> Trainer:
@@ -78,7 +78,7 @@ def create_trainer(
             uninterrupted training, bit for bit.
         overwrite: Replace the run in `out`, once the new one has a checkpoint of its start.
         tensorboard: Write event files to out/tensorboard (needs the extra `tensorboard`).
-        data: Arguments of load_scene() ("path", "exposure_index", "max_size", ...), saved to load the photos again.
+        data: Arguments with which the scene was loaded, saved to load its photos again.
         ranks: Processes that train together, of which this one leads.
         shared: Decisions of a larger set that this scene is part of; by default they are made for this scene.
 
@@ -95,7 +95,7 @@ def create_trainer(
             if resumes:
                 trainer = _resumed_trainer(scene, folder, config, device, ranks, tensorboard)
             else:
-                config, data = config or Config(), data or {}
+                config, data = config or Config(), data or LoadArguments()
                 trainer = _new_trainer(
                     scene, folder, config, device, ranks, tensorboard, data, shared, overwrite=overwrite
                 )
@@ -118,7 +118,7 @@ def _new_trainer(
     device: torch.device,
     ranks: Ranks | None,
     tensorboard: bool,
-    data: dict[str, Any],
+    data: LoadArguments,
     shared: SharedDecisions | None,
     *,
     overwrite: bool,
