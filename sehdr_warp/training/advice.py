@@ -3,17 +3,36 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 STILL_RISING = 0.2  # dB that held-out photos gained in the last third of a training that was too short
 UNFINISHED = 0.5  # dB gained there from which blur, and not movement, explains what differs from the photos
-FALLING = 0.5  # dB that they lost since their best, in a training that was too long for so few photos
+FALLING = 0.5  # dB that they lost since their best in a training that overfits; seeds differ by up to 0.3 dB
 EXPOSURE_JUMP = (
     0.4  # Stops by which a whole photo is brighter or darker than the scene if its exposure is not as stated
 )
 _FEW_PHOTOS = 30
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
+
+
+class Evaluation(NamedTuple):
+    """PSNR of the held-out photos after an iteration, dB."""
+
+    iteration: int
+    psnr: float
+
+
+def evaluations(metrics: Sequence[Mapping[str, Any]]) -> list[Evaluation]:
+    """Return the evaluations of held-out photos in the lines of metrics.jsonl."""
+    scored = [(line["iteration"], line.get("psnr_ldr")) for line in metrics if line.get("split", "test") == "test"]
+    return [Evaluation(iteration, psnr) for iteration, psnr in scored if psnr is not None]
+
+
+def best_if_overfitted(points: Sequence[Evaluation]) -> Evaluation | None:
+    """Return the best evaluation if the last one is more than FALLING below it; else None."""
+    best = max(points, key=lambda point: point.psnr, default=None)
+    return best if best is not None and best.psnr - points[-1].psnr > FALLING else None
 
 
 def advice(path: Path, summary: Mapping[str, Any], train_photos: int, scene: str = "SCENE") -> list[str]:
@@ -27,22 +46,20 @@ def advice(path: Path, summary: Mapping[str, Any], train_photos: int, scene: str
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
     again = f"sehdr-warp train {shlex.quote(scene)} --out {run} --overwrite"
-    points = [(line["iteration"], line["psnr_ldr"]) for line in summary["metrics"] if line.get("split") == "test"]
-    points = [(iteration, decibels) for iteration, decibels in points if decibels is not None]
-    lines, gain = [], 0.0
+    points, lines, gain = evaluations(summary["metrics"]), [], 0.0
     if len(points) >= 3:
-        earlier = [decibels for iteration, decibels in points if iteration <= iterations * 2 / 3 + 1]
-        gain = points[-1][1] - max(earlier, default=points[0][1])
-        best = max(points, key=lambda point: point[1])
+        earlier = [point.psnr for point in points if point.iteration <= iterations * 2 / 3 + 1]
+        gain = points[-1].psnr - max(earlier, default=points[0].psnr)
         if gain > STILL_RISING:
             command = f"sehdr-warp train --resume --out {run} --iterations {2 * iterations}"
             lines.append(f"held-out photos still gained {gain:.1f} dB at the end; more steps help: {command}")
-        elif best[1] - points[-1][1] > FALLING:
+        elif best := best_if_overfitted(points):
             lines.append(
-                f"held-out photos were {best[1] - points[-1][1]:.1f} dB better at iteration {best[0]}: {train_photos} "
-                f"photos hold no more; add photos from other places, or stop there: {again} --iterations {best[0]}"
+                f"held-out photos were {best.psnr - points[-1].psnr:.1f} dB better at iteration {best.iteration}: "
+                f"{train_photos} photos hold no more; add photos from other places, or stop there: "
+                f"{again} --iterations {best.iteration}"
             )
-        elif train_photos < _FEW_PHOTOS and points[-1][1] < 25:
+        elif train_photos < _FEW_PHOTOS and points[-1].psnr < 25:
             lines.append(
                 f"{train_photos} photos are few: more from places between them, and nearer, would help most: {again}"
             )

@@ -141,8 +141,17 @@ def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
     codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
     clipped = clipped_weights(config, target) if target.scale.mu and config.clipping else ClippedWeights()
     if target.mask is None and weight:
-        weights = {"distance_weight": _distance_weight(config.form, weight), "dissimilarity_weight": weight}
-        return photo_loss(image, codes, scale, index, **weights, clipped=clipped, estimates=target.estimates)
+        # The common case: the terms below in one launch, and with one gradient.
+        return photo_loss(
+            image,
+            codes,
+            scale,
+            index,
+            distance_weight=_distance_weight(config.form, weight),
+            dissimilarity_weight=weight,
+            clipped=clipped,
+            estimates=target.estimates,
+        )
     prediction, truth = code_residual(image, codes, scale, index)
     loss = image_loss(prediction, truth, target.mask, config.form, weight)
     if clipped:

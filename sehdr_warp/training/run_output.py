@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 CURVE_POINTS = 200  # Points of the curves in TensorBoard
-OVERFITTING_DB = 0.2  # Decibels by which the last score may be below the best one without a warning
 MAX_DB = 100.0  # Score of identical images, so that a mean over views is finite
 
 
@@ -118,7 +117,6 @@ class RunOutput:
         if trainer.ranks is not None:
             trainer.ranks.shutdown()
         self._write_summary(trainer)
-        warn_of_overfitting(self.folder.read_metrics())
         if self._writer is not None:
             self._writer.close()
         if not complete:
@@ -216,13 +214,3 @@ def format_scores(scores: Mapping[str, float]) -> str:
     """Format the scores of evaluate_views() for a log line."""
     formats = {"psnr_ldr": "held-out photos {:.1f} dB", "psnr_mu": "HDR {:.1f} dB (mu-law)"}
     return ", ".join(text.format(scores[name]) for name, text in formats.items() if name in scores)
-
-
-def warn_of_overfitting(metrics: Sequence[dict]) -> None:
-    """Warn if held-out photos scored better earlier in the training, by the lines of metrics.jsonl."""
-    scores = [(line["psnr_ldr"], line["iteration"]) for line in metrics if "psnr_ldr" in line]
-    if scores and (best := max(scores))[0] > scores[-1][0] + OVERFITTING_DB:
-        log.warning(
-            "held-out photos scored best at iteration %d (%.2f dB), now %.2f dB: train fewer iterations",
-            *(best[1], best[0], scores[-1][0]),
-        )

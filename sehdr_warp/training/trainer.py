@@ -24,6 +24,7 @@ from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..runs.run import Run, as_rec709
 from ..scene import Camera, Scene
+from .advice import best_if_overfitted, evaluations
 from .gradient_step import Gradients, GradientStep, StepOptions, StepResult
 from .initialization import make_matcher, scene_extent, sizes_of
 from .machine import interruptible, torch_settings
@@ -131,9 +132,13 @@ class Trainer:
     # The loop
 
     def train(self) -> Run:
-        """Train to the end and return the trained run."""
+        """Train to the end and return the trained run; warn if held-out photos were better before."""
         for _ in self:
             pass
+        points = evaluations(self.run.metrics())
+        if best := best_if_overfitted(points):
+            message = "held-out photos scored best at iteration %d (%.2f dB), now %.2f dB: train fewer iterations"
+            log.warning(message, best.iteration, best.psnr, points[-1].psnr)
         return self.run
 
     def __iter__(self) -> Iterator[TrainingProgress]:
