@@ -10,9 +10,8 @@ import itertools
 import json
 import logging
 import math
-import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import methodcaller
@@ -22,12 +21,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..caches import cache_folder, usable
 from ..errors import InputError, SehdrError
-from ..files import atomic_folder
-from ..own_files import is_sealed
 from ..parallel import run_interruptibly, signals_kept
 from ..progress import Stage, stage, tracked
+from .cached_folder import cached_folder
 from .colmap_model import SparseModel, read_model
 from .colmap_rows import counted_rows
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
@@ -122,10 +119,10 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
         model.write_binary(result)
         (result / "sizes.json").write_text(json.dumps(sizes))
 
-    with cached_result(cache, f"sfm-{key}", solve) as folder:
-        model = read_model(folder)
-        sizes = json.loads((folder / "sizes.json").read_text())
-        error, weak = _placement(folder)
+    folder = solved_folder(cache, key, solve)
+    model = read_model(folder)
+    sizes = json.loads((folder / "sizes.json").read_text())
+    error, weak = _placement(folder)
     images = (replace(image, lens=image.lens.resized(*sizes[int(Path(image.name).stem)])) for image in model.images)
     return Reconstruction(SparseModel(tuple(images), model.cloud), error, weak)
 
@@ -144,35 +141,18 @@ def _placement(folder: Path) -> tuple[float, tuple[int, ...]]:
     return error, tuple(sorted(index for index, count in shared.items() if count < FEWEST_SHARED))
 
 
-@contextlib.contextmanager
-def cached_result(cache: Path | str | None, name: str, solve: Callable[[Path, Path], None]) -> Iterator[Path]:
-    """Provide the folder of a result: the cached one, or a new one that solve(work, result) fills.
+def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Path], None]) -> Path:
+    """Return the cached folder of a result, as cached_folder() does; solve(work, result) writes it.
 
-    The user's cache is $SEHDR_CACHE, or sehdr-warp/ in $XDG_CACHE_HOME or ~/.cache. If it cannot be written, the result
-    is temporary; a damaged result is computed again. A cache that the caller names must be writable.
+    `work` is a temporary folder beside the result, with an empty folder "model".
     """
-    with contextlib.ExitStack() as stack:
-        folder = cache_folder(cache)
-        place = (folder or Path()) / name
-        if folder and place.is_dir() and not is_sealed(place):
-            _log.warning("%s is damaged and is made again", place)
-            shutil.rmtree(place, ignore_errors=True)
-        if folder and place.is_dir() and is_sealed(place):
-            _log.info("using the cached result %s", place)
-        else:
-            if cache is None and not (folder and usable(folder) and not place.exists()):
-                place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sehdr-sfm-"))) / name
-            try:
-                with (
-                    atomic_folder(place) as result,
-                    tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=place.parent) as work,
-                ):
-                    (Path(work) / "model").mkdir()
-                    solve(Path(work), result)
-            except SehdrError:
-                if not place.is_dir():  # Else another process finished the same work first; its result is used.
-                    raise
-        yield place
+
+    def fill(result: Path) -> None:
+        with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=result.parent) as work:
+            (Path(work) / "model").mkdir()
+            solve(Path(work), result)
+
+    return cached_folder(cache, f"sfm-{key}", fill)
 
 
 def file_digest(path: Path) -> str:

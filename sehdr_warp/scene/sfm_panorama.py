@@ -25,12 +25,12 @@ from .sfm import (
     SEED,
     Reconstruction,
     cache_key,
-    cached_result,
     file_digest,
     image_name,
     matching_options,
     quiet_colmap,
     run_mapper,
+    solved_folder,
 )
 from .types import View, encoded_values
 from .wide_camera import FACE_ANGLE, face_rotations, faces_of
@@ -102,9 +102,9 @@ def reconstruct_panoramas(photos: Sequence[Path], cache: Path | str | None = Non
         facts = {"poses": poses, "error": float(model.compute_mean_reprojection_error())}
         (result / "panoramas.json").write_text(json.dumps(facts))
 
-    with cached_result(cache, f"sfm-{key}", solve) as folder:
-        facts = json.loads((folder / "panoramas.json").read_text())
-        cloud: PointCloud = read_points(folder)
+    folder = solved_folder(cache, key, solve)
+    facts = json.loads((folder / "panoramas.json").read_text())
+    cloud: PointCloud = read_points(folder)
     images = []
     for index, matrix in sorted(facts["poses"].items(), key=lambda item: int(item[0])):
         width, height = photo_sizes(photos[int(index)])[1]

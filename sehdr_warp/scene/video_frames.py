@@ -3,8 +3,6 @@
 import json
 import logging
 import math
-import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,11 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..caches import cache_folder, usable
-from ..errors import InputError, SehdrError
-from ..files import atomic_folder
-from ..own_files import is_sealed
+from ..errors import InputError
 from ..progress import stage
+from .cached_folder import cached_folder
 from .dataparser import DataparserOutputs
 from .images import png16
 from .names import list_images
@@ -138,44 +134,9 @@ def _without_hidden(frames: Iterable[tuple[int, Any]]) -> Iterator[tuple[int, An
 
 
 def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
-    """Return a folder of the chosen frames, made once for a clip's content.
-
-    Args:
-        clip: the clip.
-        cache: where it lies; None is the user's cache ($SEHDR_CACHE), or a temporary folder that lasts as long as the
-            process if that cannot be written.
-    """
+    """Return a folder of the chosen frames, made once for a clip's content; `cache` as of cached_folder()."""
     name = f"video-{file_digest(clip.path)[:16]}-{_VERSION}"
-    folder = cache_folder(cache)
-    if folder is None or not usable(folder):
-        if cache is not None:
-            raise InputError(cache, "the frames cannot be kept there", "name a folder that can be written")
-        folder = _temporary()
-    place = folder / name
-    if place.is_dir() and is_sealed(place):
-        _log.info("using the cached frames %s", place)
-        return place
-    if place.is_dir():
-        _log.warning("%s is damaged and is made again", place)
-        shutil.rmtree(place, ignore_errors=True)
-    choice = choose_frames(clip)
-    try:
-        with atomic_folder(place) as result:
-            _write_frames(clip, choice, result)
-    except SehdrError:
-        if not (place.is_dir() and is_sealed(place)):  # Else another process was first; its frames are as good.
-            raise
-    return place
-
-
-_temporaries: list[tempfile.TemporaryDirectory] = []
-
-
-def _temporary() -> Path:
-    """Return a folder that goes with the process."""
-    if not _temporaries:
-        _temporaries.append(tempfile.TemporaryDirectory(prefix="sehdr-video-"))
-    return Path(_temporaries[0].name)
+    return cached_folder(cache, name, lambda folder: _write_frames(clip, choose_frames(clip), folder))
 
 
 def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:

@@ -14,8 +14,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.own_files import LIST
-from sehdr_warp.scene import load_scene, sfm
+from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.dataparser import ImageRecord, PointCloud
 from sehdr_warp.scene.exposure import shutter
@@ -242,29 +241,6 @@ def test_the_room_is_light_and_transforms_need_no_pycolmap(tmp_path):
     code += f"s.load_scene({str(tmp_path)!r}, response='srgb'); print('pycolmap' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["[]", "False"]
-
-
-@pytest.mark.parametrize("damage", ["empty", "cut", "pickle", "missing", "no list"])
-def test_a_damaged_result_of_structure_from_motion_is_made_again(tmp_path, caplog, damage):
-    solved = []
-
-    def solve(work, result):
-        solved.append(work)
-        (result / "cameras.bin").write_bytes(b"cameras")
-        (result / "sizes.json").write_text("[]")
-
-    for expected in (1, 1):
-        with sfm.cached_result(tmp_path, "sfm-key", solve) as place:
-            assert len(solved) == expected
-    file = place / ("cameras.bin" if damage != "no list" else LIST)
-    if damage in ("missing", "no list"):
-        file.unlink()
-    else:
-        file.write_bytes({"empty": b"", "cut": b"cam", "pickle": b"\x80\x04."}[damage])
-    for _ in range(2):
-        with sfm.cached_result(tmp_path, "sfm-key", solve) as place:
-            assert len(solved) == 2 and (place / "cameras.bin").read_bytes() == b"cameras"
-    assert caplog.text.count("is damaged and is made again") == 1
 
 
 def test_photos_are_averaged_side_by_side(tmp_path):

@@ -137,7 +137,7 @@ def test_frames_are_kept_in_the_cache(tmp_path, caplog):
     assert len(files) == 24 and read_ldr(files[0]).pixels.dtype == np.uint16
     with caplog.at_level(logging.INFO, "sehdr_warp.scene"):
         assert frames_folder(clip, tmp_path / "cache") == folder
-    assert "using the cached frames" in caplog.text
+    assert "using the cached result" in caplog.text
     files[0].write_bytes(b"")
     assert frames_folder(clip, tmp_path / "cache") == folder and files[0].stat().st_size > 0
 
