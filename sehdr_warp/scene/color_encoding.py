@@ -180,12 +180,6 @@ def encoding_of_profile(data: bytes, colors: str = "RGB") -> ColorEncoding:
     return _simplified(name, profile.to_rec709, profile.curves)
 
 
-@lru_cache(maxsize=64)
-def encoding_of_cicp(primaries: int, transfer: int, full_range: bool = True) -> ColorEncoding:
-    """Return the encoding that code points of ITU-T H.273 state, as in PNG, HEIF, AVIF and video."""
-    return _from_cicp((primaries, transfer, int(full_range)), "cICP")
-
-
 def note_of(encodings: dict[str, ColorEncoding | None]) -> list[str]:
     """Describe for the user what photos state of their colors.
 

@@ -18,6 +18,7 @@ from sehdr_warp.own_files import LIST
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_cameras
 from sehdr_warp.splats import LOSSY_SUFFIXES, USD_SUFFIXES, GaussianArrays, read_gaussians, write_gaussians
+from tests.ocio_config import ocio_config
 from tests.output.helpers import camera
 
 from .reader import Reader, each
@@ -108,26 +109,14 @@ def make_ocio(folder: Path) -> None:
     rows = "".join(f"{r} {g} {b}\n" for b in (0, 1) for g in (0, 1) for r in (0, 1))
     (folder / "look.cube").write_text(f"LUT_3D_SIZE 2\n{rows}")
     (folder / "curve.spi1d").write_text("Version 1\nFrom 0 1\nLength 3\nComponents 1\n{\n0\n0.4\n1\n}\n")
-    (folder / "own.ocio").write_text("""ocio_profile_version: 2
-search_path: .
-roles: {default: raw, scene_linear: raw, aces_interchange: raw, cie_xyz_d65_interchange: raw}
-file_rules:
-  - !<Rule> {name: Default, colorspace: default}
-displays:
-  D:
-    - !<View> {name: V, colorspace: out}
-colorspaces:
-  - !<ColorSpace>
-    name: raw
-  - !<ColorSpace>
-    name: out
-    from_scene_reference: !<GroupTransform>
+    (folder / "own.ocio").write_text(
+        ocio_config("""!<GroupTransform>
       children:
         - !<FileTransform> {src: look.cube, interpolation: linear}
         - !<FileTransform> {src: curve.spi1d}
         - !<MatrixTransform> {matrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
-        - !<ExponentTransform> {value: [2.2, 2.2, 2.2, 1]}
-""")
+        - !<ExponentTransform> {value: [2.2, 2.2, 2.2, 1]}""")
+    )
 
 
 def read_ocio(folder: Path):

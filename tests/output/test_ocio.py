@@ -12,6 +12,7 @@ from sehdr_warp.output.colorspace import SPACES, from_rec709
 from sehdr_warp.output.light_pictures import display_gain
 from sehdr_warp.output.ocio import ocio_view
 from sehdr_warp.output.render_views import render_views
+from tests.ocio_config import ocio_config
 
 from .helpers import AnalyticRun
 
@@ -60,22 +61,7 @@ def test_color_spaces_have_the_names_and_matrices_of_openexr(tmp_path):
 
 def config_of(folder, transform):
     """A config whose one view is a transform."""
-    folder.joinpath("own.ocio").write_text(f"""ocio_profile_version: 2
-search_path: luts:.
-strictparsing: true
-roles: {{default: raw, scene_linear: raw, aces_interchange: raw, cie_xyz_d65_interchange: raw}}
-file_rules:
-  - !<Rule> {{name: Default, colorspace: default}}
-displays:
-  D:
-    - !<View> {{name: V, colorspace: out}}
-colorspaces:
-  - !<ColorSpace>
-    name: raw
-  - !<ColorSpace>
-    name: out
-    from_scene_reference: {transform}
-""")
+    (folder / "own.ocio").write_text(ocio_config(transform, "luts:."))
     return str(folder / "own.ocio")
 
 

@@ -12,7 +12,7 @@ from PIL import Image, ImageCms
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.color_encoding import encoding_of_cicp, encoding_of_profile, stated_encoding
+from sehdr_warp.scene.color_encoding import encoding_of_profile, stated_encoding
 from sehdr_warp.scene.icc import xyz_to_rec709
 from sehdr_warp.scene.images import EncodedImage, open_image, read_ldr
 from sehdr_warp.scene.primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
@@ -345,11 +345,16 @@ def test_a_profile_that_unpacks_to_much_is_one_line(tmp_path):
         pass
 
 
-def test_narrow_range_and_unstated_code_points():
-    narrow = encoding_of_cicp(1, 13, False)
+def test_narrow_range_and_unstated_code_points(tmp_path):
+    encodings = []
+    for code_points in ([1, 13, 0, 0], [2, 2, 0, 1], [1, 13, 0, 1]):
+        png16(tmp_path / "a.png", np.full((2, 2, 3), 0.5), (b"cICP", bytes(code_points)))
+        with open_image(tmp_path / "a.png") as image:
+            encodings.append(stated_encoding(image))
+    narrow, unstated, rec709 = encodings
     light, _ = narrow.to_linear(np.array([[[16, 126, 235]]], np.uint8))
     np.testing.assert_allclose(light[0, 0], srgb_to_linear(np.array([0, 110 / 219, 1])), atol=2e-3)
-    assert encoding_of_cicp(2, 2).is_srgb and encoding_of_cicp(1, 13).is_srgb
+    assert unstated.is_srgb and rec709.is_srgb
 
 
 def test_curves_and_primaries():

@@ -12,22 +12,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, write_gaussians
 from sehdr_warp.splats.arrays import GaussianArrays
 
-NAMES = [
-    "x",
-    "y",
-    "z",
-    "f_dc_0",
-    "f_dc_1",
-    "f_dc_2",
-    "opacity",
-    "scale_0",
-    "scale_1",
-    "scale_2",
-    "rot_0",
-    "rot_1",
-    "rot_2",
-    "rot_3",
-]
+from .ply_names import DEGREE_0_NAMES
 
 
 def arrays(count=5, degree=1, color_model="display"):
@@ -40,7 +25,7 @@ def arrays(count=5, degree=1, color_model="display"):
 
 
 def write_ply(path, comments=(), **more):
-    names = [*NAMES, *more]
+    names = [*DEGREE_0_NAMES, *more]
     table = np.zeros(3, [(name, "<f4") for name in names])
     table["rot_0"], table["opacity"] = 1, 2
     table["scale_0"], table["scale_1"], table["scale_2"] = np.log([0.002, 0.02, 0.001])

@@ -5,6 +5,8 @@ import zipfile
 
 import pytest
 
+from tests.ocio_config import ocio_config
+
 from .hostile import tried
 
 pytestmark = pytest.mark.trial
@@ -73,21 +75,13 @@ LUT_FILES = {
     "zeros": ("a.cube", "\0" * 100_000),
     "icc": ("a.icc", "acsp" * 100),
 }
-CONFIG = """ocio_profile_version: 2
-search_path: {search}
-roles: {{default: raw, scene_linear: raw, aces_interchange: raw, cie_xyz_d65_interchange: raw}}
-file_rules:
-  - !<Rule> {{name: Default, colorspace: default}}
-displays:
-  D:
-    - !<View> {{name: V, colorspace: out}}
-colorspaces:
-  - !<ColorSpace>
-    name: raw
-  - !<ColorSpace>
-    name: out
-    from_scene_reference: !<FileTransform> {{src: {source}}}
-"""
+
+
+def lut_config(file, search_path="."):
+    """The text of a config whose view is a LUT."""
+    return ocio_config(f"!<FileTransform> {{src: {file}}}", search_path)
+
+
 VIEW_LINE = "render run --out seen --ocio own.ocio --view V --device cpu"
 
 
@@ -96,16 +90,16 @@ def test_luts_that_were_made(space, name):
     pytest.importorskip("PyOpenColorIO")
     file, text = LUT_FILES[name]
     (space / file).write_text(text)
-    (space / "own.ocio").write_text(CONFIG.format(search=".", source=file))
+    (space / "own.ocio").write_text(lut_config(file))
     ended = tried(space, VIEW_LINE)
     assert "root:" not in ended.err
 
 
 CONFIGS = {
-    "environment in a path": CONFIG.format(search="$HOME:$PATH:.", source="$SECRET/a.cube"),
-    "up and up": CONFIG.format(search="../../..:/", source="etc/passwd"),
-    "url": CONFIG.format(search=".", source="http://127.0.0.1:9/a.cube"),
-    "version 99": CONFIG.format(search=".", source="a.cube").replace("version: 2", "version: 99"),
+    "environment in a path": lut_config("$SECRET/a.cube", "$HOME:$PATH:."),
+    "up and up": lut_config("etc/passwd", "../../..:/"),
+    "url": lut_config("http://127.0.0.1:9/a.cube"),
+    "version 99": lut_config("a.cube").replace("version: 2", "version: 99"),
     "yaml that grows": "a: &a [x, x, x]\n"
     + "".join(f"{chr(98 + n)}: &{chr(98 + n)} [{', '.join([f'*{chr(97 + n)}'] * 9)}]\n" for n in range(12)),
     "deep": "{a: " * 3000 + "1" + "}" * 3000,
@@ -132,9 +126,7 @@ def test_archives_of_configs(space, name):
     else:
         with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
             if name != "nothing in it":
-                archive.writestr(
-                    "config.ocio", CONFIG.format(search=".", source="../a.cube" if name == "up" else "a.cube")
-                )
+                archive.writestr("config.ocio", lut_config("../a.cube" if name == "up" else "a.cube"))
             archive.writestr(
                 "../a.cube" if name == "up" else "a.cube", "0 0 0\n" * (60_000_000 if name == "bomb" else 1)
             )

@@ -11,31 +11,15 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from tests.splats.ply_names import DEGREE_0_NAMES
+
 from .hostile import MARKUP, tried
 
 pytestmark = pytest.mark.trial
 
 
 PLY_HEAD = "ply\nformat binary_little_endian 1.0\n"
-SH = "".join(
-    f"property float {name}\n"
-    for name in (
-        "x",
-        "y",
-        "z",
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-        "opacity",
-        "scale_0",
-        "scale_1",
-        "scale_2",
-        "rot_0",
-        "rot_1",
-        "rot_2",
-        "rot_3",
-    )
-)
+SH = "".join(f"property float {name}\n" for name in DEGREE_0_NAMES)
 
 
 def ply(head: str, body: bytes = bytes(14 * 4 * 3)):

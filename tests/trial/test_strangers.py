@@ -16,6 +16,7 @@ import pytest
 
 from sehdr_warp.own_files import LIST
 from tests.fuzz.mutate import VALUES
+from tests.ocio_config import ocio_config
 
 from .harness import COMMANDS, SEED, TRAIN, call, files_in
 
@@ -162,22 +163,6 @@ def test_base_times_of_ply(space, value):
     assert ended.code == int(value != "1_0"), ended.err
 
 
-CONFIG = """ocio_profile_version: 2
-search_path: .
-strictparsing: true
-roles: {default: raw, scene_linear: raw, aces_interchange: raw, cie_xyz_d65_interchange: raw}
-file_rules:
-  - !<Rule> {name: Default, colorspace: default}
-displays:
-  D:
-    - !<View> {name: V, colorspace: out}
-colorspaces:
-  - !<ColorSpace>
-    name: raw
-  - !<ColorSpace>
-    name: out
-    from_scene_reference: TRANSFORM
-"""
 LUTS = {
     "missing": "no.cube", "damaged": "bad.cube", "passwd": "/etc/passwd", "pipe": "pipe.cube", "zero": "/dev/zero",
     "random": "/dev/urandom", "folder": "d", "link to a device": "zero.cube", "up": "../../../../etc/passwd",
@@ -202,7 +187,7 @@ def test_ocio_configs(space, name):
     os.mkfifo(space / "pipe.cube")
     (space / "zero.cube").symlink_to("/dev/zero")
     (space / "d").mkdir()
-    (space / "own.ocio").write_text(CONFIG.replace("TRANSFORM", TRANSFORMS[name]))
+    (space / "own.ocio").write_text(ocio_config(TRANSFORMS[name]))
     ended = call(
         *["render", "run", "--out", "seen", "--ocio", "own.ocio", "--view", "V", "--device", "cpu"],
         folder=space,
