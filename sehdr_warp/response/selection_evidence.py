@@ -1,4 +1,4 @@
-"""What photos tell of a camera's response: colors at their edges, and how often each code occurs."""
+"""Evidence of photos about the response: colors at their edges, and how often each code occurs."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class Band:
 
 @dataclass(frozen=True)
 class PhotoEvidence:
-    """What photos of one camera tell of its response.
+    """Evidence of photos of one camera about its response.
 
     Attributes:
         edges: [E, 3, 3] encoded colors (one side, middle, other side) of clean, colored edges.
