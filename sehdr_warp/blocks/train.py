@@ -11,7 +11,8 @@ import torch
 from ..errors import InputError
 from ..files import make_parents, refuse_links, writing
 from ..runs.config import Config
-from ..runs.open import LoadArguments, load_photos, response_for_loading
+from ..runs.load_arguments import LoadArguments
+from ..runs.open import load_photos, response_for_loading
 from ..runs.run import Run, load_run
 from ..runs.run_writer import RunWriter
 from .block_plan import FILE, BlockPlan, make_block_plan

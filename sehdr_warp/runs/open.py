@@ -8,9 +8,10 @@ from __future__ import annotations
 import logging
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, SehdrError
+from .load_arguments import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     import torch
@@ -21,27 +22,6 @@ if TYPE_CHECKING:
     from .run import Run, Splats
 
 log = logging.getLogger(__name__)
-
-LOAD_OPTIONS = ("exposure_index", "max_size", "holdout")
-"""Names of LoadArguments that are options of the command line."""
-
-
-class LoadArguments(TypedDict, total=False):
-    """Arguments of load_scene() that a run saves in run.json, so that its photos can be loaded again.
-
-    Attributes:
-        path: Where the photos are: a folder, a video, or "embedded"; None or left out if that is not known.
-        exposure_index: As in load_scene().
-        max_size: As in load_scene().
-        holdout: As in load_scene().
-        views: Names of the views to read, if only some are.
-    """
-
-    path: str | None
-    exposure_index: int | None
-    max_size: int | None
-    holdout: int | None
-    views: list[str]
 
 
 def pick_device(device: str | torch.device | None) -> torch.device:

@@ -28,7 +28,7 @@ from ..splats import read_gaussians
 from .checkpoint import Checkpoint, under
 from .config import Config
 from .light_estimates import light_estimates
-from .open import LoadArguments
+from .load_arguments import LoadArguments
 from .run_folder import CameraEntry, RunFolder
 from .run_writer import write_confidence
 

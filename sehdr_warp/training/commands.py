@@ -19,7 +19,8 @@ from tyro.conf import Positional
 from ..errors import InputError, SehdrError, UsageError
 from ..files import require_text
 from ..runs import config_files as configs
-from ..runs.open import LOAD_OPTIONS, LoadArguments, load_photos, pick_device
+from ..runs.load_arguments import LOAD_OPTIONS, LoadArguments
+from ..runs.open import load_photos, pick_device
 
 log = logging.getLogger(__name__)
 
@@ -210,7 +211,7 @@ def _train(args: Train, ranks=None) -> None:
         with viewed(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
             follow(steps, trainer.total)
     photos = len(trainer.scene.train_views)
-    _print_result(args, trainer.run, partial(advice, train_photos=photos, scene=data["path"]))
+    _print_result(args, trainer.run, partial(advice, train_photos=photos, scene=data.get("path") or "SCENE"))
 
 
 def _photo_storage(config) -> str:
@@ -327,7 +328,7 @@ def _load_arguments(args: Train, saved: LoadArguments | None) -> LoadArguments:
     options: dict = {"path": _path_of(args)} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
     if saved is not None:
         options = {name: saved.get(name) if value is None else value for name, value in options.items()}
-        options |= {"views": saved["views"]} if saved.get("views") else {}
+        options |= {"views": views} if (views := saved.get("views")) else {}
     if options["path"] is None and args.output.resume:
         raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
     if options["path"] is None:

@@ -12,7 +12,8 @@ from ..errors import InputError, SehdrError
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
-from ..runs.open import LoadArguments, load_photos
+from ..runs.load_arguments import LoadArguments
+from ..runs.open import load_photos
 from ..runs.run import exposure_compensation, field_from_checkpoint
 from ..runs.run_folder import describe_scene, scene_difference
 from ..scene import Scene, View

@@ -15,7 +15,7 @@ from ..rasterizer.photo_loss import photo_loss
 from ..rasterizer.ssim import image_distance, ssim
 from ..response import Response, ToneMapper
 from ..runs.config import Config, LossConfig
-from ..runs.open import LoadArguments
+from ..runs.load_arguments import LoadArguments
 from ..scene import Scene
 
 CODE = 1 / 255  # One step of an 8-bit photo
