@@ -4,15 +4,17 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ..files import contained
-from .dataparser import ImageRecord
-from .images import LDR_SUFFIXES, PHOTO_SUFFIXES, read_ldr
+from .dataparser import UNPLACED, ImageRecord
+from .images import LDR_SUFFIXES, PHOTO_SUFFIXES, open_image, read_ldr
 from .names import bases_of, natural_key, sibling, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
+_COMMON = ("mask", "camera_mask")  # Stems of a mask of all photos
 _MOST_NAMED = 3
 _MOST_LABELS = 31  # Larger values are weights relative to white
 _LOSSY = (".jpg", ".jpeg")  # Their dark pixels may be noise
@@ -27,7 +29,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     folder of all photos, with any picture suffix after or instead of the photo's (`masks/cam0/1.jpg.png`,
     `masks/cam0/1.png`), or under its file name alone if no two photos share that. An ending `_mask`, `-mask` or `.mask`
     of the stem is ignored. Files with such an ending beside the photos are masks as well. In sets of several exposures,
-    a mask that is named like the view serves all its exposures.
+    a mask that is named like the view serves all its exposures. `mask.png` or `camera_mask.png` of the data folder is
+    the mask of all photos of its shape that have none of their own, as of a tripod or a car's bonnet.
 
     Args:
         records: the photos; a mask that the set states itself stays.
@@ -47,6 +50,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
     index = [{key: file for file, key in reversed(keys.items())} for keys in files.values()]
     beside = {parent: _masks_beside(parent) for parent in {record.image.parent for record in records}}
+    common = _common_mask(folder, records)
     masked, mask_files = [], set()
     for record in records:
         keys = _photo_keys(record, bases, shared)
@@ -55,6 +59,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         mask = record.mask or next((masks[key] for masks, names in tables for key in names if key in masks), None)
         if mask is not None and record.mask is None:
             mask = contained(folder, mask.relative_to(folder).as_posix(), folder)
+        if mask is None and common is not None and _has_shape(common, record):
+            mask = common.file
         mask_files.add(mask)
         masked.append(replace(record, mask=mask))
     notes = []
@@ -120,6 +126,39 @@ def mask_note(shares: Sequence[float | None], labeled: int = 0) -> list[str]:
     if labeled:
         lines.append(f"masks: {labeled} hold labels up to {_MOST_LABELS}; every label above 0 keeps its pixels")
     return lines
+
+
+class _CommonMask(NamedTuple):
+    """A mask of all photos of a set.
+
+    Attributes:
+        file: its path.
+        width: in pixels.
+        height: in pixels.
+    """
+
+    file: Path
+    width: int
+    height: int
+
+
+def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> _CommonMask | None:
+    """Return the mask of all photos, None if the data folder has none or holds photos itself."""
+    if not folder.is_dir() or any(record.image.parent == folder for record in records):
+        return None
+    names = (f"{stem}{suffix}" for stem in _COMMON for suffix in LDR_SUFFIXES)
+    file = next((folder / name for name in names if (folder / name).is_file()), None)
+    if file is None:
+        return None
+    with open_image(contained(folder, file.name, folder), mask=True) as image:
+        return _CommonMask(file, *image.size)
+
+
+def _has_shape(mask: _CommonMask, record: ImageRecord) -> bool:
+    """Return whether a mask has the shape of a photo, as far as that is known."""
+    lens = record.lens
+    differs = abs(mask.width * lens.height - mask.height * lens.width) > max(mask.width, mask.height)
+    return lens is UNPLACED or not differs
 
 
 def _photo_keys(record: ImageRecord, bases: Sequence[Path], shared: Counter) -> list[str]:

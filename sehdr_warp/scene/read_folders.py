@@ -295,7 +295,12 @@ def place_photos(
     if kind == "raw":
         color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
-    reconstruction = reconstruct_panoramas(photos, cache) if are_panoramas(photos) else reconstruct(photos, cache)
+    try:
+        reconstruction = reconstruct_panoramas(photos, cache) if are_panoramas(photos) else reconstruct(photos, cache)
+    except InputError as error:
+        if poses := _foreign_poses(folder):
+            raise InputError(error.path, error.problem, poses[0]) from None
+        raise
     cameras = {int(Path(image.name).stem): image for image in reconstruction.model.images}
     result = [
         replace(record, lens=image.lens, world_to_camera=image.world_to_camera)
@@ -322,7 +327,8 @@ def _remedy_without_photos(folder: Path) -> str:
     """Return what to give in place of a folder that holds no photos."""
     with suppress(OSError):
         if inner := _folders_with_photos(folder):
-            return f"give one of its folders with photos: {_listing(inner)}"
+            poses = "".join(f"; {note}" for note in _foreign_poses(folder))
+            return f"give one of its folders with photos: {_listing(inner)}{poses}"
         for file in sorted(folder.iterdir()):
             suffix = file.suffix.lower()
             if suffix in VIDEO_SUFFIXES:

@@ -1,5 +1,7 @@
 """Masks in every layout: found by name, read by value, counted in a note."""
 
+import json
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -210,6 +212,31 @@ def test_a_photo_whose_mask_cannot_be_used_is_left_out(tmp_path):
         write_mask(tmp_path / "masks" / f"{i:03d}.png", HALF[:30])
     with pytest.raises(InputError, match="mask is 64 x 30, its image 64 x 48; make the mask at the image's size"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["mask.png", "camera_mask.jpg"])
+def test_one_mask_of_all_photos(tmp_path, name):
+    write_colmap(tmp_path)
+    write_mask(tmp_path / name)
+    write_mask(tmp_path / "masks" / "002.png", np.full((48, 64), 255, np.uint8))
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == [0.5, 0.5, 1.0, 0.5, 0.5, 0.5], "a photo's own mask counts"
+    write_mask(tmp_path / name, HALF[:, :40])
+    assert shares(load(tmp_path, holdout=0)) == [1.0] * 6, "a mask of another shape is no mask of these photos"
+
+
+def test_one_mask_of_all_panoramas(tmp_path):
+    write_blender(tmp_path, 6, size=(64, 32))
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").write_text(json.dumps(values | {"camera_model": "EQUIRECTANGULAR"}))
+    whole = load(tmp_path, holdout=0).views[0].mask
+    assert not any(frame["file_path"].count("/") == 0 for frame in values["frames"]), "photos lie in a folder"
+    tripod = np.full((32, 64), 255, np.uint8)
+    tripod[-6:] = 0
+    write_mask(tmp_path / "mask.png", tripod)
+    masked = load(tmp_path, holdout=0).views[0].mask
+    np.testing.assert_allclose(masked[:-6], whole[:-6], atol=1e-6)
+    assert (masked[-6:] == 0).all() and (whole[-6:] > 0).all()
 
 
 def test_masks_that_leave_out_everything_are_named(tmp_path):

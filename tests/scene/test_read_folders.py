@@ -76,6 +76,20 @@ def test_poses_of_other_programs_are_named(tmp_path, file, tool):
     assert any(f"poses of {tool} ({file.lower()}) are not read" in note for note in find_photos(tmp_path).notes)
 
 
+def test_poses_of_other_programs_are_the_remedy_if_cameras_are_not_found(tmp_path):
+    photos(tmp_path, 3)
+    files(tmp_path, "cameras.xml")
+    with pytest.raises(InputError, match=r"be placed.*; poses of Metashape \(cameras.xml\).*nerfstudio"):
+        parse_dataset(tmp_path)
+
+
+def test_exports_of_record3d_are_named(tmp_path):
+    photos(tmp_path / "rgb", 3)
+    files(tmp_path, "metadata.json")
+    with pytest.raises(InputError, match="folders with photos: rgb; poses of Record3D"):
+        parse_dataset(tmp_path)
+
+
 @pytest.mark.parametrize("place", ["@eaDir/000.png/SYNOPHOTO_THUMB_M.jpg", "__MACOSX/000.jpg", "#recycle/1.jpg"])
 def test_folders_that_systems_keep_are_no_photos(tmp_path, place):
     write_colmap(tmp_path)
