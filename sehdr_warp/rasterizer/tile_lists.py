@@ -124,7 +124,7 @@ def pack_splats(inputs: RasterInputs, alpha_threshold: float, width: int, height
     Culls Gaussians whose features are not finite: sets their rows of inputs.projected.extents to 0 in place.
     """
     (means2d, conics, _, opacities, extents), features = inputs
-    count = len(means2d)
+    count, grid = len(means2d), tile_grid(width, height)
     packed = PackedSplats(
         means2d.new_empty(count, 4),
         means2d.new_empty(count, 4),
@@ -139,7 +139,8 @@ def pack_splats(inputs: RasterInputs, alpha_threshold: float, width: int, height
         features,
         features.shape[1],
         alpha_threshold,
-        *tile_grid(width, height),
+        grid.columns,
+        grid.rows,
         extents,
         *packed,
     )
