@@ -1,5 +1,7 @@
 """Beside gsplat itself, where it is installed: its torch functions on the CPU, and its kernels on a GPU."""
 
+import math
+
 import pytest
 import torch
 
@@ -106,3 +108,52 @@ def test_images_and_gradients_are_gsplats(options, packed):
         assert float((one - two).norm() / two.norm()) < (0.05 if "rasterize_mode" in options else 0.01)
     if not packed:
         assert float((my_absolute - absolute).norm() / absolute.norm()) < 0.01
+
+
+def relocation_by_sums(opacities, scales, ratios, binoms):
+    """gsplat's kernel for relocation, as its sums are written, in float64."""
+    pairs = []
+    for opacity, count in zip(opacities.double().tolist(), ratios.tolist(), strict=True):
+        shared, total = 1 - (1 - opacity) ** (1 / count), 0.0
+        for i in range(1, count + 1):
+            for k in range(i):
+                total += float(binoms[i - 1, k]) * (-1) ** k / math.sqrt(k + 1) * shared ** (k + 1)
+        pairs.append((shared, opacity / total))
+    shared, factors = torch.tensor(pairs, dtype=scales.dtype).T
+    return shared, scales * factors[:, None]
+
+
+def test_mcmc_changes_gaussians_and_moments_as_gsplats_does(monkeypatch):
+    draws = torch.Generator()
+
+    def draw(weights, count, **_):
+        return torch.multinomial(weights, count, replacement=True, generator=draws)
+
+    operations = pytest.importorskip("gsplat.strategy.ops")
+    monkeypatch.setattr(operations, "_multinomial_sample", draw)
+    monkeypatch.setattr(operations, "compute_relocation", relocation_by_sums)
+    monkeypatch.setattr(operations, "quat_scale_to_covar_preci", reference._quat_scale_to_covar_preci)
+    monkeypatch.setattr("sehdr_warp.compat.gsplat.strategy._draw", draw)
+    results = []
+    for module in (gsplat, ours):
+        torch.manual_seed(0)
+        draws.manual_seed(0)
+        values = {
+            "means": torch.randn(COUNT, 3), "scales": torch.rand(COUNT, 3) - 3.0, "quats": torch.randn(COUNT, 4),
+            "opacities": torch.linspace(-7.0, 3.0, COUNT), "sh0": torch.randn(COUNT, 1, 3),
+        }  # fmt: skip
+        params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
+        optimizers = {name: torch.optim.Adam([params[name]], lr=1e-2) for name in params}
+        strategy = module.MCMCStrategy(cap_max=COUNT + 9, refine_start_iter=1, refine_every=3, noise_lr=5.0)
+        state = strategy.initialize_state()
+        for step in range(8):
+            sum((value * value.detach().cos()).sum() for value in params.values()).backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad()
+            strategy.step_post_backward(params, optimizers, state, step, {}, lr=1e-2)
+        moments = [optimizers[name].state[params[name]]["exp_avg"] for name in params]
+        results.append([value.detach() for value in params.values()] + moments)
+    assert len(results[0][0]) > COUNT
+    for true, found in zip(*results, strict=True):
+        torch.testing.assert_close(found, true, rtol=1e-4, atol=1e-5)
