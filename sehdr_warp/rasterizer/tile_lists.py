@@ -130,6 +130,7 @@ def pack_splats(inputs: RasterInputs, alpha_threshold: float, width: int, height
         means2d.new_empty(count, 4),
         torch.empty(count, dtype=torch.int64, device=means2d.device),
     )
+    grid = tile_grid(width, height)
     launch(
         tile_kernels(warp_scalar(means2d.dtype)).pack_splats,
         count,
