@@ -17,6 +17,7 @@ from torch import Tensor
 from ..errors import InputError
 from ..model.confidence import Evidence
 from ..model.gaussians import PARAMETER_NAMES
+from ..runs.checkpoint import PICTURE
 from ..runs.config_files import override_config
 from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter, write_confidence
@@ -91,9 +92,8 @@ def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
     try:
         folder.begin_described(description, info, config, None, state)
         folder.write_summary(_summary(blocks, iterations, seconds, len(tensors["means"])))
-        checkpoint = folder.newest_checkpoint()
-        assert checkpoint is not None
-        write_confidence(folder, evidence, checkpoint.values["sha256"])
+        assert folder.checkpoint_hash is not None
+        write_confidence(folder, evidence, folder.checkpoint_hash)
     finally:
         folder.unlock()
     log.info("merged %d Gaussians of %d blocks", len(tensors["means"]), len(blocks))
@@ -104,7 +104,7 @@ def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:
     """Read what the merged run takes from a block."""
     folder = RunFolder(folder_of(out, plan, index))
     folder.require()
-    checkpoint = folder.newest_checkpoint()
+    checkpoint = folder.newest_checkpoint(PICTURE)
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "continue with --resume")
     info = folder.read_info()

@@ -9,10 +9,12 @@ from typing import Any
 from torch import Tensor
 
 from ..errors import InputError
-from ..files import read_bytes, refuse_links
+from ..files import UnreadableError, plain_size, read_bytes, refuse_links
 from .values import CheckpointValues, read_values
 
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
+PICTURE = "gaussians.", "fusion.", "response."
+"""Beginnings of the names of the tensors that decide the picture; the others continue a training."""
 _OLDER = "remove this folder to use an older checkpoint, or train again"
 
 
@@ -25,29 +27,45 @@ class Checkpoint:
     values: dict[str, Any]
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
-    """Return the checkpoint in a folder.
+def read_checkpoint(path: Path, parts: tuple[str, ...] = ("",)) -> Checkpoint:
+    """Return the checkpoint in a folder, which may be larger than half of the memory.
+
+    Args:
+        path: The folder.
+        parts: Beginnings of the names of the tensors to read; by default of all.
 
     Raises:
-        InputError: if a file is missing, a link, unreadable, damaged or of another format, or if a tensor holds NaN or
-            infinity.
+        InputError: If a file is missing, a link, unreadable, damaged or of another format, or if a tensor that is read
+            holds NaN or infinity.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load
+    from safetensors import SafetensorError, safe_open
 
     for file in (path / VALUES, path / TENSORS):
         refuse_links(file, path.parent)
     values, file = read_values(path / VALUES, CheckpointValues, _OLDER), path / TENSORS
-    data = read_bytes(file)
-    if (digest := hashlib.sha256(data).hexdigest()) != values["sha256"]:
+    if (digest := _sha256(file)) != values["sha256"]:
         raise InputError(file, f"its SHA-256 {digest} is not the {values['sha256']:.80} of {VALUES}", _OLDER)
     try:
-        tensors = load(data)
-    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
+        with safe_open(str(file), framework="pt") as stored:
+            # Copied, because the file is mapped, and may be replaced while the tensors are in use.
+            names = stored.keys()
+            tensors = {name: stored.get_tensor(name).clone() for name in names if name.startswith(parts)}
+    except (SafetensorError, OSError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(file, f"is not safetensors ({error})", _OLDER) from None
     if (name := first_not_finite(tensors)) is not None:
         raise InputError(file, f"{name} holds values that are not finite", _OLDER)
     return Checkpoint(path, tensors, values)
+
+
+def _sha256(file: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal; raise InputError as read_bytes() does, but for its size."""
+    try:
+        if file.exists() and plain_size(file) > 0:
+            with open(file, "rb") as stream:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise UnreadableError(file, error) from None
+    return hashlib.sha256(read_bytes(file)).hexdigest()  # It refuses what is missing or empty.
 
 
 def remove_checkpoint(path: Path) -> None:

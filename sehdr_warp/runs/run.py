@@ -25,7 +25,7 @@ from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.gravity import UpDirection
 from ..scene.normalization import Normalization
 from ..splats import read_gaussians
-from .checkpoint import Checkpoint, under
+from .checkpoint import PICTURE, Checkpoint, under
 from .config import Config
 from .light_estimates import light_estimates
 from .load_arguments import LoadArguments
@@ -296,7 +296,7 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     folder = RunFolder(path)
     folder.require()
     info, config = folder.read_info(), folder.read_config()
-    checkpoint = folder.newest_checkpoint()
+    checkpoint = folder.newest_checkpoint(PICTURE)
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
     model = field_from_checkpoint(checkpoint, config, info)

@@ -205,8 +205,11 @@ class RunFolder:
     def _has_metrics(self) -> bool:
         return self.metrics.is_file() and self.metrics.stat().st_size > 0
 
-    def newest_checkpoint(self) -> Checkpoint | None:
+    def newest_checkpoint(self, parts: tuple[str, ...] = ("",)) -> Checkpoint | None:
         """Return the newest sound checkpoint, None if there is none at all.
+
+        Args:
+            parts: Beginnings of the names of the tensors to read, as in read_checkpoint().
 
         Raises:
             InputError: of the newest, if all are damaged or hold numbers that are not finite; or if a file that
@@ -215,7 +218,7 @@ class RunFolder:
         newest: InputError | None = None
         for path in reversed(folders := self._checkpoint_folders()):
             try:
-                checkpoint = read_checkpoint(path)
+                checkpoint = read_checkpoint(path, parts)
             except InputError as error:
                 newest = newest or error
                 continue
@@ -226,7 +229,7 @@ class RunFolder:
                     raise InputError(self.path / name, problem, "put it back as it was, or train again")
             return checkpoint
         if folders != self._checkpoint_folders():  # A running training has written another and removed these.
-            return self.newest_checkpoint()
+            return self.newest_checkpoint(parts)
         if newest is not None:
             raise newest
         return None

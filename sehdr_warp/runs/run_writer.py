@@ -42,6 +42,9 @@ class RunWriter(RunFolder):
     """The files of a run, which this process writes.
 
     Raises what RunFolder does, and SehdrError for what cannot be written.
+
+    Attributes:
+        checkpoint_hash: Of the tensors of the checkpoint that this process wrote last; None before.
     """
 
     def __init__(self, path: Path | str):
@@ -49,6 +52,7 @@ class RunWriter(RunFolder):
         super().__init__(path)
         self._lock = FileLock(self.path / _LOCK, thread_local=False)
         self._lock_identity: tuple[int, int] | None = None
+        self.checkpoint_hash: str | None = None
 
     def lock(self) -> None:
         """Lock the folder, which is made if it is missing, until unlock() or the end of the process.
@@ -170,7 +174,7 @@ class RunWriter(RunFolder):
             write_json(new.config, config.model_dump())
             new.write_checkpoint(*state, keep=1)
         self._settle()
-        self._hashes = new._hashes
+        self._hashes, self.checkpoint_hash = new._hashes, new.checkpoint_hash
 
     def _settle(self) -> None:
         """Replace the run by a new one that is complete. Each step can be repeated after a kill."""
@@ -237,11 +241,12 @@ class RunWriter(RunFolder):
         self._hold()
         final = self.checkpoints / f"iteration_{values['iteration']:08d}"
         try:
-            read_checkpoint(final)
+            self.checkpoint_hash = read_checkpoint(final).values["sha256"]
         except InputError:
             self._hashes = self._hashes or self.hashes()
             data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
-            plain = values | {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest(), "run": self._hashes}
+            self.checkpoint_hash = hashlib.sha256(data).hexdigest()
+            plain = values | {"format": FORMAT, "sha256": self.checkpoint_hash, "run": self._hashes}
             remove_checkpoint(final)
             with atomic_folder(final, internal=True) as beside:
                 (beside / TENSORS).write_bytes(data)
