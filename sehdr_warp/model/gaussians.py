@@ -1,8 +1,9 @@
 """The 3D Gaussians of a scene: parameters, start values, and changes of their number during training."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -117,15 +118,14 @@ class Gaussians(nn.Module):
         reserved, count = self._reserved, self.count
         self.reallocations += reserved is None
         for name in PARAMETER_NAMES:
-            old, moments = getattr(self, name), moments_of(optimizer, getattr(self, name))
             if reserved is None:
-                new = nn.Parameter(old.detach()[index]), {key: moment[index] for key, moment in moments.items()}
-            else:
-                for tensor in (old.detach(), *moments.values()):
-                    tensor[: len(index)] = tensor[index]
-                reserved.clear(name, len(index), count)
-                new = reserved.first(name, len(index))
-            self._put(name, *new, optimizer)
+                self._replace(name, lambda tensor, _: tensor[index], optimizer)
+                continue
+            old = getattr(self, name)
+            for tensor in (old.detach(), *moments_of(optimizer, old).values()):
+                tensor[: len(index)] = tensor[index]
+            reserved.clear(name, len(index), count)
+            self._put(name, *reserved.first(name, len(index)), optimizer)
         self._update_active_count()
 
     def append(self, rows: dict[str, Tensor], optimizer: Optimizer | None = None) -> None:
@@ -135,15 +135,11 @@ class Gaussians(nn.Module):
             self._reserved = None
         self.reallocations += self._reserved is None
         for name in PARAMETER_NAMES:
-            old, added = getattr(self, name), rows[name]
             if self._reserved is None:
-                nothing, moments = torch.zeros_like(added), moments_of(optimizer, old)
-                joined = {key: torch.cat([moment, nothing]) for key, moment in moments.items()}
-                new = nn.Parameter(torch.cat([old.detach(), added])), joined
+                self._replace(name, partial(_with_rows, rows[name]), optimizer)
             else:
-                self._reserved.all_rows[name].detach()[count:total] = added
-                new = self._reserved.first(name, total)
-            self._put(name, *new, optimizer)
+                self._reserved.all_rows[name].detach()[count:total] = rows[name]
+                self._put(name, *self._reserved.first(name, total), optimizer)
         self._update_active_count()
 
     def reserve(self, rows: int, optimizer: Optimizer | None = None) -> None:
@@ -151,11 +147,14 @@ class Gaussians(nn.Module):
 
         Up to that number, changes of the count leave the parameters and their optimizer state in the same memory.
         """
-        reserved = ReservedRows(rows, self.means.device)
+        reserved, count = ReservedRows(rows, self.means.device), self.count
+        self._reserved = None  # Its memory is freed while the parameters move.
         for name in PARAMETER_NAMES:
-            old = getattr(self, name)
-            reserved.store(name, old.detach(), moments_of(optimizer, old))
-            self._put(name, *reserved.first(name, self.count), optimizer)
+            self._replace(name, reserved.with_all_rows, optimizer)
+            parameter = getattr(self, name)
+            reserved.all_rows[name], reserved.moments[name] = parameter, moments_of(optimizer, parameter)
+            reserved.clear(name, count, rows)
+            self._put(name, *reserved.first(name, count), optimizer)
         self._reserved = reserved
         self.reallocations += 1
         self._update_active_count()
@@ -216,6 +215,17 @@ class Gaussians(nn.Module):
         for state in moments_of(optimizer, getattr(self, name)).values():
             state[where] = 0
 
+    def _replace(self, name: str, change: Callable[[Tensor, bool], Tensor], optimizer: Optimizer | None) -> None:
+        """Replace a parameter and its moments by change(tensor, whether it is a moment).
+
+        One after another, so that no more than one of them is in memory twice.
+        """
+        old = getattr(self, name)
+        moments, state = moments_of(optimizer, old), {} if optimizer is None else optimizer.state.get(old, {})
+        for key in tuple(moments):
+            moments[key] = state[key] = change(moments[key], True)
+        self._put(name, nn.Parameter(change(old.detach(), False)), moments, optimizer)
+
     def _put(self, name: str, new: nn.Parameter, moments: dict[str, Tensor], optimizer: Optimizer | None) -> None:
         """Replace the parameter of this name, in the optimizer too, with its moments."""
         old = getattr(self, name)
@@ -268,17 +278,11 @@ class ReservedRows:
     """
 
     def __init__(self, rows: int, device: torch.device):
-        """Reserve `rows` rows on a device; store() fills them."""
+        """Reserve `rows` rows on a device, for parameters that follow."""
         self.rows = rows
         self.all_rows: dict[str, nn.Parameter] = {}
         self.moments: dict[str, dict[str, Tensor]] = {}
         self.active_count = torch.zeros(1, dtype=torch.int32, device=device)
-
-    def store(self, name: str, values: Tensor, moments: dict[str, Tensor]) -> None:
-        """Copy a parameter [count, ...] and its moments into new memory with all rows."""
-        self.all_rows[name] = nn.Parameter(self._with_reserved_rows(values))
-        self.moments[name] = {key: self._with_reserved_rows(moment) for key, moment in moments.items()}
-        self.clear(name, len(values), self.rows)
 
     def clear(self, name: str, first: int, last: int) -> None:
         """Set the rows [first, last) of a parameter to those of an invisible Gaussian, and their moments to 0."""
@@ -294,11 +298,16 @@ class ReservedRows:
         """Return the first `count` rows of a parameter as a parameter of its own, and of its moments."""
         return nn.Parameter(self.all_rows[name].detach()[:count]), first_rows(self.moments[name], count)
 
-    def _with_reserved_rows(self, values: Tensor) -> Tensor:
-        """Copy values into new memory with all rows."""
+    def with_all_rows(self, values: Tensor, _is_moment: bool = False) -> Tensor:
+        """Copy values into new memory with all rows; clear() sets those that are new."""
         all_rows = values.new_empty(self.rows, *values.shape[1:])
         all_rows[: len(values)] = values
         return all_rows
+
+
+def _with_rows(added: Tensor, tensor: Tensor, is_moment: bool) -> Tensor:
+    """Return a tensor [N, ...] followed by added rows, or by zeros if it is a moment."""
+    return torch.cat([tensor, torch.zeros_like(added) if is_moment else added])
 
 
 def first_rows(moments: dict[str, Tensor], count: int) -> dict[str, Tensor]:
