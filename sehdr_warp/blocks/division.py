@@ -1,16 +1,18 @@
 """Divide a set of photos by space into blocks, by what the photos show.
 
 Each photo stands for the places that it shows: the points in its field of view, near ones with more weight. The places
-of all photos are split in halves along their longest axis, and again (a k-d tree), so that blocks have about equal
-numbers of photos. The cells of the tree are the cores of the blocks: they fill space without overlap. A block trains on
-every photo of which its core, enlarged by a margin, fills a part that matters, so blocks share photos at their borders.
-VastGaussian (CVPR 2024) and CityGaussian (ECCV 2024) divide alike.
+of all photos are split in parts along their longest axis, and again (a k-d tree). The cells of the tree are the cores
+of the blocks: they fill space without overlap. A block trains on every photo of which its core, enlarged by a margin,
+fills a part that matters, so blocks share photos at their borders. The cuts are moved until blocks have about equal
+numbers of photos, those at borders included: a block in the middle has more borders, and a smaller core.
+VastGaussian (CVPR 2024) and CityGaussian (ECCV 2024) divide alike, but for the moves.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from ..errors import InputError
 from ..scene import Camera
@@ -19,7 +21,10 @@ from ..scene.photos import FEWEST_PHOTOS
 MARGIN = 0.1  # Enlargement of a core for the choice of its photos, as a fraction of its extent, on each side
 LEAST_PART = 0.15  # A block trains on photos of which its enlarged core fills at least this part
 MAX_PART = 0.8  # If a block needs a larger part of all photos, dividing saves nothing
-MOST_PLACES = 20_000  # Points that photos are described by
+FEWEST_PLACES, MOST_PLACES, PLACES_PER_PHOTO = 20_000, 200_000, 20
+"""Points that photos are described by: so many for each photo, within the first two."""
+MOST_OF_PHOTO = 4096  # Points that one photo is described by, so that 20,000 photos need 0.7 GB at most
+MOVES = 12  # Divisions that are tried to find blocks of equal numbers of photos
 LEAST_PHOTOS = max(FEWEST_PHOTOS, 6)  # Photos that a block needs at least
 
 
@@ -88,6 +93,47 @@ class Division:
         return distance
 
 
+@dataclass(frozen=True)
+class ShownPlaces:
+    """The places that V photos show.
+
+    Attributes:
+        points: [P, 3] points of scene coordinates.
+        parts: [V, P] sparse float32, the part of each photo that a point stands for; a row sums to 1, or to 0.
+        middles: [V, 3] mean of the points of each photo; of a photo without points, the place of its camera.
+    """
+
+    points: np.ndarray
+    parts: sparse.csr_array
+    middles: np.ndarray
+
+    @staticmethod
+    def of(cameras: Sequence[Camera], points: np.ndarray) -> "ShownPlaces":
+        """Describe photos by some of the points [P, 3] of what they show."""
+        points = thinned(np.asarray(points, np.float64), len(cameras))
+        columns, values = [], []
+        for camera in cameras:
+            weights = weights_of(camera, points)
+            inside = np.flatnonzero(weights)
+            inside = inside[:: -(-len(inside) // MOST_OF_PHOTO) or 1]
+            columns.append(inside.astype(np.int32))
+            values.append((weights[inside] / max(weights[inside].sum(), 1e-300)).astype(np.float32))
+        ends = np.cumsum([0, *map(len, columns)])
+        parts = sparse.csr_array(
+            (np.concatenate(values), np.concatenate(columns), ends), shape=(len(cameras), len(points))
+        )
+        middles = parts @ points
+        blind = np.diff(ends) == 0
+        middles[blind] = np.array([camera.position for camera in cameras]).reshape(-1, 3)[blind]
+        return ShownPlaces(points, parts, middles)
+
+
+def thinned(points: np.ndarray, photos: int) -> np.ndarray:
+    """Return every nth of points [P, 3], as many as describe a number of photos."""
+    most = min(max(FEWEST_PLACES, PLACES_PER_PHOTO * photos), MOST_PLACES)
+    return points[:: -(-len(points) // most) or 1]
+
+
 def divide(name: str, cameras: Sequence[Camera], points: np.ndarray, count: int) -> Division:
     """Divide photos into blocks.
 
@@ -100,39 +146,64 @@ def divide(name: str, cameras: Sequence[Camera], points: np.ndarray, count: int)
     Raises:
         InputError: If a block would have too few photos, or nearly all of them.
     """
-    if len(cameras) < count * LEAST_PHOTOS:
-        most = len(cameras) // LEAST_PHOTOS
-        problem = f"{len(cameras)} training photos are too few for {count} blocks of at least {LEAST_PHOTOS}"
-        remedy = f"use --blocks {most} at most" if most > 1 else "train without --blocks"
-        raise InputError(name, problem, remedy)
-    points = np.asarray(points, np.float64)
-    points = points[:: -(-len(points) // MOST_PLACES) or 1]
-    weights = np.stack([weights_of(camera, points) for camera in cameras])  # [V, P], each row sums to 1 or 0
-    blind = np.flatnonzero(weights.sum(1) == 0)
-    middles = weights @ points
-    middles[blind] = np.array([camera.position for camera in cameras]).reshape(-1, 3)[blind]
-    axes = _principal_axes(middles)
-    cells = _split(name, middles @ axes.T, Cell(np.full(3, -np.inf), np.full(3, np.inf)), count)
-    places = points @ axes.T
-    low, high = np.quantile(places, [0.02, 0.98], axis=0)
-    margins = np.stack([MARGIN * _extent(cell, low, high) for cell in cells])
-    enlarged = [Cell(cell.low - margin, cell.high + margin) for cell, margin in zip(cells, margins, strict=True)]
-    parts = np.stack([weights @ cell.contains(places) for cell in enlarged], axis=1)  # [V, B]
-    own = np.stack([cell.contains(middles @ axes.T) for cell in cells], axis=1)
-    members = (parts >= LEAST_PART) | own
-    photos = tuple(np.flatnonzero(column) for column in members.T)
-    _check(name, photos, len(cameras), count)
-    return Division(axes, tuple(cells), margins, photos)
+    _check_enough(name, len(cameras), count)
+    return _divide(name, ShownPlaces.of(cameras, points), count)
 
 
 def largest_count(name: str, cameras: Sequence[Camera], points: np.ndarray, most: int) -> Division | None:
-    """Return the division into `wanted` blocks, or into the largest smaller number that is possible; None for none."""
-    for count in range(most, 1, -1):
+    """Return the division into `most` blocks, or into the largest smaller number that is possible; None for none."""
+    places = ShownPlaces.of(cameras, points)
+    for count in range(min(most, len(cameras) // LEAST_PHOTOS), 1, -1):
         try:
-            return divide(name, cameras, points, count)
+            return _divide(name, places, count)
         except InputError:
             continue
     return None
+
+
+def _check_enough(name: str, photos: int, count: int) -> None:
+    """Raise InputError if there are too few photos for a number of blocks."""
+    if photos < count * LEAST_PHOTOS:
+        most = photos // LEAST_PHOTOS
+        problem = f"{photos} training photos are too few for {count} blocks of at least {LEAST_PHOTOS}"
+        remedy = f"use --blocks {most} at most" if most > 1 else "train without --blocks"
+        raise InputError(name, problem, remedy)
+
+
+def _divide(name: str, shown: ShownPlaces, count: int) -> Division:
+    """Return the division whose largest block has the fewest photos, of those that moving the cuts gives."""
+    axes = _principal_axes(shown.middles)
+    best, shares = None, np.full(count, 1 / count)
+    for _ in range(MOVES):
+        try:
+            division = _cut(name, shown, axes, shares)
+        except InputError:
+            if best is None:
+                raise
+            break
+        sizes = np.array([len(own) for own in division.photos])
+        if best is None or sizes.max() < max(map(len, best.photos)):
+            best = division
+        if np.ptp(sizes) <= 1:
+            break
+        shares *= np.sqrt(sizes.mean() / np.maximum(sizes, 1))
+        shares /= shares.sum()
+    assert best is not None
+    _check(name, best.photos, len(shown.middles), count)
+    return best
+
+
+def _cut(name: str, shown: ShownPlaces, axes: np.ndarray, shares: np.ndarray) -> Division:
+    """Divide photos into blocks whose cores have stated shares of the photos' middles."""
+    middles, places = shown.middles @ axes.T, shown.points @ axes.T
+    cells = _split(name, middles, Cell(np.full(3, -np.inf), np.full(3, np.inf)), shares)
+    low, high = np.quantile(places, [0.02, 0.98], axis=0)
+    margins = np.stack([MARGIN * _extent(cell, low, high) for cell in cells])
+    enlarged = [Cell(cell.low - margin, cell.high + margin) for cell, margin in zip(cells, margins, strict=True)]
+    inside = np.stack([cell.contains(places) for cell in enlarged], axis=1).astype(np.float32)  # [P, B]
+    own = np.stack([cell.contains(middles) for cell in cells], axis=1)
+    members = (shown.parts @ inside >= LEAST_PART) | own
+    return Division(axes, tuple(cells), margins, tuple(np.flatnonzero(column) for column in members.T))
 
 
 def weights_of(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -157,23 +228,25 @@ def _principal_axes(places: np.ndarray) -> np.ndarray:
     return axes
 
 
-def _split(name: str, places: np.ndarray, cell: Cell, count: int) -> list[Cell]:
-    """Split a cell with places [N, 3] into `count` cells with about equal numbers of places.
+def _split(name: str, places: np.ndarray, cell: Cell, shares: np.ndarray) -> list[Cell]:
+    """Split a cell with places [N, 3] into cells with stated shares of the places; the shares [B] need no sum.
 
     Raises:
         InputError: If many places are the same.
     """
+    count = len(shares)
     if count == 1:
         return [cell]
     low, high = np.quantile(places, [0.05, 0.95], axis=0)
     axis, first = int(np.argmax(high - low)), count // 2
-    at = float(np.quantile(places[:, axis], first / count))
+    at = float(np.quantile(places[:, axis], shares[:first].sum() / shares.sum()))
     below = places[:, axis] < at
     if below.sum() < first or (~below).sum() < count - first:
         problem = f"{len(places)} training photos cannot be divided into {count} blocks: many show the same place"
         raise InputError(name, problem, "use fewer blocks, or train without --blocks")
     near, far = cell.halves(axis, at)
-    return _split(name, places[below], near, first) + _split(name, places[~below], far, count - first)
+    parts = (places[below], near, shares[:first]), (places[~below], far, shares[first:])
+    return [each for part in parts for each in _split(name, *part)]
 
 
 def _extent(cell: Cell, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.blocks.division import LEAST_PHOTOS, divide, largest_count
+from sehdr_warp.blocks.division import FEWEST_PLACES, LEAST_PHOTOS, MOST_OF_PHOTO, ShownPlaces, divide, largest_count
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera, look_at
 
@@ -35,6 +35,23 @@ def test_cores_fill_space_and_blocks_share_the_photos_at_their_borders(ground, c
     assert np.allclose(np.bincount(owner) / len(ground), 1 / count, atol=0.06)
     for block, own in enumerate(division.photos):  # A street is cut across.
         assert (np.diff(own) == 1).all() and abs(np.ptp(ground[owner == block, 1]) - 1) < 0.01
+
+
+def test_blocks_in_the_middle_have_smaller_cores_and_as_many_photos(ground):
+    division = divide("street", street(200), ground, 4)
+    sizes = [len(own) for own in division.photos]
+    assert np.ptp(sizes) <= 3 and sum(sizes) > 220
+    shares = np.bincount(division.block_of(ground))[[0, 3, 1, 2]] / len(ground)
+    assert min(shares[:2]) > 1.1 * max(shares[2:]), "those at the ends have one border, not two"
+
+
+def test_many_points_and_photos_take_little_memory():
+    points = np.random.default_rng(0).uniform((-1, -1, 0), (1, 1, 0.01), (9 * FEWEST_PLACES, 3))
+    places = ShownPlaces.of(street(20, length=0.1), points)
+    assert places.parts.shape == (20, FEWEST_PLACES) and places.parts.dtype == np.float32
+    assert places.parts.nnz == pytest.approx(20 * MOST_OF_PHOTO, rel=0.5) and places.parts.nnz <= 20 * MOST_OF_PHOTO
+    assert places.parts.sum(axis=1) == pytest.approx(np.ones(20), abs=1e-4)
+    assert np.abs(places.middles[:, :2]).max() < 0.2, "of all that they show, not of the first points"
 
 
 def test_the_distance_to_a_border_is_that_to_the_faces_between_cores(ground):
