@@ -6,7 +6,7 @@ reduced photos. They are decided before any block is trained, so colors agree at
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,14 +24,14 @@ from ..runs.config_files import config_from_dict, field_and_problem, override_co
 from ..runs.load_arguments import LoadArguments
 from ..runs.open import load_photos
 from ..runs.values import DataValues, GainValues, NormalizationValues
-from ..scene import Scene
+from ..scene import Scene, View
 from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.normalization import Normalization, normalization_of
 from ..training.compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from ..training.initialization import base_time, check_views, match_points, response_for_training
 from ..training.matching import LARGEST_SIDE
 from ..training.plan import STEPS_PER_PHOTO
-from .division import Cell, Division, divide, largest_count, weights_of
+from .division import Cell, Division, divide, largest_count, thinned, weights_of
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +70,7 @@ class BlockPlanValues(BaseModel):
     normalization: NormalizationValues
     exposure_compensation: GainValues | None
     exposure_times: dict[str, Annotated[float, Field(gt=0)]]
+    photo_bytes: dict[str, Annotated[int, Field(ge=0)]] = {}
     config: dict[str, Any]
     axes: Annotated[list[Annotated[list[FiniteFloat], _THREE]], _THREE]
     blocks: Annotated[list[BlockValues], Field(min_length=1)]
@@ -105,6 +106,7 @@ class BlockPlan:
         normalization: Coordinates of the merged run.
         shared: Base time and exposure compensation.
         exposure_times: By view, seconds, before the compensation.
+        photo_bytes: By view, size of its photo's file, by which nodes with other photos are found.
         config: Requested options of each block, before its own plan.
         axes: [3, 3] rows are the axes of the cells in scene coordinates.
         blocks: The blocks.
@@ -116,6 +118,7 @@ class BlockPlan:
     normalization: Normalization
     shared: SharedDecisions
     exposure_times: Mapping[str, float]
+    photo_bytes: Mapping[str, int]
     config: Config
     axes: np.ndarray
     blocks: tuple[Block, ...]
@@ -137,6 +140,14 @@ class BlockPlan:
             fields["densification.cap_max"] = max(1, round(self.config.densification.cap_max * block.fraction))
         return override_config(self.config, fields, block.name)
 
+    def check_photos(self, views: Sequence[View]) -> None:
+        """Raise InputError if the files of photos are not those of the plan."""
+        for name, size in _photo_bytes(views).items():
+            if size != (before := self.photo_bytes.get(name, size)):
+                problem = f"{name} has {size} bytes, and had {before} when the set was divided"
+                remedy = "copy the same set to all nodes, or train again with --overwrite"
+                raise InputError(self.data.get("path") or self.scene, problem, remedy)
+
     def write(self, folder: Path) -> None:
         """Write blocks.json."""
         gains = self.shared.gains
@@ -149,6 +160,7 @@ class BlockPlan:
             "normalization": self.normalization.to_dict(),
             "exposure_compensation": None if gains is None else gains.to_dict(),
             "exposure_times": dict(self.exposure_times),
+            "photo_bytes": dict(self.photo_bytes),
             "config": self.config.model_dump(),
             "axes": self.axes.tolist(),
             "blocks": [_block_values(block) for block in self.blocks],
@@ -180,6 +192,7 @@ class BlockPlan:
             Normalization.from_dict(values["normalization"]),
             shared,
             values["exposure_times"],
+            values.get("photo_bytes", {}),
             config_from_dict(values["config"], path),
             np.array(values["axes"], np.float64),
             blocks,
@@ -237,6 +250,7 @@ def make_block_plan(
         normalization,
         shared,
         times,
+        _photo_bytes(scene.views),
         config,
         division.axes,
         _blocks(scene, division, points),
@@ -302,11 +316,18 @@ def _pixels(scene: Scene, max_size: int | None) -> float:
     return factor * sum(each.camera.width * each.camera.height for each in scene.train_views)
 
 
+def _photo_bytes(views: Sequence[View]) -> dict[str, int]:
+    """Return the sizes of the files of photos by the names of their views; without those that are no files."""
+    files = {view.name: view.source for view in views if view.source is not None}
+    return {name: file.stat().st_size for name, file in files.items() if file.is_file()}
+
+
 def _blocks(scene: Scene, division: Division, points: np.ndarray) -> tuple[Block, ...]:
     """Return the blocks of a division; a held-out view belongs to the block that it shows most of."""
     views = scene.train_views
     sizes = np.array([view.camera.width * view.camera.height for view in views], np.float64)
     names: list[list[str]] = [[views[index].name for index in own] for own in division.photos]
+    points = thinned(points, len(views))
     owner = division.block_of(points)
     for view in scene.test_views:
         weights = np.bincount(owner, weights_of(view.camera, points), len(division.cells))

@@ -1,6 +1,7 @@
 """Train one block: an ordinary training in a run folder of its own, which continues from its newest checkpoint."""
 
 import logging
+import platform
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from ..errors import SehdrError, as_user_error
 from ..runs.open import load_photos, response_for_loading
 from ..runs.run_folder import RunFolder
 from ..scene import Scene
+from ..training.launch import installed_versions
 from .block_plan import BlockPlan
 from .division import weights_of
 
@@ -23,11 +25,17 @@ MOST_POINTS = 4  # Sparse points that are looked at, relative to the largest num
 
 
 class BlockResult(NamedTuple):
-    """Result of the training of a block."""
+    """Result of the training of a block.
+
+    Attributes:
+        index: Number of the block.
+        error: One line, if the training cannot be done; None if it is done.
+        node: Name of the machine that it ran on.
+    """
 
     index: int
     error: str | None
-    """One line, if the training cannot be done; None if it is done."""
+    node: str
 
 
 def folder_of(out: Path, plan: BlockPlan, index: int) -> Path:
@@ -41,7 +49,7 @@ def is_finished(folder: Path) -> bool:
     return run.info.is_file() and run.confidence.is_file() and bool(run.read_summary().get("finished"))
 
 
-def train_block(out: Path, index: int, device: str | None, photos: str) -> BlockResult:
+def train_block(out: Path, index: int, device: str | None, photos: str, versions: str) -> BlockResult:
     """Train a block to its end, or continue its training.
 
     Args:
@@ -49,31 +57,42 @@ def train_block(out: Path, index: int, device: str | None, photos: str) -> Block
         index: Number of the block.
         device: Device to train on; None for the first GPU.
         photos: Where its photos are stored, see load_scene().
+        versions: installed_versions() of the machine that merges the blocks.
 
     Returns:
         The result. Errors that a user can act on are returned, so that a job that ran is told from one that died.
     """
-    from ..process import calm_threads
-    from ..training.train import create_trainer
-
-    calm_threads()
-    plan = BlockPlan.read(out)
-    block, folder = plan.blocks[index], folder_of(out, plan, index)
-    if is_finished(folder):
-        return BlockResult(index, None)
+    logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     try:
-        data = plan.data | {"views": list(block.views)}
-        config = plan.config_of(block)
-        response = response_for_loading(config, plan.response)
-        scene = shared_scene(plan, index, load_photos(data, response=response, photos=photos))
-        trainer = create_trainer(scene, folder, config, device=device, resume=True, data=data, shared=plan.shared)
-        trainer.train()
+        _train(out, index, device, photos, versions)
     except Exception as error:
         message = as_user_error(error)
         if message is None:
             raise
-        return BlockResult(index, str(message))
-    return BlockResult(index, None)
+        return BlockResult(index, str(message), platform.node())
+    return BlockResult(index, None, platform.node())
+
+
+def _train(out: Path, index: int, device: str | None, photos: str, versions: str) -> None:
+    """Train a block; raise SehdrError if this machine has other versions or photos than that which divided the set."""
+    from ..training.train import create_trainer
+
+    plan = BlockPlan.read(out)
+    block, folder = plan.blocks[index], folder_of(out, plan, index)
+    if is_finished(folder):
+        return
+    if (own := installed_versions()) != versions:
+        raise SehdrError(f"it has {own}, and the command was started with {versions}; install the same on both")
+    data = plan.data | {"views": list(block.views)}
+    config = plan.config_of(block)
+    response = response_for_loading(config, plan.response)
+    scene = shared_scene(plan, index, load_photos(data, response=response, photos=photos))
+    plan.check_photos(scene.views)
+    trainer = create_trainer(scene, folder, config, device=device, resume=True, data=data, shared=plan.shared)
+    for _ in trainer:
+        pass
+    if trainer.iteration < trainer.total:  # By SIGTERM, as before a preemption; not an error of the user's.
+        raise RuntimeError(f"stopped at iteration {trainer.iteration} of {trainer.total}")
 
 
 def shared_scene(plan: BlockPlan, index: int, scene: Scene) -> Scene:

@@ -6,6 +6,7 @@ its newest checkpoint; SLURM jobs that reach their time limit or are preempted a
 
 import logging
 import os
+import platform
 import secrets
 import time
 from collections import deque
@@ -16,28 +17,18 @@ from typing import Any
 import torch
 
 from ..errors import SehdrError
+from ..training.launch import installed_versions
 from .block_plan import BlockPlan
-from .job import FOLDER, BlockResult, folder_of, is_finished, train_block
+from .job import FOLDER, BlockResult, folder_of, is_finished
+from .submitted import BlockJob
 
 log = logging.getLogger(__name__)
 
-TRIES = 3  # Times that a block is started; a training that dies each time has a cause that another try does not remove
-POLL = 1.0  # Seconds between looks at running jobs
+TRIES = 3  # Times that a block is started without getting any further; another try does not remove such a cause
+POLL, SLURM_POLL = 0.2, 2.0  # Seconds between looks at running jobs, and at files that SLURM jobs write
+ARRIVES = 30.0  # Seconds until what a job wrote must be seen here
 MONTH = 30 * 24 * 60  # Minutes, for jobs of this machine, which have no time limit of their own
-
-
-class BlockJob:
-    """A block's training as submitit runs it; checkpoint() makes SLURM requeue a job whose time is over."""
-
-    def __call__(self, *arguments: Any) -> BlockResult:
-        """Train the block; arguments as of train_block()."""
-        return train_block(*arguments)
-
-    def checkpoint(self, *arguments: Any) -> Any:
-        """Return the same job: its training continues from its newest checkpoint."""
-        import submitit
-
-        return submitit.helpers.DelayedSubmission(self, *arguments)
+DAY = 24 * 60  # Minutes of a SLURM job, if none are named: partitions refuse jobs that may run much longer
 
 
 def run_blocks(
@@ -63,7 +54,9 @@ def run_blocks(
     Raises:
         SehdrError: If submitit is missing, or if blocks cannot be trained, after all others have been.
     """
-    waiting = deque(index for index in range(len(plan.blocks)) if not is_finished(folder_of(out, plan, index)))
+    unfinished = (index for index in range(len(plan.blocks)) if not is_finished(folder_of(out, plan, index)))
+    # The longest first, so that none of them is left alone at the end.
+    waiting = deque(sorted(unfinished, key=lambda index: -plan.blocks[index].fraction))
     finished = len(plan.blocks) - len(waiting)
     if finished:
         log.info("%d of %d blocks are finished already", finished, len(plan.blocks))
@@ -71,8 +64,9 @@ def run_blocks(
         return
     slots = min(gpus, len(waiting)) if slurm is None else len(waiting)
     executors = _executors(out, device, slots, slurm)
-    job_device = "cpu" if device.type == "cpu" else None
+    arguments = ("cpu" if device.type == "cpu" else None), photos, installed_versions()
     tries, errors = dict.fromkeys(waiting, 0), {}
+    reached = {index: _newest_checkpoint(folder_of(out, plan, index)) for index in waiting}
     running: dict[int, tuple[int, Any]] = {}
     try:
         while waiting or running:
@@ -81,14 +75,17 @@ def run_blocks(
                     continue
                 index = waiting.popleft()
                 tries[index] += 1
-                running[slot] = index, executors[slot].submit(BlockJob(), out.absolute(), index, job_device, photos)
+                running[slot] = index, _submit(executors[slot], out.absolute(), index, *arguments)
                 log.info("%s: training begins, %d photos", plan.blocks[index].name, len(plan.blocks[index].views))
-            time.sleep(POLL)
+            time.sleep(POLL if slurm is None else SLURM_POLL)
             for slot, (index, job) in list(running.items()):
                 if not job.done():
                     continue
                 del running[slot]
-                name, error = plan.blocks[index].name, _error_of(job)
+                name, folder = plan.blocks[index].name, folder_of(out, plan, index)
+                error = _error_of(job, folder)
+                if (now := _newest_checkpoint(folder)) != reached[index]:
+                    tries[index], reached[index] = 0, now
                 if error is None:
                     finished += 1
                     log.info("%s: finished, %d of %d", name, finished, len(plan.blocks))
@@ -105,8 +102,38 @@ def run_blocks(
     if errors:
         name, error = next(iter(errors.items()))
         others = f" and {len(errors) - 1} more blocks" if len(errors) > 1 else ""
-        remedy = f"{finished} blocks are finished; --resume trains the others (logs in {out / FOLDER / 'logs'})"
-        raise SehdrError(f"{name}{others}: {error}; {remedy}")
+        done = f"{finished} of {len(plan.blocks)} blocks are finished"
+        remedy = f"--resume trains the others (logs in {out / FOLDER / 'logs'})"
+        raise SehdrError(f"{name}{others}: {error}; {done}; {remedy}")
+
+
+def _newest_checkpoint(folder: Path) -> str:
+    """Return the name of the newest checkpoint in a run folder; empty if there is none."""
+    return max((path.name for path in folder.glob("checkpoints/iteration_*")), default="")
+
+
+def _submit(executor: Any, *arguments: Any) -> Any:
+    """Submit a block's job; raise SehdrError if SLURM refuses it."""
+    from submitit.core.utils import FailedJobError
+
+    try:
+        return executor.submit(BlockJob(), *arguments)
+    except (FailedJobError, OSError) as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+        raise SehdrError(f"SLURM does not take a job ({lines[-1]:.200}); check what --slurm asks for") from None
+
+
+def check_devices(device: torch.device, count: int) -> None:
+    """Raise SehdrError if this machine has too few GPUs, or processors, for `count` blocks at once."""
+    if device.type == "cpu":
+        if count > (most := max(2, os.cpu_count() or 1)):
+            raise SehdrError(
+                f"--gpus {count}: too many blocks at once for {os.cpu_count()} processors; use {most} at most"
+            )
+    elif (device.index or 0) + count > (there := torch.cuda.device_count()):
+        first = f" from cuda:{device.index} on" if device.index else ""
+        there -= device.index or 0
+        raise SehdrError(f"--gpus {count}: there are {there} GPUs{first}, and each block takes one; use --gpus {there}")
 
 
 def visible_gpus(device: torch.device, count: int) -> list[str]:
@@ -126,8 +153,14 @@ def _executors(out: Path, device: torch.device, slots: int, slurm: Mapping[str, 
     # submitit exchanges pickled values through this folder, so it is a new one that nobody can have prepared.
     logs = out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
     if slurm is not None:
-        executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
-        executor.update_parameters(name="sehdr-warp", **_slurm_parameters(slurm, gpu=device.type == "cuda"))
+        try:
+            executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
+            executor.update_parameters(name="sehdr-warp", **_slurm_parameters(slurm, gpu=device.type == "cuda"))
+        except (RuntimeError, ValueError, NameError, TypeError, AssertionError) as error:
+            problem = (str(error).splitlines() or [type(error).__name__])[0].partition(". Valid")[0]
+            raise SehdrError(
+                f"--slurm cannot be used ({problem:.200}); it needs srun, and names that sbatch knows"
+            ) from None
         return [executor] * slots
     executors = [submitit.LocalExecutor(folder=logs) for _ in range(slots)]
     for executor in executors:
@@ -142,7 +175,7 @@ def _executors(out: Path, device: torch.device, slots: int, slurm: Mapping[str, 
 
 def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any]:
     """Return the parameters of submitit for SLURM: one GPU a job, and `time` in minutes."""
-    parameters: dict[str, Any] = {"timeout_min": MONTH} | ({"gpus_per_node": 1} if gpu else {})
+    parameters: dict[str, Any] = {"timeout_min": DAY} | ({"gpus_per_node": 1} if gpu else {})
     for name, text in options.items():
         value = int(text) if text.isdecimal() else text
         own = {"time": "timeout_min"}.get(name, name)
@@ -150,12 +183,22 @@ def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any
     return parameters
 
 
-def _error_of(job: Any) -> str | None:
-    """Return why a job ended without a trained block, in one line; None if the block is trained."""
+def _error_of(job: Any, folder: Path) -> str | None:
+    """Return why a job ended without a trained block in its folder, in one line; None if the block is trained."""
     exception = job.exception()
-    if exception is None:
-        return job.result().error
-    lines = [line for line in str(exception).strip().splitlines() if line.strip()]
-    return (
-        f"its process died ({lines[-1].strip()[:200]})" if lines else f"its process died ({type(exception).__name__})"
-    )
+    if exception is not None:
+        # submitit reports a traceback between two rules, or in its first line what else became of the job.
+        lines = [line.strip() for line in str(exception).splitlines() if line.strip()] or [type(exception).__name__]
+        rules = [number for number, line in enumerate(lines) if set(line) == {"-"}]
+        return f"its process died ({lines[rules[-1] - 1 if len(rules) > 1 else 0][:200]})"
+    result: BlockResult = job.result()
+    where = "" if result.node == platform.node() else f"node {result.node}: "
+    if result.error is not None:
+        return where + result.error
+    until = time.monotonic() + ARRIVES
+    while not is_finished(folder):  # Other nodes may see what one has written a little later.
+        if time.monotonic() > until:
+            problem = f"{where}trained it, and {folder} does not hold the trained run: the file system has lost it"
+            return f"{problem}; put the run on one that keeps what is written, and that all nodes share"
+        time.sleep(POLL)
+    return None

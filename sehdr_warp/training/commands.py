@@ -260,15 +260,15 @@ def _train_blocks(args: Train) -> bool:
     """Train or resume a run in blocks; return False, having begun nothing, if `auto` finds that one training does."""
     from ..arguments import parse_pairs
     from ..blocks.block_plan import BlockPlan
+    from ..blocks.jobs import check_devices
     from ..blocks.train import is_in_blocks, train_in_blocks
-    from .launch import device_of_rank
 
     output, machine = args.output, args.machine
     if output.out is None:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     device = pick_device(machine.device)
-    if machine.gpus > 1:
-        device_of_rank(machine.gpus - 1, machine.device)
+    if machine.slurm is None:
+        check_devices(device, machine.gpus)
     plan = BlockPlan.read(output.out) if output.resume and is_in_blocks(output.out) else None
     data = _load_arguments(args, None if plan is None else plan.data)
     config = _config(args, None if plan is None else plan.config)

@@ -1,5 +1,6 @@
 """Processes that train together: start them for --gpus, and read rank and node that torchrun or --gpus state."""
 
+import hashlib
 import logging
 import os
 import platform
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
+from importlib.metadata import version
 from multiprocessing.connection import wait
 from pathlib import Path
 
@@ -88,6 +90,20 @@ def launched_as() -> RankInfo | None:
         problem = f"{count} ranks on {nodes} nodes, and {local_count} on this one"
         raise SehdrError(f"{problem}: start as many on each, with --nproc-per-node")
     return RankInfo(rank, count, local_rank, local_count, node, nodes) if count > 1 else None
+
+
+def installed_versions() -> str:
+    """Return the versions of this package, with a hash of its files, and of what it computes with.
+
+    The hash is there because a development version has one name for many states.
+    """
+    from .. import __version__
+
+    total = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        total.update(path.read_bytes())
+    own = f"sehdr-warp {__version__} ({total.hexdigest()[:8]}), torch {torch.__version__}"
+    return f"{own}, warp {version('warp-lang')}, Python {platform.python_version()}"
 
 
 def device_of_rank(rank: int, device: str | None) -> torch.device:

@@ -5,7 +5,6 @@ apply the same step. Rank 0 leads: it densifies, evaluates, writes and prints. O
 and shares them with the others of its node, which only run steps.
 """
 
-import hashlib
 import logging
 import os
 import pickle
@@ -16,8 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import partial
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -29,7 +26,7 @@ from ..model.adam import Adam
 from ..model.gaussians import Gaussians
 from ..parallel import WAITING_NOTICE, run_interruptibly, thread_count
 from ..scene.photo_file import PhotoFile, can_share, open_shared
-from .launch import RankInfo, open_store
+from .launch import RankInfo, installed_versions, open_store
 from .strategies import Strategy
 
 log = logging.getLogger(__name__)
@@ -282,10 +279,7 @@ class Ranks:
 
     def _check_versions(self) -> None:
         """Raise SehdrError if a rank runs other versions of packages."""
-        from .. import __version__
-
-        own = f"sehdr-warp {__version__} ({_source()}), torch {torch.__version__}, warp {version('warp-lang')}"
-        own += f", Python {platform.python_version()}"
+        own = installed_versions()
         versions: list = [None] * self.count
         with self._together():
             dist.all_gather_object(versions, own, group=self._hosts)
@@ -315,14 +309,6 @@ class Ranks:
                     message = "another rank did not answer %s for %.0f s (%s): %s"
                     log.error(message, self.info, self._patience, TIMEOUT, ENDING)
                 os._exit(1)
-
-
-def _source() -> str:
-    """Return a short hash of the package's own files, because a development version has one name for many states."""
-    total = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
-        total.update(path.read_bytes())
-    return total.hexdigest()[:8]
 
 
 def patience() -> float:
@@ -356,6 +342,8 @@ def join_ranks(info: RankInfo, device: torch.device) -> Iterator[Ranks]:
         first, message = ranks.ends_first(), isinstance(error, Exception) and as_user_error(error)
         if message and not first:
             raise SystemExit(1) from None
+        if message and info.several_nodes and str(info) not in str(message):
+            raise SehdrError(f"{info}: {message}") from None
         if info.rank and isinstance(error, KeyboardInterrupt):
             raise SystemExit(130) from None
         raise

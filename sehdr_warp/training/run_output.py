@@ -39,9 +39,16 @@ class RunOutput:
         folder: The run folder.
     """
 
-    def __init__(self, folder: RunWriter, config: Config, *, tensorboard: bool = False):
-        """Prepare to write to a run folder, which need not exist yet."""
-        self.folder = folder
+    def __init__(self, folder: RunWriter, config: Config, *, tensorboard: bool = False, part: bool = False):
+        """Prepare to write to a run folder, which need not exist yet.
+
+        Args:
+            folder: The run folder.
+            config: Options of the training.
+            tensorboard: Write event files.
+            part: The run is a part of a larger one, whose photos are not compared with it at the end.
+        """
+        self.folder, self._part = folder, part
         total = config.schedule.iterations
         self._evaluate_at = {config.scaled(n) for n in config.schedule.evaluate_at} | {total}
         self._checkpoint_every = config.scaled(config.schedule.checkpoint_every)
@@ -105,7 +112,7 @@ class RunOutput:
         self.folder.write_checkpoint(state.tensors, state.values | {"seconds": trainer.seconds}, keep=keep)
 
     def finish(self, trainer: Trainer, *, complete: bool) -> None:
-        """Write the last checkpoint and the summary; if complete, also the confidence and the residual regions.
+        """Write the last checkpoint and the summary; if complete, also the confidence, and the regions that differ.
 
         After the last step, Gaussians that no photo shows are removed before, and the rest is evaluated.
         """
@@ -121,11 +128,16 @@ class RunOutput:
             self._writer.close()
         if not complete:
             return
+        checkpoint_hash = self.folder.checkpoint_hash
+        if self._part and evidence is not None and checkpoint_hash is not None:
+            write_confidence(self.folder, evidence, checkpoint_hash)
+            return
         run = self.load_run(trainer.device)
         evidence = evidence or run.measure_confidence(trainer.scene)
         run.field.confidence = evidence.confidence()
         write_confidence(self.folder, evidence, run.checkpoint_hash)
-        self._report_residuals(run, trainer)
+        if not self._part:
+            self._report_residuals(run, trainer)
 
     def _write_summary(self, trainer: Trainer) -> None:
         """Write summary.json: times, memory and counts."""

@@ -94,7 +94,7 @@ def create_trainer(
         resumes = folder.check(resume=resume, overwrite=overwrite)
         try:
             if resumes:
-                trainer = _resumed_trainer(scene, folder, config, device, ranks, tensorboard)
+                trainer = _resumed_trainer(scene, folder, config, device, ranks, tensorboard, part=shared is not None)
             else:
                 config, data = config or Config(), data or LoadArguments()
                 trainer = _new_trainer(
@@ -133,7 +133,7 @@ def _new_trainer(
         photos = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
         base_time = None if shared is None else shared.base_time
         field = make_field(photos.scene, config, response, device, photos.matcher, base_time)
-    output = RunOutput(folder, config, tensorboard=tensorboard)
+    output = RunOutput(folder, config, tensorboard=tensorboard, part=shared is not None)
     trainer = Trainer(photos.scene, config, field, matcher=photos.matcher, ranks=ranks, output=output)
     trainer.seconds = watch.seconds
     if plan is not None and photos.decision is not None:
@@ -155,6 +155,8 @@ def _resumed_trainer(
     device: torch.device,
     ranks: Ranks | None,
     tensorboard: bool,
+    *,
+    part: bool,
 ) -> Trainer:
     """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run."""
     folder.lock()
@@ -173,7 +175,7 @@ def _resumed_trainer(
     gains = exposure_compensation(info)
     scene = scene if gains is None else gains.normalize_photos(scene, field.response)
     before, saved = saved.schedule.iterations, extended or saved
-    output = RunOutput(folder, saved, tensorboard=tensorboard)
+    output = RunOutput(folder, saved, tensorboard=tensorboard, part=part)
     trainer = Trainer(scene, saved, field, ranks=ranks, output=output)
     try:
         load_state(trainer, TrainingState(checkpoint.tensors, checkpoint.values))

@@ -27,7 +27,7 @@ def plan(tmp_path):
     shared, place = SharedDecisions(0.5, None), Normalization(np.zeros(3), 1.0)
     times = {"photo_0": 0.5, "photo_1": 0.25}
     response = response_by_name("srgb")
-    plan = BlockPlan("town", DATA, response, place, shared, times, Config(), np.eye(3), tuple(blocks))
+    plan = BlockPlan("town", DATA, response, place, shared, times, {"photo_0": 9}, Config(), np.eye(3), tuple(blocks))
     plan.write(tmp_path / "run")
     return plan
 

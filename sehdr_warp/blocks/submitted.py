@@ -1,0 +1,24 @@
+"""What submitit runs in a process of its own. Nothing else is imported, so that torch loads after the settings."""
+
+from pathlib import Path
+from typing import Any
+
+
+class BlockJob:
+    """A block's training as a job; checkpoint() makes SLURM requeue a job whose time is over."""
+
+    def __call__(self, out: Path, index: int, device: str | None, photos: str, versions: str) -> Any:
+        """Train the block; arguments and result as of train_block()."""
+        from ..process import calm_threads, collect_late
+
+        calm_threads()
+        collect_late()
+        from .job import train_block
+
+        return train_block(out, index, device, photos, versions)
+
+    def checkpoint(self, *arguments: Any) -> Any:
+        """Return the same job: its training continues from its newest checkpoint."""
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(self, *arguments)

@@ -1,0 +1,131 @@
+"""Blocks as SLURM jobs: sbatch, srun, sacct and scontrol of a cluster of one node are scripts, submitit is itself."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from benchmarks.survey import write_survey
+from sehdr_warp.blocks.block_plan import BlockPlan
+from sehdr_warp.blocks.job import folder_of
+from sehdr_warp.runs.run import load_run
+from sehdr_warp.runs.run_folder import RunFolder
+
+from ..refusals import call, refused
+
+submitit = pytest.importorskip("submitit")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="SLURM runs on Linux")
+
+# Jobs are scripts in $CLUSTER, named by their number; their states are in files beside them.
+SBATCH = """#!/bin/bash
+grep -q -- '--partition=closed' "$1" && { echo 'sbatch: error: invalid partition specified: closed' >&2; exit 1; }
+number=$((100 + $(ls "$CLUSTER" | grep -c '\\.sh$')))
+cp "$1" "$CLUSTER/$number.sh"
+start_job $number > /dev/null 2>&1 &
+echo "Submitted batch job $number"
+"""
+START = """#!/bin/bash
+export SLURM_JOB_ID=$1 SLURM_NTASKS=1 SLURM_JOB_NUM_NODES=1 SLURM_NODEID=0 SLURM_PROCID=0 SLURM_LOCALID=0
+export SLURM_JOB_NODELIST=node7
+echo RUNNING > "$CLUSTER/$1.state"
+bash "$CLUSTER/$1.sh" && echo COMPLETED > "$CLUSTER/$1.state" || echo FAILED > "$CLUSTER/$1.state"
+[ -e "$CLUSTER/$1.requeue" ] && rm "$CLUSTER/$1.requeue" && exec start_job $1
+"""
+SRUN = """#!/bin/bash
+while [[ $1 == --* ]]; do
+    case $1 in
+        --output) output=$2; shift 2;;
+        --error) error=$2; shift 2;;
+        *) shift;;
+    esac
+done
+fill() { sed "s/%j/$SLURM_JOB_ID/; s/%t/0/" <<< "$1"; }
+exec "$@" >> "$(fill "$output")" 2>> "$(fill "$error")"
+"""
+SACCT = """#!/bin/bash
+echo 'JobID|State|NodeList'
+for state in "$CLUSTER"/*.state; do echo "$(basename "$state" .state)|$(cat "$state")|node7"; done
+"""
+SCONTROL = """#!/bin/bash
+[ "$1" = requeue ] && touch "$CLUSTER/$2.requeue"
+"""
+
+FLAGS = ["--device", "cpu", "--response", "srgb", "--iterations", "200", "--preset", "fast", "--blocks", "2"]
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """Scripts in place of SLURM's programs; the folder of its jobs."""
+    programs, jobs = tmp_path / "bin", tmp_path / "jobs"
+    jobs.mkdir()
+    scripts = {"sbatch": SBATCH, "start_job": START, "srun": SRUN, "sacct": SACCT, "scontrol": SCONTROL}
+    programs.mkdir()
+    for name, text in scripts.items():
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    monkeypatch.setenv("CLUSTER", str(jobs))
+    # submitit asks for states every ten minutes, and waits for what a dead process may still write.
+    monkeypatch.setattr(submitit.SlurmJob.watcher, "_delay_s", 1)
+    monkeypatch.setattr(submitit.SlurmJob, "_results_timeout_s", 1)
+    return jobs
+
+
+@pytest.fixture
+def survey(tmp_path):
+    write_survey(tmp_path / "town", views=32, size=48, gaussians=6000)
+    return tmp_path / "town"
+
+
+def send_once(out, number):
+    """Send a signal to the first block's process when it has written a checkpoint of its training."""
+    deadline = time.monotonic() + 90
+    while time.monotonic() < deadline:
+        begun = [path.parents[1] for path in out.glob("blocks/block_*/checkpoints/iteration_*[1-9]*")]
+        for place in Path("/proc").glob("[0-9]*") if begun else ():
+            with suppress(OSError):
+                words = (place / "cmdline").read_text()
+                if "submitit.core._submit" in words and str(out) in words:
+                    os.kill(int(place.name), number)
+                    return
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("number", [signal.SIGUSR2, signal.SIGTERM], ids=["time limit", "preempted"])
+def test_a_job_that_is_ended_goes_on_and_the_blocks_are_merged(cluster, survey, tmp_path, number):
+    out = tmp_path / "run"
+    sender = threading.Thread(target=send_once, args=(out, number))
+    sender.start()
+    words = ["--schedule.checkpoint-every", "3000", "--slurm", "partition=gpu,time=9,mem=4GB"]
+    assert call("train", survey, "--out", out, *FLAGS, *words) == 0
+    sender.join()
+    scripts = [script.read_text() for script in sorted(cluster.glob("*.sh"))]
+    assert len(scripts) == (2 if number == signal.SIGUSR2 else 3), "one is requeued by SLURM, or submitted again"
+    for flag in ("--partition=gpu", "--time=9", "--mem=4GB", "--job-name=sehdr-warp"):
+        assert all(f"#SBATCH {flag}\n" in script for script in scripts)
+    plan = BlockPlan.read(out)
+    assert all(RunFolder(folder_of(out, plan, index)).read_summary()["finished"] for index in (0, 1))
+    assert load_run(out).iterations == 200
+
+
+def test_what_slurm_refuses_is_one_line(cluster, survey, tmp_path, capfd, monkeypatch):
+    def line(slurm):
+        return refused(capfd, "train", survey, "--out", tmp_path / "run", *FLAGS, "--overwrite", "--slurm", slurm)
+
+    assert (
+        "--slurm cannot be used (Unknown argument 'colour' for executor 'slurm' in parameter 'slurm_colour')"
+        in line("colour=red")
+    )
+    assert (
+        call("train", survey, "--out", tmp_path / "run", *FLAGS, "--resume", "--slurm", "partition=closed", "-q") == 1
+    )
+    own, ours = capfd.readouterr().err.splitlines()
+    assert own == "sbatch: error: invalid partition specified: closed" and ours.startswith("sehdr-warp: SLURM does not")
+    assert own in ours and ours.endswith("check what --slurm asks for")
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert 'Could not detect "srun"' in line("partition=gpu")
