@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 
 FORMAT = 1
 FILE = "blocks.json"
+MOST_BLOCKS = 10_000
+"""Largest number of blocks; more than that many trainings are never one set."""
 FEWEST_POINTS, MATCHED = 500, 4000  # With fewer points in the set, pixels are matched to divide by
 MOST_MATCHED = 400  # Photos that are matched for that
 OVERLAP = 1.3  # Photos and Gaussians of all blocks together, relative to the whole set, for the choice of their number
@@ -354,7 +356,9 @@ def _block_values(block: Block) -> dict[str, Any]:
 
 
 def _check_blocks(plan: BlockPlanValues) -> None:
-    """Raise ValueError if two blocks have a name, or a view of a block has no exposure time."""
+    """Raise ValueError for too many blocks, two of one name, or a view without an exposure time."""
+    if len(plan.blocks) > MOST_BLOCKS:
+        raise ValueError(f"blocks has {len(plan.blocks)} entries, and at most {MOST_BLOCKS} can be")
     names = [block.name for block in plan.blocks]
     if len(set(names)) < len(names):
         raise ValueError("two blocks have the same name")

@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 TRIES = 3  # Times that a block is started without getting any further; another try does not remove such a cause
 POLL, SLURM_POLL = 0.2, 2.0  # Seconds between looks at running jobs, and at files that SLURM jobs write
 ARRIVES = 30.0  # Seconds until what a job wrote must be seen here
+_DIGITS = 18  # Of a number for SLURM; Python converts no numbers of thousands of digits
 MONTH = 30 * 24 * 60  # Minutes, for jobs of this machine, which have no time limit of their own
 DAY = 24 * 60  # Minutes of a SLURM job, if none are named: partitions refuse jobs that may run much longer
 
@@ -177,7 +178,7 @@ def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any
     """Return the parameters of submitit for SLURM: one GPU a job, and `time` in minutes."""
     parameters: dict[str, Any] = {"timeout_min": DAY} | ({"gpus_per_node": 1} if gpu else {})
     for name, text in options.items():
-        value = int(text) if text.isdecimal() else text
+        value = int(text) if text.isdecimal() and len(text) <= _DIGITS else text
         own = {"time": "timeout_min"}.get(name, name)
         parameters[own if own in parameters else f"slurm_{own}"] = value
     return parameters

@@ -58,7 +58,7 @@ def read_light_unit(run: "LoadedScene") -> LightUnit | None:
     try:
         x, y = (float(value) for value in values["pixel"])
         unit = LightUnit(_checked(values["luminance"]), str(values["view"]), (x, y), str(values["reading"]))
-    except (SehdrError, LookupError, TypeError, ValueError) as error:
+    except (SehdrError, LookupError, OverflowError, TypeError, ValueError) as error:
         remedy = "delete the file, or take the reading again with `sehdr-warp meter`"
         raise InputError(path, f"cannot be used ({error})", remedy) from None
     return unit

@@ -229,12 +229,14 @@ def _print_result(args: Train, run, advice: Callable[[Path, dict], list[str]] | 
 
 def _in_blocks(args: Train) -> bool:
     """Return whether a command line trains in blocks, which --resume continues without --blocks too."""
+    from ..blocks.block_plan import MOST_BLOCKS
     from ..blocks.train import is_in_blocks
 
     options, output = args.training, args.output
     if options.blocks is not None:
-        if options.blocks != "auto" and not (options.blocks.isdecimal() and int(options.blocks) >= 2):
-            raise UsageError(f"--blocks {options.blocks} is neither auto nor a number of 2 or more")
+        digits = options.blocks.isdecimal() and len(options.blocks) <= len(str(MOST_BLOCKS))
+        if options.blocks != "auto" and not (digits and 2 <= int(options.blocks) <= MOST_BLOCKS):
+            raise UsageError(f"--blocks {options.blocks:.60} is neither auto nor a number from 2 to {MOST_BLOCKS}")
         if output.view or output.tensorboard:
             raise UsageError("--view and --tensorboard are without effect with --blocks; view the run when it is done")
         return not options.plan_only

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.blocks.block_plan import FILE, Block, BlockPlan
+from sehdr_warp.blocks.block_plan import FILE, MOST_BLOCKS, Block, BlockPlan
 from sehdr_warp.blocks.division import Cell
 from sehdr_warp.blocks.train import train_in_blocks
 from sehdr_warp.errors import InputError
@@ -67,6 +67,15 @@ def test_plans_that_cannot_be(tmp_path, plan, fields):
     path = tmp_path / "run" / FILE
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
     with pytest.raises(InputError, match=f"{FILE}: .*{next(iter(fields))}"):
+        BlockPlan.read(tmp_path / "run")
+
+
+def test_more_blocks_than_can_be(tmp_path, plan):
+    path = tmp_path / "run" / FILE
+    values = json.loads(path.read_text())
+    values["blocks"] = [values["blocks"][0] | {"name": f"block_{number}"} for number in range(MOST_BLOCKS + 1)]
+    path.write_text(json.dumps(values))
+    with pytest.raises(InputError, match=f"{FILE}: blocks.*at most {MOST_BLOCKS}"):
         BlockPlan.read(tmp_path / "run")
 
 

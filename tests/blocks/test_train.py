@@ -167,9 +167,10 @@ def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capf
     )
     assert not (tmp_path / "run").exists()
     capfd.readouterr()
-    for words in (["--blocks", "1"], ["--blocks", "many"], ["--slurm", "partition=gpu"], ["--blocks", "2", "--view"]):
+    wrong = (["--blocks", "1"], ["--blocks", "many"], ["--blocks", "9" * 5000], ["--slurm", "partition=gpu"])
+    for words in (*wrong, ["--blocks", "2", "--view"]):
         assert call("train", survey, "--out", tmp_path / "run", *words, "-q") == 2
-    assert len(capfd.readouterr().err.splitlines()) == 4
+    assert len(capfd.readouterr().err.splitlines()) == 5
 
 
 @pytest.mark.parametrize(

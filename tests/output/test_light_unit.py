@@ -125,7 +125,12 @@ def test_readings_that_cannot_be_are_refused(run, options, problem):
     assert not (run.path / UNIT_FILE).exists()
 
 
-@pytest.mark.parametrize("text", ["{}", '{"luminance": 0, "view": "a", "pixel": [1, 2], "reading": "x"}', "[1]", "{"])
+HUGE = f'{{"luminance": 1, "view": "a", "pixel": [1{"0" * 400}, 2], "reading": "x"}}'
+
+
+@pytest.mark.parametrize(
+    "text", ["{}", '{"luminance": 0, "view": "a", "pixel": [1, 2], "reading": "x"}', HUGE, "[1]", "{"]
+)
 def test_a_damaged_file_is_named(run, text):
     (run.path / UNIT_FILE).write_text(text)
     with pytest.raises(InputError, match=UNIT_FILE):
