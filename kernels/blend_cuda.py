@@ -18,8 +18,6 @@ These kernels also run in Warp's CPU block emulation (wp.config.enable_cpu_block
 """
 
 from functools import cache
-from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
@@ -83,15 +81,13 @@ def ballot(vote: bool, lane: int) -> wp.uint32:
 
 
 @cache
-def block_functions(dtype, channels: int, cuda: bool) -> SimpleNamespace:
-    """Return the steps that both passes take, for one scalar type: votes, enqueue, fetch and stage.
+def block_functions(dtype, cuda: bool) -> tuple:
+    """Return votes() and row() for one scalar type.
 
-    cuda: False for Warp's CPU block emulation.
+    votes() is a word with a bit for each lane whose vote is true; row() reads a row of four numbers, on CUDA by one
+    access if they are float32.
     """
-    g = geometry(dtype)
-    real, vec4 = g.real, g.vec4
-    quads = padded_channels(channels) // 4
-    vec_padded = vector(4 * quads, dtype)
+    vec4 = geometry(dtype).vec4
 
     if cuda:
         votes = ballot
@@ -99,7 +95,6 @@ def block_functions(dtype, channels: int, cuda: bool) -> SimpleNamespace:
 
         @wp.func
         def votes(vote: bool, lane: int) -> wp.uint32:
-            """Return a word with a bit for each lane whose vote is true."""
             bit = wp.uint32(0)
             if vote:
                 bit = wp.uint32(1) << wp.uint32(lane)
@@ -109,65 +104,15 @@ def block_functions(dtype, channels: int, cuda: bool) -> SimpleNamespace:
     if dtype is wp.float32 and cuda:
 
         @wp.func_native(ROW)
-        def row(rows: wp.array(dtype=vec4), i: int) -> vec4:
-            """Read a row of four numbers by one access."""
+        def row(rows: wp.array(dtype=vec4), i: int) -> vec4: ...
 
     else:
 
         @wp.func
         def row(rows: wp.array(dtype=vec4), i: int) -> vec4:
-            """Read a row of four numbers."""
             return rows[i]
 
-    @wp.func
-    def enqueue(queue: Any, end: int, gaussian: int, place: int, hit: bool, lane: int) -> int:
-        """Put the (gaussian, place) of all lanes with a hit into the ring buffer from `end` on; return how many."""
-        mask = votes(hit, lane)
-        lanes_below = (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
-        slot = (end + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
-        wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussian, place), hit)
-        return wp.bit_count(mask)
-
-    @wp.func
-    def fetch(
-        means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
-        gaussian: int, exists: bool,
-    ):
-        """Return (x, y, opacity, -), (conic a, b, c, -) and the padded features of a Gaussian; zeros if none exists."""
-        xy_opacity = vec4()
-        conic_cutoff = vec4()
-        fetched = vec_padded()
-        if exists:
-            xy_opacity = row(means_opacities, gaussian)
-            conic_cutoff = row(conics_cutoffs, gaussian)
-            for e in range(wp.static(quads)):
-                quad = row(features, gaussian * wp.static(quads) + e)
-                for h in range(wp.static(4)):
-                    fetched[e * 4 + h] = quad[h]
-        return xy_opacity, conic_cutoff, fetched
-
-    @wp.func
-    def stage(
-        batch_means: Any, batch_conics: Any, batch_features: Any,
-        lane: int, place: int, xy_opacity: vec4, conic: vec4, fetched: vec_padded,
-    ):
-        """Write what a lane has fetched into the batch: (x, y, opacity, place), conic and features.
-
-        The conic is staged as -a / 2, -b, -c / 2, so that the exponent is dx (q0 dx + q1 dy) + q2 dy dy.
-        """
-        wp.tile_scatter_masked(
-            batch_means, lane, vec4(xy_opacity[0], xy_opacity[1], xy_opacity[2], real(place)), True,
-        )
-        wp.tile_scatter_masked(
-            batch_conics, lane, vec4(real(-0.5) * conic[0], -conic[1], real(-0.5) * conic[2], real(0.0)), True,
-        )
-        for e in range(wp.static(quads)):
-            wp.tile_scatter_masked(
-                batch_features, lane * wp.static(quads) + e,
-                vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
-            )
-
-    return SimpleNamespace(votes=votes, enqueue=enqueue, fetch=fetch, stage=stage)
+    return votes, row
 
 
 @cache
@@ -188,8 +133,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
     vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(UNROLL, dtype)
     vec_rounds = vector(ROUNDS, wp.int32)
     blocks_across = TILE_SIZE // SUBTILE[0]
-    shared = block_functions(dtype, channels, cuda)
-    votes, enqueue, fetch, stage = shared.votes, shared.enqueue, shared.fetch, shared.stage
+    votes, row = block_functions(dtype, cuda)
 
     @wp.kernel(
         module="unique", enable_backward=False, launch_bounds=BLOCK_DIM, grid_stride=False,
@@ -226,6 +170,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         begin = bounds[0]
         count = bounds[1] - begin
         final = wp.max(count - 1, 0)
+        lanes_below = (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
         queue = wp.tile_empty(shape=wp.static(QUEUE), dtype=wp.vec2i, storage="shared")
         batch_means = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
         batch_conics = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
@@ -250,7 +195,10 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                 for k in range(wp.static(ROUNDS)):
                     place = start + k * 32
                     hit = place < count and ((touched[k] >> subtile) & 1) == 1
-                    queued += enqueue(queue, head + queued, gaussians[k], place + 1, hit, lane)
+                    mask = votes(hit, lane)
+                    slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
+                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], place + 1), hit)
+                    queued += wp.bit_count(mask)
                 turn += 1
                 for k in range(wp.static(ROUNDS)):
                     at = begin + wp.min(start + wp.static(32 * ROUNDS) + k * 32, final)
@@ -258,9 +206,16 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                     touched[k] = int(subtile_masks[at])
             coming = wp.min(queued, 32)
             own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))
-            xy_opacity, conic_cutoff, fetched = fetch(
-                means_opacities, conics_cutoffs, features, own[0], lane < coming
-            )
+            xy_opacity = vec4()
+            conic_cutoff = vec4()
+            fetched = vec_padded()
+            if lane < coming:
+                xy_opacity = row(means_opacities, own[0])
+                conic_cutoff = row(conics_cutoffs, own[0])
+                for e in range(wp.static(quads)):
+                    quad = row(features, own[0] * wp.static(quads) + e)
+                    for h in range(wp.static(4)):
+                        fetched[e * 4 + h] = quad[h]
             head = (head + coming) & wp.static(QUEUE - 1)
             queued = queued - coming
             # The batch that was fetched before
@@ -296,7 +251,19 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
             if votes(active_threshold < real(1.0), lane) == wp.uint32(0) or coming == 0:
                 alive = 0
             ready = coming
-            stage(batch_means, batch_conics, batch_features, lane, own[1], xy_opacity, conic_cutoff, fetched)
+            wp.tile_scatter_masked(
+                batch_means, lane, vec4(xy_opacity[0], xy_opacity[1], xy_opacity[2], real(own[1])), True,
+            )
+            # Staged as -a / 2, -b, -c / 2, so that the exponent is dx (q0 dx + q1 dy) + q2 dy dy.
+            wp.tile_scatter_masked(
+                batch_conics, lane,
+                vec4(real(-0.5) * conic_cutoff[0], -conic_cutoff[1], real(-0.5) * conic_cutoff[2], real(0.0)), True,
+            )
+            for e in range(wp.static(quads)):
+                wp.tile_scatter_masked(
+                    batch_features, lane * wp.static(quads) + e,
+                    vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
+                )
 
         if inside:
             pixel = py * width + px

@@ -67,8 +67,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
     vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(UNROLL, dtype)
     vec_terms = vector(2 * UNROLL, dtype)
     vec_rounds = vector(ROUNDS, wp.int32)
-    shared = block_functions(dtype, channels, cuda)
-    enqueue, fetch, stage = shared.enqueue, shared.fetch, shared.stage
+    votes, row = block_functions(dtype, cuda)
     gradient_columns = channels + 6
     staging_columns = gradient_columns + 1 - gradient_columns % 2  # odd, so that lanes fall on different banks
     blocks_across = TILE_SIZE // SUBTILE[0]
@@ -128,6 +127,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
             grad_channels[channel] = grad_pixel[channel]
         block_grad_channels = wp.tile(grad_channels, preserve_type=True)
 
+        lanes_below = (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
         queue = wp.tile_empty(shape=wp.static(QUEUE), dtype=wp.vec2i, storage="shared")
         batch_means = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
         batch_conics = wp.tile_empty(shape=32, dtype=vec4, storage="shared")
@@ -155,7 +155,10 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 for k in range(wp.static(ROUNDS)):
                     place = start - k * 32
                     hit = place >= 0 and ((touched[k] >> subtile) & 1) == 1
-                    queued += enqueue(queue, head + queued, gaussians[k], place, hit, lane)
+                    mask = votes(hit, lane)
+                    slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
+                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], place), hit)
+                    queued += wp.bit_count(mask)
                 turn += 1
                 for k in range(wp.static(ROUNDS)):
                     at = begin + wp.max(start - wp.static(32 * ROUNDS) - k * 32, 0)
@@ -163,9 +166,16 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                     touched[k] = int(subtile_masks[at])
             coming = wp.min(queued, 32)
             own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))
-            xy_opacity, conic_cutoff, fetched = fetch(
-                means_opacities, conics_cutoffs, features, own[0], lane < coming
-            )
+            xy_opacity = vec4()
+            conic_cutoff = vec4()
+            fetched = vec_padded()
+            if lane < coming:
+                xy_opacity = row(means_opacities, own[0])
+                conic_cutoff = row(conics_cutoffs, own[0])
+                for e in range(wp.static(quads)):
+                    quad = row(features, own[0] * wp.static(quads) + e)
+                    for h in range(wp.static(4)):
+                        fetched[e * 4 + h] = quad[h]
             head = (head + coming) & wp.static(QUEUE - 1)
             queued = queued - coming
 
@@ -283,6 +293,18 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 alive = 0
             ready = coming
             ready_one = own
-            stage(batch_means, batch_conics, batch_features, lane, own[1], xy_opacity, conic_cutoff, fetched)
+            wp.tile_scatter_masked(
+                batch_means, lane, vec4(xy_opacity[0], xy_opacity[1], xy_opacity[2], real(own[1])), True,
+            )
+            # Staged as -a / 2, -b, -c / 2, so that the exponent is dx (q0 dx + q1 dy) + q2 dy dy.
+            wp.tile_scatter_masked(
+                batch_conics, lane,
+                vec4(real(-0.5) * conic_cutoff[0], -conic_cutoff[1], real(-0.5) * conic_cutoff[2], real(0.0)), True,
+            )
+            for e in range(wp.static(quads)):
+                wp.tile_scatter_masked(
+                    batch_features, lane * wp.static(quads) + e,
+                    vec4(fetched[e * 4], fetched[e * 4 + 1], fetched[e * 4 + 2], fetched[e * 4 + 3]), True,
+                )
 
     return blend_backward
