@@ -22,6 +22,7 @@ from sehdr_warp.blocks.seams import measure_seams
 from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config, override_config
+from sehdr_warp.runs.load_arguments import LoadArguments
 from sehdr_warp.runs.open import load_photos
 from sehdr_warp.runs.run import Run, load_run
 from sehdr_warp.training.train import create_trainer
@@ -61,13 +62,13 @@ def run_study(study: Study) -> None:
     if not survey.is_dir():
         write_survey(survey, study.views, study.size, study.gaussians * 3 // 2, device)
     config = _config(study)
-    data = {"path": str(survey.absolute()), "exposure_index": None, "max_size": None, "holdout": None}
+    data: LoadArguments = {"path": str(survey.absolute()), "exposure_index": None, "max_size": None, "holdout": None}
     plan = make_block_plan(data, config, device, study.count)
     assert plan is not None
     fraction = sum(block.fraction for block in plan.blocks) / study.count
     plan = replace(plan, config=override_config(config, {"schedule.iterations": round(study.steps * fraction)}))
     study.note("plan", photos=[len(block.views) for block in plan.blocks], fraction=fraction)
-    warm = load_photos(data | {"views": list(plan.blocks[0].views)[:12]}, response="srgb")
+    warm = load_photos({**data, "views": list(plan.blocks[0].views)[:12]}, response="srgb")
     short = override_config(config, {"schedule.iterations": WARM_UP})
     create_trainer(warm, study.out / "warm", short, device=device, overwrite=True).train()
     seconds = _blocks(study, plan, "blocks", gpus)
@@ -79,7 +80,7 @@ def run_study(study: Study) -> None:
     ).train()
     merged = load_run(study.out / "blocks", device=device)
     names = [entry.name for entry in merged.cameras if entry.split == "test"]
-    views = load_photos(data | {"views": names}, response="srgb").views
+    views = load_photos({**data, "views": names}, response="srgb").views
     for name, run in (("merged", merged), ("whole", whole)):
         errors = measure_seams(run, views, plan.division, depths=merged)
         memory = run.summary().get("peak_gpu_memory_bytes") or run.summary().get("peak_memory_bytes")
