@@ -119,7 +119,8 @@ def test_a_signal_waits_for_the_end_of_an_import(tmp_path, kind, number):
         body = "\n".join(["try:", *[f"    {line}" for line in body.splitlines()], "except BaseException: pass"])
     (tmp_path / "slow.py").write_text(f"{body}\nos.write(1, b' complete')\n")
     program = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # A job in the background ignores it.
 from sehdr_warp import process
 process.prepare()
 process._LONGEST_IMPORT = 3.0

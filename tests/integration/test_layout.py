@@ -9,7 +9,7 @@ ROOT = TESTS.parent
 NOT_PACKAGES = {"integration", "fuzz", "trial", "scenes_generator"}
 TOPICS = {
     "benchmarks": {"bench"},
-    "blocks": {"shared_decisions"},
+    "blocks": {"shared_decisions", "slurm"},
     "compat/gsplat": {"against_gsplat", "simple_trainer"},
     "kernels": {"cuda_compilation"},
     "output": {"blender", "pictures"},

@@ -67,4 +67,4 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.write_line(f"{used:.0f} s of processor time, those of pytest and all that it started")
         if path := os.environ.get("SEHDR_TRIAL_JSON"):
             known = {row["family"]: row for row in kept(Path(path)).get("rows", [])}
-            keep(Path(path), rows=[*(known | rows).values()], seed=SEED, **told("pytest -m trial"))
+            keep(Path(path), rows=[*(known | rows).values()], seed=SEED, **told("pytest -m trial tests/trial"))
