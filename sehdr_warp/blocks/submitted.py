@@ -1,4 +1,4 @@
-"""What submitit runs in a process of its own. Nothing else is imported, so that torch loads after the settings."""
+"""Run a job of submitit in a process of its own. Nothing else is imported, so that torch loads after the settings."""
 
 from pathlib import Path
 from typing import Any

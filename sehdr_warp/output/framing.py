@@ -106,13 +106,13 @@ def opening_view(run: "LoadedScene") -> Camera | None:
     witnesses = evenly(photos, _WITNESSES)
 
     def score(camera: Camera) -> float:
-        shown = _share_shown(run, camera.within(_SIZE), witnesses)
+        coverage = _share_shown(run, camera.within(_SIZE), witnesses)
         aside = float(np.linalg.norm(camera.position - middle)) / extent
         held = 1.0
         if focus is not None and radius is not None:
             distance = float(np.linalg.norm(focus - camera.position))
             held = min(1.0, camera.height / 2 / camera.fy * distance / radius)
-        return shown - _ASIDE * aside + _TURNED * float(camera.world_to_camera[2, :3] @ common) + _WHOLE * held
+        return coverage - _ASIDE * aside + _TURNED * float(camera.world_to_camera[2, :3] @ common) + _WHOLE * held
 
     return max((_opening_of(camera, photos, up, focus, radius) for camera in evenly(photos, _OPENINGS)), key=score)
 

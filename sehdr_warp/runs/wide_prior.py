@@ -38,8 +38,8 @@ class WidePrior:
         """Prepare the faces.
 
         Args:
-            prior: what sees the faces.
-            camera: a panorama's or a fisheye lens's.
+            prior: network that estimates the light of a face.
+            camera: camera of a panorama or of a fisheye lens.
         """
         self.prior, self.camera = prior, camera
         self._faces: list[_Face] | None = None
@@ -69,11 +69,11 @@ class WidePrior:
         total, weight = torch.zeros(*size, 6, device=exposure.device), torch.zeros(*size, 1, device=exposure.device)
         padded = F.pad(picture, (1, 1, 0, 0), mode="circular" if wrapped else "replicate")
         for face in self._faces:
-            shown = F.grid_sample(padded, face.places, padding_mode="border", align_corners=False)
-            shown = shown[0].permute(1, 2, 0) * face.visible
-            if not bool((shown[..., 3:] > 0).any()):
+            view = F.grid_sample(padded, face.places, padding_mode="border", align_corners=False)
+            view = view[0].permute(1, 2, 0) * face.visible
+            if not bool((view[..., 3:] > 0).any()):
                 continue
-            found = self.prior.estimate(shown[..., :3], shown[..., 3:])
+            found = self.prior.estimate(view[..., :3], view[..., 3:])
             both = torch.cat([found.mean, found.deviation], 2).permute(2, 0, 1)[None]
             back = F.grid_sample(both, face.back, padding_mode="border", align_corners=False)
             total += face.weights * back[0].permute(1, 2, 0)

@@ -136,16 +136,16 @@ def test_rates_and_decays_follow_the_batch():
 def test_gradients_go_through_one_buffer():
     field = toy_field()
     optimizer = make_optimizer(field, VARIANTS["adc"], 1.0)
-    flat, given = FlatGradients(optimizer, 0, 1, defer_sh=False), {}
+    flat, gradients = FlatGradients(optimizer, 0, 1, defer_sh=False), {}
     for name in ("means", "opacity_logits"):
         parameter = getattr(field.gaussians, name)
-        given[name] = parameter.grad = torch.randn_like(parameter)
+        gradients[name] = parameter.grad = torch.randn_like(parameter)
     flat.collect(torch.tensor(2.0), torch.tensor(True))
     assert flat.fits(optimizer) and field.gaussians.means.grad is None
     flat.buffer.mul_(0.5)
     loss, incomplete, harmonics = flat.distribute()
     assert harmonics is None and loss == 1 and bool(incomplete) and field.gaussians.quaternions.grad is None
-    for name, gradient in given.items():
+    for name, gradient in gradients.items():
         assert torch.equal(getattr(field.gaussians, name).grad, gradient / 2)
     field.gaussians.resize(70, optimizer)
     assert not flat.fits(optimizer) and field.gaussians.count == 70

@@ -52,7 +52,7 @@ BLOCKS = {
 
 @pytest.mark.parametrize("name", BLOCKS)
 def test_plans_of_blocks(space, name):
-    """Of a run that a training would go on with."""
+    """Tamper with a run that a training would resume."""
     (space / "precious").mkdir()
     (space / "precious" / "a.txt").write_text("mine")
     (space / "new").mkdir()
@@ -85,7 +85,7 @@ def test_facts_beside_a_run(space, name, number):
 
 @pytest.mark.parametrize("number", range(len(DATA)))
 def test_load_arguments_of_a_run(space, number):
-    """Where a run says that its photos are."""
+    """State odd places of photos in a run."""
     values = json.loads((space / "run" / "run.json").read_text())
     values["data"] |= DATA[number]
     (space / "run" / "run.json").write_text(json.dumps(values))
