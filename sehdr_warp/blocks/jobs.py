@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from ..errors import SehdrError
+from ..parallel import thread_count
 from ..training.launch import installed_versions
 from .block_plan import BlockPlan
 from .job import FOLDER, BlockResult, folder_of, is_finished
@@ -66,6 +67,8 @@ def run_blocks(
     slots = min(gpus, len(waiting)) if slurm is None else len(waiting)
     executors = _executors(out, device, slots, slurm)
     arguments = ("cpu" if device.type == "cpu" else None), photos, installed_versions()
+    # Jobs that run beside each other on this machine share its processors.
+    job = BlockJob(max(1, thread_count() // slots) if slurm is None and slots > 1 else None)
     tries, errors = dict.fromkeys(waiting, 0), {}
     reached = {index: _newest_checkpoint(folder_of(out, plan, index)) for index in waiting}
     running: dict[int, tuple[int, Any]] = {}
@@ -76,29 +79,29 @@ def run_blocks(
                     continue
                 index = waiting.popleft()
                 tries[index] += 1
-                running[slot] = index, _submit(executors[slot], out.absolute(), index, *arguments)
+                running[slot] = index, _submit(executors[slot], job, out.absolute(), index, *arguments)
                 log.info("%s: training begins, %d photos", plan.blocks[index].name, len(plan.blocks[index].views))
             time.sleep(POLL if slurm is None else SLURM_POLL)
-            for slot, (index, job) in list(running.items()):
-                if not job.done():
+            for slot, (index, submitted) in list(running.items()):
+                if not submitted.done():
                     continue
                 del running[slot]
                 name, folder = plan.blocks[index].name, folder_of(out, plan, index)
-                error = _error_of(job, folder)
+                error = _error_of(submitted, folder)
                 if (now := _newest_checkpoint(folder)) != reached[index]:
                     tries[index], reached[index] = 0, now
                 if error is None:
                     finished += 1
                     log.info("%s: finished, %d of %d", name, finished, len(plan.blocks))
-                elif job.exception() is not None and tries[index] < TRIES:
+                elif submitted.exception() is not None and tries[index] < TRIES:
                     log.warning("%s: %s; it continues from its newest checkpoint", name, error)
                     waiting.append(index)
                 else:
                     log.info("%s: cannot be trained: %s", name, error)
                     errors[name] = error
     except BaseException:
-        for _, job in running.values():
-            job.cancel(check=False)
+        for _, submitted in running.values():
+            submitted.cancel(check=False)
         raise
     if errors:
         name, error = next(iter(errors.items()))
@@ -113,12 +116,12 @@ def _newest_checkpoint(folder: Path) -> str:
     return max((path.name for path in folder.glob("checkpoints/iteration_*")), default="")
 
 
-def _submit(executor: Any, *arguments: Any) -> Any:
+def _submit(executor: Any, job: BlockJob, *arguments: Any) -> Any:
     """Submit a block's job; raise SehdrError if SLURM refuses it."""
     from submitit.core.utils import FailedJobError
 
     try:
-        return executor.submit(BlockJob(), *arguments)
+        return executor.submit(job, *arguments)
     except (FailedJobError, OSError) as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
         raise SehdrError(f"SLURM does not take a job ({lines[-1]:.200}); check what --slurm asks for") from None

@@ -14,6 +14,7 @@ from sehdr_warp.blocks.job import folder_of, train_block
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.launch import installed_versions
 
 LITTLE = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_prior": False}
@@ -70,6 +71,23 @@ def test_a_file_system_that_loses_a_trained_block_is_named(divided, monkeypatch)
     with pytest.raises(SehdrError, match=rf"{lost}; .*; 1 of 2 blocks are finished; resume=True trains"):
         jobs.run_blocks(out, plan, device=torch.device("cpu"))
     assert jobs.is_finished(folder_of(out, plan, 0))
+    shutil.rmtree(out / "blocks")
+
+
+@pytest.mark.parametrize(("at_once", "threads"), [(1, 8), (2, 4)])
+def test_blocks_at_once_share_the_processors(divided, monkeypatch, at_once, threads):
+    folder, plan = divided
+    out = folder / "run"
+    monkeypatch.setenv("SEHDR_THREADS", "8")
+
+    def submit(job, *arguments):
+        result = job(*arguments)
+        return SimpleNamespace(done=lambda: True, exception=lambda: None, result=lambda: result)
+
+    monkeypatch.setattr(jobs, "_executors", lambda *_: [SimpleNamespace(submit=submit)] * at_once)
+    jobs.run_blocks(out, plan, device=torch.device("cpu"), gpus=at_once)
+    devices = {RunFolder(folder_of(out, plan, index)).read_summary()["device"] for index in range(2)}
+    assert devices == {f"cpu ({threads} threads)"}
     shutil.rmtree(out / "blocks")
 
 
