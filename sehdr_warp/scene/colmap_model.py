@@ -3,6 +3,7 @@
 import os
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,9 @@ from .lens import CAMERA_MODELS, Lens
 
 # pycolmap is not used here: it hangs on a damaged count and accepts a truncated file as a whole one.
 MAX_NAME_BYTES = 4096
+_DEEPEST = 3  # Levels of folders below a set in which a model is looked for
+_MOST_PLACES = 1000  # Folders of a level that are looked at
+_NO_MODELS = {"distorted", "images", "input"}
 _REMEDY = "export the model again with COLMAP"
 
 
@@ -46,20 +50,43 @@ class SparseModel:
     cloud: PointCloud
 
 
-def find_model(folder: Path) -> Path | None:
+def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:
     """Return the folder that holds a model's cameras, or None.
 
     Looks for sparse/0, sparse, or a text export (sparse/txt, sparse_txt, sparse_txt/0) in the folder itself, then in
-    its colmap/ and dense/. Of several models sparse/0, sparse/1 ... it is the one with the most images.
+    its colmap/ and dense/; `anywhere` also in the folder itself without sparse/ and in folders of it that are no sets.
+    Of several models sparse/0, sparse/1 ... it is the one with the most images.
     """
     names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
     places = (folder / above / name for above in (".", "colmap", "dense") for name in names)
     first = next((place for place in places if _is_model(place)), None)
+    first = first or (_model_elsewhere(folder) if anywhere else None)
     if first is None or first.name != "0":
         return first
     models = _numbered(first.parent)
     counts = {model: _image_count(model) for model in models} if len(models) > 1 else {first: 0}
     return max(counts, key=lambda model: counts[model])
+
+
+def _is_whole_model(place: Path) -> bool:
+    return any(all((place / f"{name}{end}").is_file() for name in ("cameras", "images")) for end in (".bin", ".txt"))
+
+
+def _model_elsewhere(folder: Path) -> Path | None:
+    """Return the model nearest to a folder, at most _DEEPEST levels down, that is not in a set of its own."""
+    places = [folder]
+    for _ in range(_DEEPEST + 1):
+        if models := [place for place in places if _is_whole_model(place)]:
+            return models[0]
+        inner: list[Path] = []
+        for place in places:
+            with suppress(OSError):
+                inner += sorted(each for each in place.iterdir() if each.is_dir() and not each.is_symlink())
+        # A folder with `images` is a set of its own; `distorted` is of photos before COLMAP undistorted them.
+        places = [each for each in inner if each.name not in _NO_MODELS and not (each / "images").is_dir()][
+            :_MOST_PLACES
+        ]
+    return None
 
 
 def other_models(model: Path) -> list[str]:
@@ -120,10 +147,11 @@ def read_model(folder: Path) -> SparseModel:
 
 
 def read_points(folder: Path) -> PointCloud:
-    """Read the points of points3D.bin, .txt or .ply; none if there is no such file."""
+    """Read the points of points3D.bin, .txt or .ply; none if there is no such file, or if it is empty."""
     readers = {".bin": _points_binary, ".txt": _points_text, ".ply": read_ply_points}
     for name in ("points3D.bin", "points3D.txt", "points3D.ply", "points3d.ply"):
-        if (path := folder / name).is_file():
+        # COLMAP asks for an empty file where poses are known and points are not.
+        if (path := folder / name).is_file() and path.stat().st_size:
             return readers[path.suffix](path)
     return NO_POINTS
 
@@ -222,7 +250,7 @@ def _points_binary(path: Path) -> PointCloud:
 def _records(path: Path, what: str, parse: Callable[[str], tuple]) -> Iterator[tuple]:
     """Parse the lines of a text file except empty ones and comments; ValueError becomes an InputError."""
     for number, line in enumerate(read_lines(path), start=1):
-        if line.strip() and not line.startswith("#"):
+        if line.strip() and not line.lstrip().startswith("#"):
             yield _parsed(path, number, line, what, parse)
 
 
@@ -234,7 +262,7 @@ def _image_records(path: Path) -> Iterator[tuple]:
     """
     after_image = False
     for number, line in enumerate(read_lines(path, "surrogateescape"), start=1):
-        if line.startswith("#"):
+        if line.lstrip().startswith("#"):
             continue
         if not line.strip() or (after_image and _is_observations(line)):
             after_image = False
@@ -265,7 +293,10 @@ def _parsed(path: Path, number: int, line: str, what: str, parse: Callable[[str]
 
 def _camera(line: str) -> tuple:
     number, model, width, height, *params = line.split()
-    return int(number), model, int(width), int(height), tuple(map(float, params))
+    sizes = float(width), float(height)
+    if not all(size.is_integer() for size in sizes):
+        raise ValueError
+    return int(number), model.upper(), *map(int, sizes), tuple(map(float, params))
 
 
 def _image(line: str) -> tuple:

@@ -48,7 +48,7 @@ def exr_exposure_time(path: Path) -> float | None:
     if path.suffix.lower() != ".exr":
         return None
     with _exr_file(path, header_only=True) as file:
-        time = file.header().get("expTime")
+        time = file.header(_colored_part(file)).get("expTime")
     return float(time) if isinstance(time, int | float) and np.isfinite(time) and time > 0 else None
 
 
@@ -142,7 +142,7 @@ def _from_luminance(channels: Mapping[str, np.ndarray], primaries: tuple[float, 
 
 
 def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict[str, np.ndarray], dict]:
-    """Read the channels of an OpenEXR file's first part over the display window, and its header.
+    """Read the channels of an OpenEXR file over the display window, and its header: of the part that is the picture.
 
     Pixels of the display window outside the data window are 0. Subsampled channels are interpolated. Values are as
     stored: NaN and infinity pass.
@@ -158,9 +158,11 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
         # A file whose pixels end early has no parts instead of raising.
         if not file.parts:
             raise InputError(path, "pixel data is damaged or ends early", DAMAGED)
-        header = dict(file.header())
+        part = _colored_part(file)
+        header = dict(file.header(part))
         arrays = {
-            name: (channel.pixels, channel.xSampling, channel.ySampling) for name, channel in file.channels().items()
+            name: (channel.pixels, channel.xSampling, channel.ySampling)
+            for name, channel in file.channels(part).items()
         }
     (low, high) = header["dataWindow"]
     left, top = (int(a) - b for a, b in zip(low, origin, strict=True))
@@ -174,6 +176,23 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
             channels[name] = np.zeros((height, width), np.float32)
             channels[name][max(top, 0) :, max(left, 0) :][: inside.shape[0], : inside.shape[1]] = inside
     return channels, header
+
+
+def _colored_part(file: Any) -> int:
+    """Return the number of an opened OpenEXR file's part that is the picture, 0 if none holds colors.
+
+    Passes may lie in parts of their own, also before the picture: of parts with colors the first one counts that is
+    named as the picture, else the first.
+    """
+    endings = [{name.rpartition(".")[2] for name in part.channels} for part in file.parts]
+    colored = [
+        number
+        for number, own in enumerate(endings)
+        if any(set(names) <= own for names in _COLOR_NAMES) or {"Y", "RY", "BY"} <= own
+    ]
+    names = {number: str(file.parts[number].header.get("name", "")) for number in colored}
+    pictures = [number for number in colored if names[number].rpartition(".")[2].lower() in _PICTURE_LAYERS]
+    return next(iter(pictures or colored), 0)
 
 
 def _interpolated(pixels: np.ndarray, shape: tuple[int, ...], sampling: list[int]) -> np.ndarray:
@@ -200,7 +219,7 @@ def _exr_file(path: Path, **options) -> Iterator:
 def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the display window's origin and its (width, height)."""
     with _exr_file(path, header_only=True) as file:
-        header = file.header()
+        header = file.header(_colored_part(file))
         windows = [[(int(x), int(y)) for x, y in header[key]] for key in ("displayWindow", "dataWindow")]
     sizes = [(high[0] - low[0] + 1, high[1] - low[1] + 1) for low, high in windows]
     file_size = path.stat().st_size

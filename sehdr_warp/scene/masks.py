@@ -1,5 +1,6 @@
 """Masks: which mask file belongs to which photo, and what its values mean."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ from .images import LDR_SUFFIXES, PHOTO_SUFFIXES, open_image, read_ldr
 from .names import bases_of, natural_key, sibling, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
+_OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
 _COMMON = ("mask", "camera_mask")  # Stems of a mask of all photos
 _MOST_NAMED = 3
 _MOST_LABELS = 31  # Larger values are weights relative to white
@@ -28,16 +30,18 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     Masks lie in `masks/` or `mask/` of the data folder, under the photo's path below the data folder or below the
     folder of all photos, with any picture suffix after or instead of the photo's (`masks/cam0/1.jpg.png`,
     `masks/cam0/1.png`), or under its file name alone if no two photos share that. An ending `_mask`, `-mask` or `.mask`
-    of the stem is ignored. Files with such an ending beside the photos are masks as well. In sets of several exposures,
-    a mask that is named like the view serves all its exposures. `mask.png` or `camera_mask.png` of the data folder is
-    the mask of all photos of its shape that have none of their own, as of a tripod or a car's bonnet.
+    of the stem is ignored. Files with such an ending beside the photos are masks as well, and so are those of a folder
+    `masks/` or `mask/` there. In sets of several exposures, a mask named like the view serves all its exposures.
+    `mask.png` or `camera_mask.png` of the data folder is the mask of all photos of its shape that have none of their
+    own, as of a tripod or a car's bonnet.
 
     Args:
         records: the photos; a mask that the set states itself stays.
         folder: the data folder.
 
     Returns:
-        The photos with their masks, and a note for each mask folder with files that fit no photo.
+        The photos with their masks, and a note for each mask folder with files that fit no photo, or whose name is
+        not read.
 
     Raises:
         InputError: if a mask is a link that leads out of the data folder.
@@ -46,7 +50,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     shared = Counter(
         key for image, view in {(s.image, s.view) for s in records} for key in {image.name, image.stem, view}
     )
-    places = [place for name in MASK_FOLDERS if (place := folder / name).is_dir()]
+    places = _mask_folders(folder)
     files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
     index = [{key: file for file, key in reversed(keys.items())} for keys in files.values()]
     beside = {parent: _masks_beside(parent) for parent in {record.image.parent for record in records}}
@@ -72,7 +76,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
             names_text = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
             count = "1 file that fits" if len(names) == 1 else f"{len(names)} files that fit"
             notes.append(f"{place.name}/ holds {count} no photo: {names_text}; {_REMEDY}")
-    return masked, notes
+    used = {place for mask in mask_files if mask is not None for place in mask.parents}
+    return masked, [*notes, *_unread_masks(folder, places, used)]
 
 
 def read_mask(path: Path, *, oriented: bool = False, labeled: set[Path] | None = None) -> np.ndarray:
@@ -181,11 +186,48 @@ def _files_below(place: Path) -> list[Path]:
 
 
 def _masks_beside(parent: Path) -> dict[str, Path]:
-    """Map photos' names or stems to the masks that lie in the photos' own folder."""
+    """Map photos' names or stems to the masks that lie in the photos' own folder, or in a mask folder there."""
     if not parent.is_dir():
         return {}
     files = (file for file in parent.iterdir() if file.suffix.lower() in LDR_SUFFIXES)
-    return {key: file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
+    masks = {key: file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
+    inner = (file for place in _mask_folders(parent) for file in _files_below(place) if file.parent == place)
+    return {without_mask_ending(file.stem): file for file in inner} | masks
+
+
+def _mask_folders(folder: Path) -> list[Path]:
+    """List the folders of masks in a folder, `masks` before `mask`, in any case."""
+    if not folder.is_dir():
+        return []
+    inner = [place for place in sorted(folder.iterdir()) if place.name.lower() in MASK_FOLDERS and place.is_dir()]
+    return sorted(inner, key=lambda place: MASK_FOLDERS.index(place.name.lower()))
+
+
+def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list[str]:
+    """Return notes on folders that look like masks and are not read, and on files in mask folders of other kinds.
+
+    Args:
+        folder: the data folder.
+        places: its folders of masks.
+        used: folders of the masks that photos have.
+    """
+    notes = []
+    for place in places:
+        others = sorted(file for file in place.rglob("*") if file.suffix.lower() in _OTHER_MASKS)
+        if others:
+            names_text = ", ".join(file.name for file in others[:_MOST_NAMED]) + " ..." * (len(others) > _MOST_NAMED)
+            count = f"{len(others)} files" if len(others) > 1 else "1 file"
+            notes.append(f"{place.name}/ holds {count} of kinds that are not read as masks: {names_text}; use PNG")
+    if not folder.is_dir():
+        return notes
+    # nerfstudio writes masks_2, masks_4, ... beside masks.
+    looks = r"(?!masks_\d+$).*(mask|segment)" if places else r".*(mask|segment)"
+    for place in sorted(folder.iterdir()):
+        if place in places or place in used or not re.match(looks, place.name, re.IGNORECASE):
+            continue
+        if place.is_dir() and _files_below(place):
+            notes.append(f"{place.name}/ is not read: if it holds masks of the photos, name it masks/")
+    return notes
 
 
 def _is_photo(key: str, bases: Sequence[Path]) -> bool:

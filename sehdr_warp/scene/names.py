@@ -3,9 +3,11 @@
 import itertools
 import os
 import re
+import unicodedata
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 
 from ..files import contained
@@ -44,8 +46,9 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
     """Return the image of a name that a data file states, None if it is not there.
 
     Names written on Windows have backslashes, and names that are not UTF-8 are tried as Latin-1 too. A photo with
-    another suffix, as after a conversion, is found by its stem. An absolute name, as of a set that was copied, stands
-    for the file in the folder that its last parts name.
+    another suffix, as after a conversion, is found by its stem. An absolute name, or one that begins with `..`, as of a
+    set that was copied, stands for the file in the folder that its last parts name. Upper and lower case, and the
+    forms in which Unicode writes an accent, count as equal if no file has the exact name.
 
     Args:
         folder: of the images.
@@ -65,20 +68,65 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         names = {inner: None}
     places = [contained(folder, each, source) for each in names]
     image = next((place for place in places if os.path.isfile(place)), None)
-    return image or next((photo for place in places if (photo := sibling(place, PHOTO_SUFFIXES))), None)
+    image = image or next((photo for place in places if (photo := sibling(place, PHOTO_SUFFIXES))), None)
+    return image or next((photo for each in names if (photo := _alike(folder, each, source))), None)
 
 
 def _inside(folder: Path, name: str, source: Path) -> str | None:
     """Return the longest end of an absolute name that is a photo in the folder, None if there is none."""
     path = PureWindowsPath(name)
-    if not path.anchor or "\0" in name or ".." in path.parts:
+    parts = path.parts
+    above = next((number for number, part in enumerate(parts) if part != ".."), len(parts))
+    if not (path.anchor or above) or "\0" in name or ".." in parts[above:]:
         return None
-    for start in range(1, len(path.parts)):
-        end = "/".join(path.parts[start:])
+    for start in range(max(above, 1), len(parts)):
+        end = "/".join(parts[start:])
         place = contained(folder, end, source)
         if os.path.isfile(place) or sibling(place, PHOTO_SUFFIXES) or sibling(Path(f"{place}.png"), PHOTO_SUFFIXES):
             return end
     return None
+
+
+def _alike(folder: Path, name: str, source: Path) -> Path | None:
+    """Return the photo whose path below a folder differs from a name by case or the form of accents alone.
+
+    The suffix may be that of another kind of photo, and the name may begin with the name of the folder itself.
+    """
+    parts = [part for part in name.split("/") if part not in ("", ".")]
+    if not parts:
+        return None
+    if len(parts) > 1 and _folded(parts[0]) == _folded(folder.name):
+        return find_image(folder, "/".join(parts[1:]), source)
+    place = folder
+    for part in parts[:-1]:
+        names = _entries(place)
+        if _folded(part) not in names:
+            return None
+        place /= names[_folded(part)]
+    names = _entries(place)
+    stem = PureWindowsPath(parts[-1]).stem
+    endings = dict.fromkeys((_folded(parts[-1]), *(_folded(stem) + suffix for suffix in PHOTO_SUFFIXES)))
+    found = next((names[ending] for ending in endings if ending in names), None)
+    photo = None if found is None else contained(folder, (place / found).relative_to(folder).as_posix(), source)
+    return photo if photo is not None and os.path.isfile(photo) else None
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _entries(folder: Path) -> Mapping[str, str]:
+    """Return the names in a folder by their folded form; empty if it cannot be read."""
+    try:
+        return _entries_at(folder, folder.stat().st_mtime_ns)
+    except OSError:
+        return {}
+
+
+@lru_cache(maxsize=64)
+def _entries_at(folder: Path, changed: int) -> Mapping[str, str]:
+    """Return _entries(); `changed` is when the folder changed."""
+    return {_folded(name): name for name in sorted(os.listdir(folder), reverse=True)}
 
 
 def distinct(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[str]]:

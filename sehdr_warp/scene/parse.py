@@ -19,6 +19,7 @@ from .read_folders import (
     find_photos,
     image_folder,
     is_hdr_gs,
+    model_fits,
     place_photos,
     read_colmap,
     read_hdr_gs,
@@ -130,7 +131,7 @@ def _read(folder: Path) -> DataparserOutputs:
     def has(*names: str) -> bool:
         return all((folder / name).is_file() for name in names)
 
-    model = find_model(folder)
+    model = find_model(folder, anywhere=True)
     beside = model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None
     readers = (
         (has("transforms_train.json", "exposure_train.json"), read_hdr_nerf),
@@ -138,7 +139,7 @@ def _read(folder: Path) -> DataparserOutputs:
         (is_hdr_gs(folder), read_hdr_gs),
         (beside, read_colmap),
         (has("transforms.json") or has("transforms_train.json"), read_transforms),
-        (model is not None, read_colmap),
+        (model is not None and model_fits(folder, model), read_colmap),
         (has(OPENSFM_FILE), read_opensfm),
         (has("poses_bounds.npy"), read_llff),
     )

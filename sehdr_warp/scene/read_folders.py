@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -41,6 +41,7 @@ _OTHERS = ("masks", "mask", "hdr", "exr")  # Folders of pictures that are not ph
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 # HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
 _HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)
+_LOOKED_FOR = 20  # Images of a model by whose names their folder is found
 _DEEPEST = 3  # Levels of folders in which photos are looked for, to name their folder
 # By which a program states cameras, in lower case.
 _POSE_FILES = {
@@ -57,11 +58,31 @@ def image_folder(folder: Path) -> Path | None:
     return next((folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()), None)
 
 
+def model_fits(folder: Path, model: Path) -> bool:
+    """Return whether a model is one of a set: it lies where COLMAP puts it, or photos of its names are there."""
+    if model == find_model(folder) or model == folder:
+        return True
+    names = [image.name for image in read_model(model).images[:_LOOKED_FOR]]
+    places = [place for place in (image_folder(folder), _folder_of(names, folder)) if place is not None]
+    return any(find_image(place, name, model) for place in places for name in names)
+
+
+def _folder_of(names: Sequence[str], folder: Path) -> Path | None:
+    """Return the folder of a set, or one directly in it, that holds a photo under one of the exact names."""
+    places = [folder, *sorted(place for place in folder.iterdir() if place.is_dir() and place.name not in _OTHERS)]
+    inner = [name.replace("\\", "/") for name in names]
+    files = ((place, name) for place in places for name in inner if not PurePosixPath(name).is_absolute())
+    return next((place for place, name in files if ".." not in name and (place / name).is_file()), None)
+
+
 def read_colmap(folder: Path) -> DataparserOutputs:
     """Parse a COLMAP set: one record for each image of the model, in the natural order of the names."""
     model, source = _model(folder)
     beside = (place for place in source.parents if place.is_relative_to(folder))  # dense/images is beside dense/sparse
     images = image_folder(folder) or next(filter(None, map(image_folder, beside)), None)
+    images = images or _folder_of([image.name for image in model.images[:_LOOKED_FOR]], folder)
+    if images is None and source == folder:
+        raise InputError(folder, "is a COLMAP model without photos", "give the folder that holds it and images/")
     if images is None:
         raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
     records, absent, photo_names = [], [], []
@@ -154,7 +175,7 @@ def _poses_by_view(folder: Path) -> tuple[PointCloud, dict[str, tuple]]:
 
 
 def _model(folder: Path) -> tuple[SparseModel, Path]:
-    source = find_model(folder) or folder / "sparse"
+    source = find_model(folder, anywhere=True) or folder / "sparse"
     model = read_model(source)
     if not model.images:
         raise InputError(source, "the model has no registered views", "run structure from motion again")
@@ -273,6 +294,9 @@ def find_photos(folder: Path) -> DataparserOutputs:
         )
     _require_photos(len(photos), photos[0], folder)
     notes = _foreign_poses(folder)
+    if model := find_model(folder, anywhere=True):
+        place = model.relative_to(folder).as_posix()
+        notes.append(f"the COLMAP model in {place} names none of these photos and is not used")
     if photos[0].parent == folder and (inner := [name for name in _folders_with_photos(folder) if name not in _OTHERS]):
         notes.append(f"photos in folders of it are not read: {_listing(inner)}")
     records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)

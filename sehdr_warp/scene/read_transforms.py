@@ -168,7 +168,11 @@ def _frame_image(folder: Path, name: str, path: Path) -> Path | None:
     """Return the photo of a frame, None if there is no such file."""
     # Blender's file_path has no ending; a dot in the stem is not one.
     has_suffix = PurePath(name).suffix.lower() in PHOTO_SUFFIXES
-    return find_image(folder, name if has_suffix else f"{name}.png", path)
+    name = name if has_suffix else f"{name}.png"
+    image = find_image(folder, name, path)
+    if image is None and (folder / "images").is_dir():
+        image = find_image(folder / "images", name, path)
+    return image
 
 
 def _frame_record(
@@ -237,7 +241,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         if image is None:
             raise InputError(path, "states no image size", "add w and h")
         width, height = photo_sizes(image)[0]
-    if fields.get("camera_model") == "EQUIRECTANGULAR":
+    if str(fields.get("camera_model")).upper() == "EQUIRECTANGULAR":
         return Lens("EQUIRECTANGULAR", int(width), int(height), (width, height), path)
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
@@ -245,13 +249,13 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     center = number("cx", width / 2), number("cy", height / 2)
     pinhole: tuple[Any, ...] = fy if fx is None else fx, fx if fy is None else fy, *center
     k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model, bent = fields.get("camera_model") or "OPENCV", (k1, k2, p1, p2)
+    model, bent = str(fields.get("camera_model") or "OPENCV").upper(), (k1, k2, p1, p2)
     if model == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True:
         model, bent = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL"):
         raise InputError(
             path,
-            f"camera_model {model!r:.40} is not supported",
+            f"camera_model {fields['camera_model']!r:.40} is not supported",
             "use OPENCV, OPENCV_FISHEYE, PINHOLE or EQUIRECTANGULAR",
         )
     elif k4:

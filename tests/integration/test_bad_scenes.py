@@ -203,7 +203,7 @@ PHOTOS = {
     "truth empty": (lambda data: _truth(data).write_bytes(b""), "001.exr"),
     "truth of huge windows": (lambda data: _huge_window(_truth(data)), "001.exr"),
     "truth is no OpenEXR": (lambda data: _truth(data).write_bytes(b"\x76\x2f\x31\x01" + b"\xff" * 64), "001.exr"),
-    "no folder of photos": (lambda data: (data / "images").rename(data / "photos"), "images: folder not found"),
+    "no folder of photos": (lambda data: (data / "images").rename(data.parent / "photos"), "images: folder not found"),
     "no photos": (lambda data: [path.unlink() for path in (data / "images").iterdir()], "none of the model's 6"),
 }
 

@@ -187,6 +187,27 @@ def test_layers_without_a_picture_are_named(tmp_path):
         read_hdr(write_exr(tmp_path / "a.exr", channels))
 
 
+@pytest.mark.parametrize(
+    "parts",
+    [("depth", "rgb"), ("rgb", "depth"), ("diffuse", "beauty"), ("left", "right"), ("Scene.Depth", "Scene.Combined")],
+)
+def test_the_picture_of_a_file_of_parts(tmp_path, parts):
+    """Passes may lie in parts of their own, also before the picture; of two views the first one counts."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    picture = (
+        "left"
+        if "left" in parts
+        else next(name for name in parts if name.split(".")[-1] in ("rgb", "beauty", "Combined"))
+    )
+    written = []
+    for name in parts:
+        channels = {"Z": np.ones((6, 8), np.float32)} if "epth" in name else planes(RGB if name == picture else RGB * 3)
+        written.append(OpenEXR.Part({**header, "expTime": 0.5}, channels, name=name))
+    OpenEXR.File(written).write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(read_hdr(tmp_path / "a.exr")[2, 3], RGB)
+    assert exr_exposure_time(tmp_path / "a.exr") == 0.5
+
+
 def test_a_float_image_that_is_not_finite_is_left_out(tmp_path):
     float_set(tmp_path, 0.1 + pattern(40, 30) / 255, [0.01] * 6, stated=False)
     bad = planes((0.1, np.nan, 0.1), (30, 40))

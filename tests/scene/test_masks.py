@@ -50,6 +50,8 @@ def masks_said(scene):
         "mask/{}.png",
         "masks/images/{}.png",
         "images/{}_mask.png",
+        "images/masks/{}.png",
+        "Masks/{}.png",
     ],
 )
 @pytest.mark.parametrize("layout", [write_colmap, write_llff])
@@ -71,6 +73,39 @@ def test_masks_of_photos_in_folders_of_same_names(tmp_path):
     scene = load(tmp_path, holdout=0)
     assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
     assert "masks/ holds 1 file that fits no photo: 0000.png; name each like its photo" in masks_said(scene)[0]
+
+
+def test_masks_in_a_folder_of_each_camera(tmp_path):
+    write_colmap(tmp_path, name="cam{0}/0000.png")
+    write_mask(tmp_path / "images" / "cam1" / "masks" / "0000.png")
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
+    assert not any("in no view" in note for note in scene.notes)
+
+
+def test_folders_and_files_that_look_like_masks_are_named(tmp_path):
+    write_colmap(tmp_path)
+    for folder in ("dynamic_masks", "Segmentation", "masks", "masks_2"):
+        write_mask(tmp_path / folder / "000.png")
+    Image.new("L", (64, 48)).save(tmp_path / "masks" / "001.gif")
+    assert masks_said(load(tmp_path, holdout=0)) == [
+        "masks/ holds 1 file of kinds that are not read as masks: 001.gif; use PNG",
+        "Segmentation/ is not read: if it holds masks of the photos, name it masks/",
+        "dynamic_masks/ is not read: if it holds masks of the photos, name it masks/",
+        "masks: 1 of 6 photos have one; they leave out 50.0 % of their pixels",
+    ]
+
+
+def test_a_folder_of_masks_that_frames_state_is_not_named(tmp_path):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(values["frames"]):
+        frame["mask_path"] = f"segmentation/{i}.png"
+        write_mask(tmp_path / "segmentation" / f"{i}.png", HALF[4:44, 4:34].T)
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    assert masks_said(load(tmp_path, holdout=0)) == [
+        "masks: 6 of 6 photos have one; they leave out 50.0 % of their pixels"
+    ]
 
 
 def test_masks_that_fit_no_photo_are_named(tmp_path):

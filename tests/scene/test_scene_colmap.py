@@ -7,6 +7,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.colmap_model import find_model
 from sehdr_warp.scene.lens import CAMERA_MODELS
+from sehdr_warp.scene.read_folders import find_photos, model_fits
 from tests.make_scenes import arc_poses, load, pattern, write_colmap
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -39,6 +40,68 @@ def test_models_are_found_where_people_keep_them(tmp_path, place):
     (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
     model.rename(tmp_path / place)
     assert find_model(tmp_path) == tmp_path / place and load(tmp_path).format == "colmap"
+
+
+@pytest.mark.parametrize("place", [".", "model", "undistorted/sparse", "Sparse/0"])
+@pytest.mark.parametrize("photos", ["images", "Images", "input", "."])
+def test_models_and_photos_are_found_in_other_folders_by_the_names_of_the_photos(tmp_path, place, photos):
+    write_colmap(tmp_path, name="{:03d}.png")
+    model = (tmp_path / "sparse" / "0").rename(tmp_path / "before")
+    (tmp_path / "sparse").rmdir()
+    images = (tmp_path / "images").rename(tmp_path / "photos_before")
+    for source, target in ((model, tmp_path / place), (images, tmp_path / photos)):
+        target.mkdir(parents=True, exist_ok=True)
+        for file in source.iterdir():
+            file.rename(target / file.name)
+        source.rmdir()
+    scene = load(tmp_path, holdout=0)
+    assert scene.format == "colmap" and len(scene.views) == 6
+
+
+def test_a_model_that_names_none_of_the_photos_is_not_used_and_named(tmp_path):
+    write_colmap(tmp_path / "old")
+    (tmp_path / "old" / "images").rename(tmp_path / "elsewhere")
+    for file in (tmp_path / "elsewhere").iterdir():
+        file.rename(tmp_path / f"photo_{file.name}")
+    (tmp_path / "elsewhere").rmdir()
+    dataset = find_photos(tmp_path)
+    assert dataset.notes == ("the COLMAP model in old/sparse/0 names none of these photos and is not used",)
+    assert not model_fits(tmp_path, tmp_path / "old" / "sparse" / "0")
+
+
+def test_a_folder_above_sets_is_no_set(tmp_path):
+    write_colmap(tmp_path / "room")
+    assert find_model(tmp_path, anywhere=True) is None
+    with pytest.raises(InputError, match="give one of its folders with photos: room"):
+        load(tmp_path)
+
+
+def test_a_model_without_its_photos_is_named(tmp_path):
+    write_colmap(tmp_path)
+    with pytest.raises(InputError, match="is a COLMAP model without photos; give the folder that holds it and images/"):
+        load(tmp_path / "sparse" / "0")
+
+
+@pytest.mark.parametrize("file", ["points3D.txt", "points3D.bin", "points3D.ply"])
+def test_an_empty_file_of_points_has_none(tmp_path, file):
+    """COLMAP asks for one where poses are known and points are not."""
+    write_colmap(tmp_path)
+    for path in (tmp_path / "sparse" / "0").glob("points3D.*"):
+        path.unlink()
+    (tmp_path / "sparse" / "0" / file).write_bytes(b"")
+    assert len(load(tmp_path).points) == 0
+
+
+def test_text_models_of_scripts(tmp_path):
+    """Indented comments, sizes as floats, models in lower case."""
+    write_colmap(tmp_path)
+    images, cameras = (tmp_path / "sparse" / "0" / f"{name}.txt" for name in ("images", "cameras"))
+    images.write_text("  # by a script\n" + images.read_text().replace(" ", "\t"))
+    cameras.write_text("\t# by a script\n" + cameras.read_text().replace("PINHOLE 64 48", "pinhole 64.0 48.0"))
+    assert [view.camera.width for view in load(tmp_path, holdout=0).views] == [64] * 6
+    cameras.write_text(cameras.read_text().replace("64.0", "64.5"))
+    with pytest.raises(InputError, match="line 4 is not a camera|line 5 is not a camera"):
+        load(tmp_path)
 
 
 def test_every_camera_model_has_pycolmaps_id_and_parameters():

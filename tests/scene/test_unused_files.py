@@ -191,3 +191,36 @@ def test_text_models_as_other_tools_write_them(tmp_path):
         text = file.read_text().replace("e-1", "e-01").replace("e-0", "e-00").replace("\n", "\r\n")
         file.write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert len(load(tmp_path, holdout=0).views) == 6
+
+
+@pytest.mark.parametrize("stored", ["GRÖßE_{}.PNG", "gro\u0308ße_{}.png", "Größe_{}.jpg"])
+@pytest.mark.parametrize("folder", ["", "images/", "cam/"])
+def test_case_and_forms_of_accents_do_not_matter(tmp_path, stored, folder):
+    """Windows and macOS take such names for the same; a set may also name photos from the folder above."""
+    write_colmap(tmp_path, name=("cam/" if folder == "cam/" else "") + "größe_{}.png")
+    text = (tmp_path / "sparse" / "0" / "images.txt").read_text()
+    if folder == "images/":
+        (tmp_path / "sparse" / "0" / "images.txt").write_text(text.replace("größe", "images/größe"))
+    place = tmp_path / "images" / ("cam" if folder == "cam/" else ".")
+    for i in range(6):
+        (place / f"größe_{i}.png").rename(place / stored.format(i))
+    scene = load(tmp_path, holdout=0)
+    assert [view.source.name for view in scene.views] == [stored.format(i) for i in range(6)]
+
+
+@pytest.mark.parametrize("name", ["../images/r_{}.png", "../../data/set/images/r_{}.png", "r_{}.png", "r_{}"])
+def test_names_from_another_folder(tmp_path, name):
+    """Relative to where a script ran, or without the folder."""
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(values["frames"]):
+        frame["file_path"] = name.format(i)
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    assert len(load(tmp_path, holdout=0).views) == 6
+    (tmp_path.parent / "r_0.png").write_bytes((tmp_path / "images" / "r_0.png").read_bytes())
+    shutil.rmtree(tmp_path / "images")
+    try:
+        with pytest.raises(InputError, match="contains '..'; use a path relative to|image file not found"):
+            load(tmp_path)
+    finally:
+        (tmp_path.parent / "r_0.png").unlink()
