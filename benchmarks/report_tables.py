@@ -128,7 +128,7 @@ def _rows_table(name: str, result: dict) -> Iterable[str]:
 
 
 def _captures_tables(result: dict) -> Iterable[str]:
-    table, figures = [], ("psnr", "best", "psnr_fitted", "ssim", "lpips", "seconds", "memory", "gaussians")
+    table, figures = [], ("psnr", "best", "psnr_fitted", "ssim", "lpips", "seconds", "reached", "memory", "gaussians")
     for rows in groups(result["rows"], "capture", "size", "method", "iterations").values():
         columns = [name for name in figures if all(row.get(name) is not None for row in rows)]
         means = {name: fmean(row[name] for row in rows) for name in columns}
