@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..prior import coarse_size, combined_estimates, load_prior
 from ..response import Response
-from ..scene import View
+from ..scene import Camera, View
+from ..scene.wide_camera import solid_angles
 from .config import LossConfig
 from .wide_prior import WidePrior
 
@@ -31,7 +33,8 @@ def light_estimates(
         response: the curve by which exposures are compared; None where they are not.
         config: of the loss.
         device: on which the prior runs.
-        holding: as in combined_estimates().
+        holding: as in combined_estimates(); estimates of panoramas and wide fisheye photos then weigh by the solid
+            angles of their pixels, relative to the mean, as the rest of the loss does.
 
     Raises:
         InputError: if the weights of the prior cannot be read.
@@ -57,6 +60,16 @@ def light_estimates(
         evidence = view.light_above_white
         evidence = None if evidence is None else torch.from_numpy(evidence).to(device).float()
         deviation = view.light_above_white_deviation
-        estimates = combined_estimates(exposure, mask.to(device), seeing, evidence, deviation, holding=holding)
-        result.append(estimates.cpu())
+        estimates = combined_estimates(exposure, mask.to(device), seeing, evidence, deviation, holding=holding).cpu()
+        result.append(_by_solid_angle(estimates, view.camera) if holding else estimates)
     return result
+
+
+def _by_solid_angle(estimates: Tensor, camera: Camera) -> Tensor:
+    """Return estimates [h, w, 6] whose squared weights are multiplied by the solid angles of the camera's pixels."""
+    if camera.is_pinhole:
+        return estimates
+    angles = torch.from_numpy(solid_angles(camera))
+    weights = F.interpolate(angles[None, None], size=estimates.shape[:2], mode="area")[0, 0, :, :, None]
+    weights = (weights / angles.mean().clamp_min(1e-6)).sqrt()
+    return torch.cat([estimates[..., :3], (estimates[..., 3:] * weights).half()], 2)

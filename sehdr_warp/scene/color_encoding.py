@@ -180,13 +180,13 @@ def encoding_of_profile(data: bytes, colors: str = "RGB") -> ColorEncoding:
     return _simplified(name, profile.to_rec709, profile.curves)
 
 
-def note_of(encodings: dict[str, ColorEncoding | None]) -> list[str]:
+def note_of(encodings: dict[Path, ColorEncoding | None]) -> list[str]:
     """Describe for the user what photos state of their colors.
 
     Args:
-        encodings: by the name of each photo, None for a photo that states nothing.
+        encodings: by the path of each photo, None for a photo that states nothing.
     """
-    notes: dict[str, list[str]] = {}
+    notes: dict[str, list[Path]] = {}
     for name, encoding in encodings.items():
         if encoding is not None and encoding.problem:
             notes.setdefault(f"count as sRGB: {encoding.problem}", []).append(name)
@@ -195,7 +195,7 @@ def note_of(encodings: dict[str, ColorEncoding | None]) -> list[str]:
         elif encoding is not None and not encoding.is_srgb:
             notes.setdefault(f"are in {encoding.name} and are converted to Rec.709", []).append(name)
     count = len(encodings)
-    several = {text: f"{names[0]}{' ...' * (len(names) > 1)}" for text, names in notes.items()}
+    several = {text: f"{names[0].name}{' ...' * (len(names) > 1)}" for text, names in notes.items()}
     return [f"colors: {len(notes[text])} of {count} photos {text} ({photos})" for text, photos in several.items()]
 
 

@@ -110,6 +110,19 @@ def read_items(path: Path) -> HeifItems:
         raise InputError(path, f"its list of pictures is damaged ({error!s:.80})", _DAMAGED) from None
 
 
+def avif_bits(path: Path) -> int:
+    """Return the bits of an AVIF photo's samples: 8, 10 or 12; 8 for other files, or if it does not state them."""
+    with path.open("rb") as file:
+        if b"avif" not in file.read(64)[4:]:
+            return 8
+    try:
+        items = read_items(path)
+        data = next(data for kind, data in items.items[items.primary].properties if kind == "av1C")
+        return 12 if data[2] & 0x20 else 10 if data[2] & 0x40 else 8
+    except (InputError, KeyError, IndexError, StopIteration):
+        return 8
+
+
 def item_bytes(path: Path, item: Item) -> bytes:
     """Return the bytes of an item. Raises InputError if they reach beyond the file, or are more than it holds."""
     if item.inside is not None:

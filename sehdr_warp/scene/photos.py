@@ -12,6 +12,7 @@ from ..errors import InputError
 from .color_encoding import note_of, stated_encoding
 from .dataparser import UNPLACED, ImageRecord
 from .hdr_files import hdr_size
+from .heif import avif_bits
 from .images import EncodedImage, image_sizes, open_image, read_ldr, require_file
 from .lens import Lens
 from .linear_photos import kind_of, raw_sizes, read_raw, tone_mapped
@@ -48,7 +49,9 @@ def usable_photos(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], st
             problems.append(error)
     notes += left_out(problems, len(selected))
     if kind == "encoded":
-        notes += note_of({record.image.name: record.encoding for record in usable})
+        notes += note_of({record.image: record.encoding for record in usable})
+        if deep := [record.image.name for record in usable if avif_bits(record.image) > 8]:
+            notes.append(f"AVIF is read with 8 bits, and {_names_text(deep)} hold more: use HEIC, PNG or TIFF for all")
         light = [record.encoding is not None and record.encoding.light is not None for record in usable]
         if any(light):
             linear = 2 * sum(light) >= len(light)

@@ -10,6 +10,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import LossConfig
 from sehdr_warp.runs.light_estimates import light_estimates
 from sehdr_warp.scene import Camera, View
+from sehdr_warp.scene.wide_camera import solid_angles
 from sehdr_warp.training.targets import photo_source
 
 SRGB = response_by_name("srgb")
@@ -67,3 +68,20 @@ def test_panoramas_are_seen_by_perspective_faces():
     known = first[..., 3] > 0
     assert 0 < known.float().mean() < 0.01 and known[first.shape[0] // 2, first.shape[1] // 2]
     assert (second == 0).all()
+
+
+def test_estimates_of_a_panorama_weigh_by_solid_angle_in_a_training():
+    """A pixel beside a pole covers next to nothing of the sphere; the mean weight is that of a pinhole's pixels."""
+    height, width = 16, 32
+    scale = width / (2 * np.pi)
+    camera = Camera(width, height, scale, scale, width / 2, height / 2, np.eye(4), "equirectangular")
+    codes = np.full((height, width, 3), 255, np.uint8)
+    above = np.full(codes.shape, 4.0, np.float16)
+    photo = replace(view(0), codes=codes, camera=camera, light_above_white=above, light_above_white_deviation=0.5)
+    options = [photo], SRGB, LossConfig(light_prior=False), CPU
+    (plain,), (held,) = light_estimates(*options), light_estimates(*options, holding=True)
+    assert torch.equal(plain[..., :3], held[..., :3]) and plain[..., 3:].unique().tolist() == [2.0]
+    weights = (held[..., 3:].float() ** 2 / 4)[:, 0, 0]
+    expected = solid_angles(camera)[:, 0] / solid_angles(camera).mean()
+    assert weights.tolist() == pytest.approx(expected.reshape(len(weights), -1).mean(1).tolist(), rel=5e-3)
+    assert weights.mean() == pytest.approx(1, rel=5e-3) and weights[0] < 0.2 * weights[len(weights) // 2]

@@ -268,6 +268,14 @@ def test_gamma_and_primaries_of_png(tmp_path):
         assert stated_encoding(image).is_srgb
 
 
+def test_photos_of_one_name_in_several_folders_are_counted_each(tmp_path):
+    write_colmap(tmp_path, name="cam{}/0000.png")
+    for path in (tmp_path / "images").rglob("*.png"):
+        Image.open(path).save(path, icc_profile=icc_profile("Display P3", name="P3"))
+    notes = [note for note in load(tmp_path, holdout=0).notes if note.startswith("colors")]
+    assert notes == ["colors: 6 of 6 photos are in P3 (ICC profile) and are converted to Rec.709 (0000.png ...)"]
+
+
 @pytest.mark.parametrize("stated", [{0xA001: 2}, {0xA001: 0xFFFF, "index": "R03"}])
 def test_adobe_rgb_of_exif(tmp_path, stated):
     exif = Image.Exif()
