@@ -308,7 +308,7 @@ def _image(line: str) -> tuple:
 
 def _point(line: str) -> tuple:
     _, x, y, z, *color = line.split(maxsplit=7)[:7]
-    color = [int(value) for value in color]
+    color = [int(float(value)) for value in color]
     if len(color) != 3 or not 0 <= min(color) <= max(color) <= 255:
         raise ValueError
     return float(x), float(y), float(z), *color

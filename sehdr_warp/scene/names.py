@@ -105,7 +105,9 @@ def _alike(folder: Path, name: str, source: Path) -> Path | None:
         place /= names[_folded(part)]
     names = _entries(place)
     stem = PureWindowsPath(parts[-1]).stem
-    endings = dict.fromkeys((_folded(parts[-1]), *(_folded(stem) + suffix for suffix in PHOTO_SUFFIXES)))
+    # A name may have no suffix, and a dot all the same.
+    stems = _folded(parts[-1]), _folded(stem)
+    endings = dict.fromkeys((stems[0], *(each + suffix for each in stems for suffix in PHOTO_SUFFIXES)))
     found = next((names[ending] for ending in endings if ending in names), None)
     photo = None if found is None else contained(folder, (place / found).relative_to(folder).as_posix(), source)
     return photo if photo is not None and os.path.isfile(photo) else None

@@ -4,7 +4,7 @@ import math
 import re
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path, PurePath
+from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -168,10 +168,13 @@ def _frame_image(folder: Path, name: str, path: Path) -> Path | None:
     """Return the photo of a frame, None if there is no such file."""
     # Blender's file_path has no ending; a dot in the stem is not one.
     has_suffix = PurePath(name).suffix.lower() in PHOTO_SUFFIXES
-    name = name if has_suffix else f"{name}.png"
-    image = find_image(folder, name, path)
+    full = name if has_suffix else f"{name}.png"
+    image = find_image(folder, full, path)
     if image is None and (folder / "images").is_dir():
-        image = find_image(folder / "images", name, path)
+        image = find_image(folder / "images", full, path)
+    if image is None and not has_suffix and (other := find_image(folder, name, path)) is not None:
+        # Of a kind that is not read, such as .jxl: what it is will be named.
+        image = other if other.name == PureWindowsPath(name).name else None
     return image
 
 

@@ -93,12 +93,16 @@ def test_an_empty_file_of_points_has_none(tmp_path, file):
 
 
 def test_text_models_of_scripts(tmp_path):
-    """Indented comments, sizes as floats, models in lower case."""
+    """Indented comments, sizes and colors as floats, models in lower case."""
     write_colmap(tmp_path)
     images, cameras = (tmp_path / "sparse" / "0" / f"{name}.txt" for name in ("images", "cameras"))
     images.write_text("  # by a script\n" + images.read_text().replace(" ", "\t"))
     cameras.write_text("\t# by a script\n" + cameras.read_text().replace("PINHOLE 64 48", "pinhole 64.0 48.0"))
-    assert [view.camera.width for view in load(tmp_path, holdout=0).views] == [64] * 6
+    points = tmp_path / "sparse" / "0" / "points3D.txt"
+    before = load(tmp_path).point_colors
+    points.write_text(points.read_text().replace(" 255 0 ", " 255.0 0.0 "))
+    scene = load(tmp_path, holdout=0)
+    assert [view.camera.width for view in scene.views] == [64] * 6 and np.array_equal(scene.point_colors, before)
     cameras.write_text(cameras.read_text().replace("64.0", "64.5"))
     with pytest.raises(InputError, match="line 4 is not a camera|line 5 is not a camera"):
         load(tmp_path)

@@ -208,6 +208,26 @@ def test_case_and_forms_of_accents_do_not_matter(tmp_path, stored, folder):
     assert [view.source.name for view in scene.views] == [stored.format(i) for i in range(6)]
 
 
+def test_a_photo_of_a_kind_that_is_not_read_is_named_as_what_it_is(tmp_path):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(values["frames"]):
+        (tmp_path / "images" / f"r_{i}.png").rename(tmp_path / "images" / f"r_{i}.jxl")
+        (tmp_path / "images" / f"r_{i}.jxl").write_bytes(b"\xff\x0a" + bytes(100))
+        frame["file_path"] += ".jxl"
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match="r_0.jxl: is JPEG XL, which is not read as a photo; export it as RGB or grey"):
+        load(tmp_path)
+
+
+def test_names_without_a_suffix_may_have_dots(tmp_path):
+    """As the labels of Metashape's cameras."""
+    write_colmap(tmp_path, name="frame.{:04d}.png")
+    images = tmp_path / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text().replace(".png", ""))
+    assert len(load(tmp_path, holdout=0).views) == 6
+
+
 @pytest.mark.parametrize("name", ["../images/r_{}.png", "../../data/set/images/r_{}.png", "r_{}.png", "r_{}"])
 def test_names_from_another_folder(tmp_path, name):
     """Relative to where a script ran, or without the folder."""
