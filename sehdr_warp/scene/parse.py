@@ -76,7 +76,8 @@ def parse_dataset(
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
-    notes_unused = [] if is_embedded(path) or dataset.format == "video" else unused_notes(folder, every, unplaced)
+    mentioned = [*unplaced, *dataset.mentioned]
+    notes_unused = [] if is_embedded(path) or dataset.format == "video" else unused_notes(folder, every, mentioned)
     notes = (*dataset.notes, *masks, *exposures, *odd, *times, *split, *notes_unused)
     return replace(dataset, records=tuple(records), notes=notes, name=name)
 

@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import contained, read_bytes, read_json
 from .colmap_model import SparseModel, find_model, other_models, read_model
+from .copies import copies_note, find_copies
 from .dataparser import NO_POINTS, UNPLACED, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
 from .heif import HEIF_SUFFIXES, register_heif
@@ -292,15 +293,18 @@ def find_photos(folder: Path) -> DataparserOutputs:
         raise InputError(
             photos[0], "is the only photo there", f"give one of its folders with photos: {_listing(inner)}"
         )
+    copies = find_copies(photos)
+    photos = [photo for photo in photos if photo not in copies]
     _require_photos(len(photos), photos[0], folder)
-    notes = _foreign_poses(folder)
+    notes = [*copies_note(copies), *_foreign_poses(folder)]
     if model := find_model(folder, anywhere=True):
         place = model.relative_to(folder).as_posix()
         notes.append(f"the COLMAP model in {place} names none of these photos and is not used")
     if photos[0].parent == folder and (inner := [name for name in _folders_with_photos(folder) if name not in _OTHERS]):
         notes.append(f"photos in folders of it are not read: {_listing(inner)}")
     records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)
-    return DataparserOutputs("photos", tuple(records), notes=tuple(notes))
+    names = tuple(photo.name for photo in copies)
+    return DataparserOutputs("photos", tuple(records), notes=tuple(notes), mentioned=names)
 
 
 def place_photos(

@@ -10,6 +10,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.parse import parse_dataset
 from sehdr_warp.scene.read_folders import find_photos
+from sehdr_warp.scene.unused_files import unused_notes
 from tests.make_scenes import load, pattern, write_blender, write_colmap
 
 
@@ -149,3 +150,24 @@ def test_masks_and_points_that_are_missing_are_named(tmp_path):
     assert len(scene.views) == 6
     assert "1 masks that frames state are not here, and their photos count whole: r_1.png" in scene.notes
     assert "the points that transforms.json states are not here: 'sparse_pc.ply'" in scene.notes
+
+
+def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):
+    """The kind that may hold more counts, also if a copy is turned; a photo of the same name is no copy."""
+    for i in range(5):
+        photo = Image.fromarray(pattern(96, 64, i))
+        photo.save(tmp_path / f"IMG_{i}.png")
+        turned = Image.Exif()
+        turned[0x0112] = 6
+        if i < 3:
+            Image.fromarray(np.rot90(np.asarray(photo))).resize((32, 48)).save(
+                tmp_path / f"img_{i}.JPG", quality=70, exif=turned
+            )
+    Image.fromarray(pattern(96, 64, 9)).save(tmp_path / "IMG_4.jpg")
+    (tmp_path / "IMG_3.jpg").write_bytes(b"damaged")
+    dataset = find_photos(tmp_path)
+    names = [record.image.name for record in dataset.records]
+    assert sorted(names) == ["IMG_0.png", "IMG_1.png", "IMG_2.png", "IMG_3.jpg", "IMG_3.png", "IMG_4.jpg", "IMG_4.png"]
+    assert not any("no view" in note for note in unused_notes(tmp_path, dataset.records, dataset.mentioned))
+    (note,) = dataset.notes
+    assert note.startswith("3 photos are copies of others in another kind of file and left out: img_0.JPG of IMG_0.png")

@@ -1,0 +1,64 @@
+"""Photos that are stored a second time as another kind of file, such as a phone's HEIC beside its JPEG."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from .heif import HEIF_SUFFIXES
+from .images import LDR_SUFFIXES, PILLOW_ERRORS, open_image, orientation_of, turn_upright
+from .lens import area_average
+
+_ALIKE = 0.97  # Correlation of two thumbnails of one picture; photos from two places have less
+_SIDE = 32  # Of a thumbnail
+_KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", ".jpg", ".jpeg", ".bmp")
+"""Of two files of one picture the one counts whose kind comes first here: it may hold more bits."""
+
+
+def find_copies(photos: Sequence[Path]) -> dict[Path, Path]:
+    """Return the photos that are copies of another one as another kind of file, each with that other one.
+
+    They have one name but for the suffix, and the same picture. A held-out photo would have its copy among the
+    training photos.
+    """
+    by_stem: dict[str, list[Path]] = {}
+    for photo in photos:
+        if photo.suffix.lower() in LDR_SUFFIXES:
+            by_stem.setdefault(photo.stem.lower(), []).append(photo)
+    copies: dict[Path, Path] = {}
+    for group in by_stem.values():
+        best, *others = sorted(group, key=lambda photo: _KINDS.index(photo.suffix.lower()))
+        pictures = [_thumbnail(photo) for photo in (best, *others)] if others else []
+        for photo, picture in zip(others, pictures[1:], strict=True):
+            if pictures[0] is not None and picture is not None and float((pictures[0] * picture).sum()) > _ALIKE:
+                copies[photo] = best
+    return copies
+
+
+def copies_note(copies: Mapping[Path, Path]) -> list[str]:
+    """Return a note on what find_copies() found; none if it found nothing."""
+    if not copies:
+        return []
+    copy, photo = next(iter(copies.items()))
+    count = f"{len(copies)} photos are copies" if len(copies) > 1 else "1 photo is a copy"
+    more = " ..." if len(copies) > 1 else ""
+    return [f"{count} of others in another kind of file and left out: {copy.name} of {photo.name}{more}"]
+
+
+def _thumbnail(photo: Path) -> np.ndarray | None:
+    """Return [_SIDE, _SIDE] values of an upright photo without their mean, of unit length; None if it has fewer pixels.
+
+    None also if it cannot be decoded.
+    """
+    try:
+        with open_image(photo) as image:
+            image.draft("L", (256, 256))
+            grey = turn_upright(np.asarray(image.convert("L")), orientation_of(image))
+    except (InputError, *PILLOW_ERRORS):
+        return None
+    if min(grey.shape) < _SIDE:
+        return None
+    values = area_average(grey, _SIDE, _SIDE)
+    values -= values.mean()
+    return values / max(float(np.linalg.norm(values)), 1e-6)
