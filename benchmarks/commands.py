@@ -83,20 +83,6 @@ class Step(Timed):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale(Timed):
-    """Time and memory of splats and training steps over Gaussians, pixels, channels and photos, with slopes."""
-
-    small: bool = False
-    """Every second point, without the largest."""
-
-    def measure(self):
-        """Run the benchmark and return its result."""
-        from .scale import bench_scale
-
-        return bench_scale(small=self.small, **self.timing())
-
-
-@dataclass(frozen=True, kw_only=True)
 class Workers(Timed):
     """Time training steps on more and more threads of the CPU, or on more and more GPUs."""
 
@@ -232,7 +218,6 @@ class Benchmarks:
     benchmark: (
         Annotated[Kernels, tyro.conf.subcommand("kernels")]
         | Annotated[Step, tyro.conf.subcommand("step")]
-        | Annotated[Scale, tyro.conf.subcommand("scale")]
         | Annotated[Workers, tyro.conf.subcommand("workers")]
         | Annotated[Quality, tyro.conf.subcommand("quality")]
         | Annotated[Responses, tyro.conf.subcommand("response")]

@@ -81,7 +81,6 @@ def write_readme(path: Path, result: dict) -> None:
 PLOTS: dict[str, Callable[[dict, Path], None]] = {
     "quality": plots.plot_quality,
     "kernels": plots.plot_kernels,
-    "scale": plots.plot_scale,
 }
 
 

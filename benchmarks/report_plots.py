@@ -7,7 +7,7 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
-from matplotlib.ticker import EngFormatter, NullLocator
+from matplotlib.ticker import NullLocator
 
 from sehdr_warp.output.charts import COLORS, RULE
 
@@ -26,28 +26,6 @@ def plot_kernels(result: dict, path: Path) -> None:
         labels = {"xlabel": "channels", "ylabel": "forward + backward, ms", "ylim": (0, 1.1 * most)}
         panels.append((lines, labels | {"title": f"{count:,} Gaussians, {width} x {height}"}))
     _draw(path, [panels])
-
-
-def plot_scale(result: dict, path: Path) -> None:
-    """Median times and, below, peak memory over what is varied; both axes in decades, panels of a row on one scale."""
-    names, sweeps = groups(result["rows"], "implementation", "what"), groups(result["rows"], "sweep")
-    panels = []
-    for field, unit, factor in (("median_ms", "median, ms", 1.0), ("peak_memory_bytes", "peak, MiB", 2.0**-20)):
-        values = [factor * row[field] for row in result["rows"] if row.get(field)]
-        scale = {"ylabel": unit, "yscale": "log", "xscale": "log", "ylim": (min(values) / 1.3, max(values) * 1.3)}
-        panels.append([])
-        for (sweep,), rows in sweeps.items():
-            row_groups = groups(rows, "implementation", "what")
-            lines = {
-                ": ".join(name): [
-                    (row["varied"], factor * row[field]) for row in row_groups.get(name, ()) if row.get(field)
-                ]
-                for name in names
-            }
-            ticks = sorted({row["varied"] for row in rows})
-            labels = [EngFormatter(sep="")(float(f"{value:.2g}")) for value in ticks]
-            panels[-1].append((lines, scale | {"xlabel": sweep, "xticks": ticks, "xticklabels": labels}))
-    _draw(path, panels)
 
 
 def plot_quality(result: dict, path: Path) -> None:
@@ -107,8 +85,7 @@ def _draw(path: Path, panels: Sequence[Sequence[tuple[dict, dict]]], form: str =
         for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
             if axis.get_scale() == "log":
                 axis.set_minor_locator(NullLocator())
-                if not (axis is axes.xaxis and "xticks" in labels):
-                    axis.set_ticks(ticks := decade_ticks(*limits), [f"{tick:g}" for tick in ticks])
+                axis.set_ticks(ticks := decade_ticks(*limits), [f"{tick:g}" for tick in ticks])
         axes.grid(color=RULE, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     if handles:

@@ -47,17 +47,6 @@ def _step_tables(result: dict) -> Iterable[str]:
     yield _checks_line(result)
 
 
-def _scale_tables(result: dict) -> Iterable[str]:
-    columns = {key: form for key, form in COLUMNS["scale"].items() if key != "sweep"}
-    for (sweep,), rows in groups(result["rows"], "sweep").items():
-        yield f"## Over {sweep}"
-        yield markdown_table(rows, columns)
-    yield "## Slopes of the logarithms, whole and at the large end"
-    columns = dict.fromkeys(("sweep", "rasterizer=implementation", "what", "quantity"), "")
-    yield markdown_table(result["slopes"], columns | {"slope": ".2f", "at the large end=slope_large": ".2f"})
-    yield _checks_line(result)
-
-
 def _large_tables(result: dict) -> Iterable[str]:
     rows: list[Mapping] = []
     for ours, theirs in groups(result["rows"], "gaussians", "width", "height").values():
@@ -194,15 +183,12 @@ def _relight_tables(result: dict) -> Iterable[str]:
 TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "relight": _relight_tables,
     "seeds": _seeds_tables,
-    "seeds-cpu": _seeds_tables,
     "readings": _readings_tables,
     "captures": _captures_tables,
-    "units": partial(_rows_table, "units"),
     "bits": _bits_tables,
     "panorama": partial(_rows_table, "panorama"),
     "kernels": _kernel_tables,
     "step": _step_tables,
-    "scale": _scale_tables,
     "cores": partial(_rows_table, "workers"),
     "gpus": partial(_rows_table, "workers"),
     "large": _large_tables,

@@ -1,4 +1,4 @@
-"""`python -m benchmarks kernels`, `step` and `scale`, at sizes that take seconds."""
+"""`python -m benchmarks kernels` and `step`, at sizes that take seconds."""
 
 import json
 import re
@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from benchmarks import gsplat_peer, kernels, scale, step
+from benchmarks import gsplat_peer, kernels, step
 from benchmarks.results import finish, machine_line, markdown_table, new_result
 from benchmarks.splats import Size, make_splat_scene, parse_size
 from benchmarks.timing import Variant, peak_memory, time_variants
@@ -158,8 +158,7 @@ def fake_gsplat(monkeypatch):
         return drawn.image[None], drawn.alpha[None, ..., None], info
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
-    for module in (kernels, scale):
-        monkeypatch.setattr(module, "note_missing", lambda result, device: True)
+    monkeypatch.setattr(kernels, "note_missing", lambda result, device: True)
 
 
 def test_gsplat_draws_what_we_draw(monkeypatch):
@@ -178,41 +177,6 @@ def test_gsplat_draws_what_we_draw(monkeypatch):
     result = kernels.bench_kernels([Size(150, 40, 32)], [5], CPU, **BRIEF)
     assert {row["implementation"] for row in result["rows"]} == {"sehdr-warp", "gsplat", "plain torch"}
     assert all(check["passed"] for check in result["checks"])
-
-
-def test_scale_has_splats_steps_memory_slopes_and_gsplat(monkeypatch):
-    fake_gsplat(monkeypatch)
-    points = [(count, Size(count, 48, 40), 9, 2) for count in (200, 800)]
-    photos = [(2, Size(200, 48, 40), 9, 2)]
-    monkeypatch.setattr(scale, "sweeps", lambda *_: {"gaussians": points, "photos": photos})
-    result = scale.bench_scale(CPU, **BRIEF)
-    rows = [(r["sweep"], r["varied"], r["implementation"], r["what"]) for r in result["rows"]]
-    both = ("sehdr-warp", "gsplat")
-    assert sorted(rows) == sorted(
-        [("gaussians", n, who, what) for n in (200, 800) for who in both for what in ("splat", "training step")]
-        + [("photos", 2, who, "training step") for who in both]
-    )
-    assert all(row["median_ms"] > 0 and row["peak_memory_bytes"] > 48 * 40 * 9 * 4 for row in result["rows"])
-    assert len(result["slopes"]) == 2 * 4 and result["notes"][-1] == scale.verdict(result["slopes"])
-    what = [check["what"] for check in result["checks"]]
-    assert what.count("gsplat: image") == 2 and what.count("gsplat: loss of the first step") == 3
-    assert all(check["passed"] for check in result["checks"])
-
-
-def test_a_quadratic_stage_is_found_and_a_linear_one_is_not():
-    def rows(what, times):
-        counts = (1000, 10_000, 100_000, 1_000_000)
-        fields = {"sweep": "gaussians", "implementation": "sehdr-warp", "what": what}
-        return [fields | {"varied": n, "min_ms": t} for n, t in zip(counts, times, strict=False)]
-
-    linear, quadratic = scale.fit_slopes(rows("linear", (5, 5, 40, 400)) + rows("quadratic", (1, 1, 100, 10_000)))
-    assert linear["slope_large"] == pytest.approx(0.9515, abs=1e-3)
-    assert (quadratic["slope"], quadratic["slope_large"]) == pytest.approx((1.4, 2.0))
-    assert scale.verdict([linear]).startswith("Nothing is quadratic: the steepest slope is 0.95 (time of the linear")
-    assert scale.verdict([linear, quadratic]) == (
-        "Steeper than linear at the large end: 2.00 (time of the quadratic over gaussians)."
-    )
-    assert "two points" in scale.verdict(scale.fit_slopes(rows("one", (1,))))
 
 
 def test_tables_leave_out_what_nothing_has_and_mark_what_one_lacks():
