@@ -244,7 +244,7 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         if image is None:
             raise InputError(path, "states no image size", "add w and h")
         width, height = photo_sizes(image)[0]
-    if str(fields.get("camera_model")).upper() == "EQUIRECTANGULAR":
+    if str(fields.get("camera_model")).upper() in ("EQUIRECTANGULAR", "SPHERICAL"):
         return Lens("EQUIRECTANGULAR", int(width), int(height), (width, height), path)
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:

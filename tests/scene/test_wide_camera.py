@@ -113,12 +113,11 @@ def write_set(folder, lens, size=(WIDTH, HEIGHT), mask=None):
     return folder
 
 
-def test_panoramas_of_nerfstudio_are_loaded_whole(tmp_path):
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "equirectangular", "SPHERICAL"])
+def test_panoramas_of_nerfstudio_are_loaded_whole(tmp_path, model):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[HEIGHT * 3 // 4 :] = 0  # The photographer
-    scene = load_scene(
-        write_set(tmp_path, {"camera_model": "EQUIRECTANGULAR"}, mask=mask), response="srgb", max_size=64
-    )
+    scene = load_scene(write_set(tmp_path, {"camera_model": model}, mask=mask), response="srgb", max_size=64)
     view = scene.views[0]
     assert view.camera.projection == "equirectangular" and view.codes.shape == (32, 64, 3)
     np.testing.assert_allclose(view.mask[:24], solid_angles(view.camera)[:24], atol=1e-6)
