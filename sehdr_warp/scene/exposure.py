@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..files import read_bytes
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, ExifExposure, are_camera_jpegs, exif_exposure, exif_lens, parse_number
-from .names import bases_of
+from .names import Listing, bases_of
 
 __all__ = [
     "LONGEST",
@@ -139,7 +139,8 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
     """
     images = list(dict.fromkeys(record.image for record in records))
     bases = bases_of(images, source)
-    places = dict.fromkeys((source, *reversed(bases), *(image.parent for image in images)))
+    parents = {image.parent for image in images}
+    places, listing = dict.fromkeys((source, *reversed(bases), *(image.parent for image in images))), Listing()
     times, notes = {}, []
     for place in places:
         if not (place / EXPOSURES).is_file():
@@ -155,14 +156,14 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
                 ambiguous.append(
                     f"{name} ({', '.join(image.relative_to(bases[-1]).as_posix() for image in matches[:2])})"
                 )
-            elif not any((base / _plain(name)).is_file() for base in (place, *bases, *{i.parent for i in images})):
+            elif not any(listing.holds(f"{base}/{_plain(name)}") for base in {place, *bases, *parents}):
                 strange.append(name)
         if strange:
-            listing = ", ".join(strange[:_MOST_NAMED]) + (" ..." if len(strange) > _MOST_NAMED else "")
-            notes.append(f"{EXPOSURES}: {len(strange)} of its {len(table)} names belong to no photo: {listing}")
+            text = ", ".join(strange[:_MOST_NAMED]) + (" ..." if len(strange) > _MOST_NAMED else "")
+            notes.append(f"{EXPOSURES}: {len(strange)} of its {len(table)} names belong to no photo: {text}")
         if ambiguous:
-            listing = ", ".join(ambiguous[:_MOST_NAMED])
-            notes.append(f"{EXPOSURES}: {len(ambiguous)} names fit several photos, and need their folders: {listing}")
+            text = ", ".join(ambiguous[:_MOST_NAMED])
+            notes.append(f"{EXPOSURES}: {len(ambiguous)} names fit several photos, and need their folders: {text}")
     return times, notes
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..files import contained
 from .dataparser import UNPLACED, ImageRecord
-from .images import LDR_SUFFIXES, PHOTO_SUFFIXES, open_image, read_ldr
-from .names import bases_of, natural_key, sibling, without_mask_ending
+from .images import LDR_SUFFIXES, open_image, read_ldr
+from .names import Listing, bases_of, natural_key, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
@@ -67,10 +67,10 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
             mask = common.file
         mask_files.add(mask)
         masked.append(replace(record, mask=mask))
-    notes = []
+    notes, listing = [], Listing()
     for place, keys in files.items():
         # A mask of a photo that the set leaves out is named with that photo, not here.
-        strange = [file for file, key in keys.items() if file not in mask_files and not _is_photo(key, bases)]
+        strange = [file for file, key in keys.items() if file not in mask_files and not _is_photo(key, bases, listing)]
         names = [file.relative_to(place).as_posix() for file in strange]
         if names:
             names_text = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
@@ -230,6 +230,6 @@ def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list
     return notes
 
 
-def _is_photo(key: str, bases: Sequence[Path]) -> bool:
+def _is_photo(key: str, bases: Sequence[Path], listing: Listing) -> bool:
     """Return whether a photo of this name, with or without suffix, lies in one of the folders."""
-    return any((base / key).is_file() or sibling(base / f"{key}.png", PHOTO_SUFFIXES) for base in bases)
+    return any(listing.holds(f"{base}/{key}") or listing.holds_photo(f"{base}/{key}") for base in bases)

@@ -37,6 +37,35 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
         return None
 
 
+class Listing:
+    """The files of folders, each folder read once: a set may state hundred thousands of names."""
+
+    def __init__(self) -> None:
+        """Begin without any folder."""
+        self._names: dict[str, frozenset[str]] = {}
+        self._stems: dict[str, frozenset[str]] = {}
+
+    def holds(self, path: str) -> bool:
+        """Return whether a path is a file."""
+        folder, name = os.path.split(path)
+        return name in self._read(folder)
+
+    def holds_photo(self, path: str) -> bool:
+        """Return whether a path with some suffix of photos is a file."""
+        folder, stem = os.path.split(path)
+        if folder not in self._stems:
+            pairs = (os.path.splitext(name) for name in self._read(folder))
+            self._stems[folder] = frozenset(start for start, suffix in pairs if suffix.lower() in PHOTO_SUFFIXES)
+        return stem in self._stems[folder]
+
+    def _read(self, folder: str) -> frozenset[str]:
+        if folder not in self._names:
+            self._names[folder] = frozenset()
+            with suppress(OSError, ValueError), os.scandir(folder) as entries:  # No folder, or a name that cannot be.
+                self._names[folder] = frozenset(entry.name for entry in entries if entry.is_file())
+        return self._names[folder]
+
+
 def without_mask_ending(stem: str) -> str:
     """Return a stem without the ending by which tools mark masks (`_mask`, `-mask`, `.mask`), if it has one."""
     return re.sub(r"(?<=.)[_.-]masks?$", "", stem, flags=re.IGNORECASE)

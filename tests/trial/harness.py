@@ -16,10 +16,12 @@ import traceback
 from collections.abc import Callable
 from contextlib import chdir, suppress
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from urllib.request import Request, urlopen
 
 from sehdr_warp import cli
+from sehdr_warp.output import export
 from sehdr_warp.synth.expose import RadianceView
 from tests.make_scenes import write_blender, write_reinhard
 from tests.training.toy import toy_scene
@@ -68,9 +70,20 @@ def load(folder: Path) -> None:
     views = [RadianceView(view.name, view.camera, view.hdr, view.split) for view in toy_scene(6, 16).views]
     write_reinhard(folder / "truth", views, [0.5, 2.0])
     importlib.import_module("torch").set_num_threads(1)
+    _spare_time()
     for words in (TRAIN, *COMMANDS.values()):
         with chdir(folder), suppress(SystemExit):
             cli.main([*words, "-q"])
+
+
+def _spare_time() -> None:
+    """Drop work that no case is about: pixels of figures, steps of a fit, and the source of options, which is read anew
+    for each command line (and once more for a tenth of them while pytest is loaded)."""
+    figures, docstrings = importlib.import_module("matplotlib.figure"), importlib.import_module("tyro._docstrings")
+    save, make = figures.Figure.savefig, docstrings._ClassTokenization.make
+    figures.Figure.savefig = lambda figure, *given, **options: save(figure, *given, **options | {"dpi": 40})
+    export.refine = partial(export.refine, steps=9)
+    docstrings._ClassTokenization.make = staticmethod(cache(make))
 
 
 def call(
@@ -126,6 +139,7 @@ def _run(words, folder, said, count, kill_at, prepare) -> None:
             signal.signal(each, signal.default_int_handler if each == signal.SIGINT else signal.SIG_DFL)
         sys.argv = ["sehdr-warp", *words]
         sys.addaudithook(_watch)
+        sys.modules.pop("pytest", None)  # With it tyro makes a tenth of what it has kept once more.
         prepare()
         made = _count(kill_at)
         from sehdr_warp.__main__ import run

@@ -152,7 +152,7 @@ INPUTS = {
     "run/confidence.safetensors": " ".join(COMMANDS["envmap"]),
     "made/scene.ply": "convert made/scene.ply other.ply",
     "made/scene.usda": "convert made/scene.usda other.ply",
-    "made/light.exr": "score made --truth truth",
+    "made/light.exr": "eval made --truth truth",
     "own.json": "render run --out new --cameras own.json --device cpu",
     "own.ocio": "render run --out new --ocio own.ocio --view Raw --device cpu",
     "own.toml": "train photos --out new --preset own.toml",
@@ -267,7 +267,7 @@ def test_interrupts(space, number):
     child = subprocess.Popen(
         [sys.executable, "-c", code, *words], cwd=space, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
     )
-    time.sleep(rng.uniform(0.4, 12))
+    time.sleep(rng.uniform(0.3, 6))
     for _ in range(3 if number % 2 and kind == signal.SIGINT else 1):
         child.send_signal(kind)
         time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""Long life: what a process does many times takes no more memory in the end than at a fifth of it."""
+"""Long life: what a process does many times takes hardly more memory in the end than at a fifth of it."""
 
 import gc
 import http.client
@@ -18,15 +18,15 @@ from sehdr_warp.viewer.server import Server, Viewer
 from .harness import COMMANDS, TRAIN
 
 pytestmark = pytest.mark.trial
-FRAMES, FRAMES_EACH = 5 * 3600, 90
-"""An hour at five frames a second, of clients that come, look for so many, and go."""
+FRAMES, FRAMES_EACH = 5 * 1200, 30
+"""Twenty minutes at five frames a second, of clients that come, look for so many, and go."""
 
 
 @pytest.fixture
 def live(record_property):
-    """live(act, count): does act(number) so often."""
+    """live(act, count, most): does act(number) so often; it may take so many MiB from a fifth of them on."""
 
-    def run(act, count: int) -> None:
+    def run(act, count: int, most: float) -> None:
         early = 0.0
         for number in range(count):
             act(number)
@@ -36,7 +36,7 @@ def live(record_property):
                 early, late = early or pages, pages
         memory = [round(each * resource.getpagesize() / 2**20, 1) for each in (early, late)]
         record_property("memory", "{} to {}".format(*memory))
-        assert memory[1] <= 1.05 * memory[0], memory
+        assert memory[1] <= memory[0] + most, memory
 
     return run
 
@@ -47,15 +47,15 @@ def command(folder: Path, *words: str) -> None:
     assert end.value.code == 0
 
 
-def test_200_renders(space, live):
-    live(lambda number: command(space, *COMMANDS["render"]), 200)
+def test_100_renders(space, live):
+    live(lambda number: command(space, *COMMANDS["render"]), 100, most=8)
 
 
-def test_50_trainings(space, live):
-    live(lambda number: command(space, *TRAIN, "--overwrite"), 50)
+def test_30_trainings(space, live):
+    live(lambda number: command(space, *TRAIN, "--overwrite"), 30, most=12)
 
 
-def test_an_hour_of_the_viewer(space, live):
+def test_20_minutes_of_the_viewer(space, live):
     run = load_run(space / "run")
     asked = json.dumps({"camera": run.cameras[0].camera.to_dict()})
 
@@ -70,5 +70,5 @@ def test_an_hour_of_the_viewer(space, live):
 
     with Server(Viewer([ViewerScene(run, "run", None)]), port=0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        live(look, FRAMES // FRAMES_EACH)
+        live(look, FRAMES // FRAMES_EACH, most=8)
         server.shutdown()
