@@ -125,8 +125,8 @@ class EnvironmentMap:
     out: Path
     """The file: .exr, or .hdr without alpha and confidence."""
     at: str = "center"
-    """x,y,z in the scene's coordinates, camera:NAME, or center: the middle of the training cameras, or what they walk
-    around."""
+    """x,y,z in the coordinates of exported files (0,0,0: what most photos look at), camera:NAME, or center: the middle
+    of the training cameras, or what they walk around."""
     size: int = 2048
     """Pixels across; for a cube those of one face."""
     layout: Literal["latlong", "cube"] = "latlong"
@@ -135,8 +135,10 @@ class EnvironmentMap:
     """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
     up: str | None = None
     """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
+    scale: float | None = None
+    """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
     beyond: float | None = None
-    """Leave out what is nearer than this distance, in the scene's units: a CG object then stands in the place of the
+    """Leave out what is nearer than this distance, in the units of --at: a CG object then stands in the place of the
     photographed one. By default 0, or, for the center of a walk around something, half the distance of the nearest
     photo."""
     inpaint: bool = False
@@ -169,6 +171,8 @@ class Lights:
     """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
     up: str | None = None
     """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
+    scale: float | None = None
+    """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
     unseen: Literal["inpaint", "black"] = "inpaint"
     """inpaint: directions of the map that no photo covers get the light around them; alpha still tells them."""
     overwrite: bool = False
@@ -223,10 +227,12 @@ def run_lights(args: Lights) -> None:
     """Run `sehdr-warp lights`."""
     from .light_unit import luminance_of_one
     from .lights import lights_table, write_lights
+    from .world_transform import world_transform
 
     run = open_run(args.run, args.device)
     if args.out is None:
-        print(lights_table(run.find_lights(), luminance_of_one(run)))
+        transform = world_transform(run, args.axes, up=args.up, scale=args.scale)
+        print(lights_table(run.find_lights(), luminance_of_one(run), transform))
         return
     options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device")}
     for path in write_lights(run, args.out, **options):

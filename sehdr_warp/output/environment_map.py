@@ -21,7 +21,7 @@ from .light_pictures import exposure_of_white
 from .light_shares import light_shares
 from .light_unit import EFFICACY, luminance_of_one
 from .render_views import provenance
-from .world_transform import AXES, world_transform
+from .world_transform import AXES, WorldTransform, describe, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
@@ -32,6 +32,7 @@ SUFFIXES = (".exr", ".hdr")
 # A direction counts as covered above this alpha. A covered share below _LEAST_COVERED gives a warning, as do surfaces
 # nearer than _NEAR times the spread of the cameras in more than half of all directions: the point is inside something.
 COVERED, _LEAST_COVERED, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
+_WHOLE = 99.5  # Per cent of all directions that count as all
 # Photos walk around what they look at if most of them look at it within this cosine and they stand on all sides of it;
 # what is nearer to it than this part of the distance of the nearest camera is then left out of a map at the center.
 _FACING, _SIDES, _CLEARANCE = 0.7, 0.5, 0.5
@@ -61,6 +62,7 @@ def write_environment_map(
     layout: str = "latlong",
     axes: str = "upright",
     up: str | tuple[float, float, float] | None = None,
+    scale: float | None = None,
     beyond: float | None = None,
     inpaint: bool = False,
     colorspace: str = "rec709",
@@ -74,15 +76,17 @@ def write_environment_map(
         run: From load_run, train or load_splats.
         path: .exr (R, G, B radiance; A coverage; in a second part, `data`, distance.Z and, if the run has it,
             confidence and clipped; attribute `envmap`) or .hdr (Radiance: R, G, B only).
-        at: A point in the scene's coordinates, "camera:NAME", or "center": the mean of the training cameras, or, if
-            they walk around something, the point that they look at.
+        at: A point in the coordinates that `axes` names, "camera:NAME", or "center": the mean of the training
+            cameras, or, if they walk around something, the point that they look at.
         size: Pixels across; for a cube those of one face.
         layout: "latlong": size x size / 2, the left edge at longitude pi, +Z in the middle, +X at a quarter, +Y up.
             "cube": OpenEXR's six faces, one above the other.
         axes: "upright": turned as render and export turn the scene (see world_transform), so that the map lights its
-            Gaussians as they stand: +Y is up and +Z is ahead of the middle camera. "scene": the scene's coordinates.
+            Gaussians as they stand: +Y is up, +Z is ahead of the middle camera, and 0, 0, 0 is the point that most
+            photos look at. "scene": the scene's coordinates.
         up: As in world_transform.
-        beyond: Leave out what is nearer than this distance, in the scene's units, so that a CG object can stand in the
+        scale: As in world_transform.
+        beyond: Leave out what is nearer than this distance, in the units of `at`, so that a CG object can stand in the
             place of a photographed one. None: 0, or for the center of a walk around something half the distance of the
             nearest camera.
         inpaint: Fill directions that no photo covers with the light around them, as far as A is below 1; A still tells
@@ -106,27 +110,28 @@ def write_environment_map(
     if size < 16 or size % 2 or size > _LARGEST:
         raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
     color_space(colorspace)
-    transform = world_transform(run, axes, up=up)
+    transform = world_transform(run, axes, up=up, scale=scale)
     exposure = exposure_of_white(run, reference_white)
     if beyond is not None and not 0 <= beyond < np.inf:
-        raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the scene's units")
+        raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the units of exported files")
     check_absent(path, overwrite)
     cameras = {entry.name: entry.camera for entry in run.cameras}
     photos = training_cameras(run)
-    position = _point(at, cameras, photos)
+    position = _point(at, cameras, photos, transform)
     clearance = 0.0
     if isinstance(at, str) and at == "center":
         position, clearance = map_center(photos)
+    place = transform.points(position)
     if beyond is None:
-        beyond = clearance
+        beyond = transform.scale * clearance
         if beyond:
-            place = ", ".join(f"{value:.4g}" for value in position)
             text = "the photos walk around (%s): the map is what surrounds that point beyond %.3g; --beyond changes it"
-            log.info(text, place, beyond)
+            log.info(text, ", ".join(f"{value:.4g}" for value in place), beyond)
     to_world = transform.rotation.T
     directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in photos])) if photos else 0.0
-    rendered = render_map(run, position, size, layout, to_world.T, focal, beyond=beyond, shares=run.clipped_share())
+    options = {"beyond": beyond / transform.scale, "shares": run.clipped_share()}
+    rendered = render_map(run, position, size, layout, to_world.T, focal, **options)
     hdr, alpha, distance = rendered.hdr, rendered.alpha, rendered.distance
     weight = solid_angles(size, layout)
     _judge(run, position, photos, alpha, distance, weight)
@@ -136,7 +141,8 @@ def write_environment_map(
     clipped = rendered.clipped
     shares = light_shares(hdr, added, clipped, weight, run.response.white / run.base_time)
     coverage = 100 * weight[alpha > COVERED].sum() / weight.sum()
-    log.info("%s: %.0f %% of all directions seen", path.name, coverage)
+    rest = "" if inpaint or coverage > _WHOLE else "; the rest is black, --inpaint fills it with the light around it"
+    log.info("%s: %.0f %% of all directions seen%s", path.name, coverage, rest)
     log.info("its light is\n%s", shares.table())
     hdr = exposure * from_rec709(hdr + added, colorspace)
     luminance = luminance_of_one(run)
@@ -149,8 +155,9 @@ def write_environment_map(
         data["confidence"] = rendered.confidence
     if clipped is not None:
         data["clipped"] = clipped
-    facts = {**provenance(run), "position": json.dumps(position.tolist()), "axes": axes}
+    facts = {**provenance(run), "position": json.dumps(place.tolist()), "axes": axes}
     facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(asdict(shares))}
+    facts |= {"worldMatrix": describe(transform)}
     white_luminance = None if luminance is None else luminance / exposure
     header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
     header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
@@ -321,8 +328,10 @@ def map_center(photos: list[Camera]) -> MapCenter:
     return MapCenter(focus, _CLEARANCE * nearest)
 
 
-def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], photos: list[Camera]) -> np.ndarray:
-    """Return the point [3] that `at` names, in the scene's coordinates."""
+def _point(
+    at: str | tuple[float, float, float], cameras: dict[str, Camera], photos: list[Camera], transform: WorldTransform
+) -> np.ndarray:
+    """Return the point [3] that `at` names, in the scene's coordinates; its numbers are in those of the transform."""
     if isinstance(at, str) and at == "center":
         if not photos:
             raise SehdrError("the scene has no cameras, so no center; say where with --at x,y,z")
@@ -339,7 +348,7 @@ def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], pho
         position = np.array([])
     if position.shape != (3,) or not np.isfinite(position).all():
         raise SehdrError(f"point {at!r} is neither x,y,z nor camera:NAME nor center")
-    return position
+    return transform.inverse().points(position)
 
 
 def walked_around(photos: list[Camera]) -> np.ndarray | None:

@@ -67,6 +67,7 @@ def write_lights(
     *,
     axes: str = "upright",
     up: str | None = None,
+    scale: float | None = None,
     unseen: str = "inpaint",
     overwrite: bool = False,
 ) -> list[Path]:
@@ -82,6 +83,7 @@ def write_lights(
         path: .json, or .usda.
         axes: As in world_transform.
         up: As in world_transform.
+        scale: As in world_transform.
         unseen: "inpaint": directions of the dome that no photo covers get the light around them, so that they do not
             darken what the dome lights. "black": they are black.
         overwrite: Replace files that exist.
@@ -100,7 +102,7 @@ def write_lights(
     files = [path] if suffix == ".json" else [path, rest]
     for file in files:
         check_absent(file, overwrite)
-    transform = world_transform(run, axes, up=up)
+    transform = world_transform(run, axes, up=up, scale=scale)
     lights = run.find_lights()
     if not lights:
         log.warning(
@@ -120,17 +122,20 @@ def write_lights(
     return files
 
 
-def lights_table(lights: Sequence[Any], unit: float | None = None) -> str:
+def lights_table(lights: Sequence[Any], unit: float | None = None, transform: WorldTransform | None = None) -> str:
     """Return lights as lines of text: shape, place, size, radiance, how sure it is, and share of the scene's light.
 
     Args:
         lights: As from find_lights().
         unit: cd/m^2 of a radiance of 1; None if it is not known.
+        transform: To the coordinates that places and sizes are given in; None for those of the scene.
     """
+    transform = transform or WorldTransform.identity()
     lines = [f"  share  shape  {'radiance' if unit is None else 'cd / m^2':>10}  at least  stops   place, size"]
     for light in lights:
-        size = " x ".join(f"{side:.3g}" for side in light.shape.size[: 2 if light.shape.kind == "rect" else 1])
-        place = ", ".join(f"{value:.3g}" for value in light.shape.position)
+        sides = light.shape.size[: 2 if light.shape.kind == "rect" else 1]
+        size = " x ".join(f"{transform.scale * side:.3g}" for side in sides)
+        place = ", ".join(f"{value:.3g}" for value in transform.points(light.shape.position))
         sure = "    -" if light.deviation is None else f"{light.deviation:5.2f}"
         radiances = (unit or 1.0) * np.mean([light.radiance, light.lower_bound], axis=1)
         figures = " ".join(f"{value:9.3g}" for value in radiances)

@@ -31,6 +31,7 @@ from .light_pictures import (
 from .light_unit import luminance_of_one, read_light_unit
 from .tonemap import expose, fit_tone_map
 from .ultra_hdr import MOST_STOPS, ultra_hdr
+from .world_transform import WorldTransform, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import Run
@@ -70,7 +71,7 @@ def report_page(
         _opening(brightest, times[brightest.name], gain),
         _pictures(run, comparisons, times, held_out),
         _brackets(brightest, times[brightest.name], gain),
-        _lights(lights, luminance_of_one(run)),
+        _lights(lights, luminance_of_one(run), world_transform(run)) if lights else EMPTY,
         _confidence(comparisons),
         _unexplained(run, scene),
         _plan(run.decisions()),
@@ -201,21 +202,26 @@ def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:
     return _section("Brackets", lead, body)
 
 
-def _lights(lights: Sequence[Light], unit: float | None) -> Markup:
-    """Return the table of the lights that photos clip; unit: cd/m^2 of a radiance of 1, None if it is not known."""
+def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransform) -> Markup:
+    """Return the table of the lights that photos clip, with places in the coordinates of exported files.
+
+    unit: cd/m^2 of a radiance of 1, None if it is not known.
+    """
     rows = []
     for light in lights[:_MOST_LIGHTS]:
         radiances = (float((unit or 1.0) * np.mean(values)) for values in (light.radiance, light.lower_bound))
         sides = light.shape.size if light.shape.kind == "rect" else light.shape.size[:1]
-        size = "\N{THIN SPACE}\N{MULTIPLICATION SIGN}\N{THIN SPACE}".join(f"{side:.3g}" for side in sides)
-        place = ", ".join(f"{value:.3g}" for value in light.shape.position)
+        lengths = (f"{transform.scale * side:.3g}" for side in sides)
+        size = "\N{THIN SPACE}\N{MULTIPLICATION SIGN}\N{THIN SPACE}".join(lengths)
+        place = ", ".join(f"{value:.3g}" for value in transform.points(light.shape.position))
         figures = (f"{light.share:.1%}", *(f"{value:.3g}" for value in radiances), number(light.deviation, 1))
         rows.append(("panel" if light.shape.kind == "rect" else "lamp", size, place, *figures))
     measure = "radiance" if unit is None else "cd/m\N{SUPERSCRIPT TWO}"
     titles = ("", "size", "place", "share of light", measure, "certain at least", "deviation, stops")
     lead = (
         "Lamps, windows and other areas that photos clip, those that give most first. Their radiance is an estimate "
-        "with a deviation; what photos show as white is certain. Share: of the light at the middle of the cameras."
+        "with a deviation; what photos show as white is certain. Places are upright, as in exported files. Share: of "
+        "the light at the middle of the cameras."
     )
     if len(lights) > _MOST_LIGHTS:
         lead += f" The first {_MOST_LIGHTS} of {len(lights)}."

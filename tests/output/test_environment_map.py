@@ -19,6 +19,7 @@ from sehdr_warp.output.environment_map import (
     write_environment_map,
 )
 from sehdr_warp.output.exr import write_radiance
+from sehdr_warp.output.world_transform import WorldTransform, world_transform
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
 from sehdr_warp.splats import GaussianArrays
@@ -90,7 +91,22 @@ def test_upright_maps_look_ahead_with_up_above(tmp_path, run):
     ahead, above, left = (image[place] for place in ((32, 64), (0, 64), (32, 32)))
     np.testing.assert_allclose([ahead, above, left], 0.967 * LIGHT[[4, 3, 1]], rtol=0.015)
     np.testing.assert_allclose(json.loads(header["sehdr:mapToWorld"]), np.diag([-1.0, -1, 1]), atol=1e-9)
-    assert json.loads(header["sehdr:position"]) == [0, 0, 0]
+    world = WorldTransform.from_matrix(json.loads(header["sehdr:worldMatrix"]))
+    np.testing.assert_allclose(json.loads(header["sehdr:position"]), world.points(np.zeros(3)), atol=1e-9)
+
+
+def test_a_point_is_in_the_coordinates_of_exported_files(tmp_path, run):
+    """A map at a place that a program measured in an exported scene, and beyond a distance in its meters."""
+    write_environment_map(run, tmp_path / "scene.exr", at=(0.4, 0.2, 1), size=64, axes="scene", beyond=0.5)
+    world = world_transform(run, scale=2.0)
+    at = tuple(world.points(np.array([0.4, 0.2, 1])))
+    write_environment_map(run, tmp_path / "file.exr", at=at, size=64, scale=2.0, beyond=1.0)
+    own, header = read(tmp_path / "scene.exr")[0], read(tmp_path / "file.exr")[2]
+    np.testing.assert_allclose(json.loads(header["sehdr:position"]), at, atol=1e-9)
+    assert float(header["sehdr:beyond"]) == 1
+    weight = solid_angles(64, "latlong")[..., None]
+    light = [(image * weight).sum(axis=(0, 1)) for image in (own, read(tmp_path / "file.exr")[0])]
+    np.testing.assert_allclose(light[1], light[0], rtol=0.02)  # The same light, turned
 
 
 def test_mitsuba_sees_the_same(tmp_path, run):
@@ -200,7 +216,8 @@ def test_unseen_directions_are_inpainted_on_request(tmp_path, run, logged):
     assert added[channels["A"] < 0.99].min() > 0.9 and added.max() < 9.1
     assert plain.min() < 1e-3 and full.min() > 0.4 and full.max() < 9.1
     share = (seen * solid_angles(64, "latlong")).sum() / solid_angles(64, "latlong").sum()
-    assert f"env.exr: {100 * share:.0f} % of all directions seen" in logged
+    assert f"env.exr: {100 * share:.0f} % of all directions seen; the rest is black, --inpaint" in "\n".join(logged)
+    assert f"fill.exr: {100 * share:.0f} % of all directions seen" in logged
 
 
 def test_a_fill_is_the_light_of_what_is_seen():

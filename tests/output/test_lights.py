@@ -9,7 +9,9 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.lights import Light, LightShape
+from sehdr_warp.output.commands import Lights, run_lights
 from sehdr_warp.output.lights import lights_table, write_lights
+from sehdr_warp.output.world_transform import WorldTransform, world_transform
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
 from sehdr_warp.splats.arrays import concatenated
@@ -122,6 +124,18 @@ def lights_map(folder, field, cameras):
 def test_the_table_names_place_size_and_doubt():
     lines = lights_table(LIGHTS).splitlines()
     assert "50.0 %" in lines[1] and "0.70" in lines[1] and "0.4 x 0.2" in lines[1] and "sphere" in lines[2]
+    assert "(1, 0.5, 2)" in lines[1]
+    moved = WorldTransform(np.diag([-1.0, -1, 1]), np.array([0.0, 0, 1]), 2.0)
+    assert "(-2, -1, 5), 0.8 x 0.4" in lights_table(LIGHTS, transform=moved).splitlines()[1]
+
+
+def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
+    run_lights(Lights(run=run.path, axes="scene"))
+    assert "(1, 0.5, 2), 0.4 x 0.2" in capsys.readouterr().out
+    run_lights(Lights(run=run.path, scale=10.0))
+    place = ", ".join(f"{value:.3g}" for value in world_transform(run, scale=10.0).points(PANEL.position))
+    assert f"({place}), 4 x 2" in capsys.readouterr().out
 
 
 def test_what_cannot_be_written_is_refused(tmp_path, run):
