@@ -2,15 +2,17 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from ..errors import InputError
 from ..files import read_bytes
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, ExifExposure, are_camera_jpegs, exif_exposure, exif_lens, parse_number
-from .names import Listing, bases_of
+from .images import PHOTO_SUFFIXES
+from .names import Listing, bases_of, folded
 
 __all__ = [
     "LONGEST",
@@ -134,8 +136,9 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
     """Return the seconds of photos by exposures.json, and notes on names that it could not be matched with.
 
     The file is {"path": seconds} or a list of {"file": path, "exposure_time": seconds}. Paths are relative to the data
-    folder, to a folder between it and the photos, or to the file's own; a name alone is enough if no two photos share
-    it. The suffix may be left out.
+    folder, to a folder between it and the photos, or to the file's own, or absolute, as in a set that was copied; a
+    name alone is enough if no two photos share it. The suffix may be left out or be that of another kind of photo.
+    Upper and lower case count as equal.
     """
     images = list(dict.fromkeys(record.image for record in records))
     bases = bases_of(images, source)
@@ -149,7 +152,7 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
         names = _names_of(images, [*bases, place])
         strange, ambiguous = [], []
         for name, seconds in table.items():
-            matches = names.get(_plain(name), [])
+            matches = next((names[each] for each in _spellings(name) if each in names), [])
             if len(matches) == 1:
                 times[matches[0]] = seconds
             elif matches:
@@ -180,16 +183,27 @@ def _read_times(path: Path) -> Mapping[str, float]:
 
 
 def _names_of(images: Sequence[Path], bases: Sequence[Path]) -> dict[str, list[Path]]:
-    """Map each way to name photos to those that it fits: paths below the bases, then names alone."""
+    """Map each way to name photos, folded(), to those that it fits: paths below the bases, then names alone."""
     exact: dict[str, list[Path]] = {}
     alone: dict[str, list[Path]] = {}
     for image in images:
         paths = {image.relative_to(base) for base in bases if image.is_relative_to(base)}
         for key in {key for path in paths for key in (path.as_posix(), path.with_suffix("").as_posix())}:
-            exact.setdefault(key, []).append(image)
+            exact.setdefault(folded(key), []).append(image)
         for key in {image.name, image.stem}:
-            alone.setdefault(key, []).append(image)
+            alone.setdefault(folded(key), []).append(image)
     return alone | exact
+
+
+def _spellings(name: str) -> list[str]:
+    """Return the ways to look up a name of exposures.json: as it is, without suffix, and if absolute its last parts."""
+    plain = folded(_plain(name))
+    path = PurePosixPath(plain)
+    ends = [plain]
+    if path.is_absolute() or re.match("[a-z]:/", plain):
+        ends += ["/".join(path.parts[start:]) for start in range(1, len(path.parts))]
+    stems = [end.removesuffix(path.suffix) for end in ends if path.suffix in PHOTO_SUFFIXES]
+    return [*ends, *stems]
 
 
 def _plain(name: str) -> str:

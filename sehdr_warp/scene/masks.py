@@ -12,7 +12,7 @@ import numpy as np
 from ..files import contained
 from .dataparser import UNPLACED, ImageRecord
 from .images import LDR_SUFFIXES, open_image, read_ldr
-from .names import Listing, bases_of, natural_key, without_mask_ending
+from .names import Listing, bases_of, folded, natural_key, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
@@ -52,7 +52,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     )
     places = _mask_folders(folder)
     files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
-    index = [{key: file for file, key in reversed(keys.items())} for keys in files.values()]
+    index = [{folded(key): file for file, key in reversed(keys.items())} for keys in files.values()]
     beside = {parent: _masks_beside(parent) for parent in {record.image.parent for record in records}}
     common = _common_mask(folder, records)
     masked, mask_files = [], set()
@@ -60,7 +60,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         keys = _photo_keys(record, bases, shared)
         near = beside[record.image.parent]
         tables = [*((masks, keys) for masks in index), (near, [record.image.name, record.image.stem])]
-        mask = record.mask or next((masks[key] for masks, names in tables for key in names if key in masks), None)
+        found = (masks.get(folded(key)) for masks, names in tables for key in names)
+        mask = record.mask or next((file for file in found if file is not None), None)
         if mask is not None and record.mask is None:
             mask = contained(folder, mask.relative_to(folder).as_posix(), folder)
         if mask is None and common is not None and _has_shape(common, record):
@@ -186,13 +187,13 @@ def _files_below(place: Path) -> list[Path]:
 
 
 def _masks_beside(parent: Path) -> dict[str, Path]:
-    """Map photos' names or stems to the masks that lie in the photos' own folder, or in a mask folder there."""
+    """Map folded() names or stems of photos to the masks in the photos' own folder, or in a mask folder there."""
     if not parent.is_dir():
         return {}
     files = (file for file in parent.iterdir() if file.suffix.lower() in LDR_SUFFIXES)
-    masks = {key: file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
+    masks = {folded(key): file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
     inner = (file for place in _mask_folders(parent) for file in _files_below(place) if file.parent == place)
-    return {without_mask_ending(file.stem): file for file in inner} | masks
+    return {folded(without_mask_ending(file.stem)): file for file in inner} | masks
 
 
 def _mask_folders(folder: Path) -> list[Path]:

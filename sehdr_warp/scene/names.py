@@ -124,25 +124,26 @@ def _alike(folder: Path, name: str, source: Path) -> Path | None:
     parts = [part for part in name.split("/") if part not in ("", ".")]
     if not parts:
         return None
-    if len(parts) > 1 and _folded(parts[0]) == _folded(folder.name):
+    if len(parts) > 1 and folded(parts[0]) == folded(folder.name):
         return find_image(folder, "/".join(parts[1:]), source)
     place = folder
     for part in parts[:-1]:
         names = _entries(place)
-        if _folded(part) not in names:
+        if folded(part) not in names:
             return None
-        place /= names[_folded(part)]
+        place /= names[folded(part)]
     names = _entries(place)
     stem = PureWindowsPath(parts[-1]).stem
     # A name may have no suffix, and a dot all the same.
-    stems = _folded(parts[-1]), _folded(stem)
+    stems = folded(parts[-1]), folded(stem)
     endings = dict.fromkeys((stems[0], *(each + suffix for each in stems for suffix in PHOTO_SUFFIXES)))
     found = next((names[ending] for ending in endings if ending in names), None)
     photo = None if found is None else contained(folder, (place / found).relative_to(folder).as_posix(), source)
     return photo if photo is not None and os.path.isfile(photo) else None
 
 
-def _folded(name: str) -> str:
+def folded(name: str) -> str:
+    """Return a name in which upper and lower case, and the forms of an accent, are the same."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
@@ -157,7 +158,7 @@ def _entries(folder: Path) -> Mapping[str, str]:
 @lru_cache(maxsize=64)
 def _entries_at(folder: Path, changed: int) -> Mapping[str, str]:
     """Return _entries(); `changed` is when the folder changed."""
-    return {_folded(name): name for name in sorted(os.listdir(folder), reverse=True)}
+    return {folded(name): name for name in sorted(os.listdir(folder), reverse=True)}
 
 
 def distinct(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[str]]:

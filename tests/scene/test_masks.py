@@ -75,6 +75,14 @@ def test_masks_of_photos_in_folders_of_same_names(tmp_path):
     assert "masks/ holds 1 file that fits no photo: 0000.png; name each like its photo" in masks_said(scene)[0]
 
 
+@pytest.mark.parametrize("name", ["masks/IMG_Ä{}.PNG", "masks/img_a\u0308{}.png.png", "images/Img_Ä{}_mask.png"])
+def test_case_and_forms_of_accents_do_not_matter_in_names_of_masks(tmp_path, name):
+    write_colmap(tmp_path, name="img_ä{}.png")
+    for i in range(6):
+        write_mask(tmp_path / name.format(i))
+    assert shares(load(tmp_path, holdout=0)) == [0.5] * 6
+
+
 def test_masks_in_a_folder_of_each_camera(tmp_path):
     write_colmap(tmp_path, name="cam{0}/0000.png")
     write_mask(tmp_path / "images" / "cam1" / "masks" / "0000.png")

@@ -85,12 +85,26 @@ def test_listed_times_of_no_photo_are_named(tmp_path):
     assert not [note for note in load(tmp_path).notes if "exposures.json" in note]
     table.write_text(json.dumps(stated | {"000.JPG.bak": 0.01}))
     assert "exposures.json: 1 of its 7 names belong to no photo: 000.JPG.bak" in load(tmp_path).notes
-    table.write_text(json.dumps({name.replace("5.jpg", "5.jpeg"): time for name, time in stated.items()}))
+    table.write_text(json.dumps({name.replace("5.jpg", "5x.jpg"): time for name, time in stated.items()}))
     notes = load(tmp_path).notes
-    assert "exposures.json: 1 of its 6 names belong to no photo: 005.jpeg" in notes
+    assert "exposures.json: 1 of its 6 names belong to no photo: 005x.jpg" in notes
     assert any(note.startswith("005 states no exposure time: ") for note in notes)
     table.write_text(json.dumps({f"shot{i}.jpg": 0.01 for i in range(6)}))
     assert [note for note in load(tmp_path).notes if "6 of its 6 names" in note and "shot2.jpg ..." in note]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["{}.JPG", "{}.CR2", "images/{}", "C:\\scan\\images\\{}.jpg", "/home/me/scan/images/{}.jpg", "./IMAGES/{}.jpg"],
+)
+def test_listed_times_under_other_spellings(tmp_path, name):
+    """Another case, the suffix of another kind of photo, or a path of the machine that wrote the list."""
+    write_colmap(tmp_path, name="img_{}.jpg")
+    times = {name.format(f"img_{i}"): 0.01 * 2**i for i in range(6)}
+    (tmp_path / "exposures.json").write_text(json.dumps(times))
+    scene = load(tmp_path, holdout=0)
+    assert [view.exposure_time for view in scene.views] == pytest.approx(list(times.values()))
+    assert not [note for note in scene.notes if "exposures.json" in note]
 
 
 def test_splits(tmp_path):
