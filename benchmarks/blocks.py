@@ -1,42 +1,73 @@
-"""A synthetic survey trained whole and in blocks: quality, error at borders, memory, and blocks at once on two GPUs.
+"""A synthetic survey trained whole and in blocks: quality, errors at borders, memory, blocks at once, many copies.
 
-python -m benchmarks.blocks OUT --views 400 --size 640 --gaussians 2000000
+python -m benchmarks.blocks OUT --json blocks.json
 
-Blocks train as many steps on each photo as the whole does. Findings are lines of OUT/results.jsonl. The last is a
-render of copies of the merged scene with 20 million Gaussians.
+benchmarks.survey makes the photos. Blocks train as many steps on each photo as the whole does. With three GPUs the
+whole trains on the third beside the blocks, with two after blocks were trained at once. Copies of the merged run are
+rendered from the disk and shown by `sehdr-warp view`. Each row is also a line of OUT/rows.jsonl as soon as it is known.
 """
 
-import argparse
 import json
 import logging
+import multiprocessing
+import shutil
+import socket
+import subprocess
+import sys
 import time
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
+from urllib.request import Request, urlopen
 
 import torch
+import tyro
 
 from sehdr_warp.blocks.block_plan import BlockPlan, make_block_plan
+from sehdr_warp.blocks.job import FOLDER
 from sehdr_warp.blocks.jobs import run_blocks
 from sehdr_warp.blocks.merge import merge_blocks
 from sehdr_warp.blocks.seams import measure_seams
-from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
+from sehdr_warp.files import write_json
+from sehdr_warp.model.gaussians import PARAMETER_NAMES
 from sehdr_warp.runs.config import Config
-from sehdr_warp.runs.config_files import load_config, override_config
+from sehdr_warp.runs.config_files import config_from_dict, load_config, override_config
 from sehdr_warp.runs.load_arguments import LoadArguments
 from sehdr_warp.runs.open import load_photos
 from sehdr_warp.runs.run import Run, load_run
+from sehdr_warp.runs.run_writer import RunWriter
+from sehdr_warp.scene import Camera, View
 from sehdr_warp.training.train import create_trainer
 
+from .results import new_result
 from .survey import write_survey
 
+AT_ONCE = 2  # Blocks that train at once
 WARM_UP = 30  # Steps of a training before the first that is timed, in which kernels are compiled
-COPIES = 20_000_000
 FRAMES = 20
+SIZE = 1920, 1080  # Pixels of the pictures of copies
+DRAFT = 480, 270  # Of the page's pictures while it moves
+COPY_SECONDS, VIEW_SECONDS = 30.0, 22.0  # That must be left for them
 
 
 @dataclass(frozen=True)
 class Study:
-    """Sizes of the study."""
+    """Sizes of the study, and what it has found.
+
+    Attributes:
+        out: Folder for the photos, the runs and rows.jsonl.
+        views: Photos, of which one in eight is held out.
+        size: Their width in pixels.
+        gaussians: Most Gaussians of the whole, and of all blocks together.
+        steps: Of the whole.
+        count: Blocks.
+        copies: Gaussians of the copies of the merged run.
+        device: The first device; the GPUs that follow it are used, too.
+        seconds: Time for the study; what does not fit into it is left out.
+        began: Start of the study, monotonic seconds.
+        rows: What was found.
+    """
 
     out: Path
     views: int
@@ -44,54 +75,99 @@ class Study:
     gaussians: int
     steps: int
     count: int
+    copies: int
     device: torch.device
+    seconds: float
+    began: float = field(default_factory=time.monotonic)
+    rows: list[dict[str, Any]] = field(default_factory=list)
 
-    def note(self, what: str, **values) -> None:
-        """Write a finding."""
-        with open(self.out / "results.jsonl", "a") as file:
-            file.write(json.dumps({"what": what, **values}) + "\n")
-        print(what, values, flush=True)
+    def add(self, what: str, **values: Any) -> None:
+        """Add a row, and write it."""
+        row = {"what": what, **values}
+        self.rows.append(row)
+        with open(self.out / "rows.jsonl", "a") as file:
+            file.write(json.dumps({"at": round(time.monotonic() - self.began, 1), **row}) + "\n")
+        print(row, flush=True)
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left."""
+        return self.seconds - (time.monotonic() - self.began)
+
+    @property
+    def devices(self) -> list[torch.device]:
+        """Devices from the first on: of the blocks that train at once, and of the whole."""
+        if self.device.type == "cpu":
+            return [self.device] * AT_ONCE
+        first = self.device.index or 0
+        return [torch.device("cuda", index) for index in range(first, min(torch.cuda.device_count(), first + 3))]
+
+
+class _Spans(logging.Handler):
+    """Note when the training of each block begins and ends, monotonic seconds."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        super().__init__()
+        self.begin: dict[str, float] = {}
+        self.end: dict[str, float] = {}
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Note the time of a message of run_blocks()."""
+        name, _, message = record.getMessage().partition(": ")
+        if message.startswith("training begins"):
+            self.begin[name] = time.monotonic()
+        elif message.startswith("finished"):
+            self.end[name] = time.monotonic()
 
 
 def run_study(study: Study) -> None:
-    """Train the survey in both ways, and write what is found."""
-    study.out.mkdir(parents=True, exist_ok=True)
-    device, survey = study.device, study.out / "survey"
-    gpus = torch.cuda.device_count() if device.type == "cuda" else 1
-    study.note("machine", device=str(device), gpus=gpus, torch=torch.__version__, **_sizes(study))
-    if not survey.is_dir():
-        write_survey(survey, study.views, study.size, study.gaussians * 3 // 2, device)
-    config = _config(study)
+    """Train the survey in both ways, and add what is found."""
+    survey = study.out / "survey"
+    write_survey(survey, study.views, study.size, study.gaussians * 13 // 10, study.device)
     data: LoadArguments = {"path": str(survey.absolute()), "exposure_index": None, "max_size": None, "holdout": None}
-    plan = make_block_plan(data, config, device, study.count)
+    config = _config(study)
+    plan = make_block_plan(data, config, study.device, study.count)
     assert plan is not None
     fraction = sum(block.fraction for block in plan.blocks) / study.count
-    plan = replace(plan, config=override_config(config, {"schedule.iterations": round(study.steps * fraction)}))
-    study.note("plan", photos=[len(block.views) for block in plan.blocks], fraction=fraction)
-    warm = load_photos({**data, "views": list(plan.blocks[0].views)[:12]}, response="srgb")
-    short = override_config(config, {"schedule.iterations": WARM_UP})
-    create_trainer(warm, study.out / "warm", short, device=device, overwrite=True).train()
-    seconds = _blocks(study, plan, "blocks", gpus)
-    if gpus > 1:
-        study.note("times", at_once_by_one_by_one=seconds / _blocks(study, plan, "one_by_one", 1))
-    merge_blocks(study.out / "blocks", plan)
-    whole = create_trainer(
-        load_photos(data, response="srgb"), study.out / "whole", config, device=device, overwrite=True
-    ).train()
-    merged = load_run(study.out / "blocks", device=device)
-    names = [entry.name for entry in merged.cameras if entry.split == "test"]
-    views = load_photos({**data, "views": names}, response="srgb").views
-    for name, run in (("merged", merged), ("whole", whole)):
-        errors = measure_seams(run, views, plan.division, depths=merged)
-        memory = run.summary().get("peak_gpu_memory_bytes") or run.summary().get("peak_memory_bytes")
-        study.note(name, gaussians=run.gaussian_count, seconds=run.train_seconds, peak_bytes=memory, **asdict(errors))
-    if device.type == "cuda":
-        _render_copies(study, merged)
-
-
-def _sizes(study: Study) -> dict:
-    """Return the sizes as plain values."""
-    return {name: getattr(study, name) for name in ("views", "size", "gaussians", "steps", "count")}
+    plan = replace(plan, config=override_config(plan.config, {"schedule.iterations": round(study.steps * fraction)}))
+    _warm_up(study, plan, data, config)
+    devices = study.devices
+    at_once = min(AT_ONCE, len(devices))
+    arguments = data, config.model_dump(), study.out / "whole", str(devices[-1])
+    whole = multiprocessing.get_context("spawn").Process(target=_train_whole, args=arguments, daemon=True)
+    if len(devices) > AT_ONCE:
+        whole.start()
+    # The two longest blocks train first, beside each other.
+    pair = sorted(plan.blocks, key=lambda block: -block.fraction)[:AT_ONCE]
+    spans = _train_blocks(study, plan, "at_once", at_once)
+    beside_whole = whole.pid is not None
+    if not beside_whole:
+        whole.start()
+    both = max(spans[block.name][1] for block in pair)
+    merge_blocks(study.out / "at_once", plan)
+    run = load_run(study.out / "at_once", device=study.device)
+    held_out = [entry.name for entry in run.cameras if entry.split == "test"]
+    views = load_photos({**data, "views": held_out}, response="srgb").views
+    figures = {"gaussians": run.gaussian_count, "seconds": max(end for _, end in spans.values())}
+    peak = max(row["peak_memory_bytes"] or 0 for row in study.rows)
+    errors = measure_seams(run, views, plan.division)
+    study.add(f"{study.count} blocks, {at_once} at once, merged", **figures, peak_memory_bytes=peak, **asdict(errors))
+    names = " and ".join(block.name for block in pair)
+    study.add(f"{names} at once", seconds=both, beside_whole=beside_whole)
+    if study.left > 2.2 * both:
+        for block in plan.blocks:
+            if block not in pair:  # Finished blocks are not trained again.
+                place = Path(FOLDER) / block.name
+                shutil.copytree(study.out / "at_once" / place, study.out / "one_by_one" / place)
+        alone = _train_blocks(study, plan, "one_by_one", 1)
+        seconds = max(end for _, end in alone.values())
+        study.add(f"{names}, one after the other", seconds=seconds, ratio=both / seconds, beside_whole=whole.is_alive())
+    whole.join(max(1.0, study.left - 15))
+    if not whole.is_alive() and (study.out / "whole" / "summary.json").is_file():
+        _add_whole(study, run, views, plan)
+    if study.left > COPY_SECONDS:
+        _add_copies(study, run, views)
 
 
 def _config(study: Study) -> Config:
@@ -102,57 +178,176 @@ def _config(study: Study) -> Config:
         "mcmc.cap_density": 0.0,
         "schedule.iterations": study.steps,
         "schedule.evaluate_at": [30_000],
+        "loss.light_prior": False,
+        "model.initial_density": 100.0,
+        "model.exposure_compensation": "never",
+        "seed": 0,
     }
     return override_config(load_config("default", fields), {"plan.keep": sorted(fields)})
 
 
-def _blocks(study: Study, plan: BlockPlan, name: str, at_once: int) -> float:
-    """Train all blocks; return the seconds that it takes."""
+def _warm_up(study: Study, plan: BlockPlan, data: LoadArguments, config: Config) -> None:
+    """Compile kernels before anything is timed."""
+    scene = load_photos({**data, "views": list(plan.blocks[0].views)[:12]}, response="srgb")
+    short = override_config(config, {"schedule.iterations": WARM_UP})
+    create_trainer(scene, study.out / "warm", short, device=study.device, overwrite=True).train()
+    if study.device.type == "cuda":
+        torch.cuda.empty_cache()
+
+
+def _train_whole(data: LoadArguments, config: Mapping[str, Any], out: Path, device: str) -> None:
+    """Train the whole survey, in a process of its own."""
+    logging.basicConfig(filename=out.with_suffix(".log"), level=logging.INFO, format="%(asctime)s %(message)s")
+    scene = load_photos(data, response="srgb")
+    create_trainer(scene, out, config_from_dict(dict(config), "config"), device=device, overwrite=True).train()
+
+
+def _train_blocks(study: Study, plan: BlockPlan, name: str, at_once: int) -> dict[str, tuple[float, float]]:
+    """Train the unfinished blocks in OUT/name and add a row for each.
+
+    Returns:
+        For each of them when it began and ended, seconds from the start of the first.
+    """
     out = study.out / name
     out.mkdir(exist_ok=True)
     plan.write(out)
-    began = time.perf_counter()
-    run_blocks(out, plan, device=study.device, gpus=at_once)
-    seconds = time.perf_counter() - began
-    parts = [json.loads(path.read_text()) for path in sorted(out.glob("blocks/*/summary.json"))]
-    figures = {field: [part.get(field) for part in parts] for field in ("gaussians", "train_seconds")}
-    study.note(name, at_once=at_once, seconds=seconds, **figures)
-    return seconds
+    handler = _Spans()
+    logging.getLogger("sehdr_warp").addHandler(handler)
+    began = time.monotonic()
+    try:
+        run_blocks(out, plan, device=study.device, gpus=at_once)
+    finally:
+        logging.getLogger("sehdr_warp").removeHandler(handler)
+    spans = {block: (begin - began, handler.end[block] - began) for block, begin in handler.begin.items()}
+    for block in plan.blocks:
+        if block.name in spans:
+            begin, end = spans[block.name]
+            summary = json.loads((out / FOLDER / block.name / "summary.json").read_text())
+            values = {"photos": len(block.views), "steps": plan.config.schedule.iterations, "seconds": end - begin}
+            beside = "beside another" if at_once > 1 else "alone"
+            study.add(f"{block.name}, {beside}", **values, **_facts(summary))
+    return spans
 
 
-def _render_copies(study: Study, run: Run) -> None:
-    """Render copies of the scene side by side, COPIES Gaussians in all, at 1920 x 1080."""
-    tensors, count = run.field.gaussians.tensors(), run.gaussian_count
-    copies = -(-COPIES // count)
-    span = tensors["means"].quantile(0.98, dim=0) if count < 10**7 else tensors["means"].amax(0)
-    places = [torch.tensor([k % 4 - 1.5, k // 4 - 1.5, 0.0], device=run.device) * span for k in range(copies)]
-    many = {name: torch.cat([tensors[name]] * copies)[:COPIES] for name in PARAMETER_NAMES if name != "means"}
-    means = torch.cat([tensors["means"] + place for place in places])[:COPIES]
-    run.field.gaussians, run.field.confidence = Gaussians(means, **many), None
-    del tensors, many, means
-    torch.cuda.empty_cache()
-    torch.cuda.reset_peak_memory_stats()
-    camera, frames = run.cameras[0].camera.resized(1920, 1080), []
-    for _ in range(FRAMES):
+def _facts(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the Gaussians, seconds of steps and memory of a training: a GPU's, or that of its process."""
+    peak = summary.get("peak_gpu_memory_bytes") or summary.get("peak_memory_bytes")
+    values = {"gaussians": summary["gaussians"], "step_seconds": summary["train_seconds"]}
+    return values | {"peak_memory_bytes": peak}
+
+
+def _add_whole(study: Study, merged: Run, views: Sequence[View], plan: BlockPlan) -> None:
+    """Add the figures of the whole; the merged run tells which pixels are near borders."""
+    run = load_run(study.out / "whole", device=study.device)
+    errors = measure_seams(run, tuple(views), plan.division, depths=merged)
+    photos = sum(entry.split == "train" for entry in run.cameras)
+    study.add("the whole", photos=photos, steps=study.steps, **_facts(run.summary()), **asdict(errors))
+
+
+def _add_copies(study: Study, run: Run, views: Sequence[View]) -> None:
+    """Write copies of the merged run side by side as a run, render it from the disk, and look at it."""
+    tensors = {name: tensor.detach().cpu() for name, tensor in run.field.gaussians.tensors().items()}
+    means = tensors["means"]
+    span = (means.amax(0) - means.amin(0)).clamp(max=4)
+    shifts = [torch.tensor([k % 4 - 1.5, k // 4 - 1.0, 0.0]) * span for k in range(-(-study.copies // len(means)))]
+    many = {f"gaussians.{name}": torch.cat([tensors[name]] * len(shifts))[: study.copies] for name in PARAMETER_NAMES}
+    many["gaussians.means"] = torch.cat([means + shift for shift in shifts])[: study.copies]
+    folder = study.out / "at_once"
+    RunWriter(folder).write_checkpoint(many, {"iteration": run.iterations + 1, "seconds": 1.0}, keep=1)
+    del many, run, tensors, means
+    cuda = study.device.type == "cuda"
+    if cuda:
+        torch.cuda.empty_cache()
+    before = torch.cuda.mem_get_info(study.device)[0] if cuda else 0
+    run = load_run(folder, device=study.device)
+    frames = []
+    for view in [*views[:1], *list(views)[:FRAMES]]:  # The first one is not counted.
         began = time.perf_counter()
-        float(run.render(camera).hdr.mean())
+        float(run.render(view.camera.resized(*SIZE)).hdr.mean())
         frames.append(time.perf_counter() - began)
-    free, total = torch.cuda.mem_get_info()
-    study.note(
-        "copies",
-        gaussians=COPIES,
-        median_ms=1e3 * sorted(frames)[FRAMES // 2],
-        peak_bytes=torch.cuda.max_memory_allocated(),
-        gpu_bytes=total - free,
-    )
+    memory = before - torch.cuda.mem_get_info(study.device)[0] if cuda else None
+    study.add("copies, rendered", gaussians=run.gaussian_count, **_milliseconds(frames), peak_memory_bytes=memory)
+    cameras = [view.camera for view in views]
+    del run
+    if cuda:
+        torch.cuda.empty_cache()
+    if study.left > VIEW_SECONDS:
+        _add_view(study, folder, cameras)
+
+
+def _add_view(study: Study, folder: Path, cameras: Sequence[Camera]) -> None:
+    """Ask `sehdr-warp view` for pictures as its page does: small ones while it moves, then a full one."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    cuda = study.device.type == "cuda"
+    before = torch.cuda.mem_get_info(study.device)[0] if cuda else 0
+
+    def ask(path: str, body: dict | None = None) -> bytes:
+        data = None if body is None else json.dumps(body).encode()
+        request = Request(f"http://127.0.0.1:{port}{path}", data, {"Content-Type": "application/json"})
+        with urlopen(request, timeout=60) as answer:
+            return answer.read()
+
+    words = [sys.executable, "-m", "sehdr_warp", "view", folder, "--port", str(port), "--device", str(study.device)]
+    with open(study.out / "view.log", "w") as log:
+        process = subprocess.Popen(words, stdout=log, stderr=log)
+    try:
+        while True:
+            try:
+                ask("/versions")
+                break
+            except OSError:
+                if process.poll() is not None or study.left < 5:
+                    raise
+                time.sleep(0.2)
+        for what, size, draft in (("moving", DRAFT, True), ("at rest", SIZE, False)):
+            times = []
+            for camera in [cameras[0], *cameras[:FRAMES]]:
+                began = time.perf_counter()
+                ask("/frame", {"run": 0, "camera": camera.resized(*size).to_dict(), "draft": draft})
+                times.append(time.perf_counter() - began)
+            memory = before - torch.cuda.mem_get_info(study.device)[0] if cuda else None
+            values = {"gaussians": study.copies, "peak_memory_bytes": memory}
+            study.add(f"copies, in the viewer, {what}", **values, **_milliseconds(times))
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+def _milliseconds(times: Sequence[float]) -> dict[str, float]:
+    """Return the median and the longest of times in seconds after the first, in milliseconds."""
+    later = sorted(times[1:])
+    return {"median_ms": 1e3 * later[len(later) // 2], "slowest_ms": 1e3 * later[-1]}
+
+
+def main(
+    out: tyro.conf.Positional[Path],
+    /,
+    views: int = 400,
+    size: int = 560,
+    gaussians: int = 2_300_000,
+    steps: int = 8700,
+    count: int = 4,
+    copies: int = 20_000_000,
+    device: str = "cuda" if torch.cuda.is_available() else "cpu",
+    seconds: float = 1e9,
+    json: Path | None = None,
+) -> None:
+    """Run the study in a new folder; `json` is written even if a part of it fails."""
+    logging.basicConfig(level=logging.INFO, format="%(relativeCreated)7d %(message)s", stream=sys.stdout)
+    out.mkdir(parents=True, exist_ok=True)
+    first = torch.device("cuda:0" if device == "cuda" else device)
+    study = Study(out, views, size, gaussians, steps, count, copies, first, seconds)
+    settings = {"views": views, "size": size, "gaussians": gaussians, "steps": steps, "blocks": count}
+    result = new_result("blocks", first, {**settings, "GPUs": len(study.devices) if first.type == "cuda" else 0})
+    try:
+        run_study(study)
+    finally:
+        result["rows"] = study.rows
+        if json is not None:
+            write_json(json, result, overwrite=True)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path)
-    sizes = {"views": 400, "size": 640, "gaussians": 2_000_000, "steps": 6000, "count": 4}
-    for name, default in sizes.items():
-        parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--device", type=torch.device, default="cuda" if torch.cuda.is_available() else "cpu")
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    run_study(Study(**vars(parser.parse_args())))
+    tyro.cli(main)

@@ -192,6 +192,7 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "cores": partial(_rows_table, "workers"),
     "gpus": partial(_rows_table, "workers"),
     "large": _large_tables,
+    "blocks": partial(_rows_table, "blocks"),
     "response": partial(_rows_table, "response"),
     "stability": _stability_tables,
     "trust": _trust_tables,

@@ -13,12 +13,13 @@ from ..errors import InputError
 from ..files import read_bytes, read_lines
 from .dataparser import NO_POINTS, PointCloud, pose_from_quaternion
 from .lens import CAMERA_MODELS, Lens
+from .names import is_kept_by_system
 
 # pycolmap is not used here: it hangs on a damaged count and accepts a truncated file as a whole one.
 MAX_NAME_BYTES = 4096
 _DEEPEST = 3  # Levels of folders below a set in which a model is looked for
 _MOST_PLACES = 1000  # Folders of a level that are looked at
-_NO_MODELS = {"distorted", "images", "input"}
+_NO_MODELS = {"distorted", "images", "input"}  # `distorted` is of photos before COLMAP undistorted them
 _REMEDY = "export the model again with COLMAP"
 
 
@@ -80,12 +81,11 @@ def _model_elsewhere(folder: Path) -> Path | None:
             return models[0]
         inner: list[Path] = []
         for place in places:
-            with suppress(OSError):
-                inner += sorted(each for each in place.iterdir() if each.is_dir() and not each.is_symlink())
-        # A folder with `images` is a set of its own; `distorted` is of photos before COLMAP undistorted them.
-        places = [each for each in inner if each.name not in _NO_MODELS and not (each / "images").is_dir()][
-            :_MOST_PLACES
-        ]
+            with suppress(OSError), os.scandir(place) as entries:
+                names = sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
+                inner += [place / name for name in names if name not in _NO_MODELS and not is_kept_by_system(name)]
+        # A folder with `images` is a set of its own.
+        places = [each for each in inner[:_MOST_PLACES] if not (each / "images").is_dir()]
     return None
 
 
