@@ -132,7 +132,8 @@ def blend_on_cpu(
     def rows(*shape):
         return features.new_empty(tile_count, *shape, blend_cpu.LANES)
 
-    lane_offsets, count = torch.arange(blend_cpu.LANES, dtype=features.dtype), blend_cpu.HALVES * TILE_SIZE
+    count = blend_cpu.HALVES * TILE_SIZE
+    lane_offsets = torch.arange(blend_cpu.LANES, dtype=features.dtype, device=features.device)
     means_opacities, conics_cutoffs = packed.means_opacities, packed.conics_cutoffs
     frame = features, lists.columns, width, height, alpha_threshold, lane_offsets
     tile_transmittance, last_contributor = rows(count), rows(count)
@@ -196,7 +197,7 @@ def balanced_pieces(lists: TileLists) -> Tensor:
         (lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]).add(16).cumsum(0).double()
     )  # 16: a tile costs something in itself
     pieces = min(thread_count() * PIECES_PER_THREAD, tile_count)
-    goals = torch.arange(pieces + 1, dtype=torch.float64) * (float(work[-1]) / pieces)
+    goals = torch.arange(pieces + 1, dtype=torch.float64, device=work.device) * (float(work[-1]) / pieces)
     bounds = torch.searchsorted(work, goals, out_int32=True)
     bounds[0], bounds[-1] = 0, tile_count
     return bounds

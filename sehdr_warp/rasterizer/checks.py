@@ -5,6 +5,8 @@ Nothing here waits for a GPU: values are looked at on the CPU alone.
 
 import math
 import operator
+from collections.abc import Callable
+from numbers import Real
 from typing import Any
 
 import torch
@@ -62,12 +64,52 @@ def integer(name: str, value: Any, least: int, most: int) -> int:
     return number
 
 
+def real(name: str, value: Any, accepts: Callable[[float], bool], expected: str) -> float:
+    """Return the value as a float; raise TypeError for what is not a number, ValueError for one that is not accepted.
+
+    expected: what accepts() does, as in "a positive number".
+    """
+    if not isinstance(value, Real):
+        raise TypeError(f"{name} is {value!r:.60}, expected a number")
+    if not accepts(number := float(value)):
+        raise ValueError(f"{name} {value} is not {expected}")
+    return number
+
+
+def is_positive(number: float) -> bool:
+    """Return whether a number is above 0 and finite."""
+    return 0.0 < number < math.inf
+
+
+def is_not_negative(number: float) -> bool:
+    """Return whether a number is 0 or more, and finite."""
+    return 0.0 <= number < math.inf
+
+
+def check_render_options(near_plane: Any, alpha_threshold: Any, **flags: Any) -> None:
+    """Raise TypeError or ValueError for options of a render that are of another type or out of range.
+
+    flags: by name, options that are True or False.
+    """
+    real("near_plane", near_plane, is_positive, "a positive number")
+    real("alpha_threshold", alpha_threshold, lambda number: 0.0 < number < 1.0, "between 0 and 1")
+    for name, flag in flags.items():
+        if flag not in (True, False):
+            raise TypeError(f"{name} is {flag!r:.60}, expected True or False")
+
+
 def check_opacities(opacities: Tensor) -> None:
     """Raise ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
     if opacities.device.type == "cpu" and opacities.numel():
         low, high = (float(value) for value in opacities.detach().aminmax())
         if -math.inf < low < -1e-6 or math.inf > high > 1 + 1e-6:
             raise ValueError(f"opacities are from {low:g} to {high:g}, expected 0 to 1; give logits through a sigmoid")
+
+
+def check_position(position: Tensor) -> None:
+    """Raise ValueError for a position [3] on the CPU that is not finite."""
+    if position.device.type == "cpu" and not all(map(math.isfinite, place := position.detach().tolist())):
+        raise ValueError(f"position is {place}, expected finite numbers")
 
 
 def check_cameras(world_to_camera: Tensor, intrinsics: Tensor) -> None:

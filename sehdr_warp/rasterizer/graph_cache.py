@@ -173,7 +173,7 @@ class CapturedRender:
         projects = len(inputs) == 7
         channels = inputs[FEATURES].shape[1] + options.depth if projects else inputs[-1].shape[1]
         image, transmittance = inputs[0].new_empty(height, width, channels), inputs[0].new_empty(height, width)
-        counter = torch.empty(1, dtype=torch.int64, pin_memory=True)
+        counter = torch.empty(1, dtype=torch.int64, device="cpu", pin_memory=True)
         self._counter, self._count = counter, ctypes.c_int64.from_address(counter.data_ptr())
         self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(device)
         self._counting = CudaGraphRunner(device)

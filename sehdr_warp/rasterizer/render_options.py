@@ -1,12 +1,11 @@
 """The options of a rendered image, and their ranges."""
 
-import math
 from typing import NamedTuple
 
 import torch
 
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
-from .checks import integer
+from .checks import check_render_options, integer, is_not_negative, real
 from .cuda_graphs import is_capturing
 
 MAX_INTERSECTIONS = 2**31 - 1  # They are counted in int32.
@@ -36,12 +35,9 @@ class RenderOptions(NamedTuple):
                 "rasterize() waits for the GPU to learn how much memory it needs, which a CUDA graph cannot; "
                 "give max_intersections"
             )
-        if not 0.0 < self.near_plane < math.inf:
-            raise ValueError(f"near_plane {self.near_plane} is not a positive number")
-        if not 0.0 <= self.eps2d < math.inf:
-            raise ValueError(f"eps2d {self.eps2d} is not a number from 0")
-        if not 0.0 < self.alpha_threshold < 1.0:
-            raise ValueError(f"alpha_threshold {self.alpha_threshold} is not between 0 and 1")
+        real("eps2d", self.eps2d, is_not_negative, "a number from 0")
+        flags = {"antialiased": self.antialiased, "depth": self.depth, "deterministic": self.deterministic}
+        check_render_options(self.near_plane, self.alpha_threshold, **flags)
         width = integer("width", self.width, 1, MAX_SIDE)
         height = integer("height", self.height, 1, MAX_SIDE)
         if width is self.width and height is self.height and limit is self.max_intersections:

@@ -10,7 +10,15 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
 from .blending import gather_by_gaussian
-from .checks import check_opacities, check_tensors
+from .checks import (
+    check_opacities,
+    check_position,
+    check_render_options,
+    check_tensors,
+    is_not_negative,
+    is_positive,
+    real,
+)
 from .memory import oom_context
 from .projection import launch_projection
 from .tile_lists import EmitOrder, check_intersection_count, depth_order, lists_by_tile, tile_grid
@@ -76,6 +84,10 @@ def rasterize_directions(
         directions=(directions, ("H", "W", 3)),
     )
     check_opacities(opacities)
+    check_position(position)
+    real("focal_length", focal_length, is_positive, "a positive number")
+    real("pixel_angle", pixel_angle, is_not_negative, "a number from 0")
+    check_render_options(near_plane, alpha_threshold, antialiased=antialiased)
     height, width = directions.shape[:2]
     if not height * width:
         raise ValueError(f"directions has shape {list(directions.shape)}, expected [H, W, 3] with at least one pixel")

@@ -327,14 +327,15 @@ def _count_by_tile(tiles, gaussians, length: int, tile_count: int, keep_emit_ord
     """Sort by counting: each thread takes a few chunks, and within a tile those of the first chunk come first."""
     tiles, gaussians = tiles[:length], gaussians[:length]
     chunks = max(1, min(2 * thread_count(), length // MIN_CHUNK))
-    counts = torch.zeros(chunks, tile_count + 1, dtype=torch.int32)
-    size, spans = -(-length // chunks), torch.arange(chunks + 1, dtype=torch.int32)
+    counts = torch.zeros(chunks, tile_count + 1, dtype=torch.int32, device=tiles.device)
+    size = -(-length // chunks)
+    spans = torch.arange(chunks + 1, dtype=torch.int32, device=tiles.device)
     launch(kernels.count_tiles, chunks, tiles, size, counts, ranges=spans)
     by_tile = counts.t().reshape(-1)
     starts = (by_tile.cumsum(0) - by_tile).int().view(tile_count + 1, chunks).t().contiguous()
     tile_ranges = torch.stack([starts[0, :-1], starts[0, 1:]], 1)
     ordered = torch.empty_like(gaussians)
-    emit_indices = torch.empty(length if keep_emit_order else 0, dtype=torch.int32)
+    emit_indices = torch.empty(length if keep_emit_order else 0, dtype=torch.int32, device=tiles.device)
     launch(kernels.place_intersections, chunks, tiles, gaussians, size, starts, ordered, emit_indices, ranges=spans)
     return tile_ranges, ordered, None, emit_indices if keep_emit_order else None
 

@@ -15,6 +15,14 @@ T = TypeVar("T")
 
 HALF = torch.float16, torch.bfloat16
 
+NOT_TWICE = b"operations of sehdr_warp are differentiable once, not twice (once_differentiable)"
+NOT_BATCHED = (
+    "operations of sehdr_warp do not differentiate batches of gradients (vectorize=True, is_grads_batched=True); "
+    "call torch.autograd.grad() for each"
+)
+
+_BATCHES = torch._C._parse_dispatch_key("VmapMode")
+_includes_key = torch._C._dispatch_tls_is_dispatch_key_included
 _transforms_are_active = torch._C._are_functorch_transforms_active
 
 
@@ -94,15 +102,23 @@ def keeps_graph() -> bool:
 
 
 def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
-    """Mark an autograd.Function's backward as torch.autograd.function.once_differentiable() does, for less host time.
+    """Let what differentiates a gradient raise RuntimeError, and a batch of gradients NotImplementedError.
 
-    Torch's own wrapper is called only while gradients of gradients are recorded.
+    torch.autograd.function.once_differentiable() lets a gradient pass that came from a constant, as that of a sum does:
+    what a loss adds by it would then be missing from the second derivative in silence.
     """
-    marked = torch.autograd.function.once_differentiable(backward)
 
     @wraps(backward)
-    def call(ctx: Any, *upstream: Any) -> T:
-        return (marked if torch.is_grad_enabled() else backward)(ctx, *upstream)
+    def call(ctx: Any, *upstream: Any) -> Any:
+        if _includes_key(_BATCHES):
+            raise NotImplementedError(NOT_BATCHED)
+        if not torch.is_grad_enabled():
+            return backward(ctx, *upstream)
+        with torch.no_grad():
+            gradients = backward(ctx, *upstream)
+        gradients = gradients if isinstance(gradients, tuple) else (gradients,)
+        refuse: Any = torch._C._functions.DelayedError(NOT_TWICE, len(gradients))
+        return refuse(*(None if each is None else each.detach().requires_grad_() for each in gradients))
 
     return call
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import rasterize, spherical_harmonics, ssim
+from sehdr_warp.rasterizer import rasterize, rasterize_directions, spherical_harmonics, ssim
 
 from .scenes import random_scene
 
@@ -65,12 +65,39 @@ def arguments(**changes):
         ("near_plane", lambda _: float("nan"), ValueError, "near_plane nan is not"),
         ("eps2d", lambda _: -0.1, ValueError, "eps2d -0.1 is not"),
         ("alpha_threshold", lambda _: float("nan"), ValueError, "alpha_threshold nan is not"),
+        ("near_plane", lambda _: None, TypeError, "near_plane is None, expected a number"),
+        ("eps2d", lambda _: torch.tensor(0.3), TypeError, r"eps2d is tensor\(0.3000\), expected a number"),
+        ("antialiased", lambda _: "no", TypeError, "antialiased is 'no', expected True or False"),
     ],
 )
 def test_misfits_of_a_render_are_named(name, change, kind, message):
     with pytest.raises(kind, match=message) as caught:
         rasterize(**arguments(**{name: change}))
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "message"),
+    [
+        ("focal_length", 0.0, ValueError, "focal_length 0.0 is not a positive number"),
+        ("focal_length", "60", TypeError, "focal_length is '60', expected a number"),
+        ("pixel_angle", NAN, ValueError, "pixel_angle nan is not a number from 0"),
+        ("near_plane", -1.0, ValueError, "near_plane -1.0 is not a positive number"),
+        ("alpha_threshold", 1.0, ValueError, "alpha_threshold 1.0 is not between 0 and 1"),
+        ("antialiased", None, TypeError, "antialiased is None, expected True or False"),
+        (
+            "position",
+            torch.tensor([0.0, NAN, 0.0]).double(),
+            ValueError,
+            "position is .*nan.*, expected finite numbers",
+        ),
+    ],
+)
+def test_misfits_of_a_picture_of_the_sphere_are_named(name, value, kind, message):
+    tensors = random_scene(count=5).arguments[:5]
+    given = {"position": torch.zeros(3).double(), "directions": torch.ones(2, 2, 3).double(), "focal_length": 60.0}
+    with pytest.raises(kind, match=message):
+        rasterize_directions(*tensors, **given | {name: value})
 
 
 def test_a_device_without_kernels_is_named():

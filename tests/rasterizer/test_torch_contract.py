@@ -65,13 +65,13 @@ def operations(device="cpu"):
 
     position = torch.zeros(3, dtype=torch.float64, device=device, requires_grad=True)
     images = random(7, 6, 3), random(7, 6, 3)
-    look = {"focal_length": 22.0, "alpha_threshold": 1e-9}
+    rays, look = directions(device), {"focal_length": 22.0, "alpha_threshold": 1e-9}
     return {
         # Without a threshold: at its border the picture is not continuous, and differences are no derivatives.
         "rasterize": (lambda *t: rasterize(*t, *SIZE, alpha_threshold=1e-9).image, leaves),
         "transmittance": (lambda *t: rasterize(*t, *SIZE, alpha_threshold=1e-9).transmittance, leaves),
         "depth": (lambda *t: rasterize(*t, *SIZE, depth=True, alpha_threshold=1e-9).depth, leaves),
-        "directions": (lambda *t: rasterize_directions(*t, directions(device), **look)[0], [*leaves[:5], position]),
+        "directions": (lambda *t: rasterize_directions(*t, rays, **look)[0], [*leaves[:5], position]),
         "harmonics": (lambda *t: spherical_harmonics(3, *t), [random(5, 16, 3), random(5, 3), position]),
         "ssim": (ssim, images),
         "ssim_map": (ssim_map, images),
@@ -119,12 +119,30 @@ def test_changes_in_place_raise_torchs_error_or_change_no_gradient(name):
     assert errors
 
 
+@pytest.mark.parametrize("total", [torch.sum, lambda result: result.square().sum()], ids=["sum", "squares"])
 @pytest.mark.parametrize("name", NAMES)
-def test_gradients_of_gradients_are_refused(name):
+def test_gradients_of_gradients_are_refused(name, total):
     function, leaves = operations()[name]
-    gradient = torch.autograd.grad(function(*leaves).square().sum(), leaves[0], create_graph=True)[0]
-    with pytest.raises(RuntimeError, match="once_differentiable"):
+    gradient = torch.autograd.grad(total(function(*leaves)), leaves[0], create_graph=True)[0]
+    with pytest.raises(RuntimeError, match="differentiable once, not twice"):
         (gradient * leaves[0]).sum().backward()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_batches_of_gradients_are_refused_by_a_sentence(name):
+    function, leaves = operations()[name]
+    result = function(*leaves)
+    with pytest.raises(NotImplementedError, match="do not differentiate batches of gradients"):
+        torch.autograd.grad(result, leaves, torch.ones(2, *result.shape).to(result), is_grads_batched=True)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_default_device_of_the_user_changes_nothing(name):
+    function, leaves = operations()[name]
+    truth = torch.autograd.grad(function(*leaves).sum(), leaves)
+    with torch.device("meta"):
+        gradients = torch.autograd.grad(function(*leaves).sum(), leaves)
+    assert all(map(torch.equal, gradients, truth))
 
 
 @pytest.mark.parametrize("name", NAMES)

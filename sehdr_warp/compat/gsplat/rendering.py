@@ -1,12 +1,13 @@
 """gsplat's rasterization() made of the rasterizer's stages."""
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from ...rasterizer.checks import integer
+from ...rasterizer.checks import integer, is_not_negative, real
 from ...rasterizer.memory import oom_context
 from ...rasterizer.rasterization import render_projected
 from ...rasterizer.render_options import MAX_SIDE, RenderOptions
@@ -17,6 +18,7 @@ from .splats import JoinedSplats, make_meta
 
 RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RASTERIZE_MODES = "classic", "antialiased"
 
 
 @torch_operation
@@ -109,10 +111,16 @@ def rasterization(
         raise ValueError(f"render_mode {render_mode!r} is none of {', '.join(RENDER_MODES)}")
     if camera_model not in CAMERA_MODELS:
         raise ValueError(f"camera_model {camera_model!r} is none of {', '.join(CAMERA_MODELS)}")
+    if rasterize_mode not in RASTERIZE_MODES:
+        raise ValueError(f"rasterize_mode {rasterize_mode!r} is none of {', '.join(RASTERIZE_MODES)}")
+    for name in ("near_plane", "far_plane", "radius_clip"):
+        real(name, values[name], lambda number: not math.isnan(number), "a number")
+    real("eps2d", eps2d, is_not_negative, "a number from 0")
     if covars is not None:
         quats = scales = None
     inputs = Inputs.flattened(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, sh_degree)
     size = integer("width", width, 1, MAX_SIDE), integer("height", height, 1, MAX_SIDE)
+    tile_size = integer("tile_size", tile_size, 1, MAX_SIDE)
     culling = Culling(max(near_plane, 0.0), far_plane, radius_clip)
     antialiased, has_depth, has_color = rasterize_mode == "antialiased", "D" in render_mode, "RGB" in render_mode
     with oom_context(means.device, lambda: (means.shape[-2], *size)):

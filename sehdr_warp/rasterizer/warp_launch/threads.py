@@ -115,7 +115,7 @@ def single_range(count: int) -> Tensor:
 
 @lru_cache
 def _even_ranges(count: int, pieces: int) -> Tensor:
-    return torch.arange(pieces + 1).mul(count).div(pieces, rounding_mode="floor").int()
+    return torch.arange(pieces + 1, device="cpu").mul(count).div(pieces, rounding_mode="floor").int()
 
 
 @contextmanager
