@@ -1,17 +1,25 @@
 """gsplat's projection: any of its cameras that a matrix describes, covariances, and the tiles that Gaussians touch."""
 
 import math
-from typing import Literal, NamedTuple
+from itertools import product
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ...rasterizer.checks import check_tensors
 from ...rasterizer.projection import FRUSTUM_MARGIN, ProjectedGaussians, project_to_camera
 from ...rasterizer.render_options import ALPHA_THRESHOLD, RenderOptions
 
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS = "pinhole", "ortho", "fisheye"
 SMALLEST_SIZE = 1e-30  # A size of 0 has no logarithm; its gradient is 0 as the covariance's is.
+
+
+def check_camera_model(camera_model: Any) -> None:
+    """Raise ValueError for what is not one of CAMERA_MODELS."""
+    if camera_model not in CAMERA_MODELS:
+        raise ValueError(f"camera_model {camera_model!r} is none of {', '.join(CAMERA_MODELS)}")
 
 
 class Culling(NamedTuple):
@@ -222,12 +230,12 @@ def fully_fused_projection(
     """Project N Gaussians to C cameras.
 
     Args:
-        means: [N, 3].
-        covars: [N, 3, 3] or [N, 6], or None with quats and scales.
-        quats: [N, 4].
-        scales: [N, 3].
-        viewmats: [C, 4, 4].
-        Ks: [C, 3, 3].
+        means: [..., N, 3]; "..." are batch axes, which all tensors share.
+        covars: [..., N, 6] (upper triangles) or [..., N, 3, 3], or None with quats and scales.
+        quats: [..., N, 4].
+        scales: [..., N, 3].
+        viewmats: [..., C, 4, 4].
+        Ks: [..., C, 3, 3].
         width: of the images, pixels.
         height: of the images, pixels.
         eps2d: variance in square pixels added to each 2D Gaussian.
@@ -238,35 +246,62 @@ def fully_fused_projection(
         sparse_grad: must be False.
         calc_compensations: return the factors of antialiased opacities.
         camera_model: "pinhole", "ortho" or "fisheye".
-        opacities: [N], for tighter radii; 1 if None.
+        opacities: [..., N], for tighter radii; 1 if None.
 
     Returns:
-        radii [C, N, 2] int32 (0 if culled), means2d [C, N, 2], depths [C, N], conics [C, N, 3] and compensations [C, N]
-        or None. If packed: batch_ids, camera_ids, gaussian_ids [nnz] and then the same with [nnz] rows.
+        radii [..., C, N, 2] int32 (0 if culled), means2d [..., C, N, 2], depths [..., C, N], conics [..., C, N, 3] and
+        compensations [..., C, N] or None. If packed: batch_ids, camera_ids, gaussian_ids [nnz] and then the same with
+        [nnz] rows.
+
+    Raises:
+        TypeError: for what is not a tensor.
+        ValueError: for an argument that is not supported, and for shapes, dtypes or devices that do not fit.
     """
     if sparse_grad:
         raise ValueError("sparse_grad = True is not supported, expected False")
-    if covars is not None and covars.shape[-1] == 6:
+    check_camera_model(camera_model)
+    if isinstance(covars, Tensor) and covars.shape[-1] == 6:
         covars = covars[..., (0, 1, 2, 1, 3, 4, 2, 4, 5)].unflatten(-1, (3, 3))
-    alphas = torch.ones_like(means[:, 0]) if opacities is None else opacities
+    batch = tuple(means.shape[:-2]) if isinstance(means, Tensor) else ()
+    shapes: dict[str, tuple[Any, tuple[int | str, ...]]] = {"covars": (covars, (*batch, "N", 3, 3))}
+    if covars is None:
+        shapes = {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
+    if opacities is not None:
+        shapes["opacities"] = opacities, (*batch, "N")
+    check_tensors(
+        means=(means, (*batch, "N", 3)),
+        **shapes,
+        viewmats=(viewmats, (*batch, "C", 4, 4)),
+        Ks=(Ks, (*batch, "C", 3, 3)),
+    )
+    alphas = torch.ones_like(means[..., 0]) if opacities is None else opacities
+    indices = list(product(*map(range, (*batch, viewmats.shape[-3]))))
+    if not indices:
+        raise ValueError(f"viewmats has shape {list(viewmats.shape)}, expected a camera at least")
     views = [
         project_gaussians(
-            means, quats, scales, covars, alphas, viewmat, K, width, height, eps2d=eps2d,
+            means[scene], *(None if tensor is None else tensor[scene] for tensor in (quats, scales, covars)),
+            alphas[scene], viewmats[*scene, camera], Ks[*scene, camera], width, height, eps2d=eps2d,
             culling=Culling(near_plane, far_plane, radius_clip), antialiased=calc_compensations,
             camera_model=camera_model,
         )
-        for viewmat, K in zip(viewmats, Ks, strict=True)
+        for *axes, camera in indices
+        for scene in (tuple(axes),)
     ]  # fmt: skip
-    means2d, conics, depths, lowered, extents = (torch.stack(each) for each in zip(*views, strict=True))
-    compensations = lowered / alphas.clamp_min(1e-30) if calc_compensations else None
+    shape = *batch, viewmats.shape[-3]
+    stacked = (torch.stack(each).unflatten(0, shape) for each in zip(*views, strict=True))
+    means2d, conics, depths, lowered, extents = stacked
+    compensations = lowered / alphas[..., None, :].clamp_min(1e-30) if calc_compensations else None
     radii = extents.ceil().int()
     if not packed:
         return radii, means2d, depths, conics, compensations
-    camera_ids, gaussian_ids = (radii > 0).all(-1).nonzero(as_tuple=True)
-    rows = camera_ids, gaussian_ids
-    packed_compensations = None if compensations is None else compensations[rows]
-    ids = torch.zeros_like(camera_ids), camera_ids, gaussian_ids
-    return *ids, radii[rows], means2d[rows], depths[rows], conics[rows], packed_compensations
+    batch_ids, camera_ids, gaussian_ids = (radii > 0).all(-1).reshape(-1, *radii.shape[-3:-1]).nonzero(as_tuple=True)
+    rows = (batch_ids * shape[-1] + camera_ids) * radii.shape[-2] + gaussian_ids
+    packed_compensations = None if compensations is None else compensations.reshape(-1)[rows]
+    values = (value.flatten(0, -2)[rows] for value in (radii, means2d, depths[..., None], conics))
+    packed_radii, packed_means, packed_depths, packed_conics = values
+    ids = batch_ids, camera_ids, gaussian_ids
+    return *ids, packed_radii, packed_means, packed_depths[:, 0], packed_conics, packed_compensations
 
 
 def isect_tiles(
@@ -286,9 +321,9 @@ def isect_tiles(
     """Return the tiles that the bounding rectangles of 2D Gaussians touch.
 
     Args:
-        means2d: [C, N, 2] or, packed, [nnz, 2].
-        radii: [C, N, 2] or [nnz, 2] int32.
-        depths: [C, N] or [nnz], positive.
+        means2d: [..., N, 2] or, packed, [nnz, 2].
+        radii: [..., N, 2] or [nnz, 2] int32.
+        depths: [..., N] or [nnz], positive.
         tile_size: in pixels.
         tile_width: tiles across.
         tile_height: tiles down.
@@ -300,12 +335,13 @@ def isect_tiles(
         gaussian_ids: has no effect.
 
     Returns:
-        tiles_per_gauss [C, N] or [nnz] int32; isect_ids [M] int64, in bits from the highest: image, tile, 32 bits of
+        tiles_per_gauss [..., N] or [nnz] int32; isect_ids [M] int64, in bits from the highest: image, tile, 32 bits of
         the depth; flatten_ids [M] int32, the index in the flattened inputs.
     """
     shape = depths.shape
     if image_ids is None:
-        image_ids = torch.arange(shape[0], device=depths.device).repeat_interleave(shape[-1]).reshape(-1)
+        images = math.prod(shape[:-1])
+        image_ids = torch.arange(images, device=depths.device).repeat_interleave(shape[-1]).reshape(-1)
     centres, reach, depths = means2d.detach().reshape(-1, 2), radii.reshape(-1, 2), depths.detach().reshape(-1)
     limits = torch.tensor([tile_width, tile_height], device=centres.device)
     low = ((centres - reach) / tile_size).floor().clamp_min(0).minimum(limits).long()

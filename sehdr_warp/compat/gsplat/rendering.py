@@ -13,7 +13,7 @@ from ...rasterizer.rasterization import render_projected
 from ...rasterizer.render_options import MAX_SIDE, RenderOptions
 from ...rasterizer.torch_contract import torch_operation
 from .inputs import UNSUPPORTED, Inputs, check_supported
-from .projection import CAMERA_MODELS, CameraModel, Culling, project_gaussians
+from .projection import CameraModel, Culling, check_camera_model, project_gaussians
 from .splats import JoinedSplats, make_meta
 
 RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
@@ -109,8 +109,7 @@ def rasterization(
     check_supported({name: values[name] for name in UNSUPPORTED}, rolling_shutter)
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode {render_mode!r} is none of {', '.join(RENDER_MODES)}")
-    if camera_model not in CAMERA_MODELS:
-        raise ValueError(f"camera_model {camera_model!r} is none of {', '.join(CAMERA_MODELS)}")
+    check_camera_model(camera_model)
     if rasterize_mode not in RASTERIZE_MODES:
         raise ValueError(f"rasterize_mode {rasterize_mode!r} is none of {', '.join(RASTERIZE_MODES)}")
     for name in ("near_plane", "far_plane", "radius_clip"):

@@ -337,3 +337,43 @@ def test_antialiasing_is_differentiated_whole(device):
         gradients_of.append(torch.autograd.grad(image.square().sum(), leaves))
     for ours, true in zip(*gradients_of, strict=True):
         assert float((ours - true).norm() / true.norm()) < 1e-4
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_projections_of_batches_are_those_of_each_scene(packed, device):
+    leaves, (viewmats, Ks, width, height) = scene(device=device)
+    means, quats, scales, opacities = (leaf.detach() for leaf in leaves[:4])
+    shifts = [torch.tensor([0.1 * k, 0.0, 0.0], device=device) for k in range(2)]
+    options = {"packed": packed, "calc_compensations": True}
+    each = [
+        fully_fused_projection(
+            means + shift, None, quats, scales, viewmats, Ks, width, height, opacities=opacities, **options
+        )
+        for shift in shifts
+    ]
+    pair = [torch.stack([tensor] * 2) for tensor in (quats, scales, viewmats, Ks, opacities)]
+    both = fully_fused_projection(
+        torch.stack([means + shift for shift in shifts]), None, *pair[:4], width, height, opacities=pair[4], **options
+    )
+    if packed:
+        assert torch.equal(both[0].bincount(), torch.tensor([len(one[0]) for one in each], device=device))
+    for mine, *true in zip(both[packed:], *(one[packed:] for one in each), strict=True):
+        assert torch.equal(mine, torch.cat(true) if packed else torch.stack(true))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"camera_model": "ftheta"}, "camera_model 'ftheta' is none of pinhole, ortho, fisheye"),
+        ({"sparse_grad": True}, "sparse_grad = True is not supported"),
+        ({"quats": None}, r"quats is a builtins.NoneType, expected a torch tensor \[N, 4\]"),
+        ({"scales": torch.ones(3, 3)}, r"scales has shape \[3, 3\], expected \[N, 3\]"),
+        ({"opacities": torch.ones(3)}, r"opacities has shape \[3\], expected \[N\]"),
+    ],
+)
+def test_misfits_of_a_projection_are_named(options, message):
+    (means, quats, scales, *_), place = scene()
+    names = "means", "covars", "quats", "scales", "viewmats", "Ks", "width", "height"
+    given = dict(zip(names, (means, None, quats, scales, *place), strict=True)) | options
+    with pytest.raises((ValueError, TypeError), match=message):
+        fully_fused_projection(**given)
