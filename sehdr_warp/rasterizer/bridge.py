@@ -114,7 +114,8 @@ class _ProgramFunction(torch.autograd.Function):
         program = Program(plain, True)
         result = body(program, *plain, **options)
         outputs = result if isinstance(result, tuple) else (result,)
-        launches, tensors_of_program = program._launches, program._tensors
+        launches = program._launches
+        tensors_of_program = *tensors, *program._tensors[len(tensors) :]
         places = [program._places.get(id(tensor), -1) for tensor in outputs]
         if not program._written.issuperset(places):
             raise TypeError(f"{body.__name__}() returns a tensor that program.empty_output() did not make")

@@ -182,7 +182,7 @@ class _Blend(torch.autograd.Function):
         ctx.inputs = lists.tile_ranges, lists.gaussians, lists.directions.view(-1, 3)
         arguments = *ctx.inputs, *splats, *ctx.frame, image.view(-1, channels), transmittance, ends
         launch(ctx.kernels.blend, ctx.pixels, *arguments, min_range=_PIXELS)
-        ctx.save_for_backward(*splats, transmittance, ends)
+        ctx.save_for_backward(caps, across, along, opacities, features, transmittance, ends)
         return image, transmittance
 
     @staticmethod

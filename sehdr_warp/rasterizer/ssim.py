@@ -89,8 +89,7 @@ class _Similarity(torch.autograd.Function):
     @staticmethod
     def forward(ctx, a, b, mean):
         _check(a, b)
-        a, b = a.detach().contiguous(), b.detach().contiguous()
-        similarity, derivatives = _compare(a, b)
+        similarity, derivatives = _compare(a.detach().contiguous(), b.detach().contiguous())
         ctx.save_for_backward(a, b, derivatives)
         ctx.mean = mean
         # Sums within rows first: each is one thread's work, so the order of the additions is fixed.
@@ -100,6 +99,7 @@ class _Similarity(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, upstream):
         a, b, derivatives = ctx.saved_tensors
+        a, b = a.contiguous(), b.contiguous()
 
         def gradient(x, y, derivatives):
             if ctx.mean:

@@ -15,13 +15,13 @@ T = TypeVar("T")
 
 HALF = torch.float16, torch.bfloat16
 
-NOT_TWICE = b"operations of sehdr_warp are differentiable once, not twice (once_differentiable)"
+NOT_TWICE = "operations of sehdr_warp are differentiable once, not twice (once_differentiable)"
 NOT_BATCHED = (
     "operations of sehdr_warp do not differentiate batches of gradients (vectorize=True, is_grads_batched=True); "
     "call torch.autograd.grad() for each"
 )
 
-_BATCHES = torch._C._parse_dispatch_key("VmapMode")
+_BATCHES: Any = torch._C._parse_dispatch_key("VmapMode")
 _includes_key = torch._C._dispatch_tls_is_dispatch_key_included
 _transforms_are_active = torch._C._are_functorch_transforms_active
 
@@ -105,7 +105,8 @@ def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
     """Let what differentiates a gradient raise RuntimeError, and a batch of gradients NotImplementedError.
 
     torch.autograd.function.once_differentiable() lets a gradient pass that came from a constant, as that of a sum does:
-    what a loss adds by it would then be missing from the second derivative in silence.
+    what a loss adds by it would then be missing from the second derivative in silence. This one also refuses gradients
+    by what the node has saved of its inputs.
     """
 
     @wraps(backward)
@@ -116,11 +117,27 @@ def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
             return backward(ctx, *upstream)
         with torch.no_grad():
             gradients = backward(ctx, *upstream)
-        gradients = gradients if isinstance(gradients, tuple) else (gradients,)
-        refuse: Any = torch._C._functions.DelayedError(NOT_TWICE, len(gradients))
-        return refuse(*(None if each is None else each.detach().requires_grad_() for each in gradients))
+        parts: tuple[Any, ...] = gradients if isinstance(gradients, tuple) else (gradients,)
+        sources = [tensor for tensor in (*ctx.saved_tensors, *upstream) if tensor is not None and tensor.requires_grad]
+        if not sources:
+            sources = [
+                torch.zeros((), device=next(part.device for part in parts if part is not None), requires_grad=True)
+            ]
+        return _Once.apply(len(parts), *parts, *sources)
 
     return call
+
+
+class _Once(torch.autograd.Function):
+    """Makes gradients functions of their sources that cannot be differentiated."""
+
+    @staticmethod
+    def forward(ctx, count: int, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
+        return tuple(None if tensor is None else tensor.detach() for tensor in tensors[:count])
+
+    @staticmethod
+    def backward(ctx, *upstream: Tensor) -> Any:
+        raise RuntimeError(NOT_TWICE)
 
 
 def direct_apply(function: type[torch.autograd.Function]) -> Callable[..., Any]:

@@ -280,8 +280,8 @@ def fully_fused_projection(
         raise ValueError(f"viewmats has shape {list(viewmats.shape)}, expected a camera at least")
     views = [
         project_gaussians(
-            means[scene], *(None if tensor is None else tensor[scene] for tensor in (quats, scales, covars)),
-            alphas[scene], viewmats[*scene, camera], Ks[*scene, camera], width, height, eps2d=eps2d,
+            means[scene], _row(quats, scene), _row(scales, scene), _row(covars, scene), alphas[scene],
+            viewmats[*scene, camera], Ks[*scene, camera], width, height, eps2d=eps2d,
             culling=Culling(near_plane, far_plane, radius_clip), antialiased=calc_compensations,
             camera_model=camera_model,
         )
@@ -302,6 +302,10 @@ def fully_fused_projection(
     packed_radii, packed_means, packed_depths, packed_conics = values
     ids = batch_ids, camera_ids, gaussian_ids
     return *ids, packed_radii, packed_means, packed_depths[:, 0], packed_conics, packed_compensations
+
+
+def _row(tensor: Tensor | None, place: tuple[int, ...]) -> Tensor | None:
+    return None if tensor is None else tensor[place]
 
 
 def isect_tiles(
