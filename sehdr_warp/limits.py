@@ -95,8 +95,9 @@ def _slurm_memory(environment: Mapping[str, str]) -> int | None:
     """Return the bytes that a Slurm job asked for on this machine, which Slurm states in megabytes."""
     with suppress(KeyError, ValueError):
         return int(environment["SLURM_MEM_PER_NODE"]) << 20 or None
-    with suppress(KeyError, ValueError):
-        return (int(environment["SLURM_MEM_PER_CPU"]) * int(environment["SLURM_CPUS_ON_NODE"])) << 20 or None
+    for each, count in (("CPU", "SLURM_CPUS_ON_NODE"), ("GPU", "SLURM_GPUS_ON_NODE")):
+        with suppress(KeyError, ValueError):
+            return (int(environment[f"SLURM_MEM_PER_{each}"]) * int(environment[count])) << 20 or None
     return None
 
 

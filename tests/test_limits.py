@@ -61,6 +61,8 @@ def test_slurm(tmp_path, monkeypatch):
     assert memory_left(*places, {"SLURM_MEM_PER_NODE": "4096"}) == pytest.approx(4 * GB, rel=1e-3)
     per_cpu = {"SLURM_MEM_PER_CPU": "512", "SLURM_CPUS_ON_NODE": "4"}
     assert memory_left(*places, per_cpu) == pytest.approx(2 * GB, rel=1e-3)
+    per_gpu = {"SLURM_MEM_PER_GPU": "1024", "SLURM_GPUS_ON_NODE": "2"}
+    assert memory_left(*places, per_gpu) == pytest.approx(2 * GB, rel=1e-3)
     assert memory_left(*places, {"SLURM_MEM_PER_NODE": "0"}) is None, "all of the machine"
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "3")
     processor_limit.cache_clear()
