@@ -78,7 +78,7 @@ def _model_elsewhere(folder: Path) -> Path | None:
     places = [folder]
     for _ in range(_DEEPEST + 1):
         if models := [place for place in places if _is_whole_model(place)]:
-            return models[0]
+            return max(models, key=_image_count) if len(models) > 1 else models[0]
         inner: list[Path] = []
         for place in places:
             with suppress(OSError), os.scandir(place) as entries:
@@ -92,6 +92,8 @@ def _model_elsewhere(folder: Path) -> Path | None:
 def other_models(model: Path) -> list[str]:
     """Return a note on the models that lie beside the one that is used; none if there are no others."""
     models = _numbered(model.parent) if model.name.isdecimal() else []
+    if not models and model.parent.name.lower() == "sparse":
+        models = sorted(place for place in model.parent.iterdir() if place.is_dir() and _is_whole_model(place))
     if len(models) < 2:
         return []
     others = ", ".join(f"{each.name} ({_image_count(each)} images)" for each in models if each != model)

@@ -29,12 +29,14 @@ from .read_folders import (
 from .read_opensfm import FILE as OPENSFM_FILE
 from .read_opensfm import read_opensfm
 from .read_transforms import read_hdr_nerf, read_transforms
+from .truth_files import assign_truth
 from .unused_files import ARCHIVE_SUFFIXES, unused_notes
 from .video import UNSTITCHED_SUFFIXES, is_video
 from .video_frames import read_video
 
 _MARK = "transforms_train.json"  # A file of every embedded scene
 _HOLDOUT = 8  # Every eighth view is held out, as LLFF, Mip-NeRF 360 and 3DGS do
+_WITH_TRUTH = ("colmap", "transforms", "opensfm", "llff", "photos")  # Layouts that do not say where truth lies
 _FEWEST_FOR_TEST = 5  # In smaller sets no view is held out
 
 
@@ -61,6 +63,7 @@ def parse_dataset(
     if not dataset.records:
         raise InputError(folder, "has no views", "check the data folder")
     records, masks = assign_masks(dataset.records, folder)
+    records, truth = assign_truth(records, folder) if dataset.format in _WITH_TRUTH else (records, [])
     every = records
     records, exposures = choose_exposure(records, exposure_index, folder)
     records, kind, odd = usable_photos(records)
@@ -78,7 +81,7 @@ def parse_dataset(
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
     mentioned = [*unplaced, *dataset.mentioned]
     notes_unused = [] if is_embedded(path) or dataset.format == "video" else unused_notes(folder, every, mentioned)
-    notes = (*dataset.notes, *masks, *exposures, *odd, *times, *split, *notes_unused)
+    notes = (*dataset.notes, *masks, *truth, *exposures, *odd, *times, *split, *notes_unused)
     return replace(dataset, records=tuple(records), notes=notes, name=name)
 
 

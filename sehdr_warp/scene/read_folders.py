@@ -2,7 +2,6 @@
 
 import os
 import re
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -87,7 +86,6 @@ def read_colmap(folder: Path) -> DataparserOutputs:
     if images is None:
         raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
     records, absent, photo_names = [], [], []
-    truth = _TruthFiles(folder, images)
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
         image = find_image(images, entry.name, source)
         photo_names += [] if image is None else [(entry.name, image)]
@@ -97,45 +95,16 @@ def read_colmap(folder: Path) -> DataparserOutputs:
             absent.append(entry.name)
             continue
         else:
-            hdr = truth.of(image)
+            hdr = None
         records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, hdr=hdr))
     if not records:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         raise InputError(images, problem, _REMEDY)
     records, repeated = distinct(records)
-    notes = [*other_models(source), *renamed_note(photo_names), *repeated, *truth.notes(records)]
+    notes = [*other_models(source), *renamed_note(photo_names), *repeated]
     if absent:
         notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
     return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))
-
-
-class _TruthFiles:
-    """HDR truth in `hdr/` or `exr/` under the photos' paths, or under their names alone if no two photos share one."""
-
-    def __init__(self, folder: Path, images: Path):
-        self.places = [place for name in ("hdr", "exr") if (place := folder / name).is_dir()]
-        self.images = images
-        files = (file for _, _, names in os.walk(images) for file in names) if self.places else ()
-        self.stems = Counter(Path(file).stem for file in files if Path(file).suffix.lower() in LDR_SUFFIXES)
-
-    def of(self, image: Path) -> Path | None:
-        """Return the truth of a photo, None if it has none."""
-        path = image.relative_to(self.images)
-        names = [path, Path(path.name)] if self.stems[path.stem] <= 1 else [path]
-        files = (sibling(place / name, HDR_SUFFIXES) for name in names for place in self.places)
-        return next((file for file in files if file), None)
-
-    def notes(self, records: Sequence[ImageRecord]) -> list[str]:
-        """Return a note for each folder with files that are the truth of no photo."""
-        in_use, notes = {record.hdr for record in records}, []
-        for place in self.places:
-            files = (file for file in place.rglob("*") if file.suffix.lower() in HDR_SUFFIXES)
-            others = sorted(file.relative_to(place).as_posix() for file in files if file not in in_use)
-            if others:
-                listing = ", ".join(others[:3]) + " ..." * (len(others) > 3)
-                count = f"{len(others)} files that are" if len(others) > 1 else "1 file that is"
-                notes.append(f"{place.name}/ holds {count} the truth of no photo: {listing}")
-        return notes
 
 
 def is_hdr_gs(folder: Path) -> bool:

@@ -69,6 +69,16 @@ def test_a_model_that_names_none_of_the_photos_is_not_used_and_named(tmp_path):
     assert not model_fits(tmp_path, tmp_path / "old" / "sparse" / "0")
 
 
+def test_of_models_under_other_names_the_largest_is_used(tmp_path):
+    write_colmap(tmp_path / "few", 3)
+    write_colmap(tmp_path)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "second")
+    (tmp_path / "few" / "sparse" / "0").rename(tmp_path / "sparse" / "first")
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6
+    assert "sparse/second is used, the largest model (6 images); not used: first (3 images)" in scene.notes
+
+
 def test_a_folder_above_sets_is_no_set(tmp_path):
     write_colmap(tmp_path / "room")
     assert find_model(tmp_path, anywhere=True) is None

@@ -1,0 +1,101 @@
+"""HDR truth of photos: which OpenEXR or Radiance file belongs to which photo."""
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ..files import contained
+from .dataparser import ImageRecord
+from .images import HDR_SUFFIXES, LDR_SUFFIXES
+from .names import bases_of, folded
+
+TRUTH_FOLDERS = ("hdr", "exr")
+_MOST_NAMED = 3
+
+
+def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[ImageRecord], list[str]]:
+    """Give each photo without truth the float picture that is named like it, in any layout.
+
+    Truth lies beside the photo, or in `hdr/` or `exr/` of the data folder under the photo's path below the data folder
+    or below the folder of all photos, or under its file name alone if no two photos share that.
+
+    Args:
+        records: the photos; truth that the set states itself stays.
+        folder: the data folder.
+
+    Returns:
+        The photos with their truth, without float pictures that are the truth of others, and a note for each truth
+        folder with files that are the truth of no photo.
+
+    Raises:
+        InputError: if truth is a link that leads out of its folder.
+    """
+    photos = [record for record in records if _may_have_truth(record)]
+    if not photos:
+        return list(records), []
+    bases = bases_of([record.image for record in photos], folder)
+    places = _truth_folders(folder)
+    files = {place: {_key(file.relative_to(place)): file for file in _float_files(place)} for place in places}
+    stems = _stems_below(bases[0]) if places else Counter()
+    beside = {parent: _beside(parent) for parent in {record.image.parent for record in photos}}
+    result = []
+    for record in records:
+        image, hdr = record.image, record.hdr
+        if _may_have_truth(record):
+            keys = [_key(image.relative_to(base)) for base in bases if image.is_relative_to(base)]
+            keys += [folded(image.stem)] * (stems[folded(image.stem)] <= 1)
+            found = ((place, files[place].get(key)) for key in keys for place in places)
+            near = image.parent, beside[image.parent].get(folded(image.stem))
+            hdr = next((_inside(place, file, folder) for place, file in (*found, near) if file), None)
+        result.append(replace(record, hdr=hdr))
+    in_use, notes = {record.hdr for record in result}, []
+    result = [record for record in result if record.hdr == record.image or record.image not in in_use]
+    for place in places:
+        others = sorted(file.relative_to(place).as_posix() for file in files[place].values() if file not in in_use)
+        if others:
+            listing = ", ".join(others[:_MOST_NAMED]) + " ..." * (len(others) > _MOST_NAMED)
+            count = f"{len(others)} files that are" if len(others) > 1 else "1 file that is"
+            notes.append(f"{place.name}/ holds {count} the truth of no photo: {listing}")
+    return result, notes
+
+
+def _may_have_truth(record: ImageRecord) -> bool:
+    return record.hdr is None and not record.derived and record.image.suffix.lower() in LDR_SUFFIXES
+
+
+def _inside(place: Path, file: Path, folder: Path) -> Path:
+    """Return a file in a folder, or raise InputError if it is a link that leads out of it."""
+    return contained(place, file.relative_to(place).as_posix(), folder)
+
+
+def _truth_folders(folder: Path) -> list[Path]:
+    """List the folders of truth in a data folder, `hdr` before `exr`, in any case."""
+    if not folder.is_dir():
+        return []
+    places = [place for place in sorted(folder.iterdir()) if place.name.lower() in TRUTH_FOLDERS and place.is_dir()]
+    return sorted(places, key=lambda place: TRUTH_FOLDERS.index(place.name.lower()))
+
+
+def _float_files(place: Path) -> list[Path]:
+    return sorted(file for file in place.rglob("*") if file.suffix.lower() in HDR_SUFFIXES and file.is_file())
+
+
+def _beside(parent: Path) -> dict[str, Path]:
+    """Map folded() stems to the float pictures of a folder."""
+    if not parent.is_dir():
+        return {}
+    files = (file for file in sorted(parent.iterdir(), reverse=True) if file.suffix.lower() in HDR_SUFFIXES)
+    return {folded(file.stem): file for file in files if file.is_file()}
+
+
+def _stems_below(folder: Path) -> Counter:
+    """Count the folded() stems of the photos below a folder."""
+    names = (Path(name) for _, _, files in os.walk(folder) for name in files)
+    return Counter(folded(name.stem) for name in names if name.suffix.lower() in LDR_SUFFIXES)
+
+
+def _key(path: Path) -> str:
+    """Return a relative path without suffix, folded()."""
+    return folded(path.with_suffix("").as_posix())

@@ -1,0 +1,47 @@
+"""HDR truth of photos: found by name in any layout, and named if it belongs to no photo."""
+
+import os
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from sehdr_warp.errors import InputError
+from tests.make_scenes import load, write_blender, write_colmap, write_llff
+
+
+def write_truth(path, size=(64, 48), light=0.5):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, {"RGB": np.full((size[1], size[0], 3), light, np.float32)}).write(str(path))
+
+
+@pytest.mark.parametrize("name", ["hdr/{}.exr", "exr/images/{}.exr", "HDR/{}.EXR", "images/{}.exr"])
+@pytest.mark.parametrize("layout", [write_colmap, write_llff, write_blender])
+def test_names_of_truth(tmp_path, layout, name):
+    layout(tmp_path)
+    size = (40, 30) if layout is write_blender else (64, 48)
+    for photo in (tmp_path / "images").glob("*.png"):
+        write_truth(tmp_path / name.format(photo.stem), size, float(photo.stem.removeprefix("r_")) + 1)
+    scene = load(tmp_path, holdout=0)
+    assert [float(view.hdr.mean()) for view in scene.views] == pytest.approx(range(1, 7))
+    assert not any("in no view" in note or "left out" in note for note in scene.notes)
+
+
+def test_truth_of_no_photo_is_named(tmp_path):
+    write_colmap(tmp_path)
+    write_truth(tmp_path / "hdr" / "000.exr")
+    write_truth(tmp_path / "hdr" / "probe.exr")
+    scene = load(tmp_path, holdout=0)
+    assert [view.hdr is not None for view in scene.views] == [True] + [False] * 5
+    assert "hdr/ holds 1 file that is the truth of no photo: probe.exr" in scene.notes
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights")
+def test_truth_that_leads_out_of_its_folder_is_refused(tmp_path):
+    write_colmap(tmp_path / "set")
+    write_truth(tmp_path / "private.exr")
+    (tmp_path / "set" / "hdr").mkdir()
+    (tmp_path / "set" / "hdr" / "000.exr").symlink_to(tmp_path / "private.exr")
+    with pytest.raises(InputError, match="leads outside the data folder"):
+        load(tmp_path / "set")
