@@ -34,6 +34,10 @@ class ColorModel:
         """Return [N, 3] start values of the harmonics' constant part from encoded values [N, 3] in [0, 1]."""
         return np.log(response.start_exposures(_clip_to_codes(encoded)))
 
+    def brightened(self, value: Tensor, logarithm: Tensor) -> Tensor:
+        """Return values [N, 3] whose exposures are exp(logarithm) times those of `value`."""
+        return value + logarithm
+
     def colors(self, value: Tensor) -> Tensor:
         """Return the colors [N, 3] to blend, given the sums of the harmonics [N, 3]."""
         return bounded_exponential(value, LOG_EXPOSURE_LIMIT)
@@ -51,6 +55,10 @@ class LinearModel(ColorModel):
     def start(self, encoded, response):
         """Return exposures of encoded values [N, 3], as in ColorModel."""
         return response.start_exposures(_clip_to_codes(encoded))
+
+    def brightened(self, value, logarithm):
+        """Return exposures, multiplied."""
+        return value * logarithm.exp()
 
     def colors(self, value):
         """Return exposures, clamped from below to EXPOSURE_FLOOR."""

@@ -108,7 +108,7 @@ def gather_evidence(
     *,
     degree: int | None = None,
     truth: bool = False,
-    estimates: Sequence[Tensor] | None = None,
+    certainties: Sequence[Tensor] | None = None,
 ) -> Evidence:
     """Gather the evidence of photos for the Gaussians of a field.
 
@@ -118,7 +118,7 @@ def gather_evidence(
         degree: Highest SH degree, by default all.
         truth: The field was trained on HDR truth. If a view has it, it replaces the photo: nothing is clipped and the
             misfit is the whole uncertainty.
-        estimates: Of the views' clipped light, as clipped_light_energy() takes them.
+        certainties: Of the estimates of each view's clipped light, [h, w, 3], as ClippedLight has them.
     """
     # Of a paged field, pictures are on a GPU and Gaussians are not.
     device, home = field.render_device, field.gaussians.means.device
@@ -137,7 +137,7 @@ def gather_evidence(
             clipped = torch.zeros_like(stops)
         else:
             photo = torch.tensor(view.image, device=device)
-            deviation = None if estimates is None else _deviation(estimates[index].to(device), photo)
+            deviation = None if certainties is None else _deviation(certainties[index].to(device), photo)
             stops, clipped = pixel_uncertainty(photo, exposure, field.response, deviation)
             weight = weight + (RESIDUAL_WEIGHT - 1) * high_residual_mask(view, exposure, field.response)
         if view.mask is not None:
@@ -151,10 +151,13 @@ def gather_evidence(
     return Evidence(weight_sum, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1), peak)
 
 
-def _deviation(estimates: Tensor, photo: Tensor) -> Tensor:
-    """Return the deviation [H, W, 3], stops, of estimates [h, w, 6] at the pixels of a photo; infinite for none."""
+def _deviation(certainty: Tensor, photo: Tensor) -> Tensor:
+    """Return the deviation [H, W, 3], stops, of estimates with a certainty [h, w, 3] at the pixels of a photo.
+
+    It is infinite where there is no estimate.
+    """
     rows, columns = (
         torch.arange(size, device=photo.device) * coarse // size
-        for size, coarse in zip(photo.shape[:2], estimates.shape[:2], strict=True)
+        for size, coarse in zip(photo.shape[:2], certainty.shape[:2], strict=True)
     )
-    return 1 / (math.log(2) * estimates[rows][:, columns, 3:].to(photo))
+    return 1 / (math.log(2) * certainty[rows][:, columns].to(photo))

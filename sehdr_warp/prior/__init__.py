@@ -1,5 +1,5 @@
 """A learned prior for light above white: what clipped pixels probably hold, from everything else in a photo."""
 
-from .estimate import LightEstimate, LightPrior, coarse_size, combined_estimates, load_prior
+from .estimate import ClippedLight, LightEstimate, LightPrior, coarse_size, combined_estimates, load_prior
 
-__all__ = ["LightEstimate", "LightPrior", "coarse_size", "combined_estimates", "load_prior"]
+__all__ = ["ClippedLight", "LightEstimate", "LightPrior", "coarse_size", "combined_estimates", "load_prior"]

@@ -36,6 +36,20 @@ class LightEstimate:
     deviation: Tensor
 
 
+@dataclass(frozen=True)
+class ClippedLight:
+    """Estimates of a photo's clipped light from all sources; float16, 0 where nothing is clipped or known.
+
+    Attributes:
+        held: [h, w, 6], as clipped_light_energy() takes it: for each channel the natural logarithm of the expected
+            light over white, and then the root of its weight in a training.
+        certainty: [h, w, 3], 1 / the deviation of that logarithm.
+    """
+
+    held: Tensor
+    certainty: Tensor
+
+
 class LightPrior:
     """A loaded network, on one device."""
 
@@ -96,9 +110,7 @@ def combined_estimates(
     prior: Prior | None,
     stated: Tensor | None = None,
     stated_deviation: float = 0.0,
-    *,
-    holding: bool = False,
-) -> Tensor:
+) -> ClippedLight:
     """Return what is known of a photo's clipped light, from the prior and from what its file states.
 
     Args:
@@ -107,13 +119,10 @@ def combined_estimates(
         prior: LightPrior, or another for a photo by a camera that is no pinhole; None leaves it out.
         stated: [H, W, 3], light in multiples of white, at least 1 where it is known, as View.light_above_white has it.
         stated_deviation: standard deviation of its natural logarithm.
-        holding: for the loss of a training: estimates of the prior weigh by their light, not by their deviations.
 
     Returns:
-        [h, w, 6] float16 at the size of the prior's estimate, or of `coarse_size`: for each channel the natural
-        logarithm of the expected light over white, and then 1 / the deviation of the logarithm (or the root of the
-        weight, if holding); 0 where nothing is clipped or known. Two estimates of a value are averaged by their
-        precisions.
+        What is known, at the size of the prior's estimate, or of `coarse_size`. Two estimates of a value are averaged
+        by their precisions. In a training estimates of the prior weigh by their light, not by their deviations.
     """
     estimate = None if prior is None else prior.estimate(exposure, clipped)
     size = coarse_size(*exposure.shape[:2]) if estimate is None else (estimate.mean.shape[0], estimate.mean.shape[1])
@@ -134,9 +143,11 @@ def combined_estimates(
         precision += stated_precision
     some = _averaged(clipped.to(exposure), size) > 0
     mean = torch.where(some, total / precision.clamp_min(1e-12), 0)
-    if holding and prior is not None:
-        precision = stated_precision + torch.exp(HELD_POWER * mean) / (HELD_DEVIATION * math.log(2)) ** 2
-    return torch.cat([mean, torch.where(some, precision.sqrt(), 0)], 2).half()
+    weight = stated_precision
+    if prior is not None:
+        weight = weight + torch.exp(HELD_POWER * mean) / (HELD_DEVIATION * math.log(2)) ** 2
+    roots = [torch.where(some, values.sqrt(), 0) for values in (weight, precision)]
+    return ClippedLight(torch.cat([mean, roots[0]], 2).half(), roots[1].half())
 
 
 def _averaged(values: Tensor, size: tuple[int, int]) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..prior import coarse_size, combined_estimates, load_prior
+from ..prior import ClippedLight, coarse_size, combined_estimates, load_prior
 from ..response import Response
 from ..scene import Camera, View
 from ..scene.wide_camera import solid_angles
@@ -20,10 +20,8 @@ def light_estimates(
     response: Response | None,
     config: LossConfig,
     device: torch.device,
-    *,
-    holding: bool = False,
-) -> list[Tensor] | None:
-    """Return what is known of each view's clipped light, on the CPU, as clipped_light_energy() takes it.
+) -> list[ClippedLight] | None:
+    """Return what is known of each view's clipped light, on the CPU.
 
     None where nothing clips, where the loss does not use it, or where nothing is known. The views are seen by the
     learned prior if config.light_prior is on; light that a photo's file states counts in any case.
@@ -33,8 +31,10 @@ def light_estimates(
         response: the curve by which exposures are compared; None where they are not.
         config: of the loss.
         device: on which the prior runs.
-        holding: as in combined_estimates(); estimates of panoramas and wide fisheye photos then weigh by the solid
-            angles of their pixels, relative to the mean, as the rest of the loss does.
+
+    Returns:
+        What is known of each view. In a training, estimates of panoramas and wide fisheye photos weigh by the solid
+        angles of their pixels, relative to the mean, as the rest of the loss does.
 
     Raises:
         InputError: if the weights of the prior cannot be read.
@@ -54,14 +54,15 @@ def light_estimates(
             seeing = wide
         if not bool(mask.any()):
             size = (coarse_size if seeing is None else seeing.size)(*mask.shape[:2])
-            result.append(torch.zeros(*size, 6, dtype=torch.float16))
+            nothing = torch.zeros(*size, 6, dtype=torch.float16)
+            result.append(ClippedLight(nothing, nothing[..., 3:]))
             continue
         exposure = response.decode(torch.from_numpy(view.image).to(device)).float() / response.white
         evidence = view.light_above_white
         evidence = None if evidence is None else torch.from_numpy(evidence).to(device).float()
         deviation = view.light_above_white_deviation
-        estimates = combined_estimates(exposure, mask.to(device), seeing, evidence, deviation, holding=holding).cpu()
-        result.append(_by_solid_angle(estimates, view.camera) if holding else estimates)
+        known = combined_estimates(exposure, mask.to(device), seeing, evidence, deviation)
+        result.append(ClippedLight(_by_solid_angle(known.held.cpu(), view.camera), known.certainty.cpu()))
     return result
 
 

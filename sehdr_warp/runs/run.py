@@ -278,7 +278,8 @@ class Run(LoadedScene):
         estimates = None
         if not (truth or self.field.color_model.encoded):
             estimates = light_estimates(views, self.field.response, self.config.loss, self.device)
-        evidence = gather_evidence(self.field, views, degree=self.degree, truth=truth, estimates=estimates)
+        certainties = None if estimates is None else [estimate.certainty for estimate in estimates]
+        evidence = gather_evidence(self.field, views, degree=self.degree, truth=truth, certainties=certainties)
         self.field.confidence = evidence.confidence()
         return evidence
 

@@ -22,6 +22,7 @@ from ..rasterizer.residual_sampling import sample_residual_pixels
 from ..response import Response
 from ..scene import Camera, View, codes_of
 from ..splats.arrays import HARMONIC_0
+from .clipped_start import TOLERANCE, expected_excess
 from .strategies import Proposals
 from .strategies.mcmc import MAX_DISTANCE
 from .targets import TrainingView
@@ -295,6 +296,11 @@ def seed_gaussians(
     valid &= sampled & (torch.arange(bound, device=valid.device) < number)
     starts = _start_values(field.color_model, field.response, matches.colors.device)
     start = starts.gather(0, (matches.colors * 255).round().long())
+    if target.estimates is not None:
+        times = field.base_time / float(view.exposure_time)
+        excess = expected_excess(target.estimates, pixels[:, 1:].long(), matcher.size(index), times)
+        is_white = start >= starts[-1] - TOLERANCE
+        start = field.color_model.brightened(start, torch.where(is_white, excess, 0))
     rest = field.gaussians.harmonics_rest
     nearer = (MAX_DISTANCE / matches.points.norm(dim=1)).clamp_max(1.0)
     quaternions = torch.zeros(bound, 4, device=rest.device)

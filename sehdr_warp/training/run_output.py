@@ -17,7 +17,6 @@ from ..model.radiance_field import RadianceField
 from ..model.residual_regions import MAX_LISTED, compare_photos, regions_to_dict
 from ..runs.checkpoint import first_not_finite
 from ..runs.config import Config
-from ..runs.light_estimates import light_estimates
 from ..runs.run import Run, load_run
 from ..runs.run_writer import RunWriter, write_confidence
 from ..scene import View
@@ -186,11 +185,9 @@ class RunOutput:
 def remove_unseen(trainer: Trainer) -> Evidence:
     """Remove the Gaussians that no training photo shows; return the evidence of the photos for the others."""
     views, truth = trainer.scene.train_views, trainer.config.loss.uses_hdr
-    estimates, field = None, trainer.field
-    if not (truth or field.color_model.encoded):
-        estimates = light_estimates(views, field.response, trainer.config.loss, field.gaussians.means.device)
-    options = {"degree": trainer.degree, "truth": truth, "estimates": estimates}
-    evidence = gather_evidence(field, views, **options)
+    estimates = None if truth else trainer.views.estimates
+    certainties = None if estimates is None else [estimate.certainty for estimate in estimates]
+    evidence = gather_evidence(trainer.field, views, degree=trainer.degree, truth=truth, certainties=certainties)
     count, contributes = trainer.field.gaussians.count, evidence.contributes
     remaining = int(contributes.sum())
     if remaining == count or remaining == 0:

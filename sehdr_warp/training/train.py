@@ -18,6 +18,7 @@ from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
 from ..scene import Scene
 from ..scene.normalization import normalization_of
+from .clipped_start import brighten_clipped
 from .compensation import SharedDecisions, prepare_photos
 from .following import send_training, several_ranks_notes
 from .initialization import make_field, response_for_training, sizes_of
@@ -135,6 +136,10 @@ def _new_trainer(
         field = make_field(photos.scene, config, response, device, photos.matcher, base_time)
     output = RunOutput(folder, config, tensorboard=tensorboard, part=shared is not None)
     trainer = Trainer(photos.scene, config, field, matcher=photos.matcher, ranks=ranks, output=output)
+    with watch:
+        held = trainer.views.held_estimates
+        if held is not None and not config.model.init_file:
+            brighten_clipped(field, normalization_of(scene).scene(photos.scene).train_views, held)
     trainer.seconds = watch.seconds
     if plan is not None and photos.decision is not None:
         plan = plan.with_decision(photos.decision)

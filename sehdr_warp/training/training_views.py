@@ -2,6 +2,7 @@
 
 import operator
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from ..errors import InputError
 from ..model.radiance_field import RadianceField
 from ..rasterizer.code_residual import CodeScale
 from ..runs.config import Config
-from ..runs.light_estimates import light_estimates
+from ..runs.light_estimates import ClippedLight, light_estimates
 from ..scene import Scene, View
 from .losses import INTERVALS_FROM, compares_exposures
 from .photo_stream import PhotoStream, make_view_source
@@ -81,6 +82,20 @@ class TrainingViews:
         self._widened = False
         self.scale = CodeScale(torch.empty(0))
 
+    @cached_property
+    def estimates(self) -> list[ClippedLight] | None:
+        """Estimates of each view's clipped light; None as by light_estimates(), or if colors are encoded values."""
+        field = self._field
+        if field.color_model.encoded:
+            return None
+        return light_estimates(self._views, field.response, self._config.loss, field.gaussians.means.device)
+
+    @property
+    def held_estimates(self) -> list[Tensor] | None:
+        """The estimates [h, w, 6] that the loss holds clipped light at; None if it compares no exposures."""
+        estimates = self.estimates if compares_exposures(self._config.loss, self._field) else None
+        return None if estimates is None else [estimate.held for estimate in estimates]
+
     def at(self, iteration: int) -> ViewStack | PhotoStream | Sequence[TrainingView]:
         """Return the views for the step of an iteration."""
         if self._source is None:
@@ -101,7 +116,7 @@ class TrainingViews:
             device,
             clipping=loss.clipping,
             compare_by=response,
-            estimates=light_estimates(self._views, response, loss, device, holding=True),
+            estimates=self.held_estimates,
             truth=loss.uses_hdr,
         )
         self.scale = source.scale

@@ -131,10 +131,9 @@ def test_doubt_of_clipped_light_is_the_deviation_of_its_estimate():
 def test_estimates_of_views_reach_the_confidence_of_what_they_show():
     model = field()
     shown = replace(view(model), codes=np.full((12, 20, 3), 255, np.uint8))
-    sure, unsure = torch.zeros(2, 3, 5, 6, dtype=torch.float16)
-    sure[..., 3:], unsure[..., 3:] = 8.0, 0.8
     high, low, none = (
-        gather_evidence(model, [shown], estimates=e).stops[0] for e in ([sure], [unsure], [torch.zeros_like(sure)])
+        gather_evidence(model, [shown], certainties=[torch.full((3, 5, 3), value, dtype=torch.float16)]).stops[0]
+        for value in (8.0, 0.8, 0.0)
     )
     assert low - high == pytest.approx((1 / 0.8 - 1 / 8) / np.log(2), rel=1e-2)
     assert none == gather_evidence(model, [shown]).stops[0]

@@ -28,8 +28,8 @@ def view(code, stated=None, deviation=0.0):
 def test_gain_maps_count_without_the_prior():
     views = [view(255, stated=4.0, deviation=0.5), view(100)]
     first, second = light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)
-    assert first[0, 0].tolist() == pytest.approx([np.log(4)] * 3 + [2.0] * 3, rel=1e-3)
-    assert (second == 0).all() and second.shape == first.shape
+    assert first.held[0, 0].tolist() == pytest.approx([np.log(4)] * 3 + [2.0] * 3, rel=1e-3)
+    assert (second.held == 0).all() and second.held.shape == first.held.shape
 
 
 @pytest.mark.parametrize(
@@ -46,14 +46,15 @@ def test_nothing_is_estimated_where_nothing_clips_or_exposures_are_not_compared(
 
 def test_targets_carry_the_estimates():
     views = [replace(view(255, stated=4.0, deviation=0.5), name=name) for name in "ab"]
-    estimates = light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)
+    estimates = [known.held for known in light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)]
     source = photo_source(views, 1.0, CPU, truth=False, compare_by=SRGB, estimates=estimates)
     assert torch.equal(source[1].target.estimates, estimates[1])
 
 
 def test_the_prior_estimates_photos_that_clip_alone():
     first, second = light_estimates([view(255), view(100)], SRGB, LossConfig(), CPU)
-    assert (first[..., 3:] > 0).all() and (first[..., :3] >= 0).all() and (second == 0).all()
+    assert (first.held[..., 3:] > 0).all() and (first.held[..., :3] >= 0).all() and (first.certainty > 0).all()
+    assert (second.held == 0).all() and (second.certainty == 0).all()
 
 
 def test_panoramas_are_seen_by_perspective_faces():
@@ -64,10 +65,10 @@ def test_panoramas_are_seen_by_perspective_faces():
     codes[150:170, 310:330] = 255
     photo = replace(view(0), codes=codes, camera=camera)
     first, second = light_estimates([photo, replace(photo, codes=codes // 2)], SRGB, LossConfig(), CPU)
-    assert first.shape == second.shape and first.shape[0] > 200
-    known = first[..., 3] > 0
-    assert 0 < known.float().mean() < 0.01 and known[first.shape[0] // 2, first.shape[1] // 2]
-    assert (second == 0).all()
+    assert first.certainty.shape == second.certainty.shape and first.certainty.shape[0] > 200
+    known = first.certainty[..., 0] > 0
+    assert 0 < known.float().mean() < 0.01 and known[known.shape[0] // 2, known.shape[1] // 2]
+    assert (second.held == 0).all()
 
 
 def test_estimates_of_a_panorama_weigh_by_solid_angle_in_a_training():
@@ -78,10 +79,9 @@ def test_estimates_of_a_panorama_weigh_by_solid_angle_in_a_training():
     codes = np.full((height, width, 3), 255, np.uint8)
     above = np.full(codes.shape, 4.0, np.float16)
     photo = replace(view(0), codes=codes, camera=camera, light_above_white=above, light_above_white_deviation=0.5)
-    options = [photo], SRGB, LossConfig(light_prior=False), CPU
-    (plain,), (held,) = light_estimates(*options), light_estimates(*options, holding=True)
-    assert torch.equal(plain[..., :3], held[..., :3]) and plain[..., 3:].unique().tolist() == [2.0]
-    weights = (held[..., 3:].float() ** 2 / 4)[:, 0, 0]
+    (known,) = light_estimates([photo], SRGB, LossConfig(light_prior=False), CPU)
+    assert known.certainty.unique().tolist() == [2.0]
+    weights = (known.held[..., 3:].float() ** 2 / 4)[:, 0, 0]
     expected = solid_angles(camera)[:, 0] / solid_angles(camera).mean()
     assert weights.tolist() == pytest.approx(expected.reshape(len(weights), -1).mean(1).tolist(), rel=5e-3)
     assert weights.mean() == pytest.approx(1, rel=5e-3) and weights[0] < 0.2 * weights[len(weights) // 2]

@@ -1,5 +1,6 @@
 """Points matched between photos lie on what the photos show, and errors are where Gaussians are born."""
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -11,6 +12,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer.plane_sweep import BORDER
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
 from sehdr_warp.training.matching import seed_gaussians
 from sehdr_warp.training.targets import photo_source
@@ -118,6 +120,12 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     assert {name: tuple(values.shape[1:]) for name, values in rows.items()} == {
         name: tuple(values.shape[1:]) for name, values in field.gaussians.tensors().items()
     }
+    # White ones are born at the light that the photo is expected to hold.
+    held = torch.full((16, 16, 6), math.log(50), dtype=torch.float16, device=device)
+    lit = replace(views[0], target=replace(views[0].target, estimates=held))
+    brighter = seed_gaussians(field, matcher, shown, lit, 0, wanted, 200, random_seed=3).rows["harmonics_dc"]
+    rise = (brighter[: int(born)] - rows["harmonics_dc"])[:, 0] * HARMONIC_0
+    torch.testing.assert_close(rise, math.log(50) * white[:, None].expand_as(rise), rtol=2e-3, atol=1e-5)
 
 
 def test_a_scene_of_two_photos_or_of_none_that_match_still_starts(tmp_path):
