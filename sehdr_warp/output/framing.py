@@ -153,7 +153,7 @@ def frame_subject(run: "LoadedScene", path: Sequence[Camera], photos: Sequence[C
     The lens opens until the sphere of subject_radius fits, to at most 75 degrees: up to twice the picture if photos
     surround the focus, else up to their height, because wider pictures would show what no photo does. Cameras behind
     a wall or in a floater come forward, smoothly along the path. Those too near for the subject step back, as far as
-    the median of the photos. `photos` are the training cameras.
+    half of the photos stand, or a quarter of them if the lens may not open. `photos` are the training cameras.
     """
     focus = common_focus(photos)
     radius = None if focus is None else subject_radius(run, photos, focus)
@@ -163,17 +163,19 @@ def frame_subject(run: "LoadedScene", path: Sequence[Camera], photos: Sequence[C
     # Tangents of half the vertical fields of view
     present = path[0].height / 2 / path[0].fy
     photo = float(np.median([camera.height / 2 / camera.fy for camera in photos]))
-    most = _MOST_ZOOM * present if surround(photos, focus) else max(photo, present)
-    cleared = _far_enough(cleared, photos, focus, _MARGIN * radius / math.sin(math.atan(most)))
+    around = surround(photos, focus)
+    most = _MOST_ZOOM * present if around else max(photo, present)
+    farthest = np.percentile([np.linalg.norm(each.position - focus) for each in photos], 50 if around else 75)
+    needed = _MARGIN * radius / math.sin(math.atan(most))
+    cleared = _far_enough(cleared, focus, min(needed, float(farthest)))
     distance = min(float(np.linalg.norm(camera.position - focus)) for camera in cleared)
     needed = math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
     zoom = present / min(max(present, needed), most)
     return [replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom) for camera in cleared]
 
 
-def _far_enough(path: Sequence[Camera], photos: Sequence[Camera], focus: np.ndarray, distance: float) -> list[Camera]:
-    """Return the cameras, at least `distance` from the focus, or the median distance of the photos if that is less."""
-    least = min(distance, float(np.percentile([np.linalg.norm(each.position - focus) for each in photos], 50)))
+def _far_enough(path: Sequence[Camera], focus: np.ndarray, least: float) -> list[Camera]:
+    """Return the cameras, moved away from the focus to at least this distance."""
     moved = []
     for camera in path:
         offset = camera.position - focus
