@@ -18,8 +18,7 @@ COLOR_SPACE = "lin_rec709_scene"
 _BASE_TIME, _WORLD_MATRIX = "sehdr:baseExposureTime", "sehdr:worldMatrix"
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _BIAS = 0.5 / HARMONIC_0
-# The extent that viewers clip by: three standard deviations hold 99.7 % of a Gaussian.
-_DEVIATIONS = 3.0
+_FAINTEST = 1 / 255  # Opacity below which programs draw nothing of a Gaussian
 
 
 def pxr(module: str) -> Any:
@@ -171,5 +170,11 @@ def _quaternions(values: np.ndarray):
 
 
 def _extent(gaussians: GaussianArrays) -> np.ndarray:
-    reach = _DEVIATIONS * np.exp(gaussians.log_scales.max(axis=1, keepdims=True))
+    """Return corners [2, 3] of the box that viewers clip by and frame: all that programs draw of the Gaussians."""
+    from scipy.spatial.transform import Rotation
+
+    rotations = Rotation.from_quat(gaussians.unit_quaternions, scalar_first=True).as_matrix()
+    variances = np.einsum("nij,nj->ni", rotations**2, np.exp(2 * gaussians.log_scales.astype(np.float64)))
+    deviations = np.sqrt(2 * np.log(np.maximum(gaussians.opacities.astype(np.float64) / _FAINTEST, 1)))
+    reach = deviations[:, None] * np.sqrt(variances)
     return np.stack([(gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)])
