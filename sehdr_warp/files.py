@@ -213,6 +213,7 @@ def contained(folder: Path, name: str, source: Path) -> Path:
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise InputError(source, f"file name {name!r} is not usable", "correct the entry")
+    remedy = f"use a path relative to {folder} without '..'"
     try:
         if PurePosixPath(name).is_absolute() or PureWindowsPath(name).anchor:
             problem = "is absolute"
@@ -221,12 +222,12 @@ def contained(folder: Path, name: str, source: Path) -> Path:
         elif max(map(len, (data := os.fsencode(name)).split(b"/"))) > _LONGEST_NAME or len(data) > _LONGEST_PATH:
             problem = f"has more than {_LONGEST_PATH} bytes, or more than {_LONGEST_NAME} in a part"
         elif not (folder / name).resolve().is_relative_to(folder.resolve()):
-            problem = "leads outside the data folder"
+            problem, remedy = "leads outside the data folder by a link", f"copy what it links to into {folder}"
         else:
             return folder / name
     except (OSError, ValueError, RuntimeError) as error:
         problem = f"cannot be resolved ({error})"
-    raise InputError(source, f"file name {name!r:.80} {problem}", f"use a path relative to {folder} without '..'")
+    raise InputError(source, f"file name {name!r:.80} {problem}", remedy)
 
 
 def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = False, internal: bool = False) -> None:

@@ -103,12 +103,12 @@ def read_aovs(names: str | Sequence[str]) -> tuple[str, ...]:
         SehdrError: For an unknown or repeated name.
     """
     requested = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
-    if requested == ["all"]:
-        return tuple(AOVS)
     for name in requested:
-        if name not in AOVS:
+        if name not in AOVS and name != "all":
             names_text = ", ".join(AOVS)
             raise SehdrError(f"AOV {name!r} is not one of {names_text}, all{did_you_mean(name, AOVS)}")
+    if "all" in requested:
+        return tuple(AOVS)
     if len(set(requested)) < len(requested):
         raise SehdrError(f"AOVs {', '.join(requested)}: one is named twice; leave it out")
     return tuple(requested)
