@@ -13,17 +13,20 @@ from pathlib import Path
 from threading import Thread
 
 import numpy as np
-from PIL import Image, ImageChops
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import uniform_filter
 
 import sehdr_warp as sw
 from sehdr_warp.output.camera_paths import interpolate
-from sehdr_warp.output.comparison import compare
+from sehdr_warp.output.comparison import compare, darker_stops
 from sehdr_warp.output.images import as_array, quantize
-from sehdr_warp.output.report import comparison_figure
+from sehdr_warp.output.tonemap import expose as expose_light
 from sehdr_warp.synth.expose import expose, exposure_ladder
 
 PICTURES = Path(__file__).parent / "images"
 WIDTH = 1500
+CROPPED, GAP, TITLE = 0.36, 8, 40  # Part of a picture that is enlarged; pixels between pictures and of a title
+FONT = ImageFont.load_default(24)
 SOFTWARE = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
 WINDOW = {"width": 1280, "height": 720}
 REST = 3000  # Milliseconds until a page in software WebGL is whole
@@ -64,14 +67,34 @@ def photographed(photos: str, folder: str, view: str) -> None:
 
 
 def _beside(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
-    """The photo, and the same view of photo, scene and truth at four stops less."""
-    figure = comparison_figure([compare(run, shown, scene.views)], shown.exposure_time, "")
-    drawn = io.BytesIO()
-    figure.savefig(drawn, dpi=160, facecolor="white", format="png")
-    picture = Image.open(drawn).convert("RGB")
-    content = ImageChops.difference(picture, Image.new("RGB", picture.size, "white")).getbbox()
-    assert content is not None
-    return picture.crop((0, max(0, content[1] - 8), picture.width, min(picture.height, content[3] + 8)))
+    """The photo, and photo, scene and truth some stops darker; below each the part that differs most, enlarged."""
+    found, time = compare(run, shown, scene.views), shown.exposure_time
+    assert found.truth is not None
+    darker = darker_stops([found], time)
+    dark = [expose_light(light, darker, scale=time) for light in (found.from_photo, found.hdr, found.truth)]
+    height, width = dark[0].shape[:2]
+    side = round(CROPPED * min(height, width))
+    gain = uniform_filter(np.abs(dark[1] - dark[0]).mean(2), side, mode="constant")
+    row, column = np.unravel_index(int(gain.argmax()), gain.shape)
+    top, left = (int(np.clip(at - side // 2, 0, most - side)) for at, most in ((row, height), (column, width)))
+    titles = ["Photo", *(f"{name} at {darker} EV" for name in ("The photo", "The HDR scene", "The truth"))]
+    columns, cell = [], (WIDTH - 3 * GAP) // 4
+    for title, picture in zip(titles, [found.photo, *dark], strict=True):
+        whole = Image.fromarray(quantize(picture))
+        part = whole.crop((left, top, left + side, top + side)).resize((cell, cell), Image.Resampling.BICUBIC)
+        whole = whole.resize((cell, round(cell * height / width)), Image.Resampling.LANCZOS)
+        frame = [round(value * cell / width) for value in (left, top, left + side, top + side)]
+        ImageDraw.Draw(whole).rectangle(frame, outline="white", width=2)
+        canvas = Image.new("RGB", (cell, TITLE + whole.height + GAP + cell), "white")
+        place = (cell / 2, TITLE / 2)
+        ImageDraw.Draw(canvas).text(place, title, "black", FONT, anchor="mm")
+        canvas.paste(whole, (0, TITLE))
+        canvas.paste(part, (0, TITLE + whole.height + GAP))
+        columns.append(canvas)
+    picture = Image.new("RGB", (4 * cell + 3 * GAP, columns[0].height), "white")
+    for index, canvas in enumerate(columns):
+        picture.paste(canvas, (index * (cell + GAP), 0))
+    return picture
 
 
 def _browsed(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
