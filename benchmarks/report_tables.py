@@ -186,6 +186,7 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "readings": _readings_tables,
     "captures": _captures_tables,
     "bits": _bits_tables,
+    "files": partial(_rows_table, "files"),
     "panorama": partial(_rows_table, "panorama"),
     "kernels": _kernel_tables,
     "step": _step_tables,
