@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from ...rasterizer import spherical_harmonics as evaluate
+from ...rasterizer.checks import check_tensors
 from ...rasterizer.harmonics import MAX_DEGREE
 
 
@@ -20,9 +21,14 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
         [..., 3].
 
     Raises:
-        ValueError: for a degree above 3, and for shapes that do not fit.
+        TypeError: for what is not a tensor.
+        ValueError: for a degree above 3, and for shapes, dtypes or devices that do not fit.
     """
     check_degree("degrees_to_use", degrees_to_use)
+    batch = tuple(dirs.shape[:-1]) if isinstance(dirs, Tensor) else ()
+    check_tensors(dirs=(dirs, (*batch, 3)), coeffs=(coeffs, (*batch, "K", 3)))
+    if masks is not None and masks.shape != batch:
+        raise ValueError(f"masks has shape {list(masks.shape)}, expected {list(batch)}")
     shape = dirs.shape
     origin = dirs.new_zeros(3)
     values = evaluate(degrees_to_use, coeffs.reshape(-1, *coeffs.shape[-2:]), dirs.reshape(-1, 3), origin)

@@ -196,7 +196,13 @@ def quat_scale_to_covar_preci(
         compute_covar: whether covariances are wanted.
         compute_preci: whether their inverses are.
         triu: whether to return the six numbers of the upper triangle, [..., 6], in place of [..., 3, 3].
+
+    Raises:
+        TypeError: for what is not a tensor.
+        ValueError: for shapes, dtypes or devices that do not fit.
     """
+    batch = tuple(quats.shape[:-1]) if isinstance(quats, Tensor) else ()
+    check_tensors(quats=(quats, (*batch, 4)), scales=(scales, (*batch, 3)))
     rotation = rotation_matrices(quats)
 
     def gram(sizes: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from ...rasterizer.checks import check_tensors
 from ...rasterizer.relocation import MOST_COPIES, relocation_sums
 
 
@@ -17,7 +18,14 @@ def compute_relocation(
         scales: [N, 3].
         ratios: [N], from 1; more than 51 count as 51.
         binoms: has no effect; gsplat's table of binomials.
+
+    Raises:
+        TypeError: for what is not a tensor.
+        ValueError: for shapes, dtypes or devices that do not fit.
     """
+    check_tensors(opacities=(opacities, ("N",)), scales=(scales, ("N", 3)))
+    if ratios.shape != opacities.shape:
+        raise ValueError(f"ratios has shape {list(ratios.shape)}, expected [N] with N = {len(opacities)}")
     count = ratios.long().clamp(1, MOST_COPIES)
     shared = 1 - (1 - opacities.double()).pow(1 / count)
     powers = shared[:, None] ** torch.arange(1, MOST_COPIES + 1, device=opacities.device)

@@ -5,6 +5,7 @@ import pickle
 import pytest
 import torch
 
+from sehdr_warp.compat import gsplat
 from sehdr_warp.compat.gsplat import fully_fused_projection, quat_scale_to_covar_preci, rasterization
 from sehdr_warp.rasterizer import rasterize, spherical_harmonics
 
@@ -377,3 +378,21 @@ def test_misfits_of_a_projection_are_named(options, message):
     given = dict(zip(names, (means, None, quats, scales, *place), strict=True)) | options
     with pytest.raises((ValueError, TypeError), match=message):
         fully_fused_projection(**given)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: gsplat.compute_relocation(torch.ones(3), torch.ones(2, 3), torch.ones(3)),
+            r"scales has shape \[2, 3\]",
+        ),
+        (lambda: gsplat.compute_relocation(torch.ones(3), torch.ones(3, 3), torch.ones(2)), r"ratios has shape \[2\]"),
+        (lambda: gsplat.spherical_harmonics(1, torch.ones(3, 3), torch.ones(2, 4, 3)), r"coeffs has shape \[2, 4, 3\]"),
+        (lambda: gsplat.spherical_harmonics(1, torch.ones(3, 2), torch.ones(3, 4, 3)), r"dirs has shape \[3, 2\]"),
+        (lambda: quat_scale_to_covar_preci(torch.ones(3, 4), torch.ones(2, 3)), r"scales has shape \[2, 3\]"),
+    ],
+)
+def test_misfits_of_other_functions_are_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
