@@ -15,6 +15,7 @@ from .values import CheckpointValues, read_values
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
 PICTURE = "gaussians.", "fusion.", "response."
 """Beginnings of the names of the tensors that decide the picture; the others continue a training."""
+_LARGE = 1 << 28  # Bytes that are hashed in no time
 _OLDER = "remove this folder to use an older checkpoint, or train again"
 
 
@@ -43,6 +44,7 @@ def read_checkpoint(path: Path, parts: tuple[str, ...] = ("",)) -> Checkpoint:
     for file in (path / VALUES, path / TENSORS):
         refuse_links(file, path.parent)
     values, file = read_values(path / VALUES, CheckpointValues, _OLDER), path / TENSORS
+    _check_length(file)
     if (digest := _sha256(file)) != values["sha256"]:
         raise InputError(file, f"its SHA-256 {digest} is not the {values['sha256']:.80} of {VALUES}", _OLDER)
     try:
@@ -55,6 +57,18 @@ def read_checkpoint(path: Path, parts: tuple[str, ...] = ("",)) -> Checkpoint:
     if (name := first_not_finite(tensors)) is not None:
         raise InputError(file, f"{name} holds values that are not finite", _OLDER)
     return Checkpoint(path, tensors, values)
+
+
+def _check_length(file: Path) -> None:
+    """Raise InputError if a large file does not have the length that its header states, before it is read whole."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        if file.is_file() and file.stat().st_size > _LARGE:
+            with safe_open(str(file), framework="pt"):
+                pass
+    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
+        raise InputError(file, f"is not safetensors ({error})", _OLDER) from None
 
 
 def _sha256(file: Path) -> str:

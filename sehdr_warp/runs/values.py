@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from ..errors import InputError
 from ..files import UnreadableError, read_json, read_text
 from ..scene.exposure import LONGEST, SHORTEST
+from ..scene.gravity import LEAST_UNIT, MOST_UNIT
 from .config_files import field_and_problem
 
 FORMAT = 3
@@ -70,7 +71,7 @@ class UpValues(Values):
 
     direction: _Row
     source: Text
-    unit: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
+    unit: Annotated[float, Field(ge=LEAST_UNIT, le=MOST_UNIT)] | None = None
 
 
 class RunValues(Values):

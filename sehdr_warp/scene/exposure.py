@@ -157,12 +157,14 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
                 times[matches[0]] = seconds
             elif matches:
                 ambiguous.append(
-                    f"{name} ({', '.join(image.relative_to(bases[-1]).as_posix() for image in matches[:2])})"
+                    f"{name:.90} ({', '.join(image.relative_to(bases[-1]).as_posix() for image in matches[:2])})"
                 )
             elif not any(listing.holds(f"{base}/{_plain(name)}") for base in {place, *bases, *parents}):
                 strange.append(name)
         if strange:
-            text = ", ".join(strange[:_MOST_NAMED]) + (" ..." if len(strange) > _MOST_NAMED else "")
+            text = ", ".join(f"{name:.90}" for name in strange[:_MOST_NAMED]) + (
+                " ..." if len(strange) > _MOST_NAMED else ""
+            )
             notes.append(f"{EXPOSURES}: {len(strange)} of its {len(table)} names belong to no photo: {text}")
         if ambiguous:
             text = ", ".join(ambiguous[:_MOST_NAMED])

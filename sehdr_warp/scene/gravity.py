@@ -36,6 +36,8 @@ _MORE_ROLL, _MORE_ROLL_ALIKE = math.radians(2.0), math.radians(8.0)
 
 _GPS_IFD, _EARTH = 0x8825, 6_371_000.0  # EXIF's table of GPS; mean radius in meters
 _GPS_PHOTOS = 4  # Fewest that state a place
+_HIGHEST = 1e5  # Meters of an altitude
+LEAST_UNIT, MOST_UNIT = 1e-6, 1e6  # Meters of a unit that places may state
 _GPS_MISFIT = 0.04  # Largest distance (RMS) between GPS and cameras, of the middle extent of the places
 
 
@@ -231,7 +233,10 @@ def _up_from_gps(views: Sequence[View]) -> UpDirection | None:
     left, values, right = np.linalg.svd(local.T @ offsets)
     sign = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
     rotation = (left * sign) @ right
-    unit = float((values * sign).sum() / (offsets**2).sum())
+    squared = float((offsets**2).sum())
+    unit = float((values * sign).sum()) / squared if squared > 0 else 0.0
+    if not LEAST_UNIT <= unit <= MOST_UNIT:
+        return None
     misfit = math.sqrt(float(((unit * offsets @ rotation.T - local) ** 2).sum(axis=1).mean()))
     return UpDirection(rotation[2], "gps", unit) if misfit < _GPS_MISFIT * extent[1] else None
 
@@ -249,7 +254,7 @@ def _gps_place(path: Path | None) -> tuple[float, float, float] | None:
     except (*PILLOW_ERRORS, InputError, KeyError, TypeError, ValueError, ArithmeticError):
         return None
     place = (latitude, longitude, altitude)
-    fits = all(map(math.isfinite, place)) and abs(latitude) <= 90 and abs(longitude) <= 180 and place[:2] != (0, 0)
+    fits = abs(altitude) <= _HIGHEST and abs(latitude) <= 90 and abs(longitude) <= 180 and place[:2] != (0, 0)
     return place if fits else None
 
 

@@ -201,6 +201,7 @@ def _mask_folders(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     inner = [place for place in sorted(folder.iterdir()) if place.name.lower() in MASK_FOLDERS and place.is_dir()]
+    inner = [contained(folder, place.name, folder) for place in inner]
     return sorted(inner, key=lambda place: MASK_FOLDERS.index(place.name.lower()))
 
 
@@ -226,7 +227,7 @@ def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list
     for place in sorted(folder.iterdir()):
         if place in places or place in used or not re.match(looks, place.name, re.IGNORECASE):
             continue
-        if place.is_dir() and _files_below(place):
+        if place.is_dir() and not place.is_symlink() and _files_below(place):
             notes.append(f"{place.name}/ is not read: if it holds masks of the photos, name it masks/")
     return notes
 

@@ -127,6 +127,7 @@ def read_hdr_gs(folder: Path) -> DataparserOutputs:
     seconds, notes = _hdr_gs_seconds(folder, 1 + max(key for files in exposures.values() for key in files))
     for view, (lens, pose) in poses.items():
         hdr = sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES)
+        hdr = hdr and contained(folder, hdr.relative_to(folder).as_posix(), folder)
         for key, image in sorted(exposures.get(view, {}).items()):
             records.append(ImageRecord(view, image, lens, pose, key, seconds[key] if seconds else None, hdr=hdr))
     if not records:

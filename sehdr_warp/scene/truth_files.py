@@ -4,6 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 from ..files import contained
@@ -13,6 +14,7 @@ from .names import bases_of, folded
 
 TRUTH_FOLDERS = ("hdr", "exr")
 _MOST_NAMED = 3
+_MOST_FILES = 1 << 20  # Files among which photos of one name are looked for
 
 
 def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[ImageRecord], list[str]]:
@@ -30,7 +32,7 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         folder with files that are the truth of no photo.
 
     Raises:
-        InputError: if truth is a link that leads out of its folder.
+        InputError: if truth, or its folder, is a link that leads out of the folder that holds it.
     """
     photos = [record for record in records if _may_have_truth(record)]
     if not photos:
@@ -75,6 +77,7 @@ def _truth_folders(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     places = [place for place in sorted(folder.iterdir()) if place.name.lower() in TRUTH_FOLDERS and place.is_dir()]
+    places = [contained(folder, place.name, folder) for place in places]
     return sorted(places, key=lambda place: TRUTH_FOLDERS.index(place.name.lower()))
 
 
@@ -93,7 +96,7 @@ def _beside(parent: Path) -> dict[str, Path]:
 def _stems_below(folder: Path) -> Counter:
     """Count the folded() stems of the photos below a folder."""
     names = (Path(name) for _, _, files in os.walk(folder) for name in files)
-    return Counter(folded(name.stem) for name in names if name.suffix.lower() in LDR_SUFFIXES)
+    return Counter(folded(name.stem) for name in islice(names, _MOST_FILES) if name.suffix.lower() in LDR_SUFFIXES)
 
 
 def _key(path: Path) -> str:

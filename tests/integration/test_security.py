@@ -22,8 +22,8 @@ from tests.trial import harness
 
 ROOT = Path(__file__).resolve().parents[2]
 STRANGERS, CASES, REQUESTS = (f"trial/test_{n}.py::test" for n in ("strangers", "cases", "requests"))
-HOSTILE_CAMERAS, HOSTILE_LOOKS, HOSTILE_PHOTOS, HOSTILE_PLACES, HOSTILE_RUNS, HOSTILE_SPLATS = (
-    f"trial/test_hostile_{n}.py::test" for n in ("cameras", "looks", "photos", "places", "runs", "splats")
+HOSTILE_CAMERAS, HOSTILE_LOOKS, HOSTILE_PHOTOS, HOSTILE_PLACES, HOSTILE_RUNS, HOSTILE_SETS, HOSTILE_SPLATS = (
+    f"trial/test_hostile_{n}.py::test" for n in ("cameras", "looks", "photos", "places", "runs", "sets", "splats")
 )
 RUNS, HERE = "runs/test_run_folder.py::test", "integration/test_security.py::test"
 HELD_BY = {
@@ -71,6 +71,8 @@ HELD_BY = {
         f"{HOSTILE_SPLATS}_splats_that_were_made",
         f"{HOSTILE_PHOTOS}_opcodes_of_dng",
         f"{RUNS}_sparse_files_are_not_read",
+        f"{RUNS}_a_sparse_checkpoint_is_refused_by_its_length",
+        f"{HOSTILE_SETS}_states_of_a_checkpoint",
         "splats/test_streamed_sog.py::test_a_small_index_takes_no_memory_that_its_chunks_do_not_state",
         "scene/test_heif.py::test_parts_of_an_item_that_overlap_take_no_memory",
     ],
@@ -78,7 +80,13 @@ HELD_BY = {
         f"{CASES}_inputs_that_are_pipes_are_not_waited_for",
         "test_files.py::test_devices_and_pipes_are_not_read",
     ],
-    "Names in a data set stay inside": [f"{HERE}_names_of_a_set_stay_inside", f"{HOSTILE_PLACES}_links_in_a_set"],
+    "Names in a data set stay inside": [
+        f"{HERE}_names_of_a_set_stay_inside",
+        f"{HOSTILE_PLACES}_links_in_a_set",
+        f"{HOSTILE_SETS}_links_that_lead_out_of_a_set",
+        "scene/test_masks.py::test_folders_that_lead_out_of_the_set_are_not_searched",
+        "scene/test_scene_colmap.py::test_the_folder_of_photos_may_be_a_link",
+    ],
     "OpenUSD and MATLAB files, and videos": [
         "test_sandbox.py::test_bounds",
         "scene/test_video.py::test_counts_beyond_the_file_take_no_memory",
@@ -142,7 +150,10 @@ HELD_BY = {
         "viewer/test_connections.py::test_a_save_ends_when_its_client_leaves",
         "viewer/test_connections.py::test_a_save_that_would_fill_the_disk_is_refused",
     ],
-    "Blocks exchange them": ["blocks/test_train.py::test_jobs_exchange_values_in_a_new_folder"],
+    "Blocks exchange them": [
+        "blocks/test_train.py::test_jobs_exchange_values_in_a_new_folder",
+        f"{HOSTILE_SETS}_more_plans_of_blocks",
+    ],
 }
 """Beginnings of sentences, and the functions that hold them."""
 TRUSTED = ("The user who types", "TOML presets", "The installed packages")

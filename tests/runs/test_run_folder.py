@@ -168,6 +168,13 @@ def test_sparse_files_are_not_read(run):
             read()
 
 
+def test_a_sparse_checkpoint_is_refused_by_its_length(run):
+    """Reading 40 GiB for its hash would take a minute."""
+    os.truncate(next(run.glob("checkpoints/*/state.safetensors")), 40 << 30)
+    with pytest.raises(InputError, match="is not safetensors"):
+        load_run(run)
+
+
 def test_files_that_may_not_be_read_say_so(run, monkeypatch):
     """As root reads everything, the system's answer is made up."""
     folder = RunFolder(run)

@@ -100,6 +100,30 @@ def test_places_in_exif_tell_up_and_the_unit(tmp_path, south):
     assert again is not None and again.direction == pytest.approx(up.direction) and again.unit == up.unit
 
 
+@pytest.mark.parametrize("altitude", [1e6, 1e308, float("nan"), float("-inf")])
+def test_altitudes_that_cannot_be_are_not_used(tmp_path, monkeypatch, altitude):
+    photos, _ = flight(tmp_path)
+    table = {1: "N", 2: (48.0, 0.0, 0.0), 3: "E", 4: (16.0, 0.0, 0.0), 6: altitude}
+    monkeypatch.setattr(Image.Exif, "get_ifd", lambda exif, tag: table)
+    assert find_up(photos).source == "cameras"
+
+
+def test_places_of_other_planets_are_not_used(tmp_path):
+    """A run states meters a unit up to a million; it could not be read with more."""
+    photos, _ = flight(tmp_path)
+    views = [
+        replace(view, camera=replace(view.camera, world_to_camera=shrunk(view.camera.world_to_camera, 1e-6)))
+        for view in photos.views
+    ]
+    assert find_up(scene(views)).source == "cameras"
+
+
+def shrunk(pose, factor):
+    pose = pose.copy()
+    pose[:3, 3] *= factor
+    return pose
+
+
 def test_places_that_do_not_fit_the_poses_are_not_used(tmp_path):
     photos, _ = flight(tmp_path, noise=8.0)
     assert find_up(photos).source == "cameras" and UpDirection.from_dict(None) is None

@@ -222,6 +222,21 @@ def test_a_mask_that_leads_out_of_the_set_is_refused(tmp_path):
         load(tmp_path / "set")
 
 
+@pytest.mark.parametrize("name", ["masks", "mask", "old_masks", "hdr"])
+def test_folders_that_lead_out_of_the_set_are_not_searched(tmp_path, name):
+    from sehdr_warp import InputError
+
+    write_colmap(tmp_path / "set")
+    (tmp_path / "outside").mkdir()
+    write_mask(tmp_path / "outside" / "strange.png")
+    (tmp_path / "set" / name).symlink_to(tmp_path / "outside")
+    if name == "old_masks":
+        assert not any("old_masks" in note for note in load(tmp_path / "set").notes)
+    else:
+        with pytest.raises(InputError, match="outside the data folder"):
+            load(tmp_path / "set")
+
+
 def test_note_without_masks():
     assert mask_note([None, None]) == []
 

@@ -207,6 +207,14 @@ def test_link_out_of_the_folder_is_refused(tmp_path):
         load(tmp_path / "set")
 
 
+def test_the_folder_of_photos_may_be_a_link(tmp_path):
+    """As where photos lie on another disk; what the model names stays inside it."""
+    write_colmap(tmp_path / "set")
+    (tmp_path / "set" / "images").rename(tmp_path / "photos")
+    (tmp_path / "set" / "images").symlink_to(tmp_path / "photos")
+    assert len(load(tmp_path / "set").views) == 6
+
+
 def test_fern_is_read_as_pycolmap_reads_it(shared):
     folder = shared / "data" / "fern"
     oracle = pycolmap.Reconstruction(folder / "sparse" / "0")

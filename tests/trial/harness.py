@@ -137,13 +137,13 @@ def _run(words, folder, said, count, kill_at, prepare) -> None:
         sys.stdin, sys.stdout, sys.stderr = (os.fdopen(n, m, closefd=False) for n, m in enumerate("rww"))
         for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(each, signal.default_int_handler if each == signal.SIGINT else signal.SIG_DFL)
+        from sehdr_warp.__main__ import run  # Before prepare(), which may leave no memory for it.
+
         sys.argv = ["sehdr-warp", *words]
         sys.addaudithook(_watch)
         sys.modules.pop("pytest", None)  # With it tyro makes a tenth of what it has kept once more.
         prepare()
         made = _count(kill_at)
-        from sehdr_warp.__main__ import run
-
         try:
             run()
         finally:

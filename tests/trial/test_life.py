@@ -18,8 +18,8 @@ from sehdr_warp.viewer.server import Server, Viewer
 from .harness import COMMANDS, TRAIN
 
 pytestmark = pytest.mark.trial
-FRAMES, FRAMES_EACH = 5 * 1200, 30
-"""Twenty minutes at five frames a second, of clients that come, look for so many, and go."""
+FRAMES, FRAMES_EACH = 5 * 3600, 90
+"""An hour at five frames a second, of clients that come, look for so many, and go."""
 
 
 @pytest.fixture
@@ -47,15 +47,15 @@ def command(folder: Path, *words: str) -> None:
     assert end.value.code == 0
 
 
-def test_100_renders(space, live):
-    live(lambda number: command(space, *COMMANDS["render"]), 100, most=8)
+def test_200_renders(space, live):
+    live(lambda number: command(space, *COMMANDS["render"]), 200, most=8)
 
 
-def test_30_trainings(space, live):
-    live(lambda number: command(space, *TRAIN, "--overwrite"), 30, most=12)
+def test_50_trainings(space, live):
+    live(lambda number: command(space, *TRAIN, "--overwrite"), 50, most=12)
 
 
-def test_20_minutes_of_the_viewer(space, live):
+def test_an_hour_of_the_viewer(space, live):
     run = load_run(space / "run")
     asked = json.dumps({"camera": run.cameras[0].camera.to_dict()})
 
