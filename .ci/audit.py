@@ -33,15 +33,15 @@ def holes(advisory: dict, name: str, version: Version) -> bool:
 
 
 def main(database: Path) -> int:
-    stored, found = sorted((database / "vulns").glob("*/*.yaml")), 0
+    stored, hits = sorted((database / "vulns").glob("*/*.yaml")), 0
     if not stored:
         sys.exit(f"{database}: holds no advisories; clone https://github.com/pypa/advisory-database")
     by_name: dict[str, list[dict]] = {}
     lines = (line.partition(";")[0].strip() for line in PINS.read_text().splitlines())
     pins = [line.split("==") for line in lines if "==" in line]
-    wanted, newest = {canonicalize_name(name) for name, _ in pins}, ""
+    pinned, newest = {canonicalize_name(name) for name, _ in pins}, ""
     for path in stored:
-        if canonicalize_name(path.parent.name) in wanted:
+        if canonicalize_name(path.parent.name) in pinned:
             advisory = yaml.load(path.read_text(encoding="utf-8"), yaml.CSafeLoader)
             by_name.setdefault(canonicalize_name(path.parent.name), []).append(advisory)
             newest = max(newest, str(advisory["modified"])[:10])
@@ -49,10 +49,10 @@ def main(database: Path) -> int:
         for advisory in by_name.get(canonicalize_name(name), ()):
             if holes(advisory, canonicalize_name(name), Version(version)):
                 print(f"{name}=={version}: {advisory['id']} {', '.join(advisory.get('aliases', ()))}")
-                found += 1
-    told = sum(map(len, by_name.values()))
-    print(f"{len(pins)} pins, {told} advisories about them, the newest of {newest or 'no day'}: {found} holes")
-    return int(found > 0)
+                hits += 1
+    count = sum(map(len, by_name.values()))
+    print(f"{len(pins)} pins, {count} advisories about them, the newest of {newest or 'no day'}: {hits} holes")
+    return int(hits > 0)
 
 
 if __name__ == "__main__":

@@ -44,8 +44,8 @@ def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) ->
     projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
     lists, packed = list_splats(RasterInputs(projected, features), options, blocks=True)
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
-    image, left = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
-    last_contributor = blend_blocks(pad_features(features), lists, packed, image, left, ALPHA_THRESHOLD)
+    image, transmittance = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
+    last_contributor = blend_blocks(pad_features(features), lists, packed, image, transmittance, ALPHA_THRESHOLD)
     beyond = 0, lists.columns * TILE_SIZE - width, 0, lists.rows * TILE_SIZE - height
     last_contributor = torch.nn.functional.pad(last_contributor.view(height, width), beyond)
     # Rows of tiles, of their subtile_masks, of pixels; then columns of each.

@@ -37,10 +37,10 @@ def main(name: str = "embedded:lamps", folder: str = "runs/hero", view: str = ""
     truth, camera = sw.load_scene(name), sw.response_by_name("camera")
     scene = expose(truth, camera, exposure_ladder(truth, camera)[2])
     run = sw.load_run(folder) if Path(folder).exists() else sw.train(scene, folder, {"response.name": "camera"})
-    shown = next(each for each in scene.test_views if each.name == (view or each.name))
-    _save(_beside(run, shown, scene), "hero.jpg")
+    photo_view = next(each for each in scene.test_views if each.name == (view or each.name))
+    _save(_beside(run, photo_view, scene), "hero.jpg")
     if shutil.which("chromium") and importlib.util.find_spec("playwright"):
-        _save(_browsed(run, shown, scene), "viewer.jpg")
+        _save(_browsed(run, photo_view, scene), "viewer.jpg")
     else:
         print("viewer.jpg stays as it was: it needs Chromium and playwright (pip install 'sehdr-warp[test]')")
 
@@ -51,27 +51,27 @@ def photographed(photos: str, folder: str, view: str) -> None:
         sw.train(sw.load_scene(photos, max_size=360), folder)
     run = sw.load_run(folder)
     scene = run.normalize_photos(sw.load_scene(photos, max_size=360, response=run.response))
-    shown = next(each for each in scene.views if each.name == view)
-    others = (each.camera for each in scene.views if each is not shown)
-    near = min(others, key=lambda camera: float(np.linalg.norm(camera.position - shown.camera.position)))
+    photo_view = next(each for each in scene.views if each.name == view)
+    others = (each.camera for each in scene.views if each is not photo_view)
+    near = min(others, key=lambda camera: float(np.linalg.norm(camera.position - photo_view.camera.position)))
 
     def rendered(camera: sw.Camera, stops: float = 0.0) -> np.ndarray:
-        return as_array(run.render_ldr(camera, shown.exposure_time * 2.0**stops))
+        return as_array(run.render_ldr(camera, photo_view.exposure_time * 2.0**stops))
 
-    between = interpolate([shown.camera, near], 3)[1]
-    rows = [[shown.image, rendered(shown.camera)], [rendered(shown.camera, -1.5), rendered(between)]]
-    gap = np.ones((shown.camera.height, 6, 3))
+    between = interpolate([photo_view.camera, near], 3)[1]
+    rows = [[photo_view.image, rendered(photo_view.camera)], [rendered(photo_view.camera, -1.5), rendered(between)]]
+    gap = np.ones((photo_view.camera.height, 6, 3))
     lines = [np.concatenate([left, gap, right], axis=1) for left, right in rows]
     picture = np.concatenate([lines[0], np.ones((6, lines[0].shape[1], 3)), lines[1]])
     _save(Image.fromarray(quantize(picture)), "drone.jpg")
 
 
-def _beside(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
+def _beside(run: sw.Run, photo_view: sw.View, scene: sw.Scene) -> Image.Image:
     """The photo, and photo, scene and truth some stops darker; below each the part that differs most, enlarged."""
-    found, time = compare(run, shown, scene.views), shown.exposure_time
-    assert found.truth is not None
-    darker = darker_stops([found], time)
-    dark = [expose_light(light, darker, scale=time) for light in (found.from_photo, found.hdr, found.truth)]
+    comparison, time = compare(run, photo_view, scene.views), photo_view.exposure_time
+    assert comparison.truth is not None
+    darker = darker_stops([comparison], time)
+    dark = [expose_light(light, darker, scale=time) for light in (comparison.from_photo, comparison.hdr, comparison.truth)]
     height, width = dark[0].shape[:2]
     side = round(CROPPED * min(height, width))
     gain = uniform_filter(np.abs(dark[1] - dark[0]).mean(2), side, mode="constant")
@@ -79,7 +79,7 @@ def _beside(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
     top, left = (int(np.clip(at - side // 2, 0, most - side)) for at, most in ((row, height), (column, width)))
     titles = ["Photo", *(f"{name} at {darker} EV" for name in ("The photo", "The HDR scene", "The truth"))]
     columns, cell = [], (WIDTH - 3 * GAP) // 4
-    for title, picture in zip(titles, [found.photo, *dark], strict=True):
+    for title, picture in zip(titles, [comparison.photo, *dark], strict=True):
         whole = Image.fromarray(quantize(picture))
         part = whole.crop((left, top, left + side, top + side)).resize((cell, cell), Image.Resampling.BICUBIC)
         whole = whole.resize((cell, round(cell * height / width)), Image.Resampling.LANCZOS)
@@ -97,7 +97,7 @@ def _beside(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
     return picture
 
 
-def _browsed(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
+def _browsed(run: sw.Run, photo_view: sw.View, scene: sw.Scene) -> Image.Image:
     """The page of `view`, two and a half stops down beside the photo, with the pointer on the brightest light."""
     from playwright.sync_api import sync_playwright
 
@@ -111,14 +111,14 @@ def _browsed(run: sw.Run, shown: sw.View, scene: sw.Scene) -> Image.Image:
         chromium = driver.chromium.launch(executable_path=shutil.which("chromium"), args=SOFTWARE)
         page = chromium.new_page(viewport=WINDOW)
         page.goto(server.url)
-        page.select_option("#view", label=f"{shown.name} ({shown.split})")
+        page.select_option("#view", label=f"{photo_view.name} ({photo_view.split})")
         page.select_option("#left", "photo")
         page.locator("#stops").evaluate("range => { range.value = -2.5; range.dispatchEvent(new Event('input')); }")
         page.wait_for_timeout(REST)
         page.wait_for_selector("#stage[data-frame=full]")
         box = page.locator("#picture").bounding_box()
         assert box is not None
-        light = run.render(shown.camera).hdr.sum(2)
+        light = run.render(photo_view.camera).hdr.sum(2)
         row, column = divmod(int(light[:, light.shape[1] // 2 :].argmax()), light.shape[1] // 2)
         scale = box["height"] / light.shape[0]
         # The photo has the left half.

@@ -63,8 +63,8 @@ def main(out: Path, *, views: int = 72, size: int = 48, samples: int = 32, itera
 
     truth, ours = (lit_balls(mi, out / name, 2 * size, samples) for name in ("truth.exr", "env.exr"))
     gain = 0.8 / np.percentile(truth, 99)
-    shown = encode_srgb(np.concatenate([truth, ours, 4 * np.abs(ours - truth)], axis=1) * gain)
-    Image.fromarray(np.rint(shown * 255).astype(np.uint8)).save(out / "relighting.png")
+    panels = encode_srgb(np.concatenate([truth, ours, 4 * np.abs(ours - truth)], axis=1) * gain)
+    Image.fromarray(np.rint(panels * 255).astype(np.uint8)).save(out / "relighting.png")
     error = float(np.abs(ours - truth).mean() / truth.mean())
     print(f"{out / 'relighting.png'}: truth, ours, four times the difference; {100 * error:.1f} % off in the mean")
     return error
@@ -91,15 +91,15 @@ def write(path: Path, radiance: np.ndarray) -> None:
 def true_map(mi: Any, room: Any, size: int, samples: int) -> np.ndarray:
     """[2 size, 4 size, 3] of the faces of a cube around the place."""
     directions = latlong(4 * size)
-    made = np.zeros(directions.shape, np.float32)
+    latlong_map = np.zeros(directions.shape, np.float32)
     for axis in FACES:
         camera = camera_of(size, 90, PLACE, axis, np.roll(axis, 1))
         face = picture(mi, room, camera, samples)
         x, y, z = np.moveaxis(directions @ camera.world_to_camera[:3, :3].T, 2, 0)
-        seen = (z > 0) & (np.maximum(np.abs(x), np.abs(y)) <= z)
-        column, row = (np.clip(v[seen] / z[seen] * camera.fx + size / 2, 0, size - 1).astype(int) for v in (x, y))
-        made[seen] = face[row, column]
-    return made
+        inside = (z > 0) & (np.maximum(np.abs(x), np.abs(y)) <= z)
+        column, row = (np.clip(v[inside] / z[inside] * camera.fx + size / 2, 0, size - 1).astype(int) for v in (x, y))
+        latlong_map[inside] = face[row, column]
+    return latlong_map
 
 
 def lit_balls(mi: Any, env: Path, size: int, samples: int) -> np.ndarray:

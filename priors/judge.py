@@ -102,7 +102,7 @@ def _collect(
 ) -> dict:
     """Return lists over photos: truth, mean and deviation of clipped values, cues, and what else figures need."""
     camera = Camera(pack, device, chosen, rooms=False, seed=seed, stretch_share=stretch_share)
-    found: dict = {name: [] for name in ("truth", "mean", "deviation", "cues", "level", "clipped", "exposure")}
+    pixels: dict = {name: [] for name in ("truth", "mean", "deviation", "cues", "level", "clipped", "exposure")}
     for _ in range(PHOTOS // BATCH):
         photos = camera.take(BATCH, SIZE, plain=plain)
         mean, deviation = network(network_input(photos.exposure, photos.clipped))
@@ -112,14 +112,14 @@ def _collect(
             if int(clipped.sum()) < 5 or (plain and not (0.01 < middle < 0.7 and share >= 0.001)):
                 continue
             truth = photos.truth[k][clipped].cpu().numpy()
-            found["truth"].append(truth)
-            found["mean"].append(mean[k][clipped].cpu().numpy())
-            found["deviation"].append(deviation[k][clipped].cpu().numpy())
-            found["cues"].append(_cues(photos, k))
-            found["level"].append(float(truth.mean()))
-            found["clipped"].append(clipped.cpu().numpy())
-            found["exposure"].append(torch.where(clipped, 1.0, photos.exposure[k].clamp(0, 1)).cpu().numpy())
-    return found
+            pixels["truth"].append(truth)
+            pixels["mean"].append(mean[k][clipped].cpu().numpy())
+            pixels["deviation"].append(deviation[k][clipped].cpu().numpy())
+            pixels["cues"].append(_cues(photos, k))
+            pixels["level"].append(float(truth.mean()))
+            pixels["clipped"].append(clipped.cpu().numpy())
+            pixels["exposure"].append(torch.where(clipped, 1.0, photos.exposure[k].clamp(0, 1)).cpu().numpy())
+    return pixels
 
 
 def _energy(photos: dict, scale: float) -> dict[str, float]:

@@ -46,21 +46,21 @@ def room_views(data: Path):
 def curves(measured: Path) -> np.ndarray:
     """Return [C, STEPS + 1] increasing curves from 0 to 1: sRGB, DoRF's, and formulas, a quarter of all."""
     exposure = np.linspace(0, 1, STEPS + 1) ** 3
-    found = []
+    cameras = []
     if measured.is_file():
         import scipy.io
 
         table = scipy.io.loadmat(measured)
         for light, encoded in zip(table["I"], table["B"], strict=True):
-            found.append(np.interp(exposure, light, encoded))
+            cameras.append(np.interp(exposure, light, encoded))
     srgb = np.where(exposure <= 0.0031308, 12.92 * exposure, 1.055 * np.maximum(exposure, 1e-9) ** (1 / 2.4) - 0.055)
     formulas = [srgb, exposure ** (1 / 2.2), exposure ** (1 / 1.8)]
     for white in (WHITE_OF_REINHARD, 60.0, 15.0, 4.0):
         x = exposure * white
         curve = (x / (1 + x)) ** (1 / 2.2)
         formulas.append(curve / curve[-1])
-    found += formulas * max(1, len(found) // (3 * len(formulas)))
-    steps = np.maximum.accumulate(np.array([srgb, *found]), 1) + 1e-7 * np.arange(STEPS + 1)
+    cameras += formulas * max(1, len(cameras) // (3 * len(formulas)))
+    steps = np.maximum.accumulate(np.array([srgb, *cameras]), 1) + 1e-7 * np.arange(STEPS + 1)
     return ((steps - steps[:, :1]) / (steps[:, -1:] - steps[:, :1])).astype(np.float32)
 
 

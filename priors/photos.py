@@ -143,14 +143,14 @@ class Camera:
         if not plain:
             exposure = self._with_pages(self._stretch(exposure))
         truth = exposure.clamp_min(1).log2()
-        seen = exposure
+        noisy = exposure
         if not plain:
             noise = torch.randn(exposure.shape, generator=self.generator, device=self.device)
             strength = 2.0 ** self._uniform(count, -14, -7)
-            seen = (seen + noise * (strength * (seen.clamp(0, 1) + 0.01)).sqrt()).clamp_min(0)
+            noisy = (noisy + noise * (strength * (noisy.clamp(0, 1) + 0.01)).sqrt()).clamp_min(0)
         chosen = np.zeros(count, int) if plain else self.random.integers(len(self.curves), size=count)
         curves = self.curves[torch.from_numpy(chosen).to(self.device)]
-        encoded = _interpolate(curves, seen.clamp(0, 1))
+        encoded = _interpolate(curves, noisy.clamp(0, 1))
         if not plain:
             encoded = self._jpeg(encoded)
         codes = torch.round(encoded * LEVELS)
@@ -220,8 +220,8 @@ def _interpolate(curves: Tensor, values: Tensor) -> Tensor:
     place = values.flatten(1) ** (1 / 3) * steps
     low = place.floor().long().clamp_max(steps - 1)
     part = place - low
-    found = curves.gather(1, low) * (1 - part) + curves.gather(1, low + 1) * part
-    return found.reshape(values.shape)
+    between = curves.gather(1, low) * (1 - part) + curves.gather(1, low + 1) * part
+    return between.reshape(values.shape)
 
 
 def _inverse(curves: Tensor, encoded: Tensor) -> Tensor:

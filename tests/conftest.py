@@ -74,7 +74,7 @@ def coarse_figures(monkeypatch):
 
     save = Figure.savefig
     monkeypatch.setattr(
-        Figure, "savefig", lambda figure, *given, **options: save(figure, *given, **options | {"dpi": 50})
+        Figure, "savefig", lambda figure, *args, **options: save(figure, *args, **options | {"dpi": 50})
     )
 
 

@@ -101,7 +101,7 @@ def test_what_cannot_be_written_is_said_before_the_work(line, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "line,told",
+    "line,message",
     [
         ("trian", "no command trian, did you mean train?"),
         ("fly", "no command fly; sehdr-warp --help"),
@@ -134,10 +134,10 @@ def test_what_cannot_be_written_is_said_before_the_work(line, tmp_path, capsys):
         ("completion tsch", "shell tsch: not one of 'bash', 'fish', 'tcsh', 'zsh'"),
     ],
 )
-def test_wrong_usage_is_one_line_with_the_nearest_right_word(line, told, capsys):
+def test_wrong_usage_is_one_line_with_the_nearest_right_word(line, message, capsys):
     assert call(*line.split()) == 2
     error = capsys.readouterr().err
-    assert error.startswith("sehdr-warp: ") and told in error
+    assert error.startswith("sehdr-warp: ") and message in error
     assert error.count("\n") == 1
 
 
@@ -184,9 +184,9 @@ def test_a_run_in_place_of_photos_is_told_how_to_go_on(run, tmp_path, capsys):
 
 def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
     assert call("train", "--resume", "--out", run, "--device", "cpu") == 0
-    told = capsys.readouterr()
-    assert "all 30 iterations are done: nothing is left to train" in told.err
-    lines = told.out.splitlines()
+    message = capsys.readouterr()
+    assert "all 30 iterations are done: nothing is left to train" in message.err
+    lines = message.out.splitlines()
     assert lines[0].startswith(f"{run}: 30 iterations, ")
     assert re.search(r", held-out photos [\d.]+ dB, HDR [\d.]+ dB \(mu-law\), [\d.]+ s on cpu", lines[0])
     assert len(lines) >= 4 and all(
@@ -329,9 +329,9 @@ def test_simulated_photos_merge_back_to_the_rendered_radiance(run, tmp_path, kin
             total += weight * np.log(np.maximum(decode(value), 1e-12) / exposure["exposure_time"])
             weights += weight
         radiance = read_hdr(out / "hdr" / f"{view['view']}.exr")
-        seen = weights > 0
-        assert seen[radiance > 1e-3].mean() > 0.99
-        error = np.exp(total[seen] / weights[seen]) / radiance[seen] - 1
+        weighted = weights > 0
+        assert weighted[radiance > 1e-3].mean() > 0.99
+        error = np.exp(total[weighted] / weights[weighted]) / radiance[weighted] - 1
         assert np.sqrt(np.mean(error**2)) < tolerance
 
 
@@ -352,15 +352,15 @@ def test_score_parts_photos_into_the_regions_of_eval(run, tmp_path, capsys):
 
     def shares(*words):
         assert call(*words, "--json", "-") == 0
-        return {name: found["fraction"] for name, found in json.loads(capsys.readouterr().out)["regions"].items()}
+        return {name: region["fraction"] for name, region in json.loads(capsys.readouterr().out)["regions"].items()}
 
     inside, outside = shutil.copytree(run, tmp_path / "run") / "views", tmp_path / "views"
     assert call("render", run, "--out", outside, "--device", "cpu") == 0
     shutil.copytree(outside, inside)
     capsys.readouterr()
-    wanted, options = shares("eval", run, "--device", "cpu"), ("--truth", "embedded", "--max-size", 48)
-    assert wanted == shares("eval", inside / "hdr", *options) == shares("eval", outside / "hdr", *options)
-    assert wanted != shares("eval", inside / "hdr", *options, "--response", "srgb")
+    expected, options = shares("eval", run, "--device", "cpu"), ("--truth", "embedded", "--max-size", 48)
+    assert expected == shares("eval", inside / "hdr", *options) == shares("eval", outside / "hdr", *options)
+    assert expected != shares("eval", inside / "hdr", *options, "--response", "srgb")
     assert enclosing_run_response(outside / "hdr") is None
     assert getattr(enclosing_run_response(inside / "hdr"), "name", None) == "hdr-nerf"
 

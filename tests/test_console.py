@@ -35,7 +35,7 @@ def steps(count):
             logging.getLogger("sehdr_warp.training").info("held-out [psnr] 20 dB")
 
 
-def told(monkeypatch, stream, columns="80", level="info"):
+def printed(monkeypatch, stream, columns="80", level="info"):
     monkeypatch.setenv("COLUMNS", columns)
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setattr(Step, "read", 0)
@@ -49,13 +49,13 @@ def told(monkeypatch, stream, columns="80", level="info"):
     [("60", "21.5 dB 50.1k"), ("80", "loss 0.043 21.5 dB"), ("120", "PSNR 21.46 dB  50.1k Gaussians")],
 )
 def test_a_terminal_has_a_bar_that_fits(columns, figures, monkeypatch):
-    text = told(monkeypatch, Terminal(), columns)
+    text = printed(monkeypatch, Terminal(), columns)
     assert "300/300" in text and "━" in text and "1:03 left" in text and "it/s" in text and figures in text
     assert "held-out [psnr] 20 dB\n" in text
 
 
 def test_elsewhere_there_are_plain_lines(monkeypatch):
-    text = told(monkeypatch, io.StringIO())
+    text = printed(monkeypatch, io.StringIO())
     assert text.splitlines() == [
         "iteration 1/300, loss 0.0432, PSNR 21.46 dB, 50123 Gaussians, 1:03 left",
         "held-out [psnr] 20 dB",
@@ -65,13 +65,13 @@ def test_elsewhere_there_are_plain_lines(monkeypatch):
 
 
 def test_quiet_is_quiet(monkeypatch):
-    assert told(monkeypatch, Terminal(), level="warning") == "" and Step.read == 0
+    assert printed(monkeypatch, Terminal(), level="warning") == "" and Step.read == 0
 
 
 def test_reports_that_cost_more_come_less_often(monkeypatch):
     now = iter(range(10_000))
     monkeypatch.setattr(console.time, "monotonic", lambda: next(now))
-    told(monkeypatch, Terminal())
+    printed(monkeypatch, Terminal())
     # A second each time the clock is asked: a report costs one, and waits for the ten of the longest pause.
     assert 20 < Step.read < 40
 
@@ -94,8 +94,8 @@ def test_psnr_is_a_running_mean(monkeypatch):
     monkeypatch.setattr(console.time, "monotonic", lambda: next(clock) / 10)
     console.show_logs()
     console.follow((Uneven(iteration=i) for i in range(1, 301)), 300)
-    shown = [float(line.split("PSNR ")[1].split(" dB")[0]) for line in stream.getvalue().splitlines()]
-    assert shown[0] == 10 and len(shown) > 2 and all(19 <= value <= 21 for value in shown[2:])
+    psnrs = [float(line.split("PSNR ")[1].split(" dB")[0]) for line in stream.getvalue().splitlines()]
+    assert psnrs[0] == 10 and len(psnrs) > 2 and all(19 <= value <= 21 for value in psnrs[2:])
 
 
 def test_a_stage_on_a_terminal_is_one_line(monkeypatch):
@@ -112,9 +112,9 @@ def test_a_stage_on_a_terminal_is_one_line(monkeypatch):
             matching.later = 60.0
             matching.update(5)
     lines = [line for line in re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())) if line]
-    kept = stream.getvalue().count("\n")
+    line_count = stream.getvalue().count("\n")
     assert "a note" in lines and lines[-1].startswith("matching") and "5/10" in lines[-1]
-    assert kept == 3, "one line for each stage, and the note above them"
+    assert line_count == 3, "one line for each stage, and the note above them"
 
 
 def test_a_terminal_obeys_nothing_of_what_files_say(monkeypatch):

@@ -63,10 +63,10 @@ def test_what_this_program_did_not_write_is_never_replaced(tmp_path, change):
         target.write_text("theirs")
     if change == "never ours":
         (tmp_path / LIST).write_bytes(b"\xff\n" * 3)
-    kept = target.read_text()
+    content = target.read_text()
     with pytest.raises(InputError, match="a.txt: was not written by sehdr-warp, or was changed since"):
         write(target, overwrite=True)
-    assert target.read_text() == kept and listing(tmp_path) == ["a.txt"]
+    assert target.read_text() == content and listing(tmp_path) == ["a.txt"]
 
 
 def test_links_devices_and_pipes_are_never_replaced(tmp_path):
@@ -75,8 +75,8 @@ def test_links_devices_and_pipes_are_never_replaced(tmp_path):
     (tmp_path / "dangling.txt").symlink_to("nowhere")
     (tmp_path / "set").symlink_to(".")
     os.mkfifo(tmp_path / "pipe")
-    for name, told in (("link.txt", "link"), ("dangling.txt", "link"), ("pipe", "a pipe"), ("/dev/null", "a device")):
-        with pytest.raises(InputError, match=told):
+    for name, kind in (("link.txt", "link"), ("dangling.txt", "link"), ("pipe", "a pipe"), ("/dev/null", "a device")):
+        with pytest.raises(InputError, match=kind):
             write(tmp_path / name, overwrite=True)
     with pytest.raises(InputError, match="link"), atomic_folder(tmp_path / "set", overwrite=True):
         pass
@@ -88,7 +88,7 @@ def test_links_devices_and_pipes_are_never_replaced(tmp_path):
 
 
 def test_a_sealed_folder_tells_when_it_is_damaged(tmp_path):
-    def made():
+    def make_folder():
         folder = tmp_path / "set"
         shutil.rmtree(folder, ignore_errors=True)
         (folder / "deep").mkdir(parents=True)
@@ -103,9 +103,9 @@ def test_a_sealed_folder_tells_when_it_is_damaged(tmp_path):
         lambda folder: (folder / LIST).write_text(""),
         lambda folder: (folder / LIST).unlink(),
     ]
-    assert is_sealed(made())
+    assert is_sealed(make_folder())
     for change in changes:
-        folder = made()
+        folder = make_folder()
         change(folder)
         assert not is_sealed(folder)
 
@@ -230,13 +230,13 @@ with files.atomic_folder(Path("set")) as folder, files.atomic_path(Path("a.txt")
 
 
 @pytest.mark.parametrize(
-    "hook, left, kept",
+    "hook, left, content",
     [
         ("rename = os.rename\nos.rename = lambda a, b: (rename(a, b), die())", 2, "set/old"),
         ("files.shutil.rmtree = die", 1, "set/new"),
     ],
 )
-def test_a_folder_that_was_being_replaced_by_a_killed_process_is_never_lost(tmp_path, hook, left, kept):
+def test_a_folder_that_was_being_replaced_by_a_killed_process_is_never_lost(tmp_path, hook, left, content):
     """Killed between the two renames, or before what was set aside is removed."""
     with atomic_folder(tmp_path / "set") as folder:
         (folder / "old").write_text("1")
@@ -247,7 +247,7 @@ with files.atomic_folder(Path("set"), overwrite=True) as folder:
     assert len([name for name in killed(hook + code, tmp_path) if name.startswith(".set.")]) == left
     with pytest.raises(InputError, match="exists already"), atomic_folder(tmp_path / "set"):
         pass
-    assert listing(tmp_path) == ["set", kept]
+    assert listing(tmp_path) == ["set", content]
 
 
 def test_what_another_process_is_writing_is_left_alone(tmp_path):

@@ -25,18 +25,18 @@ def test_order_is_kept_and_at_most_ahead_are_computed(monkeypatch, threads):
             first_may_end.set()
         return item * item
 
-    made = prefetch_map(make, range(8), 3)
-    assert next(made) == 0
+    results = prefetch_map(make, range(8), 3)
+    assert next(results) == 0
     assert len(begun) <= int(threads)
-    assert list(made) == [item * item for item in range(1, 8)]
+    assert list(results) == [item * item for item in range(1, 8)]
 
 
 def test_an_exception_comes_where_its_turn_is(monkeypatch):
     monkeypatch.setenv("SEHDR_THREADS", "4")
-    made = prefetch_map(lambda item: 1 / item, [1, 2, 0, 4], 4)
-    assert [next(made), next(made)] == [1, 0.5]
+    results = prefetch_map(lambda item: 1 / item, [1, 2, 0, 4], 4)
+    assert [next(results), next(results)] == [1, 0.5]
     with pytest.raises(ZeroDivisionError):
-        next(made)
+        next(results)
 
 
 WAITS = """

@@ -16,7 +16,7 @@ from sehdr_warp.training.machine import interruptible
 
 
 @pytest.mark.parametrize(
-    "line, code, told",
+    "line, code, message",
     [
         ("presets --json > /dev/full", 1, "sehdr-warp: standard output cannot be written (No space left on device)"),
         ("presets --json >&-", 1, "sehdr-warp: standard output cannot be written (Bad file descriptor)"),
@@ -25,10 +25,10 @@ from sehdr_warp.training.machine import interruptible
         ("frobnicate 2> /dev/full", 2, ""),
     ],
 )
-def test_streams(line, code, told):
+def test_streams(line, code, message):
     call = f"{sys.executable} -m sehdr_warp {line}"
     ended = subprocess.run(["bash", "-c", call], capture_output=True, text=True, check=False)
-    assert ended.returncode == code and ended.stderr.startswith(told) and ended.stderr.count("\n") == bool(told)
+    assert ended.returncode == code and ended.stderr.startswith(message) and ended.stderr.count("\n") == bool(message)
 
 
 def test_what_is_said_of_the_work_never_ends_it():
@@ -145,7 +145,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.parametrize(
-    "error, told",
+    "error, message",
     [
         (OSError(36, "File name too long", "nnn"), "nnn: cannot be used (File name too long); check"),
         (OSError(5, "Input/output error"), "a file: cannot be used (Input/output error)"),
@@ -158,9 +158,9 @@ except KeyboardInterrupt:
         (RuntimeError("shapes differ"), None),
     ],
 )
-def test_what_the_surroundings_refuse_is_one_line(error, told):
-    found = as_user_error(error)
-    assert found is None if told is None else str(found).startswith(told)
+def test_what_the_surroundings_refuse_is_one_line(error, message):
+    user_error = as_user_error(error)
+    assert user_error is None if message is None else str(user_error).startswith(message)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of address space as Linux has them")

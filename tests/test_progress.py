@@ -41,22 +41,22 @@ def test_an_unknown_total_promises_nothing(clock, logged):
 
 
 def test_a_display_replaces_lines(logged):
-    shown = []
-    with progress.shown_by(lambda stage: shown.append((stage.done, stage.ended))):
+    fractions = []
+    with progress.shown_by(lambda stage: fractions.append((stage.done, stage.ended))):
         for _ in progress.tracked("reading photos", range(2), LOG):
             pass
-    assert shown == [(0, False), (1, False), (2, False), (2, True)] and logged == []
+    assert fractions == [(0, False), (1, False), (2, False), (2, True)] and logged == []
 
 
 def test_quiet_shows_nothing():
-    before, shown = LOG.level, []
+    before, fractions = LOG.level, []
     LOG.setLevel(logging.WARNING)
     try:
-        with progress.shown_by(shown.append), progress.stage("reading photos", 2, LOG) as reading:
+        with progress.shown_by(fractions.append), progress.stage("reading photos", 2, LOG) as reading:
             reading.update(1)
     finally:
         LOG.setLevel(before)
-    assert shown == []
+    assert fractions == []
 
 
 @pytest.mark.parametrize("seconds,text", [(None, "-:--"), (5, "0:05"), (63.4, "1:03"), (3723, "1:02:03")])

@@ -10,7 +10,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians
 
 
-def given(path):
+def read_args(path):
     return {"read": np.frombuffer(path.read_bytes(), np.uint8), "word": "é"}
 
 
@@ -26,14 +26,14 @@ def test_bounds(tmp_path, monkeypatch):
     (tmp_path / "a").write_bytes(b"abc")
     (tmp_path / "numpy.py").write_text("raise SystemExit('a module of the folder was run')")
     monkeypatch.chdir(tmp_path)
-    stored = sandbox.read_sandboxed(given, tmp_path / "a", "x", "y")
+    stored = sandbox.read_sandboxed(read_args, tmp_path / "a", "x", "y")
     assert bytes(stored["read"]) == b"abc" and str(stored["word"]) == "é"
-    for read, seconds, told in (
+    for read, seconds, message in (
         (fills_memory, sandbox._SECONDS, "a: cannot be read as x .*allocate"),
         (never_ends, 1, "not read after 1 s"),
     ):
         monkeypatch.setattr(sandbox, "_SECONDS", seconds)
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             sandbox.read_sandboxed(read, tmp_path / "a", "x", "y")
 
 

@@ -170,13 +170,13 @@ def _check_enough(name: str, photos: int, count: int) -> None:
         raise InputError(name, problem, remedy)
 
 
-def _divide(name: str, shown: ShownPlaces, count: int) -> Division:
+def _divide(name: str, coverage: ShownPlaces, count: int) -> Division:
     """Return the division whose largest block has the fewest photos, of those that moving the cuts gives."""
-    axes = _principal_axes(shown.middles)
+    axes = _principal_axes(coverage.middles)
     best, shares = None, np.full(count, 1 / count)
     for _ in range(MOVES):
         try:
-            division = _cut(name, shown, axes, shares)
+            division = _cut(name, coverage, axes, shares)
         except InputError:
             if best is None:
                 raise
@@ -189,20 +189,20 @@ def _divide(name: str, shown: ShownPlaces, count: int) -> Division:
         shares *= np.sqrt(sizes.mean() / np.maximum(sizes, 1))
         shares /= shares.sum()
     assert best is not None
-    _check(name, best.photos, len(shown.middles), count)
+    _check(name, best.photos, len(coverage.middles), count)
     return best
 
 
-def _cut(name: str, shown: ShownPlaces, axes: np.ndarray, shares: np.ndarray) -> Division:
+def _cut(name: str, coverage: ShownPlaces, axes: np.ndarray, shares: np.ndarray) -> Division:
     """Divide photos into blocks whose cores have stated shares of the photos' middles."""
-    middles, places = shown.middles @ axes.T, shown.points @ axes.T
+    middles, places = coverage.middles @ axes.T, coverage.points @ axes.T
     cells = _split(name, middles, Cell(np.full(3, -np.inf), np.full(3, np.inf)), shares)
     low, high = np.quantile(places, [0.02, 0.98], axis=0)
     margins = np.stack([MARGIN * _extent(cell, low, high) for cell in cells])
     enlarged = [Cell(cell.low - margin, cell.high + margin) for cell, margin in zip(cells, margins, strict=True)]
     inside = np.stack([cell.contains(places) for cell in enlarged], axis=1).astype(np.float32)  # [P, B]
     own = np.stack([cell.contains(middles) for cell in cells], axis=1)
-    members = (shown.parts @ inside >= LEAST_PART) | own
+    members = (coverage.parts @ inside >= LEAST_PART) | own
     return Division(axes, tuple(cells), margins, tuple(np.flatnonzero(column) for column in members.T))
 
 

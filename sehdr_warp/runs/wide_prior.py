@@ -73,8 +73,8 @@ class WidePrior:
             view = view[0].permute(1, 2, 0) * face.visible
             if not bool((view[..., 3:] > 0).any()):
                 continue
-            found = self.prior.estimate(view[..., :3], view[..., 3:])
-            both = torch.cat([found.mean, found.deviation], 2).permute(2, 0, 1)[None]
+            estimate_of_view = self.prior.estimate(view[..., :3], view[..., 3:])
+            both = torch.cat([estimate_of_view.mean, estimate_of_view.deviation], 2).permute(2, 0, 1)[None]
             back = F.grid_sample(both, face.back, padding_mode="border", align_corners=False)
             total += face.weights * back[0].permute(1, 2, 0)
             weight += face.weights

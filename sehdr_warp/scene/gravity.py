@@ -218,10 +218,10 @@ def _support(normals: np.ndarray, weights: np.ndarray, directions: np.ndarray, w
 
 def _up_from_gps(views: Sequence[View]) -> UpDirection | None:
     """Return up and the unit of length by the places in the photos' EXIF; None if they do not fit the cameras."""
-    found = [(place, view.camera.position) for view in views if (place := _gps_place(view.source)) is not None]
-    if len(found) < max(_GPS_PHOTOS, len(views) // 2):
+    gps_places = [(place, view.camera.position) for view in views if (place := _gps_place(view.source)) is not None]
+    if len(gps_places) < max(_GPS_PHOTOS, len(views) // 2):
         return None
-    places, cameras = (np.array(each) for each in zip(*found, strict=True))
+    places, cameras = (np.array(each) for each in zip(*gps_places, strict=True))
     middle = places.mean(axis=0)
     east = np.radians(places[:, 1] - middle[1]) * math.cos(math.radians(middle[0])) * _EARTH
     local = np.stack([east, np.radians(places[:, 0] - middle[0]) * _EARTH, places[:, 2] - middle[2]], axis=1)

@@ -271,8 +271,8 @@ def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float, tup
         if len(primaries) != 8:
             raise InputError(path, f"PRIMARIES = {line[1][:60]!r} are not eight numbers", _REMEDY)
         # Photoshop writes eight zeros for none.
-        stated = any(primaries) and not np.allclose(primaries, _RADIANCE, atol=0.002)
-        primaries = primaries if stated else REC709
+        has_other_primaries = any(primaries) and not np.allclose(primaries, _RADIANCE, atol=0.002)
+        primaries = primaries if has_other_primaries else REC709
     return int(size[2]), int(size[1]), size.end(), exposure, primaries
 
 

@@ -137,8 +137,8 @@ def _alike(folder: Path, name: str, source: Path) -> Path | None:
     # A name may have no suffix, and a dot all the same.
     stems = folded(parts[-1]), folded(stem)
     endings = dict.fromkeys((stems[0], *(each + suffix for each in stems for suffix in PHOTO_SUFFIXES)))
-    found = next((names[ending] for ending in endings if ending in names), None)
-    photo = None if found is None else contained(folder, (place / found).relative_to(folder).as_posix(), source)
+    match = next((names[ending] for ending in endings if ending in names), None)
+    photo = None if match is None else contained(folder, (place / match).relative_to(folder).as_posix(), source)
     return photo if photo is not None and os.path.isfile(photo) else None
 
 

@@ -303,8 +303,8 @@ def _chroma_places(frame: Any, layout: str) -> tuple[float, float]:
         ramp = 0 * rows if axis is None else 1000 * steps[axis] * (columns if axis else rows)
         plane.update((20_000 + ramp).astype("<u2").tobytes())
     _, right, down = _planes(_reformatted(probe, "yuv444p16le"))
-    found = (16 - (ramp[16, 16] - 20_000) / 1000 for ramp in (down, right))
-    first, second = (float(np.clip(round(2 * place) / 2, 0, 1)) for place in found)
+    offsets = (16 - (ramp[16, 16] - 20_000) / 1000 for ramp in (down, right))
+    first, second = (float(np.clip(round(2 * place) / 2, 0, 1)) for place in offsets)
     return first, second
 
 

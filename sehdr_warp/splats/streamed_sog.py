@@ -64,19 +64,19 @@ def read_streamed_sog(path: Path) -> GaussianArrays:
             if "lods" in node and "0" in node["lods"]:
                 part = node["lods"]["0"]
                 parts.setdefault(int(part["file"]), []).append((int(part["offset"]), int(part["count"])))
-        found: dict[Path, GaussianArrays] = {}
+        chunks: dict[Path, GaussianArrays] = {}
         for index, ranges in sorted(parts.items()):
             if index < 0:
                 raise ValueError(f"file {index}")
             chunk = contained(path.parent, meta["filenames"][index], path)
-            if chunk in found:
+            if chunk in chunks:
                 raise ValueError("a chunk is listed twice")
             folder = chunk.parent
             gaussians = gaussians_of_files(lambda name, folder=folder: read_bytes(contained(folder, name, path)), chunk)
-            found[chunk] = gaussians.rows(_rows(ranges, gaussians.count))
-        if not found:
+            chunks[chunk] = gaussians.rows(_rows(ranges, gaussians.count))
+        if not chunks:
             raise ValueError("no node has Gaussians of level 0")
-    return merged_chunks([*found.values()])
+    return merged_chunks([*chunks.values()])
 
 
 def _rows(ranges: list[tuple[int, int]], count: int) -> np.ndarray:

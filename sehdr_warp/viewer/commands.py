@@ -53,18 +53,18 @@ def run_view(args: View) -> None:
 
     @cache
     def photos(index: int) -> dict:
-        if not isinstance(watch.shown[index].run, Run):
+        if not isinstance(watch.scenes[index].run, Run):
             raise InputError(args.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
-        return {view.name: view for view in load_run_photos(watch.shown[index].run, args.data).views}
+        return {view.name: view for view in load_run_photos(watch.scenes[index].run, args.data).views}
 
     return_memory()
     watch.start()
-    with Server(Viewer(watch.shown, photos), args.host, args.port, args.origin) as server:
+    with Server(Viewer(watch.scenes, photos), args.host, args.port, args.origin) as server:
         print(f"{server.url}  (Ctrl-C ends it)", flush=True)
         try:
             server.serve_forever()
         except KeyboardInterrupt:
             log.info("the viewer has ended")
         watch.stop()
-        for run in watch.shown:  # What is being rendered is waited for: kernels must not outlive Python.
+        for run in watch.scenes:  # What is being rendered is waited for: kernels must not outlive Python.
             run.lock.close(timeout=30)

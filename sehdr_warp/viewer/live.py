@@ -40,7 +40,7 @@ class LiveTraining(ViewerScene):
         self.paused = self.ended = False
         self._thread: threading.Thread | None = None
         self._steps = 0
-        self._asked: queue.Queue[_Picture] = queue.Queue()
+        self._requests: queue.Queue[_Picture] = queue.Queue()
         self._credit = self._spent = 0.0
         self._curve: list[tuple] = []
         self._progress: dict[str, Any] = {}
@@ -80,7 +80,7 @@ class LiveTraining(ViewerScene):
         if threading.current_thread() is self._thread:
             return make()
         picture = _Picture(make)
-        self._asked.put(picture)
+        self._requests.put(picture)
         while not picture.done.wait(_WAIT):
             if self.ended:
                 raise SehdrError("the training has ended; `sehdr-warp view` shows the run")
@@ -122,15 +122,15 @@ class LiveTraining(ViewerScene):
             self.ended, self._thread = True, None
 
     def _serve(self) -> None:
-        while self._credit > 0 and not self._asked.empty():
-            self._make(self._asked.get())
+        while self._credit > 0 and not self._requests.empty():
+            self._make(self._requests.get())
         while self.paused and not self.run.ending:
             if self._steps:
                 self._steps -= 1
                 return
             self.run.pause()
             try:
-                self._make(self._asked.get(timeout=_WAIT))
+                self._make(self._requests.get(timeout=_WAIT))
             except queue.Empty:
                 continue
 

@@ -31,7 +31,7 @@ class Watch(threading.Thread):
         self._load, self._ended = load, threading.Event()
         self._states = [_state(path) for path in paths]  # Before they are read: what comes between is not missed.
         runs = [load(path) for path in paths]
-        self.shown = [ViewerScene(run, str(path), run.clipped_share()) for run, path in zip(runs, paths, strict=True)]
+        self.scenes = [ViewerScene(run, str(path), run.clipped_share()) for run, path in zip(runs, paths, strict=True)]
 
     def run(self) -> None:
         """Look for changes until stop() is called."""
@@ -40,7 +40,7 @@ class Watch(threading.Thread):
 
     def look(self) -> None:
         """Load again the scenes whose files have changed."""
-        for index, rendering in enumerate(self.shown):
+        for index, rendering in enumerate(self.scenes):
             path, last_state = Path(rendering.name), self._states[index]
             self._states[index] = state = _state(path)
             if state == last_state:

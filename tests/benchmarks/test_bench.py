@@ -59,8 +59,8 @@ def test_what_is_wrong_is_written_and_fails(gradient, tmp_path, monkeypatch, cap
     monkeypatch.setattr(kernels, "rasterize", wrong)
     assert call(*KERNELS, "--channels", "3", "--json", tmp_path / "a.json") == 1
     error = capsys.readouterr().err.strip().splitlines()[-1]
-    wanted = "gradient of log_scales" if gradient else "sehdr-warp: image"
-    assert wanted in error and "do not use these times" in error
+    words = "gradient of log_scales" if gradient else "sehdr-warp: image"
+    assert words in error and "do not use these times" in error
     assert not all(check["passed"] for check in json.loads((tmp_path / "a.json").read_text())["checks"])
 
 
@@ -149,13 +149,13 @@ def fake_gsplat(monkeypatch):
     ):  # fmt: skip
         matrix = matrix[0]
         camera = torch.stack([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-        drawn = rasterize(
+        image_of = rasterize(
             means, scales.log(), quats, opacities, colors, viewmats[0], camera, width, height,
             antialiased=rasterize_mode == "antialiased", eps2d=eps2d,
         )  # fmt: skip
-        radii = drawn.radii[None, :, None].expand(-1, -1, 2)
-        info = {"means2d": drawn.means2d[None], "radii": radii, "depths": drawn.depths[None]}
-        return drawn.image[None], drawn.alpha[None, ..., None], info
+        radii = image_of.radii[None, :, None].expand(-1, -1, 2)
+        info = {"means2d": image_of.means2d[None], "radii": radii, "depths": image_of.depths[None]}
+        return image_of.image[None], image_of.alpha[None, ..., None], info
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
     monkeypatch.setattr(kernels, "note_missing", lambda result, device: True)
@@ -171,7 +171,7 @@ def test_gsplat_draws_what_we_draw(monkeypatch):
     )
     torch.testing.assert_close(theirs.image, ours.image, rtol=1e-5, atol=1e-6)
     assert torch.equal(theirs.visible, ours.visible)
-    gradients = [torch.autograd.grad(drawn.image.square().sum(), scene.leaves) for drawn in (ours, theirs)]
+    gradients = [torch.autograd.grad(image_of.image.square().sum(), scene.leaves) for image_of in (ours, theirs)]
     for mine, other in zip(*gradients, strict=True):
         torch.testing.assert_close(other, mine, rtol=1e-3, atol=1e-3)
     result = kernels.bench_kernels([Size(150, 40, 32)], [5], CPU, **BRIEF)

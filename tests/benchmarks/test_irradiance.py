@@ -40,10 +40,10 @@ def folder(tmp_path):
     """A set with one map, whose half along -Z no photo shows."""
     fine = latlong(256)
     radiance = light(fine).reshape(32, 4, 64, 4, 3).mean((1, 3))
-    seen = 1.0 * (latlong(64)[..., 2] > 0)
+    upper = 1.0 * (latlong(64)[..., 2] > 0)
     header = {"sehdr:position": json.dumps(PLACE.tolist())}
     (tmp_path / "light").mkdir()
-    write_exr(tmp_path / "light" / "place_0.exr", rgb_channels(radiance) | {"A": seen}, header=header, pixel="float")
+    write_exr(tmp_path / "light" / "place_0.exr", rgb_channels(radiance) | {"A": upper}, header=header, pixel="float")
     return tmp_path
 
 
@@ -63,8 +63,8 @@ def test_a_lamp_that_is_missing_shows_on_surfaces_that_face_it(folder):
     missing.render_directions = lambda position, directions, **_: SimpleNamespace(
         hdr=torch.tensor(np.minimum(light(directions), 1.0))
     )
-    found = irradiance_errors(missing, read_light_maps(folder), [CAMERA])
-    assert 0.5 < found["percentile_90"] < 1.0
+    figures = irradiance_errors(missing, read_light_maps(folder), [CAMERA])
+    assert 0.5 < figures["percentile_90"] < 1.0
 
 
 def test_sets_without_maps_have_no_figure_and_damage_is_named(folder, tmp_path):

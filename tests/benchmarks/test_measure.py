@@ -17,9 +17,9 @@ def leaves(number, build="a", **more):
 def test_results_of_a_page_are_joined(tmp_path):
     (tmp_path / "page").mkdir()
     (tmp_path / "page" / "9.json").write_text("of before")
-    made = measure({"command": leaves(1) + leaves(2, notes=["a word"])}, tmp_path / "page")
-    assert made["rows"] == [1, 2] and made["notes"] == ["a word"]
-    assert made["command"].count("printf") == 2
+    joined = measure({"command": leaves(1) + leaves(2, notes=["a word"])}, tmp_path / "page")
+    assert joined["rows"] == [1, 2] and joined["notes"] == ["a word"]
+    assert joined["command"].count("printf") == 2
 
 
 @pytest.mark.parametrize("command", ["false\n" + leaves(1), "true", leaves(1) + leaves(2, "b")])

@@ -70,14 +70,14 @@ def test_jobs_are_every_combination_and_their_keys_tell_them_apart(tmp_path):
     changes = {"exposures": (0, 4), "responses": ("known", "blind"), "seeds": (0, 1)}
     plain = tmp_path / "plain.toml"
     plain.write_text('base = "default"\n[loss]\nclipping = false\nssim_weight = 0.1\n')
-    made = jobs(("default", "truth", "hdr-gs", str(plain)), **changes)
+    unique_jobs = jobs(("default", "truth", "hdr-gs", str(plain)), **changes)
     # The upper bound learns from truth and hdr-gs learns the curve: blind they would be the same trainings again.
-    assert len(made) == 2 * 2 * (2 + 1 + 1 + 2)
-    assert len({job.key for job in made}) == len({job.folder(Path()) for job in made}) == len(made)
-    for job in made:
+    assert len(unique_jobs) == 2 * 2 * (2 + 1 + 1 + 2)
+    assert len({job.key for job in unique_jobs}) == len({job.folder(Path()) for job in unique_jobs}) == len(unique_jobs)
+    for job in unique_jobs:
         config, training = job.config, job.config["training"]
-        told = {"known": "hdr-nerf", "blind": "auto"}.get(config["response"])
-        assert told is None or training["response"]["name"] == told
+        response_name = {"known": "hdr-nerf", "blind": "auto"}.get(config["response"])
+        assert response_name is None or training["response"]["name"] == response_name
         assert config["sees_truth"] == (config["method"] == "truth")
         assert training["schedule"]["iterations"] == 10 and "schedule.iterations" in training["plan"]["keep"]
         if config["method"] == "plain":
@@ -119,35 +119,35 @@ def test_what_cannot_be_planned_is_named(capfd, tmp_path):
     ):
         line = refused(capfd, *SMALL, "--out", tmp_path / "out", *arguments)
         assert message in line, line
-    asked = ["--scenes", tmp_path / "photos", "--methods", "default"]
-    assert call(*SMALL, "--out", tmp_path / "out", *asked) == 1
+    request = ["--scenes", tmp_path / "photos", "--methods", "default"]
+    assert call(*SMALL, "--out", tmp_path / "out", *request) == 1
     assert "1 of 1 jobs failed, the first with: " in (line := capfd.readouterr().err) and "no HDR truth" in line
 
 
 def test_finished_jobs_never_run_again_and_damaged_results_do(tmp_path, monkeypatch):
     monkeypatch.setattr(quality, "run_job", run_stub)
-    asked = jobs(seeds=(FINE, 7, 8))
-    assert [row["gt_max"] for row in run_jobs(asked, tmp_path, device="cpu")] == [30.0] * 3
-    folders = [job.folder(tmp_path) for job in asked]
+    request = jobs(seeds=(FINE, 7, 8))
+    assert [row["gt_max"] for row in run_jobs(request, tmp_path, device="cpu")] == [30.0] * 3
+    folders = [job.folder(tmp_path) for job in request]
     whole = (folders[1] / RESULT).read_bytes()
     (folders[1] / RESULT).write_bytes(whole[: len(whole) // 2])
     (folders[2] / RESULT).write_text(json.dumps(json.loads((folders[2] / RESULT).read_text()) | {"key": "other"}))
-    assert [job.result(tmp_path) is not None for job in asked] == [True, False, False]
-    rows = run_jobs(asked, tmp_path, device="cpu")
+    assert [job.result(tmp_path) is not None for job in request] == [True, False, False]
+    rows = run_jobs(request, tmp_path, device="cpu")
     assert ran(tmp_path) == [FINE, 7, 7, 8, 8] and not any("error" in row for row in rows)
 
 
 def test_a_job_that_fails_costs_itself_alone_and_is_tried_again(tmp_path, monkeypatch):
     monkeypatch.setattr(quality, "run_job", run_stub)
-    asked = jobs(seeds=(DIVERGES, BREAKS, 7))
-    rows = run_jobs(asked, tmp_path, device="cpu")
+    request = jobs(seeds=(DIVERGES, BREAKS, 7))
+    rows = run_jobs(request, tmp_path, device="cpu")
     assert [row.get("error") for row in rows] == ["iteration 7: not finite", "RuntimeError: a defect", None]
-    run_jobs(asked, tmp_path, device="cpu")
+    run_jobs(request, tmp_path, device="cpu")
     assert ran(tmp_path) == [DIVERGES] * 2 + [BREAKS] * 2 + [7]
     # A success takes the failure of before away.
-    write_json(asked[0].folder(tmp_path) / RESULT, made_up(asked[0]))
-    assert not any("error" in row for row in run_jobs(asked[:1], tmp_path, device="cpu"))
-    assert (asked[1].folder(tmp_path) / FAILURE).is_file()
+    write_json(request[0].folder(tmp_path) / RESULT, made_up(request[0]))
+    assert not any("error" in row for row in run_jobs(request[:1], tmp_path, device="cpu"))
+    assert (request[1].folder(tmp_path) / FAILURE).is_file()
 
 
 def test_submitit_runs_several_at_once_and_outlives_one_that_dies(tmp_path, monkeypatch):
@@ -172,18 +172,18 @@ def test_several_jobs_without_submitit_end_in_one_line(tmp_path, monkeypatch):
 
 
 def test_only_methods_with_truth_see_that_of_training_views(tmp_path, monkeypatch):
-    seen = {}
+    environments = {}
 
     def look(scene, out, config, **options):
-        seen["train"] = {view.hdr is not None for view in scene.train_views}
-        seen["test"] = {view.hdr is not None for view in scene.test_views}
+        environments["train"] = {view.hdr is not None for view in scene.train_views}
+        environments["test"] = {view.hdr is not None for view in scene.test_views}
         raise SehdrError("seen enough")
 
     monkeypatch.setattr(quality, "train", look)
     for name, truth in (("default", False), ("truth", True), ("paper", False), ("hdr-gs-truth", True)):
         with pytest.raises(SehdrError, match="seen enough"):
             run_job(jobs((name,), max_size=32)[0], tmp_path, "cpu", None)
-        assert seen == {"train": {truth}, "test": {True}}, name
+        assert environments == {"train": {truth}, "test": {True}}, name
 
 
 def test_exposures_are_four_times_apart_and_photos_follow():

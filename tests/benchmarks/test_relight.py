@@ -50,10 +50,10 @@ def test_a_light_shines_from_where_its_map_does(mi, shape, monkeypatch):
     ours = relight.balls(mi, place, np.zeros((128, 256, 3)), [(shape, radiance)], 64)
     # Of each ball the light, and where on the ball it is.
     for part in range(3):
-        true, found = (image[:, 16 * part : 16 * part + 16].mean(2) for image in (lit, ours))
-        assert true.mean() > 0.01 and found.mean() == pytest.approx(true.mean(), rel=0.15)
+        true, measured = (image[:, 16 * part : 16 * part + 16].mean(2) for image in (lit, ours))
+        assert true.mean() > 0.01 and measured.mean() == pytest.approx(true.mean(), rel=0.15)
         middles = [
-            np.average(np.mgrid[:16, :16], axis=(1, 2), weights=np.stack([each, each])) for each in (true, found)
+            np.average(np.mgrid[:16, :16], axis=(1, 2), weights=np.stack([each, each])) for each in (true, measured)
         ]
         assert middles[1] == pytest.approx(middles[0], abs=1.0)
 
@@ -78,10 +78,10 @@ class Stub:
 def test_stored_light_comes_back(tmp_path):
     place = LightMap(PLACE, np.zeros((4, 8, 3)), np.ones((4, 8)))
     store_light(tmp_path / "light.npz", Stub(), [place, place], [], 3.0)
-    found = read_light(tmp_path / "light.npz")
-    assert [each.shape for each in found.maps] == [(4, 8, 3)] * 2 and (found.maps[1] == 6).all()
-    assert (found.rest[0] == 3).all()
-    ((shape, radiance),) = found.lights
+    measured = read_light(tmp_path / "light.npz")
+    assert [each.shape for each in measured.maps] == [(4, 8, 3)] * 2 and (measured.maps[1] == 6).all()
+    assert (measured.rest[0] == 3).all()
+    ((shape, radiance),) = measured.lights
     assert shape.kind == "rect" and shape.size == PANEL.size and radiance.tolist() == [12, 12, 12]
     (tmp_path / "text.npz").write_text("{}")
     with pytest.raises(InputError, match=r"text\.npz"):

@@ -43,8 +43,8 @@ def test_quality_is_paired_with_the_upper_bound(tmp_path):
     scenes = {"exposures": (1, 2), "responses": ("known",), "iterations": 10}
     rows = []
     for method, decibels in (("default", (30.0, 28.0)), ("hdr-gs", (20.0, 22.0)), ("truth", (33.0, 32.0))):
-        made = plan_jobs(["embedded"], [method], **scenes)
-        rows += [row_of(made_up(job, psnr)) for job, psnr in zip(made, decibels, strict=True)]
+        planned = plan_jobs(["embedded"], [method], **scenes)
+        rows += [row_of(made_up(job, psnr)) for job, psnr in zip(planned, decibels, strict=True)]
     machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
     result = {
         "command": "python -m benchmarks quality",
@@ -84,16 +84,18 @@ def test_what_is_no_result_is_named(tmp_path):
 def test_means_over_the_whole_are_told_by_seed(tmp_path):
     rows = []
     for method, seed, decibels in (("default", 0, (30, 28)), ("default", 1, (31, 29)), ("truth", 0, (33, 32))):
-        made = plan_jobs(["embedded"], [method], exposures=(1, 2), seeds=(seed,), responses=("known",), iterations=10)
-        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(made, decibels, strict=True)]
+        planned = plan_jobs(
+            ["embedded"], [method], exposures=(1, 2), seeds=(seed,), responses=("known",), iterations=10
+        )
+        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(planned, decibels, strict=True)]
     rows += [row_of(made_up(plan_jobs(["embedded"], ["default"], seeds=(2,), iterations=10)[0], 20.0))]
     machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
     result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
     write_reports(tmp_path)
-    told = (tmp_path / "quality.md").read_text().split("by seed:")[1]
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in told.splitlines() if line.startswith("| ")]
+    section = (tmp_path / "quality.md").read_text().split("by seed:")[1]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.startswith("| ")]
     assert cells[2:] == [
         ["default", "0", "29.00", "-3.50"],
         ["default", "1", "30.00", "-"],
@@ -104,8 +106,8 @@ def test_means_over_the_whole_are_told_by_seed(tmp_path):
 def test_methods_are_compared_where_all_were_trained(tmp_path):
     rows = []
     for method, exposures, decibels in (("default", (1, 2, 3), (30, 28, 20)), ("3dgs", (2,), (26,))):
-        made = plan_jobs(["embedded"], [method], exposures=exposures, responses=("known",), iterations=10)
-        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(made, decibels, strict=True)]
+        planned = plan_jobs(["embedded"], [method], exposures=exposures, responses=("known",), iterations=10)
+        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(planned, decibels, strict=True)]
     machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
     result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
     (tmp_path / "results").mkdir()

@@ -16,14 +16,14 @@ def test_what_warps_draw_is_counted(device, monkeypatch):
 
     def counted(opacities, grown=0.0):
         """What is counted, and the warps that have a pixel which a Gaussian colors, were it alone."""
-        given = means, log_scales + grown, quaternions, opacities, features
+        gaussians = means, log_scales + grown, quaternions, opacities, features
         with monkeypatch.context() as blocks:
             blocks.setattr(wp.config, "enable_cpu_blocks", device == "cpu")
-            pairs, drawn = count_blended_pairs((*given, *camera), 40, 24)
-        each = [rasterize(*(tensor[i : i + 1] for tensor in given), *camera, 40, 24).alpha for i in range(400)]
+            pairs, blended = count_blended_pairs((*gaussians, *camera), 40, 24)
+        each = [rasterize(*(tensor[i : i + 1] for tensor in gaussians), *camera, 40, 24).alpha for i in range(400)]
         colored = torch.stack(each) >= ALPHA_THRESHOLD
-        assert pairs == rasterize(*given, *camera, 40, 24).intersection_count
-        return drawn, int(colored.view(400, 6, 4, 5, 8).any(4).any(2).sum())
+        assert pairs == rasterize(*gaussians, *camera, 40, 24).intersection_count
+        return blended, int(colored.view(400, 6, 4, 5, 8).any(4).any(2).sum())
 
     faint, alone = counted(0.05 * opacities)
     assert alone <= faint < 1.1 * alone

@@ -188,14 +188,14 @@ def test_confidence_is_ranked_against_errors():
     plain = evaluate(run(lambda hdr: hdr / 2.1), scene(VIEWS))["confidence"]
     assert plain["spearman_log2"] is None and "not measured" in plain["reason"]
     doubt = torch.rand(24, 30, generator=torch.Generator().manual_seed(1))
-    made = run(lambda hdr: hdr * 2 ** (3 * doubt[..., None]))
-    made.render_confidence = lambda camera: 1 - doubt
-    result = evaluate(made, scene(VIEWS))
+    doubtful_run = run(lambda hdr: hdr * 2 ** (3 * doubt[..., None]))
+    doubtful_run.render_confidence = lambda camera: 1 - doubt
+    result = evaluate(doubtful_run, scene(VIEWS))
     assert result["confidence"]["pixels"] == 2 * 24 * 30
     # The scale is the median's: errors grow with doubt on one side of it and fall on the other.
-    made.render_confidence = lambda camera: 1 - (doubt - doubt.median()).abs()
-    better = evaluate(made, scene(VIEWS))
+    doubtful_run.render_confidence = lambda camera: 1 - (doubt - doubt.median()).abs()
+    better = evaluate(doubtful_run, scene(VIEWS))
     assert better["confidence"]["spearman_log2"] > 0.8 > result["confidence"]["spearman_log2"]
     assert "confidence ranks errors: " in format_table(better)
-    without = evaluate(made, scene([view(0, "train", truth=False), view(1, "test", truth=False)]))
+    without = evaluate(doubtful_run, scene([view(0, "train", truth=False), view(1, "test", truth=False)]))
     assert without["confidence"]["spearman_log2"] is None and "no HDR truth" in without["confidence"]["reason"]

@@ -33,8 +33,8 @@ def compare(render, radius=3.0, clipped=lambda camera: None):
 
 
 def count(render, radius=3.0):
-    found = compare(render, radius)
-    return {name: found[name] for name in ("count", "lost")}
+    comparison = compare(render, radius)
+    return {name: comparison[name] for name in ("count", "lost")}
 
 
 def test_a_light_that_is_missing_is_lost_once():

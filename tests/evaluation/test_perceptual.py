@@ -52,9 +52,9 @@ def test_torchvisions_own_file_serves_as_backbone(made_up, tmp_path):
     assert load_lpips(tmp_path)[0](a, b) == load_lpips(made_up)[0](a, b)
 
 
-@pytest.mark.parametrize("kept, missing", [("squeeze.pth", "backbone"), ("squeezenet1_1_features.pth", "squeeze.pth")])
-def test_an_incomplete_folder_is_a_reason(made_up, tmp_path, kept, missing):
-    shutil.copy(made_up / kept, tmp_path)
+@pytest.mark.parametrize("files, missing", [("squeeze.pth", "backbone"), ("squeezenet1_1_features.pth", "squeeze.pth")])
+def test_an_incomplete_folder_is_a_reason(made_up, tmp_path, files, missing):
+    shutil.copy(made_up / files, tmp_path)
     metric, reason = load_lpips(tmp_path)
     assert metric is None and missing in reason
     with pytest.raises(InputError, match="does not exist"):

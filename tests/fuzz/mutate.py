@@ -88,10 +88,10 @@ def _splice(data, other, rng):
 
 
 def _token(data, rng):
-    found = list(_TOKEN.finditer(data[:200_000]))
-    if not found:
+    tokens = list(_TOKEN.finditer(data[:200_000]))
+    if not tokens:
         return data
-    match = rng.choice(found)
+    match = rng.choice(tokens)
     value = rng.choice(NUMBERS).encode("utf-8", "surrogatepass")
     return data[: match.start()] + value + data[match.end() :]
 

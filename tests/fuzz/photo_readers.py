@@ -99,8 +99,8 @@ def make_gain_maps(folder: Path) -> None:
 
 
 def read_light(path: Path):
-    found = read_gain_map(path, oriented=True)
-    return has_gain_map(path), light_of(read_photo(path), found) if found is not None else None
+    pair = read_gain_map(path, oriented=True)
+    return has_gain_map(path), light_of(read_photo(path), pair) if pair is not None else None
 
 
 def make_heic(folder: Path) -> None:

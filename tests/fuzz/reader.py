@@ -61,8 +61,8 @@ class Workspace:
         return self.reader.read(self.changed if hasattr(self.reader.read, "alone") else self.folder)
 
     def restore(self) -> None:
-        found = [Path(place, name) for place, _, names in os.walk(self.folder) for name in names]
-        for path in {*found} - self.whole.keys():
+        paths = [Path(place, name) for place, _, names in os.walk(self.folder) for name in names]
+        for path in {*paths} - self.whole.keys():
             path.unlink()
         for path, data in self.whole.items():
             if path == self.changed or not path.is_file() or path.stat().st_mtime_ns != self.times[path]:

@@ -21,8 +21,8 @@ def quick_children(monkeypatch):
 @pytest.mark.parametrize("name", list(READERS))
 def test_readers_refuse_damage_in_one_line(name, tmp_path):
     count = share(name, 1200)
-    found = [finding for _, finding in fuzz(name, tmp_path / name, 7, 0, count, 5.0)]
-    assert found == ["begun", None] * count
+    findings = [finding for _, finding in fuzz(name, tmp_path / name, 7, 0, count, 5.0)]
+    assert findings == ["begun", None] * count
 
 
 # What a million inputs have found, one of each kind; (reader, seed, index).
@@ -44,7 +44,7 @@ FOUND = (
 @pytest.mark.parametrize("name", sorted({name for name, _, _ in FOUND}))
 def test_what_was_found_stays_refused(name, tmp_path):
     space = Workspace(READERS[name], tmp_path / name)
-    for _, seed, index in [found for found in FOUND if found[0] == name]:
+    for _, seed, index in [findings for findings in FOUND if findings[0] == name]:
         make_input(space, name, seed, index)
         assert try_input(space, 5.0) is None, (seed, index)
         space.restore()
@@ -52,9 +52,9 @@ def test_what_was_found_stays_refused(name, tmp_path):
 
 def test_mutations_change_files_and_repeat():
     data = b'{"a": [1, 2.5, "x"], "b": {"c": null}}\n' * 3
-    made = [mutate(data, [data], True, random.Random(seed)) for seed in range(200)]
-    assert made == [mutate(data, [data], True, random.Random(seed)) for seed in range(200)]
-    assert len(set(made)) > 120
+    mutated = [mutate(data, [data], True, random.Random(seed)) for seed in range(200)]
+    assert mutated == [mutate(data, [data], True, random.Random(seed)) for seed in range(200)]
+    assert len(set(mutated)) > 120
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,9 @@ def test_stub_and_lazy_names_agree():
     """What editors read in the stub is what the package loads, each name from the same place."""
     stub = ast.parse((ROOT / "sehdr_warp" / "__init__.pyi").read_text())
     homes = {alias.name: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names}
-    (stated,) = (node.value for node in stub.body if isinstance(node, ast.Assign) and node.targets[0].id == "__all__")
+    (declared,) = (node.value for node in stub.body if isinstance(node, ast.Assign) and node.targets[0].id == "__all__")
     assert homes == sehdr_warp._HOME_OF
-    assert sorted(ast.literal_eval(stated)) == sehdr_warp.__all__ == sorted(homes)
+    assert sorted(ast.literal_eval(declared)) == sehdr_warp.__all__ == sorted(homes)
 
 
 @pytest.mark.parametrize("name", sehdr_warp.__all__)
@@ -36,13 +36,16 @@ def test_public_names_load_and_are_documented(name):
 @pytest.mark.parametrize("name", sehdr_warp.__all__)
 def test_docstrings_name_every_argument_and_field_in_googles_form(name):
     """Else the site of the pages takes what is said of them for something else."""
-    made = getattr(sehdr_warp, name)
-    if inspect.isclass(made):
-        section, names = "Attributes", [each.name for each in fields(made)] if is_dataclass(made) else []
+    public_object = getattr(sehdr_warp, name)
+    if inspect.isclass(public_object):
+        section, names = (
+            "Attributes",
+            [each.name for each in fields(public_object)] if is_dataclass(public_object) else [],
+        )
     else:
-        section, names = "Args", list(inspect.signature(made).parameters)
-    told = re.search(rf"^{section}:\n((?: {{4}}.*\n)+)", inspect.getdoc(made) + "\n", re.MULTILINE)
-    assert not names or {*re.findall(r"^ {4}(\w+): ", told[1], re.MULTILINE)} == {*names}
+        section, names = "Args", list(inspect.signature(public_object).parameters)
+    match = re.search(rf"^{section}:\n((?: {{4}}.*\n)+)", inspect.getdoc(public_object) + "\n", re.MULTILINE)
+    assert not names or {*re.findall(r"^ {4}(\w+): ", match[1], re.MULTILINE)} == {*names}
 
 
 def test_type_checkers_see_every_public_name():
@@ -60,8 +63,8 @@ def test_unknown_names_are_attribute_errors():
 
 
 def test_versions_agree():
-    stated = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    assert sehdr_warp.__version__ == stated
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert sehdr_warp.__version__ == declared
 
 
 def test_kernels_presets_and_types_are_inside_the_package():
@@ -95,8 +98,8 @@ def test_pins_with_known_holes_are_told(tmp_path):
         affected = {"package": {"name": "Pillow"}, "ranges": [{"type": "ECOSYSTEM", "events": events}]}
         text = json.dumps({"id": name, "modified": "2026-01-02T00:00:00Z", "affected": [affected]})
         (folder / f"{name}.yaml").write_text(text)
-    told = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, ROOT / ".ci" / "audit.py", tmp_path], capture_output=True, text=True, check=False
     )
-    assert told.returncode == 1 and told.stdout.startswith("pillow==") and "open" in told.stdout
-    assert told.stdout.endswith("2 advisories about them, the newest of 2026-01-02: 1 holes\n")
+    assert completed.returncode == 1 and completed.stdout.startswith("pillow==") and "open" in completed.stdout
+    assert completed.stdout.endswith("2 advisories about them, the newest of 2026-01-02: 1 holes\n")

@@ -261,8 +261,8 @@ def test_the_viewer_listens_on_this_machine_alone():
 
 def test_the_trial_sees_programs_and_connections(monkeypatch):
     """What the trial's children may not do, by the audit events that Python raises for it."""
-    told = []
-    monkeypatch.setattr(harness.os, "write", lambda number, text: told.append(text))
+    lines = []
+    monkeypatch.setattr(harness.os, "write", lambda number, text: lines.append(text))
     monkeypatch.setattr(sys, "argv", ["sehdr-warp", "render"])
     for event, arguments in (
         ("subprocess.Popen", ("/bin/sh", ["sh"])),
@@ -272,12 +272,12 @@ def test_the_trial_sees_programs_and_connections(monkeypatch):
         ("socket.bind", (None, ("127.0.0.1", 80))),
         ("socket.getaddrinfo", ("example.org", 80, 0, 0, 0)),
     ):
-        told.clear()
+        lines.clear()
         harness._watch(event, arguments)
-        assert told and told[0].startswith(b"STARTED"), event
-    told.clear()
+        assert lines and lines[0].startswith(b"STARTED"), event
+    lines.clear()
     harness._watch("subprocess.Popen", (sys.executable, []))
     harness._watch("socket.connect", (None, ("127.0.0.1", 80)))
     monkeypatch.setattr(sys, "argv", ["sehdr-warp", "view"])
     harness._watch("socket.bind", (None, ("127.0.0.1", 80)))
-    assert told == []
+    assert lines == []

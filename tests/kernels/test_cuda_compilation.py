@@ -63,9 +63,13 @@ KERNELS: dict[str, Callable[[], Any]] = {
 }
 
 
-def warp_modules(made: Any) -> list[Any]:
+def warp_modules(kernel_objects: Any) -> list[Any]:
     """Return the modules of a kernel, of a namespace of kernels or of a Python module."""
-    kernels = [made] if isinstance(made, wp.Kernel) else [k for k in vars(made).values() if isinstance(k, wp.Kernel)]
+    kernels = (
+        [kernel_objects]
+        if isinstance(kernel_objects, wp.Kernel)
+        else [k for k in vars(kernel_objects).values() if isinstance(k, wp.Kernel)]
+    )
     assert kernels
     return list({id(kernel.module): kernel.module for kernel in kernels}.values())
 

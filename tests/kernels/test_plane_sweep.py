@@ -29,7 +29,7 @@ def reference(images, cameras, pixel, depth) -> float:
     values = images[view].astype(float) / 255
     weights = [np.exp(-np.abs(values[row + y, column + x] - values[row, column]).mean() / 0.1) for x, y in window]
     for other in NEIGHBORS[view][NEIGHBORS[view] >= 0]:
-        camera, seen, total = cameras[other], images[other].astype(float) / 255, 0.0
+        camera, other_image, total = cameras[other], images[other].astype(float) / 255, 0.0
         for (x, y), weight in zip(window, weights, strict=True):
             ray = [(column + x + 0.5 - own.cx) / own.fx, (row + y + 0.5 - own.cy) / own.fy, 1]
             world = own.camera_to_world @ np.append(np.multiply(ray, depth), 1)
@@ -39,8 +39,8 @@ def reference(images, cameras, pixel, depth) -> float:
                 break
             left, top = int(u), int(v)
             a, b = u - left, v - top
-            color = (1 - b) * ((1 - a) * seen[top, left] + a * seen[top, left + 1])
-            color += b * ((1 - a) * seen[top + 1, left] + a * seen[top + 1, left + 1])
+            color = (1 - b) * ((1 - a) * other_image[top, left] + a * other_image[top, left + 1])
+            color += b * ((1 - a) * other_image[top + 1, left] + a * other_image[top + 1, left + 1])
             total += weight * min(np.abs(color - values[row + y, column + x]).mean(), 0.25)
         else:
             costs.append(total / sum(weights))
@@ -52,8 +52,8 @@ def test_costs_are_the_reference(photos, device):
     pixels = [(0, 11, 8), (0, 4, 5), (0, 20, 14), (1, 10, 9), (1, 2, 2), (2, 15, 6)]
     depths = [0.4, 1.0, 2.0, 5.0, 40.0]
     expected = [[reference(images, cameras, pixel, depth) for depth in depths] for pixel in pixels]
-    given = torch.tensor(pixels, dtype=torch.int32, device=device), torch.tensor(depths, device=device).repeat(6, 1)
-    costs = matching_costs(PhotoSet.of(images, cameras, NEIGHBORS, device), *given)
+    inputs = torch.tensor(pixels, dtype=torch.int32, device=device), torch.tensor(depths, device=device).repeat(6, 1)
+    costs = matching_costs(PhotoSet.of(images, cameras, NEIGHBORS, device), *inputs)
     np.testing.assert_allclose(costs.cpu(), expected, atol=2e-5)
     # Places that two neighbors see, and places that they do not, are both among them; the last view has one neighbor.
     assert 0.5 in costs[0] or 0.5 in costs[1]
@@ -100,20 +100,20 @@ def test_depths_are_trusted_where_costs_are_sure(device):
         row[valley] = rng.choice([0.0, 0.02, 0.049, 0.055]) + 0.001 * (np.arange(40)[valley] - place) ** 2
     costs[0], costs[1] = 0.5, np.inf
     costs = costs.astype(np.float32)
-    given = (torch.tensor(values, dtype=torch.float32, device=device) for values in (costs, planes))
-    found = trusted_depths(*given, **TRUST).cpu().numpy()
+    inputs = (torch.tensor(values, dtype=torch.float32, device=device) for values in (costs, planes))
+    depth_values = trusted_depths(*inputs, **TRUST).cpu().numpy()
     expected = np.array([trusted(row, planes) for row in costs])
-    assert 0.2 < (expected > 0).mean() < 0.9 and found[0] == found[1] == 0
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    assert 0.2 < (expected > 0).mean() < 0.9 and depth_values[0] == depth_values[1] == 0
+    np.testing.assert_allclose(depth_values, expected, rtol=2e-3)
 
 
 def test_matches_are_where_cameras_see_them(photos, device):
     images, cameras = photos
-    given = PhotoSet.of(images, cameras, NEIGHBORS, device)
+    inputs = PhotoSet.of(images, cameras, NEIGHBORS, device)
     poses = torch.tensor(np.stack([camera.camera_to_world for camera in cameras]), dtype=torch.float32, device=device)
     pixels = torch.tensor([[0, 9, 5], [2, 14, 7]], dtype=torch.int32, device=device)
     depths = torch.tensor([3.0, 0.7], device=device)
-    points, colors, footprints = (values.cpu().numpy() for values in matched_points(given, poses, pixels, depths))
+    points, colors, footprints = (values.cpu().numpy() for values in matched_points(inputs, poses, pixels, depths))
     for (view, column, row), depth, point, color, footprint in zip(
         pixels.tolist(), depths.tolist(), points, colors, footprints, strict=True
     ):

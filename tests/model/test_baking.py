@@ -21,8 +21,8 @@ def camera(x=0.0, size=32):
 
 def test_basis_is_that_of_the_renderer():
     directions, coefficients = sphere_directions(40), gaussians(40).harmonics
-    given = torch.from_numpy(coefficients), torch.from_numpy(directions).float()
-    rendered = spherical_harmonics(3, *given, torch.zeros(3))
+    inputs = torch.from_numpy(coefficients), torch.from_numpy(directions).float()
+    rendered = spherical_harmonics(3, *inputs, torch.zeros(3))
     by_basis = np.einsum("nk,nkc->nc", harmonic_basis(directions, 3), coefficients)
     np.testing.assert_allclose(by_basis, rendered, atol=2e-5)
 
@@ -38,13 +38,13 @@ def test_bake_gives_back_what_harmonics_can_hold(monkeypatch):
 def test_bake_follows_the_cameras_where_harmonics_cannot_hold_all():
     start = gaussians(200, color_model="log")
     positions = np.array([[x, y, -8.0] for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    seen = start.means[:, None] - positions
-    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
-    target = SRGB.encode(evaluate_colors(start, seen) * 4)
+    view_directions = start.means[:, None] - positions
+    view_directions /= np.linalg.norm(view_directions, axis=2, keepdims=True)
+    target = SRGB.encode(evaluate_colors(start, view_directions) * 4)
     errors = []
-    for given in (positions, NOWHERE):
-        baked = bake(start, lambda radiance: SRGB.encode(radiance * 4), "display", camera_positions=given)
-        errors.append(np.abs(evaluate_colors(baked, seen) - target).mean())
+    for inputs in (positions, NOWHERE):
+        baked = bake(start, lambda radiance: SRGB.encode(radiance * 4), "display", camera_positions=inputs)
+        errors.append(np.abs(evaluate_colors(baked, view_directions) - target).mean())
     assert errors[0] < 0.01 and errors[0] < 0.5 * errors[1]
 
 
@@ -76,8 +76,8 @@ def test_fused_brackets_are_fitted_in_log_radiance():
     field.fusion.forward = lambda logs: (0.8 * logs).exp() * 3  # pyright: ignore[reportAttributeAccessIssue]
     directions = sphere_directions(20)
     expected = 3 * (evaluate_colors(gaussians(), directions) * 0.5) ** 0.8
-    found = evaluate_colors(gaussians_of(field, "log", NOWHERE), directions)
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    colors = evaluate_colors(gaussians_of(field, "log", NOWHERE), directions)
+    np.testing.assert_allclose(colors, expected, rtol=1e-4)
 
 
 def test_refinement_brings_display_colors_to_the_pictures(device):

@@ -121,11 +121,11 @@ def test_table_matches_exact(name):
     difference = (fusion(log_base) - fusion.exact(log_base)).detach()
     assert difference.abs().max() < 2e-3, "largest at the kinks of a clipping response"
     assert difference.square().mean().sqrt() < 1e-4
-    given, wanted = (
+    inputs, expected = (
         torch.autograd.grad(evaluate(log_base).sum(), [log_base, *fusion.parameters()])
         for evaluate in (fusion, fusion.exact)
     )
-    for a, b in zip(given, wanted, strict=True):
+    for a, b in zip(inputs, expected, strict=True):
         assert (a - b).norm() < 0.06 * b.norm()
 
 

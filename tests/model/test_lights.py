@@ -30,8 +30,8 @@ def panel(width=1.2, height=0.6, step=0.04, at=(0.0, 0.0, 4.0)):
 def views(target=(0, 0, 4.0)):
     """Cameras in front of the light, all of which see it whole, as finely as received()."""
     positions = [(x, y, 0) for x in (-0.6, 0, 0.6) for y in (-0.3, 0.3)]
-    made = [look_at(position, target, up=(0, -1, 0)) for position in positions]
-    return [(Camera(256, 192, 240.0, 240.0, 128.0, 96.0, pose), 1.0) for pose in made]
+    orientations = [look_at(position, target, up=(0, -1, 0)) for position in positions]
+    return [(Camera(256, 192, 240.0, 240.0, 128.0, 96.0, pose), 1.0) for pose in orientations]
 
 
 def received(scene):
@@ -64,8 +64,8 @@ def test_a_ball_is_a_sphere():
     scene = field(ball((0.5, 0, 4)), RADIANCE, 0.03)
     (light,) = find_lights(scene, torch.ones(900), views((0.5, 0, 4)))
     assert light.shape.kind == "sphere" and light.shape.position == pytest.approx([0.5, 0, 3.9], abs=0.15)
-    seen = light.radiance * light.shape.solid_angle(np.zeros(3))
-    assert seen == pytest.approx(received(scene), rel=0.1)
+    irradiance = light.radiance * light.shape.solid_angle(np.zeros(3))
+    assert irradiance == pytest.approx(received(scene), rel=0.1)
 
 
 def test_lights_apart_are_two_and_what_is_dark_or_did_not_clip_is_none():
@@ -95,10 +95,10 @@ def test_panoramas_show_lights_in_all_directions(target):
     wide = [(Camera(256, 128, 40.7, 40.7, 128.0, 64.0, pose, "equirectangular"), 1.0) for pose in poses]
     # As fine as the panoramas: pixels blur small lights.
     plain = [(Camera(64, 64, 40.7, 40.7, 32.0, 32.0, look_at(place, target, up=up)), 1.0) for place in places]
-    (seen,), (reference,) = find_lights(scene, clipped, wide), find_lights(scene, clipped, plain)
-    assert seen.shape.size == pytest.approx(reference.shape.size, rel=0.1)
-    assert seen.radiance == pytest.approx(reference.radiance, rel=0.1)
-    assert seen.share == pytest.approx(reference.share, rel=0.2)
+    (irradiance,), (reference,) = find_lights(scene, clipped, wide), find_lights(scene, clipped, plain)
+    assert irradiance.shape.size == pytest.approx(reference.shape.size, rel=0.1)
+    assert irradiance.radiance == pytest.approx(reference.radiance, rel=0.1)
+    assert irradiance.share == pytest.approx(reference.share, rel=0.2)
 
 
 def test_a_fisheye_lens_shows_a_light_beside_it():

@@ -128,8 +128,10 @@ def test_only_fields_that_do_not_fit_are_paged(street, logged):
 def test_boxes_in_view():
     low = np.array([[-1, -1, -1], [50, 0, 0], [-1, -1, 20], [-1e3, -1e3, -1e3]], float)
     high = np.array([[1, 1, 0], [51, 1, 1], [1, 1, 21], [1e3, 1e3, 1e3]], float)
-    seen = boxes_in_view(Camera(40, 40, 40.0, 40.0, 20.0, 20.0, look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0))), low, high)
-    assert seen.tolist() == [True, False, False, True]
+    in_view = boxes_in_view(
+        Camera(40, 40, 40.0, 40.0, 20.0, 20.0, look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0))), low, high
+    )
+    assert in_view.tolist() == [True, False, False, True]
 
 
 def test_lights_and_confidence_are_those_of_the_whole(street, device):

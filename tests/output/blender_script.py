@@ -9,7 +9,7 @@ import bpy
 
 folder = Path(sys.argv[1])
 facts = json.loads((folder / "facts.json").read_text())
-found = {"version": bpy.app.version_string}
+report = {"version": bpy.app.version_string}
 
 
 def reset():
@@ -46,7 +46,7 @@ turned = lambda p: (p[0], -p[2], p[1])  # noqa: E731
 scene = reset()
 bpy.ops.wm.usd_import(filepath=str(folder / "cameras.usda"))
 cameras = [each for each in bpy.data.objects if each.type == "CAMERA"]
-found["cameras"] = sorted(each.name for each in cameras)
+report["cameras"] = sorted(each.name for each in cameras)
 for point in facts["points"]:
     emitter(turned(point), facts["radius"])
 [scene.camera] = cameras[:1]
@@ -62,7 +62,7 @@ nodes, links = world.node_tree.nodes, world.node_tree.links
 texture, mapping = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeMapping")
 coordinates = nodes.new("ShaderNodeTexCoord")
 texture.image = bpy.data.images.load(str(folder / "env.exr"))
-found["map"] = {"size": list(texture.image.size), "space": texture.image.colorspace_settings.name}
+report["map"] = {"size": list(texture.image.size), "space": texture.image.colorspace_settings.name}
 mapping.inputs["Rotation"].default_value = (0, 0, math.pi / 2)
 links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
 links.new(mapping.outputs["Vector"], texture.inputs["Vector"])
@@ -98,7 +98,7 @@ scene = reset()
 for name in ("splats.glb", "splats.usdc"):
     if (folder / name).exists():
         load = bpy.ops.import_scene.gltf if name.endswith("glb") else bpy.ops.wm.usd_import
-        found[name] = sorted(load(filepath=str(folder / name)))
+        report[name] = sorted(load(filepath=str(folder / name)))
 picture = bpy.data.images.load(str(folder / "picture.exr"))
-found["picture"] = {"size": list(picture.size), "space": picture.colorspace_settings.name}
-print("RESULT " + json.dumps(found))
+report["picture"] = {"size": list(picture.size), "space": picture.colorspace_settings.name}
+print("RESULT " + json.dumps(report))

@@ -72,8 +72,8 @@ def spots(image):
 
 
 def test_cameras_match_within_a_pixel(opened):
-    folder, found, _, run, _, points = opened
-    assert found["cameras"] == ["orbit"]
+    folder, report, _, run, _, points = opened
+    assert report["cameras"] == ["orbit"]
     transform = world_transform(run)
     cameras = [transform.camera(each.resized(*SIZE)) for _, each in select_cameras(run, "orbit", count=3)]
     for frame in FRAMES:
@@ -82,14 +82,14 @@ def test_cameras_match_within_a_pixel(opened):
         expected = local[:, :2] / local[:, 2:] * focal + middle
         inside = ((expected > 3) & (expected < np.array(SIZE) - 3)).all(axis=1)
         assert inside.sum() >= 2
-        seen = spots(read_hdr(folder / f"match_{frame}.exr"))
-        distances = np.linalg.norm(expected[inside][:, None] - seen, axis=2).min(axis=1)
-        assert distances.max() < 1, (frame, expected, seen)
+        spots_of_map = spots(read_hdr(folder / f"match_{frame}.exr"))
+        distances = np.linalg.norm(expected[inside][:, None] - spots_of_map, axis=2).min(axis=1)
+        assert distances.max() < 1, (frame, expected, spots_of_map)
 
 
 def test_a_map_lights_as_it_should(opened):
-    folder, found, _, _, light, _ = opened
-    assert found["map"]["size"] == [128, 64] and "Rec.709" in found["map"]["space"]
+    folder, report, _, _, light, _ = opened
+    assert report["map"]["size"] == [128, 64] and "Rec.709" in report["map"]["space"]
     directions, weight = latlong(128), solid_angles(128, "latlong")[..., None]
     weight = weight * 4 * np.pi / weight.sum()
     for index, normal in enumerate(NORMALS):
@@ -100,8 +100,8 @@ def test_a_map_lights_as_it_should(opened):
 
 
 def test_files_are_imported_without_warnings(opened):
-    _, found, output, *_ = opened
-    assert found["splats.glb"] == found["splats.usdc"] == ["FINISHED"]
-    assert found["picture"]["size"] == list(SIZE) and "Rec.709" in found["picture"]["space"]
+    _, report, output, *_ = opened
+    assert report["splats.glb"] == report["splats.usdc"] == ["FINISHED"]
+    assert report["picture"]["size"] == list(SIZE) and "Rec.709" in report["picture"]["space"]
     lines = [line for line in output.splitlines() if "warning" in line.lower() or "error" in line.lower()]
     assert [line for line in lines if "blender_script.py" not in line] == []  # Of the script itself

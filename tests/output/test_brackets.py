@@ -17,16 +17,16 @@ EXIF_IFD, EXPOSURE_TIME, EXPOSURE_BIAS = 0x8769, 0x829A, 0x9204
 
 
 def test_exposures_ascend_and_are_of_the_one_grammar():
-    made = bracket_exposures(0.5, evs=[2, -4, 0])
-    assert [(e.time, e.ev, e.label) for e in made] == [(1 / 32, -4, "ev-4.0"), (0.5, 0, "ev+0.0"), (2, 2, "ev+2.0")]
-    for given in ([8, 0.125], "1/8, 8s", "1/4x,+4ev"):
-        assert [(e.time, e.ev) for e in bracket_exposures(0.5, exposures=given)] == [(0.125, -2), (8, 4)]
+    bracket = bracket_exposures(0.5, evs=[2, -4, 0])
+    assert [(e.time, e.ev, e.label) for e in bracket] == [(1 / 32, -4, "ev-4.0"), (0.5, 0, "ev+0.0"), (2, 2, "ev+2.0")]
+    for words in ([8, 0.125], "1/8, 8s", "1/4x,+4ev"):
+        assert [(e.time, e.ev) for e in bracket_exposures(0.5, exposures=words)] == [(0.125, -2), (8, 4)]
     assert bracket_exposures(0.5, evs="-2,4") == bracket_exposures(0.5, evs=[4, -2])
     assert bracket_exposures(1.0, evs=[-0.01])[0].label == "ev+0.0"
 
 
 @pytest.mark.parametrize(
-    "given, message",
+    "words, message",
     [  # The grammar's own refusals are field's to test.
         ({"evs": [0], "exposures": [1]}, "both are set"),
         ({}, "neither is set"),
@@ -37,9 +37,9 @@ def test_exposures_ascend_and_are_of_the_one_grammar():
         ({"exposures": [1e-30]}, "exposures: 1e-30 s .* is outside"),
     ],
 )
-def test_unusable_exposures_name_the_value(given, message):
+def test_unusable_exposures_name_the_value(words, message):
     with pytest.raises(SehdrError, match=message):
-        bracket_exposures(0.5, **given)
+        bracket_exposures(0.5, **words)
     with pytest.raises(SehdrError, match="base exposure time = -1"):
         bracket_exposures(-1, evs=[0])
 

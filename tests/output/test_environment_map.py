@@ -77,9 +77,9 @@ def test_white_is_an_exposure_that_the_file_states(tmp_path, run, suffix):
         assert float(head.split("\nEXPOSURE=")[1].split()[0]) == pytest.approx(2)
         np.testing.assert_allclose(again, radiance, rtol=0.01, atol=0.01)
     else:
-        (radiance, _, _), (shown, _, header) = (read(tmp_path / f"{name}.exr") for name in ("plain", "exposed"))
+        (radiance, _, _), (exposed, _, header) = (read(tmp_path / f"{name}.exr") for name in ("plain", "exposed"))
         assert header["expTime"] == pytest.approx(4 * run.base_time) == 2
-        np.testing.assert_allclose(shown, radiance * header["expTime"], rtol=1e-6)
+        np.testing.assert_allclose(exposed, radiance * header["expTime"], rtol=1e-6)
     with pytest.raises(SehdrError, match="white 0.0 is not between"):
         write_environment_map(run, tmp_path / f"none{suffix}", reference_white=0.0)
 
@@ -115,8 +115,8 @@ def test_mitsuba_sees_the_same(tmp_path, run):
     write_environment_map(run, tmp_path / "env.exr", at=(0, 0, 0), size=256, axes="scene", pixel="float")
     scene = mi.load_dict({"type": "scene", "env": {"type": "envmap", "filename": str(tmp_path / "env.exr")}})
     for axis, light in zip(AXES, LIGHT, strict=True):
-        seen = eval_map(mi, scene, axis)
-        np.testing.assert_allclose(seen, 0.98 * light, rtol=0.01)
+        radiances = eval_map(mi, scene, axis)
+        np.testing.assert_allclose(radiances, 0.98 * light, rtol=0.01)
 
 
 def eval_map(mi, scene, axis):
@@ -167,9 +167,9 @@ def test_openexrs_reference_picture_lies_as_maps_do(shared):
     oiio = pytest.importorskip("OpenImageIO")
     file = shared / "data" / "env_maps" / "OrientationLatLong.exr"
     picture, directions = read_hdr(file)[4::16, 4::16], latlong(1024)[4::16, 4::16]
-    seen = looked_at(oiio, file, directions.reshape(-1, 3)).reshape(picture.shape)
-    turned = [seen[:, ::-1], seen[::-1], *(np.roll(seen, columns, axis=1) for columns in (16, 32, 48))]
-    assert decibels(seen, picture) > 22 > 17 > max(decibels(other, picture) for other in turned)
+    radiances = looked_at(oiio, file, directions.reshape(-1, 3)).reshape(picture.shape)
+    turned = [radiances[:, ::-1], radiances[::-1], *(np.roll(radiances, columns, axis=1) for columns in (16, 32, 48))]
+    assert decibels(radiances, picture) > 22 > 17 > max(decibels(other, picture) for other in turned)
 
 
 def test_openexrs_converter_and_openimageio_see_the_same(tmp_path, run):
@@ -185,8 +185,8 @@ def test_openexrs_converter_and_openimageio_see_the_same(tmp_path, run):
     write_environment_map(run, tmp_path / "cube.exr", size=128, layout="cube", **options)
     ours = read(tmp_path / "cube.exr")[0]
     oiio = pytest.importorskip("OpenImageIO")
-    seen = looked_at(oiio, tmp_path / "env.exr", cube(128).reshape(-1, 3)[::17])
-    assert decibels(seen, ours.reshape(-1, 3)[::17]) > 40
+    radiances = looked_at(oiio, tmp_path / "env.exr", cube(128).reshape(-1, 3)[::17])
+    assert decibels(radiances, ours.reshape(-1, 3)[::17]) > 40
     if shutil.which("exrenvmap") is None:
         pytest.skip("exrenvmap is not installed")
     subprocess.run(["exrenvmap", "-c", "-w", "128", tmp_path / "env.exr", tmp_path / "theirs.exr"], check=True)
@@ -211,11 +211,11 @@ def test_unseen_directions_are_inpainted_on_request(tmp_path, run, logged):
     write_environment_map(run, tmp_path / "fill.exr", at=(0, 0, 0), size=64, axes="scene", inpaint=True)
     (plain, channels, _), (full, again, _) = read(tmp_path / "env.exr"), read(tmp_path / "fill.exr")
     np.testing.assert_array_equal(channels["A"], again["A"])
-    seen = channels["A"] > 0.5
+    radiances = channels["A"] > 0.5
     added = (full - plain) / np.maximum(1 - channels["A"], 1e-3)[..., None]
     assert added[channels["A"] < 0.99].min() > 0.9 and added.max() < 9.1
     assert plain.min() < 1e-3 and full.min() > 0.4 and full.max() < 9.1
-    share = (seen * solid_angles(64, "latlong")).sum() / solid_angles(64, "latlong").sum()
+    share = (radiances * solid_angles(64, "latlong")).sum() / solid_angles(64, "latlong").sum()
     assert f"env.exr: {100 * share:.0f} % of all directions seen; the rest is black, --inpaint" in "\n".join(logged)
     assert f"fill.exr: {100 * share:.0f} % of all directions seen" in logged
 

@@ -41,12 +41,12 @@ def test_a_wrong_suffix_is_told_all_that_export_writes(tmp_path):
 def test_exposure_of_display_colors(tmp_path, run, logged):
     export(run, tmp_path / "a.ply")
     export(run, tmp_path / "b.ply", exposure_time=2.0)
-    kept = [float(line.split()[1]) for line in logged if line.startswith("kept:")]
-    assert len(kept) == 2 and min(kept) > 30
+    shares = [float(line.split()[1]) for line in logged if line.startswith("kept:")]
+    assert len(shares) == 2 and min(shares) > 30
     assert [read_gaussians(tmp_path / name).base_time for name in ("a.ply", "b.ply")] == [0.5, 2.0]
-    shown = [load_splats(tmp_path / name).render_ldr(camera()).mean() for name in ("a.ply", "b.ply")]
-    wanted = [run.render_ldr(camera(), time).mean() for time in (0.5, 2.0)]
-    np.testing.assert_allclose(shown, wanted, rtol=0.05)
+    means = [load_splats(tmp_path / name).render_ldr(camera()).mean() for name in ("a.ply", "b.ply")]
+    expected = [run.render_ldr(camera(), time).mean() for time in (0.5, 2.0)]
+    np.testing.assert_allclose(means, expected, rtol=0.05)
     export(run, tmp_path / "dark.ply", exposure_time=0.125)
     light = [each.render(camera()).hdr.mean() for each in (load_splats(tmp_path / "dark.ply"), run)]
     np.testing.assert_allclose(*light, rtol=0.1)
@@ -57,8 +57,8 @@ def test_cameras_beside_are_read_again(tmp_path, run):
     first = json.loads((tmp_path / "a.cameras.json").read_text())[1]
     assert set(first) == {"id", "img_name", "width", "height", "position", "rotation", "fy", "fx"}
     splats = load_splats(tmp_path / "a.ply")
-    for entry, given in zip(splats.cameras, run.cameras, strict=True):
-        np.testing.assert_allclose(entry.camera.world_to_camera, given.camera.world_to_camera, atol=1e-9)
+    for entry, original in zip(splats.cameras, run.cameras, strict=True):
+        np.testing.assert_allclose(entry.camera.world_to_camera, original.camera.world_to_camera, atol=1e-9)
     assert [name for name, _ in load_cameras(tmp_path / "a.cameras.json")] == ["0", "1", "2"]
     (tmp_path / "b.cameras.json").write_text("mine")
     with pytest.raises(InputError, match=r"cameras.json: exists already"):

@@ -51,19 +51,19 @@ def test_metadata_reaches_both_readers(tmp_path):
         provenance={"scene": "room", "iteration": "7"},
     )
     write_exr(tmp_path / "a.exr", rgb_channels(radiance()), header=header)
-    _, _, found = read_exr(tmp_path / "a.exr")
-    assert found["expTime"] == np.float32(0.1) and float(found["sehdr:exposureTime"]) == 0.1
-    assert found["capDate"] == "2025:01:02 03:04:05"
-    assert found["sehdr:scene"] == "room" and found["sehdr:pixelType"] == "half"
-    assert found["colorInteropID"] == "lin_ap1_scene"
-    np.testing.assert_allclose(found["chromaticities"][:2], (0.713, 0.293), atol=1e-6)
-    np.testing.assert_allclose(found["pixelAspectRatio"], view.fy / view.fx, rtol=1e-6)
-    assert json.loads(found["sehdr:camera"]) == view.to_dict()
+    _, _, attributes = read_exr(tmp_path / "a.exr")
+    assert attributes["expTime"] == np.float32(0.1) and float(attributes["sehdr:exposureTime"]) == 0.1
+    assert attributes["capDate"] == "2025:01:02 03:04:05"
+    assert attributes["sehdr:scene"] == "room" and attributes["sehdr:pixelType"] == "half"
+    assert attributes["colorInteropID"] == "lin_ap1_scene"
+    np.testing.assert_allclose(attributes["chromaticities"][:2], (0.713, 0.293), atol=1e-6)
+    np.testing.assert_allclose(attributes["pixelAspectRatio"], view.fy / view.fx, rtol=1e-6)
+    assert json.loads(attributes["sehdr:camera"]) == view.to_dict()
 
     _, spec = read_openimageio(tmp_path / "a.exr")
     assert spec.get_float_attribute("ExposureTime") == np.float32(0.1)
     assert spec.get_string_attribute("DateTime") == "2025:01:02 03:04:05"
-    np.testing.assert_allclose(np.reshape(spec.getattribute("worldToCamera"), (4, 4)), found["worldToCamera"])
+    np.testing.assert_allclose(np.reshape(spec.getattribute("worldToCamera"), (4, 4)), attributes["worldToCamera"])
 
 
 def test_camera_matrices_follow_their_conventions():

@@ -49,17 +49,17 @@ def smooth_run():
 )
 def test_a_film_holds_the_light_and_says_how(tmp_path, transfer, codec, tags):
     run, cameras = smooth_run()
-    shown, context = frames(
+    decoded, context = frames(
         write_film(run, tmp_path / "f.mov", cameras, transfer=transfer, exposed=True, fps=24000 / 1001)
     )
-    assert shown.shape == (5, 64, 96, 3) and context.name == codec
+    assert decoded.shape == (5, 64, 96, 3) and context.name == codec
     assert (context.color_primaries, context.color_trc, context.colorspace) == tags
     gain = run.base_time * display_gain(run.response)
-    for picture, camera in zip(shown, cameras, strict=True):
+    for picture, camera in zip(decoded, cameras, strict=True):
         light = run.render(camera.resized(96, 64)).hdr * gain
         assert np.abs(picture - encode(light, transfer)).mean() < 0.02
     if transfer == "hdr10":  # Clipped where SDR clips it is not: codes of white, and of the light above.
-        assert encode(np.ones(3), "hdr10") == pytest.approx(0.581, abs=2e-3) and shown.max() > 0.65
+        assert encode(np.ones(3), "hdr10") == pytest.approx(0.581, abs=2e-3) and decoded.max() > 0.65
 
 
 def test_references_of_the_curves():
@@ -77,9 +77,9 @@ def test_references_of_the_curves():
 def test_a_ramp_runs_through_the_stops(tmp_path):
     run, cameras = smooth_run()
     still = [cameras[0]] * 5
-    shown, _ = frames(write_film(run, tmp_path / "f.mp4", still, ev_ramp=(-4, 0)))
+    decoded, _ = frames(write_film(run, tmp_path / "f.mp4", still, ev_ramp=(-4, 0)))
     light = run.render(cameras[0].resized(96, 64)).hdr * run.base_time * display_gain(run.response)
-    for stops, picture in zip(range(-4, 1), shown, strict=True):
+    for stops, picture in zip(range(-4, 1), decoded, strict=True):
         assert picture.mean() == pytest.approx(encode(light * 2.0**stops, "sdr").mean(), abs=0.01)
     assert _ramp("-4:4") == (-4, 4) and _ramp("1.5") == (1.5, 1.5) and _ramp(None) == (0, 0)
     for bad in ("", "a:b", "1:2:3", "99:0", "nan:1"):

@@ -116,7 +116,7 @@ def test_a_walk_ahead_is_followed_not_orbited():
     photos = street()
     broken = street(leap=4)
     assert len(walk(photos)) == 12 and walk(photos[:3]) == []
-    assert all(found is photo for found, photo in zip(walk(broken), broken[4:], strict=True))
+    assert all(view is photo for view, photo in zip(walk(broken), broken[4:], strict=True))
     assert walk(around(24, 4)) == walk(around(24, 4, span=90)) == []
     path = walk_path(photos, 30)
     places = np.stack([each.position for each in path])

@@ -91,9 +91,9 @@ def test_radiance_files_hold_watts(lit, tmp_path):
 def test_lights_are_in_candelas(lit, tmp_path):
     unit = meter(lit, "r_0", (16, 12), luminance=250.0).luminance
     write_lights(lit, tmp_path / "lights.json", axes="scene")
-    found = json.loads((tmp_path / "lights.json").read_text())
-    assert found["units"] == "cd/m^2, linear Rec.709"
-    assert found["lights"][0]["radiance"] == pytest.approx([8 * unit, 4 * unit, 2 * unit])
+    lights_file = json.loads((tmp_path / "lights.json").read_text())
+    assert lights_file["units"] == "cd/m^2, linear Rec.709"
+    assert lights_file["lights"][0]["radiance"] == pytest.approx([8 * unit, 4 * unit, 2 * unit])
     assert "cd / m^2" in lights_table(LIGHTS, unit) and "radiance" in lights_table(LIGHTS)
     write_lights(lit, tmp_path / "lights.usda", axes="scene")
     assert f"float inputs:intensity = {unit!r}\n        asset inputs:texture" in (tmp_path / "lights.usda").read_text()

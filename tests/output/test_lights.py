@@ -40,11 +40,11 @@ def run(tmp_path, monkeypatch):
 
 def test_json_has_every_figure(tmp_path, run):
     assert write_lights(run, tmp_path / "lights.json", axes="scene") == [tmp_path / "lights.json"]
-    found = json.loads((tmp_path / "lights.json").read_text())
-    first, second = found["lights"]
+    lights_file = json.loads((tmp_path / "lights.json").read_text())
+    first, second = lights_file["lights"]
     assert first["position"] == [1.0, 0.5, 2.0] and first["size"] == [0.4, 0.2] and first["shape"] == "rect"
     assert first["radiance"] == [8, 4, 2] and first["deviation_stops"] == 0.7 and second["deviation_stops"] is None
-    assert (first["share_of_light"], second["shape"]) == (0.5, "sphere") and "Rec.709" in found["units"]
+    assert (first["share_of_light"], second["shape"]) == (0.5, "sphere") and "Rec.709" in lights_file["units"]
 
 
 def test_usd_lights_stand_and_shine_as_the_scene_s(tmp_path, run):

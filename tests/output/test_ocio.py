@@ -23,12 +23,12 @@ CONFIG = "ocio://default"
 def test_previews_are_the_view(tmp_path):
     run = AnalyticRun()
     render_views(run, tmp_path, ocio=CONFIG, view="Un-tone-mapped")
-    shown = np.asarray(Image.open(tmp_path / "preview" / "t_0.png")) / 255
+    preview = np.asarray(Image.open(tmp_path / "preview" / "t_0.png")) / 255
     light = run.render(run.cameras[3].camera).hdr * run.base_time * display_gain(run.response)
     # Without a tone map this view is sRGB's curve.
     expected = np.clip(light, 0, 1)
     expected = np.where(expected <= 0.0031308, 12.92 * expected, 1.055 * expected ** (1 / 2.4) - 0.055)
-    np.testing.assert_allclose(shown, expected, atol=1.5 / 255)
+    np.testing.assert_allclose(preview, expected, atol=1.5 / 255)
     other = ocio_view(CONFIG, "Display P3 - Display/ACES 2.0 - SDR 100 nits (P3 D65)")(np.full((1, 1, 3), 1e6))
     assert 0.9 < other.min() <= other.max() <= 1
 
@@ -52,9 +52,9 @@ def test_what_a_config_lacks_is_named(tmp_path):
 def test_color_spaces_have_the_names_and_matrices_of_openexr(tmp_path):
     """colorInteropID is an identifier of the Color Interop Forum, which OpenColorIO's own spaces state."""
     config = OCIO.Config.CreateFromFile(CONFIG)
-    found = {space.getInteropID(): space.getName() for space in config.getColorSpaces()}
+    names = {space.getInteropID(): space.getName() for space in config.getColorSpaces()}
     for space in (space for space in SPACES if space.interop_id):
-        to = config.getProcessor(found["lin_rec709_scene"], found[space.interop_id]).getDefaultCPUProcessor()
+        to = config.getProcessor(names["lin_rec709_scene"], names[space.interop_id]).getDefaultCPUProcessor()
         for light in np.eye(3):
             np.testing.assert_allclose(to.applyRGB(light.tolist()), from_rec709(light, space.name), atol=2e-5)
 

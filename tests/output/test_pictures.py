@@ -20,8 +20,8 @@ def test_other_readers_see_16_bits(tmp_path):
     cv2 = pytest.importorskip("cv2")
     codes = np.random.default_rng(0).integers(0, 2**16, (7, 5, 3)).astype(np.uint16)
     write_picture(tmp_path / "a.png", codes, exif=exposure_exif(2.0))
-    found = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(found[..., ::-1], codes)
+    stored = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(stored[..., ::-1], codes)
 
 
 def test_jpeg_is_close_and_keeps_colour_detail(tmp_path):
@@ -49,17 +49,17 @@ def test_srgb_matches_colour_science():
 
 def test_tone_map_and_stops_do_not_depend_on_the_unit_of_radiance():
     image = radiance()
-    shown = fit_tone_map([image])(image)
+    display = fit_tone_map([image])(image)
     for unit in (1e-4, 1e4):
-        np.testing.assert_allclose(fit_tone_map([image * unit])(image * unit), shown, atol=1e-3)
+        np.testing.assert_allclose(fit_tone_map([image * unit])(image * unit), display, atol=1e-3)
     np.testing.assert_allclose(expose(image * 1e-3, -1, scale=3.0), encode_srgb(image * 1.5e-3), atol=1e-6)
 
 
 def test_tone_map_uses_the_display():
     image = radiance(64, 64)
-    shown = fit_tone_map([image])(image)
-    assert shown.min() >= 0 and 0.999 < shown.max() <= 1
-    assert 0.25 < shown.mean() < 0.6
+    display = fit_tone_map([image])(image)
+    assert display.min() >= 0 and 0.999 < display.max() <= 1
+    assert 0.25 < display.mean() < 0.6
     # Greys keep their order and stay grey; highlights run into white.
     grey = np.repeat(np.geomspace(1e-3, 1e2, 100)[:, None], 3, axis=1).astype(np.float32)
     tones = ToneMap(0.2, 4.0)(grey)
@@ -71,5 +71,5 @@ def test_tone_map_uses_the_display():
 def test_tone_map_of_nothing_is_black():
     black = np.zeros((4, 4, 3), np.float32)
     assert fit_tone_map([black])(black).max() == 0
-    shown = fit_tone_map([black + 1, black])(black + 1)
-    assert np.isfinite(shown).all() and 0.2 < shown.mean() < 0.8
+    display = fit_tone_map([black + 1, black])(black + 1)
+    assert np.isfinite(display).all() and 0.2 < display.mean() < 0.8

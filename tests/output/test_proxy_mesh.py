@@ -118,10 +118,10 @@ def test_the_floor_is_found_and_a_tilt_of_it(mesh):
 def test_depth_agrees_with_the_scene(mesh):
     run = BallOnFloor()
     camera = run.cameras[-1].camera.within(96)
-    truth, found = run.render(camera).depth, mesh_depth(mesh, camera)
-    both = (truth > 0) & (found > 0)
-    assert (found > 0)[24:72, 24:72].mean() > 0.98
-    assert np.median(np.abs(found - truth)[both] / truth[both]) < 0.01
+    truth, measured = run.render(camera).depth, mesh_depth(mesh, camera)
+    both = (truth > 0) & (measured > 0)
+    assert (measured > 0)[24:72, 24:72].mean() > 0.98
+    assert np.median(np.abs(measured - truth)[both] / truth[both]) < 0.01
 
 
 def test_openusd_holds_mesh_and_ground(tmp_path, logged):
@@ -147,10 +147,10 @@ def test_a_floor_that_is_not_level_comes_with_the_option_that_levels_it(tmp_path
     up = f"{np.sin(turn):.6f},{np.cos(turn):.6f},0"
     write_proxy_mesh(BallOnFloor(), tmp_path / "tilted.obj", resolution=48, up=up)
     [line] = [line for line in logged if line.startswith("ground")]
-    found = np.array([float(value) for value in line.split("--up=")[1].split(" ")[0].split(",")])
-    np.testing.assert_allclose(found, [0, 1, 0], atol=0.02)
+    measured = np.array([float(value) for value in line.split("--up=")[1].split(" ")[0].split(",")])
+    np.testing.assert_allclose(measured, [0, 1, 0], atol=0.02)
     logged.clear()
-    write_proxy_mesh(BallOnFloor(), tmp_path / "level.obj", resolution=48, up=",".join(map(str, found)))
+    write_proxy_mesh(BallOnFloor(), tmp_path / "level.obj", resolution=48, up=",".join(map(str, measured)))
     [line] = [line for line in logged if line.startswith("ground")]
     assert "--up" not in line
 

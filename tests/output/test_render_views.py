@@ -94,8 +94,8 @@ def test_folders_by_exposure_hold_sequences(tmp_path):
     )
     names = [f"orbit_{i:03d}" for i in range(3)]
     for folder, suffix in (("brackets", "exr"), ("brackets_ldr", "png")):
-        wanted = [f"{label}/{name}.{suffix}" for label in ("b0_ev-2.0", "b1_ev+0.0") for name in names]
-        assert tree(tmp_path / folder) == wanted
+        file_names = [f"{label}/{name}.{suffix}" for label in ("b0_ev-2.0", "b1_ev+0.0") for name in names]
+        assert tree(tmp_path / folder) == file_names
     manifest = json.loads((tmp_path / "brackets.json").read_text())
     files = [each["file"] for view in manifest["views"] for each in view["exposures"]]
     assert len(files) == 6 and all((tmp_path / file).is_file() for file in files)
@@ -167,13 +167,13 @@ def sees(view, point):
 
 @pytest.mark.parametrize("degrees", [60, 360])
 def test_orbit_looks_at_the_focus_smoothly(degrees):
-    given = arc(12, degrees)
-    path = orbit(given, 48, 1)
+    camera_path = arc(12, degrees)
+    path = orbit(camera_path, 48, 1)
     positions = np.stack([view.position for view in path])
     for view in path:
         np.testing.assert_allclose(sees(view, np.zeros(3)), (view.cx, view.cy), atol=1e-6)
         assert view.world_to_camera[1, :3] @ [0, 1, 0] > 0.9
-        np.testing.assert_allclose(np.linalg.norm(view.position), np.linalg.norm(given[0].position), rtol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(view.position), np.linalg.norm(camera_path[0].position), rtol=1e-6)
     steps = np.linalg.norm(np.diff(positions, axis=0, append=positions[:1]), axis=1)
     assert steps.max() < 4 / len(path) * np.ptp(positions, axis=0).max()
     azimuth = np.degrees(np.arctan2(positions[:, 0], -positions[:, 2]))
@@ -184,10 +184,10 @@ def test_orbit_follows_an_arc_that_goes_up_and_down():
     # A hand-held walk over a mound and around a corner: higher and farther away in the middle.
     angles = np.radians(np.linspace(-34, 34, 10))
     heights, distances = 0.6 - 9 * (angles - 0.1) ** 2 / 4, 12 - 5 * angles**2
-    given = [
+    camera_path = [
         camera(position=(d * np.sin(a), -h, -d * np.cos(a))) for a, h, d in zip(angles, heights, distances, strict=True)
     ]
-    for view in orbit(given, 48, 1):
+    for view in orbit(camera_path, 48, 1):
         x, y, z = view.position
         near = np.argsort(np.abs(angles - np.arctan2(x, -z)))[:2]
         assert heights[near].min() - 0.05 < -y < heights[near].max() + 0.05
@@ -206,16 +206,16 @@ def test_orbit_of_parallel_cameras_uses_the_depth_seen():
 
 
 def test_interpolation_passes_through_its_cameras():
-    given = arc(5, 90)
-    path = interpolate(given, 41)
+    camera_path = arc(5, 90)
+    path = interpolate(camera_path, 41)
     assert len(path) == 41
-    for i, view in enumerate(given):
+    for i, view in enumerate(camera_path):
         np.testing.assert_allclose(path[10 * i].world_to_camera, view.world_to_camera, atol=1e-6)
     turns = [np.linalg.norm(a.world_to_camera - b.world_to_camera) for a, b in pairwise(path)]
     assert max(turns) < 1.5 * min(turns)
-    repeated = interpolate([given[0], given[0], given[1]], 3)
-    np.testing.assert_allclose(repeated[2].world_to_camera, given[1].world_to_camera, atol=1e-9)
-    assert len(interpolate(given[:1], 4)) == 4
+    repeated = interpolate([camera_path[0], camera_path[0], camera_path[1]], 3)
+    np.testing.assert_allclose(repeated[2].world_to_camera, camera_path[1].world_to_camera, atol=1e-9)
+    assert len(interpolate(camera_path[:1], 4)) == 4
 
 
 def test_paths_need_cameras():
@@ -267,9 +267,9 @@ def test_size_keeps_the_vertical_field_of_view(tmp_path):
     run = AnalyticRun()
     render_views(run, tmp_path, size="64x36")
     camera_ = Camera.from_dict(json.loads(read_exr(tmp_path / "hdr" / "t_0.exr")[2]["sehdr:camera"]))
-    given = run.cameras[3].camera
-    assert (camera_.width, camera_.height) == (64, 36) and camera_.fy / 36 == given.fy / given.height
-    assert (camera_.cx - 32) / camera_.fx == pytest.approx((given.cx - given.width / 2) / given.fx)
+    camera_path = run.cameras[3].camera
+    assert (camera_.width, camera_.height) == (64, 36) and camera_.fy / 36 == camera_path.fy / camera_path.height
+    assert (camera_.cx - 32) / camera_.fx == pytest.approx((camera_path.cx - camera_path.width / 2) / camera_path.fx)
     for size in ("64", "0x9", "axb", "99999x99999"):
         with pytest.raises(SehdrError, match="such as 1920x1080"):
             render_views(run, tmp_path / "other", size=size)
@@ -280,9 +280,9 @@ def test_cameras_that_see_nothing_are_warned_of(tmp_path, logged, monkeypatch):
     rendered = run.render
 
     def nothing(view):
-        seen = rendered(view)
-        seen.alpha *= 0.001
-        return seen
+        image = rendered(view)
+        image.alpha *= 0.001
+        return image
 
     monkeypatch.setattr(run, "render", nothing)
     render_views(run, tmp_path)

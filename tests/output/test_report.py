@@ -58,8 +58,8 @@ def test_without_test_views_and_metrics(tmp_path):
 
 def test_the_chart_has_a_line_for_every_run_and_a_name_for_every_row():
     figure = training_chart({"sky": [METRICS]})
-    drawn = [[line.get_xydata().tolist() for line in axes.get_lines()] for axes in figure.axes]
-    assert drawn == [[[[1.5, 20.0], [3.0, 26.0]]], [[[1.5, 18.0], [3.0, 25.5]]]]
+    curves = [[line.get_xydata().tolist() for line in axes.get_lines()] for axes in figure.axes]
+    assert curves == [[[[1.5, 20.0], [3.0, 26.0]]], [[[1.5, 18.0], [3.0, 25.5]]]]
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles == ["Photos: 26.0 dB", "HDR, mu-law (gt-max): 25.5 dB"] and not figure.legends
     only = [{"seconds": 1.0, "psnr_ldr": 20.0}, {"iteration": 3}]
@@ -97,21 +97,21 @@ def test_photos_in_a_sensors_colors_are_shown_as_the_scene_is(tmp_path):
     view, plain = scene.views[0], compare(run, scene.views[0], scene.views)
     run.color_matrix = np.eye(3)[::-1].copy()
     run.base_time = 0.5 / plain.from_photo.max()  # What is white in a channel counts as clipped: see rec709_of().
-    shown = compare(run, view, scene.views)
-    np.testing.assert_allclose(shown.from_photo, plain.from_photo[..., ::-1], rtol=1e-5, atol=1e-6)
-    exposure = np.clip(shown.from_photo * view.exposure_time, 0, 1)
-    np.testing.assert_allclose(shown.photo, encode_srgb(exposure), atol=1e-6)
+    compared = compare(run, view, scene.views)
+    np.testing.assert_allclose(compared.from_photo, plain.from_photo[..., ::-1], rtol=1e-5, atol=1e-6)
+    exposure = np.clip(compared.from_photo * view.exposure_time, 0, 1)
+    np.testing.assert_allclose(compared.photo, encode_srgb(exposure), atol=1e-6)
 
 
 def test_the_new_view_lies_halfway_to_the_nearest(tmp_path):
     run, scene = make(tmp_path, splits=("train", "test", "train"))
-    seen = []
+    calls = []
     render = run.render
-    run.render = lambda camera: seen.append(camera.position) or render(camera)
+    run.render = lambda camera: calls.append(camera.position) or render(camera)
     write_report(run, scene, tmp_path / "report")
     first, second, third = (view.camera.position for view in scene.views)
     between = 0.5 * (second + min(first, third, key=lambda place: np.linalg.norm(place - second)))
-    assert np.abs(np.array(seen) - between).sum(axis=1).min() < 1e-9
+    assert np.abs(np.array(calls) - between).sum(axis=1).min() < 1e-9
     comparison = Comparison("v", scene.views[0].image, *[scene.views[0].hdr] * 3, None, scene.views[0].hdr * 2)
     titles = [axes.get_title() for axes in comparison_figure([comparison], 0.5, "").axes]
     stops = f"\N{MINUS SIGN}{-darker_stops([comparison], 0.5)} EV"

@@ -60,8 +60,8 @@ def validate(text):
     ]
     commands = [["tidy", "-q", "-e"], *(["java", "-jar", str(jar), "-"] for jar in folders if jar.is_file())]
     for command in (command for command in commands if shutil.which(command[0])):
-        told = subprocess.run(command, input=text, capture_output=True, text=True)
-        assert told.returncode == 0 and not told.stderr, told.stderr
+        checked = subprocess.run(command, input=text, capture_output=True, text=True)
+        assert checked.returncode == 0 and not checked.stderr, checked.stderr
 
 
 def headings(text):
@@ -76,8 +76,8 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     expected = ["Light above white", "Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
     assert headings(text) == [*expected, "What was left out, and why", "Figures", "Error against time", "Cameras"]
     assert "<li>a note of the training</li>" in text
-    for told in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
-        assert told in text
+    for checked in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
+        assert checked in text
     assert '<rect x="3.8" y="5.8"' in text  # Around the box, by three units of a 32-pixel photo
 
 
@@ -114,20 +114,20 @@ def test_what_is_not_known_is_left_out(tmp_path):
 def test_the_pictures_keep_the_light_and_look_like_photos(tmp_path):
     imagecodecs = pytest.importorskip("imagecodecs")
     run, scene = make(tmp_path)
-    shown = re.search(r'src="data:image/jpeg;base64,([^"]*)" alt="Scene of v_1"', page(tmp_path))
-    decoded = imagecodecs.ultrahdr_decode(base64.b64decode(shown[1])).astype(np.float64)[..., :3]
+    thumbnail = re.search(r'src="data:image/jpeg;base64,([^"]*)" alt="Scene of v_1"', page(tmp_path))
+    decoded = imagecodecs.ultrahdr_decode(base64.b64decode(thumbnail[1])).astype(np.float64)[..., :3]
     exposure = run.render(scene.views[1].camera).hdr * 0.5
     light = exposure * display_gain(run.response)
     inside = light < 16
     assert inside.any() and np.median(decoded[inside] / light[inside]) == pytest.approx(1, abs=0.02)
-    plain = np.asarray(Image.open(io.BytesIO(base64.b64decode(shown[1])))) / 255
+    plain = np.asarray(Image.open(io.BytesIO(base64.b64decode(thumbnail[1])))) / 255
     np.testing.assert_allclose(plain.mean((0, 1)), run.response.encode(exposure).clip(0, 1).mean((0, 1)), atol=0.01)
 
 
 def test_a_dial_holds_half_floats():
     light = np.geomspace(1e-3, 1e3, 4 * 3 * 3).reshape(4, 3, 3)
-    found = np.frombuffer(zlib.decompress(base64.b64decode(packed_light(light))), "<f2").reshape(4, 3, 3)
-    np.testing.assert_allclose(found, light, rtol=1e-3)
+    floats = np.frombuffer(zlib.decompress(base64.b64decode(packed_light(light))), "<f2").reshape(4, 3, 3)
+    np.testing.assert_allclose(floats, light, rtol=1e-3)
     html = dial({"A & B": light}, 0.5, 1.0, "A & B")
     assert 'data-light="A &amp; B"' in html and "split" not in html
 
@@ -225,9 +225,9 @@ def test_browsers_run_our_script_and_no_other(tmp_path):
     text = path.read_text()
     forced = tmp_path / "forced.html"  # As if one had come through all the same.
     forced.write_text(text.replace("</main>", "<script>window.PWNED=1</script><img src=x onerror='PWNED=1'></main>"))
-    with browser() as made:
+    with browser() as chromium:
         for file in (path, forced):
-            page = made.new_page()
+            page = chromium.new_page()
             page.goto(file.as_uri())
             page.wait_for_timeout(500)
             assert page.evaluate("typeof window.PWNED") == "undefined"
@@ -251,8 +251,8 @@ def test_no_markup_is_made_but_by_the_one_function(path):
 
 def test_the_opening_shows_what_photos_clip_as_grey():
     flat = np.full((4, 4, 3), 2.0)
-    shown = Comparison("v", np.ones((4, 4, 3)), flat, flat * 30)
+    thumbnail = Comparison("v", np.ones((4, 4, 3)), flat, flat * 30)
     # White of 2 s^-1 for half a second is an exposure of 1: two stops darker it is a quarter.
-    assert darker_stops([shown], 0.5) == -2
-    assert darker_stops([shown], 0.5, gain=8.0) == -5
-    assert darker_stops([shown], 1e-9) == -1 and darker_stops([shown], 1e9) == -8
+    assert darker_stops([thumbnail], 0.5) == -2
+    assert darker_stops([thumbnail], 0.5, gain=8.0) == -5
+    assert darker_stops([thumbnail], 1e-9) == -1 and darker_stops([thumbnail], 1e9) == -8

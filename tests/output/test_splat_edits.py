@@ -160,15 +160,15 @@ def test_edits_that_leave_nothing_say_where_the_scene_is(tmp_path, run):
 
 def test_strays_come_near_or_go(tmp_path, logged):
     cameras = [camera(position=(i - 1, 0, -6)) for i in range(3)]
-    given = splats([(0, 0, 0), (0, 0, 1e5), (0, 1e6, 0)], [0.9, 0.9, 0.007], scale=10.0)
-    result = without_strays(given, cameras)
+    original = splats([(0, 0, 0), (0, 0, 1e5), (0, 1e6, 0)], [0.9, 0.9, 0.007], scale=10.0)
+    result = without_strays(original, cameras)
     assert result.count == 2 and np.abs(result.means).max() < 700
     # As seen from the middle camera it has the size and the place that it had.
     offset = result.means[1] - cameras[1].position
     assert np.exp(result.log_scales[1, 0]) / np.linalg.norm(offset) == pytest.approx(10 / 1e5, rel=1e-3)
     assert any("2 Gaussians beyond" in line and "1 faint ones left out, 1 moved" in line for line in logged)
     near = splats([(0, 0, 0), (5, 5, 5)], [0.9, 0.9])
-    assert without_strays(near, cameras) is near and without_strays(given, []) is given
+    assert without_strays(near, cameras) is near and without_strays(original, []) is original
 
 
 def test_merged_runs_show_both(tmp_path, run):

@@ -21,9 +21,9 @@ LOOKS = {
 @pytest.mark.parametrize("look", LOOKS)
 def test_the_light_is_kept_whatever_the_plain_picture(look):
     imagecodecs = pytest.importorskip("imagecodecs")
-    kept = imagecodecs.ultrahdr_decode(ultra_hdr(LIGHT, LOOKS[look])).astype(np.float64)[..., :3] / LIGHT
+    ratio = imagecodecs.ultrahdr_decode(ultra_hdr(LIGHT, LOOKS[look])).astype(np.float64)[..., :3] / LIGHT
     for column in range(8, 248, 16):
-        np.testing.assert_allclose(np.median(kept[:, column : column + 16], axis=(0, 1)), 1, atol=0.02)
+        np.testing.assert_allclose(np.median(ratio[:, column : column + 16], axis=(0, 1)), 1, atol=0.02)
 
 
 def test_brighter_light_than_the_most_is_shown_at_that():

@@ -202,9 +202,9 @@ def test_kept_orientation_and_options(tmp_path):
     before = world_transform(run)
     write_orientation(run, up=(0, 0, 2))
     assert write_orientation(run, scale=0.5).read_text()
-    kept = world_transform(run)
-    np.testing.assert_allclose(kept.rotation @ [0, 0, 1], [0, 1, 0], atol=1e-12)
-    assert (before.scale, kept.scale) == (1, 0.5)
+    saved_transform = world_transform(run)
+    np.testing.assert_allclose(saved_transform.rotation @ [0, 0, 1], [0, 1, 0], atol=1e-12)
+    assert (before.scale, saved_transform.scale) == (1, 0.5)
     np.testing.assert_allclose(world_transform(run, up="-y").rotation @ [0, -1, 0], [0, 1, 0], atol=1e-12)
     assert world_transform(run, "scene").is_identity
     for options, words in (

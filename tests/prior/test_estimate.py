@@ -55,12 +55,12 @@ def test_estimates_are_there_where_the_photo_clips_alone():
 
 def test_what_a_file_states_counts_by_its_precision():
     exposure, clipped = photo()
-    stated = torch.where(clipped, 8.0, 0.0)
-    alone = combined_estimates(exposure, clipped, None, stated, 0.25)
+    limits = torch.where(clipped, 8.0, 0.0)
+    alone = combined_estimates(exposure, clipped, None, limits, 0.25)
     assert torch.allclose(alone.held[6, 12].float(), torch.tensor(3 * [math.log(8)] + 3 * [4.0]), rtol=1e-3)
     assert torch.allclose(alone.certainty[6, 12].float(), torch.tensor(4.0), rtol=1e-3)
     sure, unsure = (
-        combined_estimates(exposure, clipped, small_prior(), stated, d).held[6, 12, 0] for d in (0.01, 100.0)
+        combined_estimates(exposure, clipped, small_prior(), limits, d).held[6, 12, 0] for d in (0.01, 100.0)
     )
     assert sure == pytest.approx(math.log(8), abs=1e-2)
     assert unsure == pytest.approx(float(combined_estimates(exposure, clipped, small_prior()).held[6, 12, 0]), rel=1e-2)
@@ -92,8 +92,8 @@ def test_photos_that_hold_a_light_agree_on_the_mean_of_their_expected_light():
 
 def test_what_a_file_states_holds_by_its_deviation_beside_the_prior():
     exposure, clipped = photo()
-    stated = torch.where(clipped, 8.0, 0.0)
-    alone, both = (combined_estimates(exposure, clipped, p, stated, 0.05).held[6, 12] for p in (None, small_prior()))
+    limits = torch.where(clipped, 8.0, 0.0)
+    alone, both = (combined_estimates(exposure, clipped, p, limits, 0.05).held[6, 12] for p in (None, small_prior()))
     assert alone[3] == pytest.approx(20, rel=1e-2) and both[0] == pytest.approx(math.log(8), abs=0.02)
     weight = 20**2 + math.sqrt(8) / (HELD_DEVIATION * math.log(2)) ** 2
     assert both[3] == pytest.approx(math.sqrt(weight), rel=1e-2)
@@ -101,8 +101,8 @@ def test_what_a_file_states_holds_by_its_deviation_beside_the_prior():
 
 def test_nothing_known_is_precision_zero():
     exposure, clipped = photo()
-    for stated in (None, torch.zeros(20, 30, 3)):
-        known = combined_estimates(exposure, clipped, None, stated, 0.3)
+    for limits in (None, torch.zeros(20, 30, 3)):
+        known = combined_estimates(exposure, clipped, None, limits, 0.3)
         assert (known.held == 0).all() and (known.certainty == 0).all()
 
 

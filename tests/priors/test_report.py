@@ -11,6 +11,6 @@ def test_the_page_of_the_guide_is_that_of_the_figures(tmp_path, monkeypatch):
     (tmp_path / "images").mkdir()
     monkeypatch.setattr("sys.argv", ["report", str(ROOT / "priors" / "figures.json"), str(tmp_path)])
     report.main()
-    made, stored = (folder / "light-prior.md" for folder in (tmp_path, ROOT / "docs"))
-    assert made.read_text() == stored.read_text(), "run python -m priors.report priors/figures.json docs"
+    page, stored = (folder / "light-prior.md" for folder in (tmp_path, ROOT / "docs"))
+    assert page.read_text() == stored.read_text(), "run python -m priors.report priors/figures.json docs"
     assert (tmp_path / "images" / "light-prior.png").stat().st_size > 10_000

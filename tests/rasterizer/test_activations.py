@@ -45,11 +45,11 @@ def test_the_gradient_of_exponentials_is_that_of_finite_differences(device, func
 @pytest.mark.parametrize("function", EXPONENTIALS)
 def test_exponentials_at_and_beyond_the_bounds(device, function):
     values = torch.tensor([[-BOUND, BOUND, math.inf], [-math.inf, 0.0, math.nan]], device=device).requires_grad_()
-    made = function(values, BOUND)
-    made.sum().backward()
+    result = function(values, BOUND)
+    result.sum().backward()
     ends = math.exp(-BOUND), math.exp(BOUND)
     expected = torch.tensor([[*ends, ends[1]], [ends[0], 1.0, math.nan]])
-    torch.testing.assert_close(made.detach().cpu(), expected, equal_nan=True)
+    torch.testing.assert_close(result.detach().cpu(), expected, equal_nan=True)
     assert values.grad[0].tolist() == [0, 0, 0] and values.grad[1, :2].tolist() == [0, 1]
 
 

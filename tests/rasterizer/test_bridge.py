@@ -54,15 +54,15 @@ def test_gradients_flow_through_the_launches(device):
 
 def test_memory_is_shared_not_copied(device):
     values, _ = leaves(device)
-    seen = []
+    calls = []
 
     @differentiable
     def look(program, tensor):
-        seen.append(tensor.data_ptr())
+        calls.append(tensor.data_ptr())
         return program.empty_output(tensor.shape)
 
     result = look(values)
-    assert seen == [values.data_ptr()]
+    assert calls == [values.data_ptr()]
     assert result.device == values.device
 
 

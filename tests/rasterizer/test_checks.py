@@ -13,8 +13,8 @@ NAN = float("nan")
 
 def arguments(**changes):
     names = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
-    given = dict(zip((*names, "width", "height"), random_scene(count=5).arguments, strict=True))
-    return given | {name: change(given.get(name)) for name, change in changes.items()}
+    args = dict(zip((*names, "width", "height"), random_scene(count=5).arguments, strict=True))
+    return args | {name: change(args.get(name)) for name, change in changes.items()}
 
 
 @pytest.mark.parametrize(
@@ -101,9 +101,9 @@ def test_misfits_of_a_picture_of_the_sphere_are_named(name, value, kind, message
 
 
 def test_a_device_without_kernels_is_named():
-    given = {name: t.to("meta") if isinstance(t, torch.Tensor) else t for name, t in arguments().items()}
+    args = {name: t.to("meta") if isinstance(t, torch.Tensor) else t for name, t in arguments().items()}
     with pytest.raises(ValueError, match="means is on meta, expected the CPU or a CUDA device"):
-        rasterize(**given)
+        rasterize(**args)
 
 
 def test_whole_numbers_of_numpy_are_sizes():
@@ -123,13 +123,13 @@ def test_whole_numbers_of_numpy_are_sizes():
     ],
 )
 def test_misfits_of_harmonics_are_named(degree, change, kind, message):
-    given = {"constant": torch.ones(5, 1, 3), "rest": torch.ones(5, 3, 3)}
-    given |= {"means": torch.ones(5, 3), "camera": torch.zeros(3)} | change
+    args = {"constant": torch.ones(5, 1, 3), "rest": torch.ones(5, 3, 3)}
+    args |= {"means": torch.ones(5, 3), "camera": torch.zeros(3)} | change
     with pytest.raises(kind, match=message):
-        spherical_harmonics(degree, (given["constant"], given["rest"]), given["means"], given["camera"])
+        spherical_harmonics(degree, (args["constant"], args["rest"]), args["means"], args["camera"])
     if not change and degree == 3:
         with pytest.raises(TypeError, match=r"coefficients is a numpy.ndarray, expected a torch tensor \[N, K, 3\]"):
-            spherical_harmonics(1, np.ones((5, 4, 3)), given["means"], given["camera"])
+            spherical_harmonics(1, np.ones((5, 4, 3)), args["means"], args["camera"])
 
 
 @pytest.mark.parametrize(

@@ -56,11 +56,11 @@ def reference(light, codes, mask=None, means_of=None, estimates=None):
         total = total + WEIGHTS.smoothness / 2 * (value - others[around][near].mean()) ** 2
         if estimates is not None:
             rows, columns = estimates.shape[:2]
-            found = estimates[y * rows // light.shape[0], x * columns // light.shape[1]].double()
+            estimate = estimates[y * rows // light.shape[0], x * columns // light.shape[1]].double()
             # Light below white counts as white and is held all the same.
             above = light[y, x, channel] / WHITE
             value = value if above > 1 else above - above.detach()
-            total = total + WEIGHTS.hold / 2 * (found[channel + 3] * (value - found[channel])) ** 2
+            total = total + WEIGHTS.hold / 2 * (estimate[channel + 3] * (value - estimate[channel])) ** 2
     return total / light.numel()
 
 
@@ -69,16 +69,16 @@ def reference(light, codes, mask=None, means_of=None, estimates=None):
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 def test_values_and_gradients_are_those_of_torch(device, kernels, bits, dtype, bound, estimated):
     light, codes = clipped_photo(bits)
-    wanted = light.clone().requires_grad_()
+    reference_light = light.clone().requires_grad_()
     estimates = some_estimates() if estimated else None
-    expected = reference(wanted, codes, estimates=estimates)
+    expected = reference(reference_light, codes, estimates=estimates)
     (3 * expected).backward()
     ours = light.to(device, dtype).requires_grad_()
     options = {"estimates": estimates.to(device) if estimated else None}
     energy = clipped_light_energy(ours, code_tensor(codes, device), WHITE, WEIGHTS, **options)
     (3 * energy).backward()
     assert relative_error(energy, expected) < bound
-    assert relative_error(ours.grad, wanted.grad) < bound
+    assert relative_error(ours.grad, reference_light.grad) < bound
     stack, index = code_tensor(np.stack([codes[::-1], codes]), device), torch.tensor([1], device=device)
     assert torch.equal(clipped_light_energy(ours, stack, WHITE, WEIGHTS, index=index, **options), energy)
 

@@ -57,18 +57,18 @@ def test_values_and_gradients_are_those_of_torch(device, form, mu, bits, dtype, 
     law = mu_law if mu else torch.Tensor.double
     weights = torch.randn(light.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     true_light, table = light.clone().requires_grad_(), table_of(law(worth), form)
-    seen, truth = reference(law(true_light), codes, table)
-    (seen * weights).sum().backward()
+    prediction, truth = reference(law(true_light), codes, table)
+    (prediction * weights).sum().backward()
     scale = CodeScale(table.to(device, dtype), mu, WHITE)
     ours_light = light.to(device, dtype).requires_grad_()
-    ours, told = code_residual(ours_light, code_tensor(codes, device), scale)
+    ours, target = code_residual(ours_light, code_tensor(codes, device), scale)
     (ours * weights.to(device, dtype)).sum().backward()
-    assert relative_error(ours, seen) < bound
+    assert relative_error(ours, prediction) < bound
     # Far from what its code stands for, light is that less a difference, with no digits of its own.
-    assert form == "between" or relative_error(ours[0], seen[0]) < bound
-    assert relative_error(told, truth) < bound
+    assert form == "between" or relative_error(ours[0], prediction[0]) < bound
+    assert relative_error(target, truth) < bound
     assert relative_error(ours_light.grad, true_light.grad) < bound
-    assert not told.requires_grad
+    assert not target.requires_grad
     unchanged = (ours_light.grad == 0).float().mean()
     assert 0 < unchanged < 1 if form != "values" else unchanged == 0
 
@@ -92,11 +92,11 @@ def test_poison_stays_where_it_is(device, form):
     light = torch.tensor([[[math.nan, math.inf, 1.0]]], device=device)
     codes = torch.full((1, 1, 3), 128, dtype=torch.uint8, device=device)
     scale = CodeScale(table_of(torch.linspace(0, 1, 256), form).to(device), 9.0, 1.0)
-    seen, _ = code_residual(light, codes, scale)
-    assert seen[0, 0, 0].isnan() and seen[0, 0, 1].isinf()
-    assert seen[0, 0, 2].item() == pytest.approx(1.0, abs=0.003)
-    white, told = code_residual(light, codes + 127, scale)
-    assert form == "values" or (white[0, 0, 0].isnan() and torch.equal(white[0, 0, 1:], told[0, 0, 1:]))
+    prediction, _ = code_residual(light, codes, scale)
+    assert prediction[0, 0, 0].isnan() and prediction[0, 0, 1].isinf()
+    assert prediction[0, 0, 2].item() == pytest.approx(1.0, abs=0.003)
+    white, target = code_residual(light, codes + 127, scale)
+    assert form == "values" or (white[0, 0, 0].isnan() and torch.equal(white[0, 0, 1:], target[0, 0, 1:]))
 
 
 def test_what_does_not_fit_is_refused(device):
@@ -111,5 +111,5 @@ def test_what_does_not_fit_is_refused(device):
 def test_codes_come_back_as_values(device, dtype):
     top = np.iinfo(dtype).max
     codes = np.array([0, 1, 100, top // 2 + 1, top], dtype)
-    found = code_values(code_tensor(codes, device)).cpu().numpy()
-    np.testing.assert_array_equal(found, codes.astype(np.float32) / np.float32(top))
+    values = code_values(code_tensor(codes, device)).cpu().numpy()
+    np.testing.assert_array_equal(values, codes.astype(np.float32) / np.float32(top))

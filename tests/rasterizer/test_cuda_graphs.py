@@ -19,9 +19,9 @@ def test_no_two_recorders_alive_record_on_one_stream(monkeypatch):
     class Owner:
         pass
 
-    taken = iter(range(3))
+    places = iter(range(3))
     monkeypatch.setattr(cuda_graphs, "_idle_streams", {})
-    monkeypatch.setattr(torch.cuda, "Stream", lambda device: (device, next(taken)))
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: (device, next(places)))
     device = torch.device("cuda:0")
     first, second, third = Owner(), Owner(), Owner()
     streams = [cuda_graphs._own_stream(owner, device) for owner in (first, second)]
@@ -66,9 +66,9 @@ def test_a_launched_graph_that_lives_on_spoils_no_recording():
         return loss, values.grad
 
     with recorder.on_capture_stream():
-        kept, _ = step()
+        kept_loss, _ = step()
     assert recorder.run("step", lambda: step()[1]).tolist() == [2.0] * 4
-    assert kept.requires_grad
+    assert kept_loss.requires_grad
 
 
 @needs_gpu

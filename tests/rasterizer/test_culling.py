@@ -45,15 +45,15 @@ def assert_gone(function, gaussians, shared, place, value):
     bad[place][part] = value
     others = torch.ones(len(bad[0]), dtype=torch.bool, device=bad[0].device)
     others[part] = False
-    image, found = gradients(function, [*bad, *shared])
+    image, grads = gradients(function, [*bad, *shared])
     truth, expected = gradients(function, [*(tensor[others] for tensor in gaussians), *shared])
     torch.testing.assert_close(image, truth, rtol=1e-6, atol=1e-7)
     # A GPU sums in any order.
     rounding = 1e-4 if image.is_cuda and image.dtype == torch.float32 else 1e-7
-    for gradient, true in zip(found[: len(bad)], expected, strict=False):
+    for gradient, true in zip(grads[: len(bad)], expected, strict=False):
         assert bool((gradient[part] == 0).all())
         torch.testing.assert_close(gradient[others], true, rtol=1e-5, atol=rounding)
-    for gradient, true in zip(found[len(bad) :], expected[len(bad) :], strict=True):
+    for gradient, true in zip(grads[len(bad) :], expected[len(bad) :], strict=True):
         torch.testing.assert_close(gradient, true, rtol=1e-5, atol=max(100 * rounding, 1e-5))
 
 
@@ -104,12 +104,12 @@ def test_a_camera_that_is_not_finite_shows_nothing_on_a_gpu_and_is_refused_on_th
             with pytest.raises(ValueError, match="finite"):
                 rasterize(*gaussians, *bad, *SIZE)
             continue
-        image, found = gradients(lambda *t: rasterize(*t, *SIZE).image, [*gaussians, *bad])
-        assert bool((image == 0).all()) and all(bool((gradient == 0).all()) for gradient in found)
+        image, grads = gradients(lambda *t: rasterize(*t, *SIZE).image, [*gaussians, *bad])
+        assert bool((image == 0).all()) and all(bool((gradient == 0).all()) for gradient in grads)
 
 
 def test_sizes_of_nearly_nothing_are_drawn_with_finite_gradients(device):
     gaussians = scene(device, torch.float32)
     gaussians[1][:] = -80.0
-    image, found = gradients(lambda *t: rasterize(*t, *SIZE).image, [*gaussians, *cameras(device, torch.float32)])
-    assert bool((image > 0).any()) and all(bool(gradient.isfinite().all()) for gradient in found)
+    image, grads = gradients(lambda *t: rasterize(*t, *SIZE).image, [*gaussians, *cameras(device, torch.float32)])
+    assert bool((image > 0).any()) and all(bool(gradient.isfinite().all()) for gradient in grads)

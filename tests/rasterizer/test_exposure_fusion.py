@@ -53,8 +53,8 @@ def test_brackets_that_are_learned_have_gradients_too(device):
 
 
 def test_what_does_not_fit_is_refused(device):
-    given = parts(learned(torch.float32, device))
+    inputs = parts(learned(torch.float32, device))
     with pytest.raises(ValueError, match=r"encoded has shape \[3, 200, 2\]"):
-        fuse_exposures(brackets().float().to(device)[..., :2], *given, scale=1.0)
+        fuse_exposures(brackets().float().to(device)[..., :2], *inputs, scale=1.0)
     with pytest.raises(ValueError, match="log_sigma is torch.float32"):
-        fuse_exposures(brackets().to(device), *given, scale=1.0)
+        fuse_exposures(brackets().to(device), *inputs, scale=1.0)

@@ -90,13 +90,13 @@ def test_a_capacity_too_small_for_one_big_splat(device):
     draw, leaves = splat(device, [[0.0, 0.0, 1.0]], [40.0], 0.5, [[1.0]], 320, 160)
     rendering = draw(max_intersections=7)
     assert rendering.overflow and rendering.intersection_count == 7
-    drawn = (rendering.alpha > 0).sum()
-    assert int(drawn) == 7 * 256
+    covered = (rendering.alpha > 0).sum()
+    assert int(covered) == 7 * 256
     assert finite_gradients(rendering, leaves)
 
 
 @pytest.mark.parametrize(
-    ("error", "asked"),
+    ("error", "is_allocation"),
     [
         (MemoryError("Unable to allocate 1.50 GiB for an array"), "1.50 GiB"),
         (MemoryError(), "some memory"),
@@ -110,8 +110,8 @@ def test_a_capacity_too_small_for_one_big_splat(device):
         (ValueError("size"), None),
     ],
 )
-def test_failed_allocations_are_told_from_other_errors(error, asked):
-    assert failed_allocation(error) == asked
+def test_failed_allocations_are_told_from_other_errors(error, is_allocation):
+    assert failed_allocation(error) == is_allocation
 
 
 def test_a_failed_allocation_says_the_sizes(device, monkeypatch):

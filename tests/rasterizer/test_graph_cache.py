@@ -38,16 +38,18 @@ def recordings():
 def values_and_gradients(splat, scene, *, by_alpha=True, **options):
     for tensor in scene.tensors:
         tensor.grad = None
-    seen = splat(*scene.arguments, **options)
-    seen.means2d.retain_grad()
-    loss = (seen.image * random_like(seen.image, 1)).sum()
+    drawing = splat(*scene.arguments, **options)
+    drawing.means2d.retain_grad()
+    loss = (drawing.image * random_like(drawing.image, 1)).sum()
     if by_alpha:
-        loss = loss + (seen.alpha * random_like(seen.alpha, 2)).sum()
-    if seen.depth is not None:
-        loss = loss + (seen.depth * random_like(seen.depth, 3)).sum()
+        loss = loss + (drawing.alpha * random_like(drawing.alpha, 2)).sum()
+    if drawing.depth is not None:
+        loss = loss + (drawing.depth * random_like(drawing.depth, 3)).sum()
     loss.backward()
-    gradients = [tensor.grad for tensor in (*scene.tensors, seen.means2d) if tensor.grad is not None]
-    return [tensor.detach().clone() for tensor in (seen.image, seen.alpha, seen.depths, seen.radii, *gradients)]
+    gradients = [tensor.grad for tensor in (*scene.tensors, drawing.means2d) if tensor.grad is not None]
+    return [
+        tensor.detach().clone() for tensor in (drawing.image, drawing.alpha, drawing.depths, drawing.radii, *gradients)
+    ]
 
 
 def assert_alike(ours, truth):
@@ -76,11 +78,11 @@ def test_pictures_stay_and_backward_passes_come_in_any_order():
     scene = scene_of()
     shifts = [0.02 * call for call in range(CALLS + graph_cache.MAX_GRAPHS)]
 
-    def seen(splat, shift):
+    def render_shifted(splat, shift):
         return splat(scene.tensors[0] + shift, *scene.arguments[1:]).image
 
-    images = [seen(rasterize, shift) for shift in shifts]
-    truths = [seen(launched, shift) for shift in shifts]
+    images = [render_shifted(rasterize, shift) for shift in shifts]
+    truths = [render_shifted(launched, shift) for shift in shifts]
     assert recordings() == graph_cache.MAX_GRAPHS
     for place in (*range(1, len(shifts), 2), *range(0, len(shifts), 2)):
         pair = [
@@ -125,19 +127,21 @@ def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
         with torch.no_grad():
             scene.tensors[4][7] = value
         for _ in range(CALLS):
-            seen = rasterize(*scene.arguments)
-    assert recordings() and not seen.visible[7] and seen.visible.any() and bool(seen.image.isfinite().all())
+            drawing = rasterize(*scene.arguments)
+    assert recordings() and not drawing.visible[7] and drawing.visible.any() and bool(drawing.image.isfinite().all())
 
 
 def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
-    kind, made = graph_cache.GraphPool(), iter("abcdefgh")
-    assert [kind.take(lambda pairs: next(made)) for _ in range(graph_cache.WARMUP_CALLS)] == [
+    kind, labels = graph_cache.GraphPool(), iter("abcdefgh")
+    assert [kind.take(lambda pairs: next(labels)) for _ in range(graph_cache.WARMUP_CALLS)] == [
         None
     ] * graph_cache.WARMUP_CALLS
-    leases = [graph_cache._Lease(kind.idle, kind.take(lambda pairs: next(made))) for _ in range(graph_cache.MAX_GRAPHS)]
-    assert kind.take(lambda pairs: next(made)) is None, "all are held"
+    leases = [
+        graph_cache._Lease(kind.idle, kind.take(lambda pairs: next(labels))) for _ in range(graph_cache.MAX_GRAPHS)
+    ]
+    assert kind.take(lambda pairs: next(labels)) is None, "all are held"
     del leases[1]
-    assert kind.take(lambda pairs: next(made)) == "b"
+    assert kind.take(lambda pairs: next(labels)) == "b"
     kind.grow(70)
     kind.grow(50)
     del leases

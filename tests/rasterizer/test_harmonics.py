@@ -99,9 +99,9 @@ def test_a_thread_for_each_coefficient_gives_the_same(device, degree, dtype):
     spherical_harmonics(degree, *leaves).backward(weights)
     means, position = (leaf.detach() for leaf in leaves[1:])
     factors = HarmonicsGradients(weights[None], position[None], means, degree)
-    found = factors.coefficient_gradients(leaves[0].detach()[:, 1:].contiguous(), 1)
-    assert torch.allclose(found, leaves[0].grad[:, 1:], rtol=1e-5, atol=1e-6)
-    assert not found[:, (degree + 1) ** 2 - 1 :].any()
+    rest_gradient = factors.coefficient_gradients(leaves[0].detach()[:, 1:].contiguous(), 1)
+    assert torch.allclose(rest_gradient, leaves[0].grad[:, 1:], rtol=1e-5, atol=1e-6)
+    assert not rest_gradient[:, (degree + 1) ** 2 - 1 :].any()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -124,9 +124,9 @@ def test_adam_multiplies_the_factors_of_two_views_out(device, degree):
         harmonics_adam_step(factored[0], start, gradients, *factored[1:], one, 0 * one, **options)
         for a, b in zip(plain, factored, strict=True):
             assert torch.allclose(a, b, rtol=1e-4, atol=1e-6)
-        kept = factored[0].clone()
+        first_gradient = factored[0].clone()
         harmonics_adam_step(factored[0], start, gradients, *factored[1:], one, one, **options)
-        assert torch.equal(kept, factored[0])
+        assert torch.equal(first_gradient, factored[0])
 
 
 @pytest.mark.parametrize("count", [60, 100])

@@ -38,10 +38,10 @@ def test_damaged_modules_go_and_are_told_once(cache, caplog, damage, end):
 
 @pytest.mark.parametrize("place", ["/dev/null", "/proc/none", "a\0b"])
 def test_a_place_that_cannot_be_used_is_done_without(monkeypatch, caplog, place):
-    made = []
+    folders = []
     monkeypatch.setattr(wp.config, "kernel_cache_dir", None)
     monkeypatch.setattr(kernel_cache.os, "environ", {"WARP_CACHE_PATH": place})
-    monkeypatch.setattr(kernel_cache.atexit, "register", lambda *given, **_: made.append(given[1]))
+    monkeypatch.setattr(kernel_cache.atexit, "register", lambda *args, **_: folders.append(args[1]))
     kernel_cache.select_folder()
-    assert made == [wp.config.kernel_cache_dir] and "for this process alone" in caplog.text
-    Path(made[0]).rmdir()
+    assert folders == [wp.config.kernel_cache_dir] and "for this process alone" in caplog.text
+    Path(folders[0]).rmdir()

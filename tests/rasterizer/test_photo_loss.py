@@ -43,23 +43,23 @@ def test_value_and_gradient_are_those_of_the_operations(device, dtype, bound, mu
     scale = CodeScale(scale.table.to(device), mu, WHITE)
     stack, index = code_tensor(np.stack([codes[::-1], codes]), device), torch.tensor([1], device=device)
     estimates = torch.rand(7, 9, 6, generator=torch.Generator().manual_seed(1)).half().to(device)
-    for given in ((stack, scale, index), (stack[1], scale, None)):
+    for targets in ((stack, scale, index), (stack[1], scale, None)):
         ours, theirs = (light.to(device).requires_grad_() for _ in range(2))
-        found = photo_loss(ours, *given, **WEIGHTS, clipped=clipped, estimates=estimates)
-        expected = composed(theirs, *given, clipped, estimates)
-        (3 * found).backward()
+        ours_loss = photo_loss(ours, *targets, **WEIGHTS, clipped=clipped, estimates=estimates)
+        expected = composed(theirs, *targets, clipped, estimates)
+        (3 * ours_loss).backward()
         (3 * expected).backward()
-        assert found.dtype == dtype and found.shape == ()
-        assert relative_error(found, expected) < bound
+        assert ours_loss.dtype == dtype and ours_loss.shape == ()
+        assert relative_error(ours_loss, expected) < bound
         assert relative_error(ours.grad, theirs.grad) < bound
 
 
 def test_without_a_gradient_the_value_is_the_same(device):
     light, codes, scale = clipped_photo(torch.float32, MU)
-    given = code_tensor(codes, device), CodeScale(scale.table.to(device), MU, WHITE)
+    targets = code_tensor(codes, device), CodeScale(scale.table.to(device), MU, WHITE)
     weights = WEIGHTS | {"clipped": CLIPPED}
     image = light.to(device)
-    assert torch.equal(photo_loss(image, *given, **weights), photo_loss(image.requires_grad_(), *given, **weights))
+    assert torch.equal(photo_loss(image, *targets, **weights), photo_loss(image.requires_grad_(), *targets, **weights))
 
 
 def test_codes_of_another_size_are_refused(device):

@@ -14,18 +14,18 @@ from .scenes import random_scene
 OPTIONS = 0.01, 0.3, 1 / 255  # near_plane, eps2d, alpha_threshold
 
 
-def seen(device="cpu", **sizes):
+def project_scene(device="cpu", **sizes):
     """The tensors that a projection takes, and what it returns."""
     scene = random_scene(**sizes).to(device=device)
-    given = *scene.tensors[:4], *scene.tensors[5:]
-    return given, project_to_camera(*given, RenderOptions(scene.width, scene.height, *OPTIONS))
+    inputs = *scene.tensors[:4], *scene.tensors[5:]
+    return inputs, project_to_camera(*inputs, RenderOptions(scene.width, scene.height, *OPTIONS))
 
 
 def test_gradients_of_any_strides_are_read(device):
     weights = torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64, device=device)
-    found = []
+    grads = []
     for expanded in (True, False):
-        given, (means2d, conics, depths, opacities, _) = seen(device)
+        inputs, (means2d, conics, depths, opacities, _) = project_scene(device)
         # The derivatives of a sum are one number that is there once, those of a product as many as there are.
         loss = means2d.sum() + (conics * weights).sum() + depths.sum() + opacities.sum()
         if not expanded:
@@ -33,36 +33,36 @@ def test_gradients_of_any_strides_are_read(device):
             loss = (means2d * ones(means2d)).sum() + (conics * weights).sum()
             loss = loss + (depths * ones(depths)).sum() + (opacities * ones(opacities)).sum()
         loss.backward()
-        found.append([tensor.grad for tensor in given])
-    for ours, theirs in zip(*found, strict=True):
+        grads.append([tensor.grad for tensor in inputs])
+    for ours, theirs in zip(*grads, strict=True):
         assert ours.abs().sum() > 0
         torch.testing.assert_close(ours, theirs)
 
 
 def test_only_what_asks_for_a_gradient_has_one(device):
-    given, (means2d, *_) = seen(device)
-    by_scales, by_pose = torch.autograd.grad(means2d.square().sum(), (given[0], given[4]))
-    assert by_scales.shape == given[0].shape and by_pose.shape == (4, 4)
-    assert all(tensor.grad is None for tensor in given)
+    inputs, (means2d, *_) = project_scene(device)
+    by_scales, by_pose = torch.autograd.grad(means2d.square().sum(), (inputs[0], inputs[4]))
+    assert by_scales.shape == inputs[0].shape and by_pose.shape == (4, 4)
+    assert all(tensor.grad is None for tensor in inputs)
     with torch.no_grad():
-        assert not seen(device)[1][0].requires_grad
-    assert not seen(device)[1][4].requires_grad
+        assert not project_scene(device)[1][0].requires_grad
+    assert not project_scene(device)[1][4].requires_grad
 
 
 def test_the_cameras_gradient_is_of_all_gaussians(device):
     """However many threads share them: each adds to the same numbers."""
-    given, (means2d, *_, extents) = seen(device, count=40_000, size=0.01)
+    inputs, (means2d, *_, extents) = project_scene(device, count=40_000, size=0.01)
     means2d.sum().backward()
     visible = (extents[:, 0] > 0).sum()
     assert visible > 20_000
-    by_lens = given[5].grad
+    by_lens = inputs[5].grad
     assert by_lens is not None
     torch.testing.assert_close(by_lens[2:], visible.double().expand(2))
 
 
 def test_a_retained_graph_gives_the_same_gradients_again(device):
-    given, (means2d, *_) = seen(device)
-    leaves = [tensor for tensor in given if tensor.requires_grad]
+    inputs, (means2d, *_) = project_scene(device)
+    leaves = [tensor for tensor in inputs if tensor.requires_grad]
     loss = means2d.square().sum()
     first = torch.autograd.grad(loss, leaves, retain_graph=True, allow_unused=True)
     second = torch.autograd.grad(loss, leaves, allow_unused=True)
@@ -78,11 +78,11 @@ def test_a_retained_graph_gives_the_same_gradients_again(device):
 def test_memory_goes_without_the_garbage_collector(device, differentiated):
     gc.disable()
     try:
-        given, results = seen(device)
+        inputs, results = project_scene(device)
         alive = [weakref.ref(tensor) for tensor in results]
         if differentiated:
             results[0].sum().backward()
-        del given, results
+        del inputs, results
         assert [tensor() for tensor in alive] == [None] * 5
     finally:
         gc.enable()

@@ -144,17 +144,17 @@ def test_many_faint_gaussians_keep_their_gradients(device):
 def test_deterministic_gradients_repeat_bit_for_bit_and_are_the_others(device):
     scene = random_scene(count=3000, channels=5, width=120, height=70, spread=2.0, seed=3).to(torch.float32, device)
 
-    def drawn(deterministic=True, max_intersections=None):
+    def render(deterministic=True, max_intersections=None):
         for tensor in scene.tensors:
             tensor.grad = None
         rendering = rasterize(*scene.arguments, deterministic=deterministic, max_intersections=max_intersections)
         backward(rendering)
         return [rendering.image, *(tensor.grad for tensor in scene.tensors[:5])]
 
-    first = drawn()
-    for again in (drawn(), drawn(), drawn(max_intersections=100_000)):
+    first = render()
+    for again in (render(), render(), render(max_intersections=100_000)):
         assert all(torch.equal(a, b) for a, b in zip(first, again))
-    for ours, other in zip(first, drawn(deterministic=False)):
+    for ours, other in zip(first, render(deterministic=False)):
         assert relative_error(ours, other) < 1e-5
 
 

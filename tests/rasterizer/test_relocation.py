@@ -62,19 +62,21 @@ def test_rows_are_copied_to_their_places_alone(device):
         assert changed.tolist() == [False, True, False, True, False]
         for total, rows in ((1.0, (0, 2, 2, 0, 4)), (0.0, (0, 1, 2, 3, 4))):
             values, chosen = start.clone(), torch.tensor([0, 2], device=device)
-            drawn = SampledRows(chosen, torch.tensor(total, dtype=torch.float64, device=device))
-            copy_rows([values], [values], places, begin, end, samples=drawn)
+            sampled = SampledRows(chosen, torch.tensor(total, dtype=torch.float64, device=device))
+            copy_rows([values], [values], places, begin, end, samples=sampled)
             assert torch.equal(values, expected(*rows))
 
 
 def test_copies_are_counted_of_the_places_there_are(device):
-    drawn = SampledRows(torch.tensor([2, 0, 2, 1], device=device), torch.ones((), dtype=torch.float64, device=device))
+    sampled = SampledRows(torch.tensor([2, 0, 2, 1], device=device), torch.ones((), dtype=torch.float64, device=device))
     changed = torch.zeros(4, dtype=torch.bool, device=device)
-    copies = count_copies(drawn, scalar(5, device), scalar(8, device), changed)
+    copies = count_copies(sampled, scalar(5, device), scalar(8, device), changed)
     assert copies.tolist() == [1, 0, 2, 0] and changed.tolist() == [True, False, True, False]
-    for begin, end, given in ((5, 4, drawn), (0, 4, SampledRows(drawn.rows, 0 * drawn.total))):
+    for begin, end, sources in ((5, 4, sampled), (0, 4, SampledRows(sampled.rows, 0 * sampled.total))):
         changed.zero_()
-        assert not count_copies(given, scalar(begin, device), scalar(end, device), changed).any() and not changed.any()
+        assert (
+            not count_copies(sources, scalar(begin, device), scalar(end, device), changed).any() and not changed.any()
+        )
 
 
 def test_marked_rows_alone_are_cleared(device):

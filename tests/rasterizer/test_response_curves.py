@@ -27,21 +27,21 @@ def exposures(response):
 def test_every_device_and_type_has_the_values_and_slopes_of_float64(device, name, dtype, bound, extension):
     """tests/response holds those against published formulae and difference quotients."""
     response = response_by_name(name)
-    given = exposures(response)
+    exposure = exposures(response)
     # Where the slope jumps or is infinite, rounding decides on which side of the place a float32 falls.
-    given = given[(given - response.clip_exposure).abs() > 1e-5 * min(response.clip_exposure, 1e3)]
-    truth = response.encode_extended(given) if extension else response.encode(given)
-    true_slope = torch.where(given > response.clip_exposure, extension / given, response.slope(given))
-    value, slope = encode_with_slope(given.to(device, dtype), response.curve, extension)
+    exposure = exposure[(exposure - response.clip_exposure).abs() > 1e-5 * min(response.clip_exposure, 1e3)]
+    truth = response.encode_extended(exposure) if extension else response.encode(exposure)
+    true_slope = torch.where(exposure > response.clip_exposure, extension / exposure, response.slope(exposure))
+    value, slope = encode_with_slope(exposure.to(device, dtype), response.curve, extension)
     assert (value.cpu().double() - truth).abs().max() < bound
     finite = true_slope.isfinite()
     assert relative_error(slope[finite.to(device)], true_slope[finite]) < 10 * bound
 
 
 def test_poison_stays_and_black_is_black(device):
-    given = torch.tensor([math.nan, 0.0, math.inf], device=device)
+    exposure = torch.tensor([math.nan, 0.0, math.inf], device=device)
     for name in NAMES:
-        value, slope = encode_with_slope(given, response_by_name(name).curve, 0.0)
+        value, slope = encode_with_slope(exposure, response_by_name(name).curve, 0.0)
         assert value[0].isnan() and slope[0].isnan()
         assert value[1] == 0
         assert value[2] > 1 - 1e-6

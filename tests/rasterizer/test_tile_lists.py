@@ -165,12 +165,12 @@ def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, 
     monkeypatch.setenv("SEHDR_THREADS", str(chunks))
     generator, tiles = torch.Generator().manual_seed(count), 40
     # Some belong to no tile, and some tiles have none.
-    given = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
-    given.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
+    tile_keys = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
+    tile_keys.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
     splats = PackedSplats(torch.zeros(1000, 4), torch.full((1000, 4), -1.0), torch.zeros(1000, dtype=torch.int64))
-    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in given), count, tiles, keep_emit_order)
-    copies = (tensor.clone() for tensor in given)
-    ranges, ones, corners, places = tile_lists._sort_by_tile(*given, count, splats, tiles, 1, keep_emit_order)
+    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in tile_keys), count, tiles, keep_emit_order)
+    copies = (tensor.clone() for tensor in tile_keys)
+    ranges, ones, corners, places = tile_lists._sort_by_tile(*tile_keys, count, splats, tiles, 1, keep_emit_order)
     alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, keep_emit_order)
     assert torch.equal(alike, ranges) and without is None and len(corners) == count
     ours_ranges, ours_ones, _, ours_places = counted

@@ -67,17 +67,17 @@ def test_a_skipped_step_changes_nothing(device, function):
 def test_many_parameters_step_as_each_by_itself(device, function):
     generator = torch.Generator().manual_seed(2)
     one = torch.ones((), device=device)
-    made = [
+    cases = [
         [
             AdamStep(*(t.to(device, copy=True) for t in tensors), one, 0.01 * size)
             for size, tensors in ((n, torch.rand(4, n, 2, generator=generator)) for n in (5, 70, 1, 33, 12, 4))
         ]
         for generator in (generator, torch.Generator().manual_seed(2))
     ]
-    function(made[0], 0 * one, **OPTIONS)
-    for step in made[1]:
+    function(cases[0], 0 * one, **OPTIONS)
+    for step in cases[1]:
         function([step], 0 * one, **OPTIONS)
-    for together, alone in zip(*made, strict=True):
+    for together, alone in zip(*cases, strict=True):
         assert all(torch.equal(a, b) for a, b in zip(together[:4], alone[:4], strict=True))
 
 
@@ -134,14 +134,14 @@ def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
     for loss, norm, incomplete in product(
         [0.0, 3.0, math.inf, math.nan], [0.0, math.inf, math.nan], (None, False, True)
     ):
-        told = None if incomplete is None else torch.tensor(incomplete, device=device)
-        given = torch.tensor([1.0, norm, 2.0], device=device)
+        overflow = None if incomplete is None else torch.tensor(incomplete, device=device)
+        inputs = torch.tensor([1.0, norm, 2.0], device=device)
         nonfinite = not (math.isfinite(loss) and math.isfinite(norm))
         skipped = nonfinite or bool(incomplete)
         tally, pairs = (torch.tensor(values, device=device) for values in ([4, 7, 2], 9))
         for counted in (None, pairs):
-            found = check_finite(torch.tensor(loss, device=device), given, told, tally, counted)
-            assert [float(value) for value in found] == [skipped, not skipped]
+            flags = check_finite(torch.tensor(loss, device=device), inputs, overflow, tally, counted)
+            assert [float(value) for value in flags] == [skipped, not skipped]
         assert tally.tolist() == [4 + 2 * nonfinite, 9, 2 + bool(incomplete)]
 
 
@@ -152,8 +152,8 @@ def test_gradient_statistics_are_lengths_on_a_screen_of_two(device, usable):
     gradient[:4] = torch.tensor([[0.0, 0.0], [1e-30, 0.0], [0.0, -1e-25], [3e-24, 4e-24]])
     radii = torch.randint(0, 3, (500,), generator=generator).float()
     sums = torch.full((500,), 0.5, device=device), torch.zeros(500, device=device)
-    given = gradient.to(device), radii.to(device), torch.tensor(usable, device=device)
-    add_gradient_statistics(*given, 200, 100, *sums)
+    inputs = gradient.to(device), radii.to(device), torch.tensor(usable, device=device)
+    add_gradient_statistics(*inputs, 200, 100, *sums)
     length = torch.hypot(gradient[:, 0] * 100, gradient[:, 1] * 50)
     counted = (radii > 0) * usable
     torch.testing.assert_close(sums[0].cpu(), 0.5 + counted * length, rtol=1e-6, atol=0)
@@ -178,12 +178,12 @@ def noise(device, opacity, seed=3, quaternion=(1.0, 0.0, 0.0, 0.0), scales=(0.3,
 
 
 def test_noise_is_normal_and_shaped_by_the_covariance(device):
-    drawn = noise(device, 0.001)
+    offsets = noise(device, 0.001)
     # Equation 8: the sigmoid of 100 (0.005 - 0.001), times R S S R^T.
     expected = STRENGTH / (1 + math.exp(-0.4)) * torch.tensor([0.09, 0.01, 0.0004])
-    torch.testing.assert_close(drawn.std(0), expected, rtol=0.02, atol=0)
-    assert (drawn.mean(0).abs() < 5 * expected / COUNT**0.5).all()
-    unit = drawn / drawn.std(0)
+    torch.testing.assert_close(offsets.std(0), expected, rtol=0.02, atol=0)
+    assert (offsets.mean(0).abs() < 5 * expected / COUNT**0.5).all()
+    unit = offsets / offsets.std(0)
     assert abs(float((unit**4).mean()) - 3) < 0.1 and (unit.T @ unit / COUNT - torch.eye(3)).abs().max() < 0.02
 
 

@@ -51,10 +51,14 @@ def write_stack(folder, photos, times=None):
 @pytest.mark.parametrize("noise, times", [(0.0, (1 / 16, 1 / 4, 1, 4, 16)), (0.5, (1 / 8, 1, 8))])
 def test_a_known_curve_is_found(name, noise, times):
     truth = response_by_name(name)
-    found = calibrate_codes(photograph(truth, light(), times, noise), times)
-    assert stops_off(found.response, truth) < 0.05
-    assert found.residual < 0.05 and max(found.channel_spread) < 0.05 and max(map(abs, found.photo_offsets)) < 0.05
-    decoded = found.response.decode(np.arange(256) / 255)
+    calibrated = calibrate_codes(photograph(truth, light(), times, noise), times)
+    assert stops_off(calibrated.response, truth) < 0.05
+    assert (
+        calibrated.residual < 0.05
+        and max(calibrated.channel_spread) < 0.05
+        and max(map(abs, calibrated.photo_offsets)) < 0.05
+    )
+    decoded = calibrated.response.decode(np.arange(256) / 255)
     assert (np.diff(decoded) > 0).all() and decoded[255] == pytest.approx(1.0)
 
 
@@ -98,7 +102,7 @@ def test_useless_stacks_get_one_line(tmp_path):
     good = photograph(curve, light(), times)
     moved = [np.roll(photo, 25 * number, axis=1) for number, photo in enumerate(good)]
     black = [np.zeros((64, 64, 3), np.uint8)] * 3
-    for place, (photos, given, words) in enumerate((
+    for place, (photos, exposure_times, words) in enumerate((
         (good[:1], times[:1], "no exposure stack"),
         (good, (1.0, 1.0, 1.0), "same exposure time"),
         (good, times[::-1], "darker than one of shorter"),
@@ -107,7 +111,7 @@ def test_useless_stacks_get_one_line(tmp_path):
         ([*good[:2], good[2][:50]], times, "differ in size"),
         (good, None, "state no exposure times"),
     )):  # fmt: skip
-        folder = write_stack(tmp_path / str(place), photos, given)
+        folder = write_stack(tmp_path / str(place), photos, exposure_times)
         with pytest.raises(InputError, match=words) as error:
             sw.calibrate(folder, out=tmp_path / "camera.csv")
         assert str(folder) in str(error.value) and "\n" not in str(error.value)
@@ -126,8 +130,8 @@ def test_real_cameras(shared, name):
     """The photos agree, channels do too, half of many photos tells what all tell, and no camera is sRGB."""
     files, times = read_stack(shared / "data" / "stacks" / name)
     codes = [read_ldr(file).pixels for file in files]
-    found = calibrate_codes(codes, times)
-    assert found.residual < 0.1 and max(found.channel_spread) < 0.1
+    calibrated = calibrate_codes(codes, times)
+    assert calibrated.residual < 0.1 and max(calibrated.channel_spread) < 0.1
     if len(times) > 5:
-        assert stops_off(calibrate_codes(codes[::2], times[::2]).response, found.response) < 0.3
-    assert stops_off(found.response, response_by_name("srgb")) > 0.8
+        assert stops_off(calibrate_codes(codes[::2], times[::2]).response, calibrated.response) < 0.3
+    assert stops_off(calibrated.response, response_by_name("srgb")) > 0.8

@@ -180,12 +180,12 @@ def test_any_table_becomes_an_invertible_curve_or_an_input_error(rows):
     except InputError as error:
         assert "rises by only" in str(error) or "cannot be computed with" in str(error)
         return
-    wanted = np.linspace(curve.black, curve.peak, 200)
-    decoded = curve.decode(wanted)
+    light_levels = np.linspace(curve.black, curve.peak, 200)
+    decoded = curve.decode(light_levels)
     assert (np.diff(decoded) >= 0).all() and decoded[0] >= 0 and decoded[-1] == pytest.approx(curve.clip_exposure)
     encoded = curve.encode(np.linspace(0, curve.clip_exposure * 1.5, 500))
     assert (np.diff(encoded) >= -1e-12).all() and encoded.min() >= 0 and encoded.max() <= 1
-    np.testing.assert_allclose(curve.encode(decoded), wanted, atol=1e-6)
+    np.testing.assert_allclose(curve.encode(decoded), light_levels, atol=1e-6)
 
 
 def channel_csv(path):
@@ -223,8 +223,8 @@ def test_photos_of_a_camera_whose_channels_differ(tmp_path):
     scene = load(tmp_path, response=str(channel_csv(tmp_path / "camera.csv")))
     for size in (None, 32):
         scene = load(tmp_path, response=scene.response, max_size=size)
-        seen = scene.response.decode(scene.views[0].image.astype(float))
-        row = seen[seen.shape[0] // 2, 4:-4:8]
+        decoded_light = scene.response.decode(scene.views[0].image.astype(float))
+        row = decoded_light[decoded_light.shape[0] // 2, 4:-4:8]
         np.testing.assert_allclose(row, row[:, 1:2].repeat(3, 1), rtol=0.03)
 
 

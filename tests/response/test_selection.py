@@ -51,17 +51,17 @@ def test_papers_score_orders_by_range_and_smoothness():
 
 def test_candidates_are_compared_on_one_thread_of_torch(monkeypatch):
     """Between so many small operations further threads would spin."""
-    found, compare, before = set(), selection_scores._mixture_surprise, torch.get_num_threads()
+    thread_counts, compare, before = set(), selection_scores._mixture_surprise, torch.get_num_threads()
 
-    def noted(*given):
-        found.add(torch.get_num_threads())
-        return compare(*given)
+    def noted(*args):
+        thread_counts.add(torch.get_num_threads())
+        return compare(*args)
 
     monkeypatch.setattr(selection_scores, "_mixture_surprise", noted)
     torch.set_num_threads(2)
     try:
         select_response(photograph("srgb", mosaic()), named("srgb", "filmic"))
-        assert found == {1} and torch.get_num_threads() == 2
+        assert thread_counts == {1} and torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
 
@@ -156,10 +156,10 @@ def test_edges_that_no_curve_explains_say_little(monkeypatch):
     def costs():
         return np.array([score.edges for score in select_response(spoilt, named("srgb", "hdr-nerf", "camera")).scores])
 
-    found = costs()
+    thread_counts = costs()
     monkeypatch.setattr(selection_scores, "EDGE_MISFITS", np.array([1.0]))
     as_rounding = costs()
-    assert np.ptp(found) < 0.9 * np.ptp(as_rounding) and (found < as_rounding - 0.2).all()
+    assert np.ptp(thread_counts) < 0.9 * np.ptp(as_rounding) and (thread_counts < as_rounding - 0.2).all()
 
 
 def test_prior_of_cameras_decides_where_nothing_else_does():

@@ -59,9 +59,9 @@ def test_paper_preset_is_the_papers():
 def test_presets_keep_the_densification_of_their_method(name):
     """The default's mcmc goes with its opacity weight; what builds on 3DGS has neither."""
     config = load_config(name)
-    found = config.densification.strategy, config.loss.opacity_weight
+    strategy_fields = config.densification.strategy, config.loss.opacity_weight
     relocates = name in ("default", "fast", "demo", "truth")
-    assert found == (("mcmc", 0.003) if relocates else ("adc", 0.0))
+    assert strategy_fields == (("mcmc", 0.003) if relocates else ("adc", 0.0))
 
 
 @pytest.mark.parametrize("path,item", list(config_fields()), ids=[path for path, _ in config_fields()])

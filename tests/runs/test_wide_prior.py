@@ -35,14 +35,14 @@ def fisheye(size=120):
 def test_faces_lie_where_the_photo_shows_them(camera):
     directions = np.nan_to_num(pixel_directions(camera))
     smooth = torch.tensor(0.5 + 0.3 * directions, dtype=torch.float32)
-    found = WidePrior(Echo(), camera).estimate(smooth, torch.ones_like(smooth, dtype=torch.bool))
-    shown = torch.tensor(np.isfinite(pixel_directions(camera)).all(axis=2))
+    result = WidePrior(Echo(), camera).estimate(smooth, torch.ones_like(smooth, dtype=torch.bool))
+    has_direction = torch.tensor(np.isfinite(pixel_directions(camera)).all(axis=2))
     if camera.projection != "equirectangular":  # The border is blurred with the black around a picture
-        shown[:6], shown[-6:], shown[:, :6], shown[:, -6:] = False, False, False, False
-    inside = torch.nn.functional.max_pool2d(1 - shown[None].float(), 5, 1, 2)[0] == 0
-    error = (found.mean - smooth).abs().amax(2)[inside]
+        has_direction[:6], has_direction[-6:], has_direction[:, :6], has_direction[:, -6:] = False, False, False, False
+    inside = torch.nn.functional.max_pool2d(1 - has_direction[None].float(), 5, 1, 2)[0] == 0
+    error = (result.mean - smooth).abs().amax(2)[inside]
     assert error.max() < 0.02 and error.mean() < 0.004
-    assert torch.allclose(found.deviation[inside], found.mean[inside] + 1, atol=1e-4)
+    assert torch.allclose(result.deviation[inside], result.mean[inside] + 1, atol=1e-4)
 
 
 def test_large_panoramas_are_seen_by_small_faces_and_dark_faces_not_at_all():

@@ -54,10 +54,10 @@ def write_jpeg_pair(path: Path, base: np.ndarray, gain: np.ndarray, segments, **
 
 def xmp_segment(fields: dict[str, str], prefix="hdrgm", space="http://ns.adobe.com/hdr-gain-map/1.0/"):
     """APP1 with XMP attributes of one namespace."""
-    stated = " ".join(f'{prefix}:{name}="{value}"' for name, value in fields.items())
+    attributes = " ".join(f'{prefix}:{name}="{value}"' for name, value in fields.items())
     text = (
         f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-        f'<rdf:Description xmlns:{prefix}="{space}" {stated}/></rdf:RDF></x:xmpmeta>'
+        f'<rdf:Description xmlns:{prefix}="{space}" {attributes}/></rdf:RDF></x:xmpmeta>'
     )
     return 0xFFE1, b"http://ns.adobe.com/xap/1.0/\0" + text.encode()
 

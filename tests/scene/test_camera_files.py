@@ -24,8 +24,8 @@ def test_nerfstudio_paths_come_back_from_the_dataparsers_space(tmp_path, logged)
     turn, scale = look_at((0.3, -1.0, 0.2), (1.0, 0.0, 0.0)), 0.25
     moved = turn @ np.linalg.inv(POSE)
     moved[:3, 3] *= scale
-    stated = {"transform": turn[:3].tolist(), "scale": scale}
-    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(stated))
+    similarity = {"transform": turn[:3].tolist(), "scale": scale}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(similarity))
     np.testing.assert_allclose(nerfstudio(tmp_path, np.linalg.inv(moved)).world_to_camera, POSE, atol=1e-9)
     (tmp_path / "dataparser_transforms.json").write_text("{}")
     with pytest.raises(InputError, match="no usable transform and scale"):

@@ -17,8 +17,8 @@ def plain(chroma):
     return np.stack([zoom(part, 2, order=3, mode="nearest", grid_mode=True) for part in np.moveaxis(chroma, 2, 0)], 2)
 
 
-def error(found, expected):
-    return float(np.sqrt(np.mean((found - expected)[8:-8, 8:-8] ** 2)))
+def error(upsampled, expected):
+    return float(np.sqrt(np.mean((upsampled - expected)[8:-8, 8:-8] ** 2)))
 
 
 def surfaces(noise=0.0):
@@ -42,8 +42,8 @@ def test_flat_areas_stay_as_even_as_plain_interpolation_makes_them(noise):
     random = np.random.default_rng(0)
     luma = (0.4 + noise * random.standard_normal((256, 256))).astype(np.float32)
     small = (0.1 + noise / 2 * random.standard_normal((128, 128, 2))).astype(np.float32)
-    found = upsample_chroma(luma, small, CENTER)
-    assert error(found, 0.1) <= error(plain(small), 0.1) + 1e-6
+    upsampled = upsample_chroma(luma, small, CENTER)
+    assert error(upsampled, 0.1) <= error(plain(small), 0.1) + 1e-6
 
 
 def test_an_edge_of_luma_alone_leaves_chroma_alone():
@@ -54,8 +54,8 @@ def test_an_edge_of_luma_alone_leaves_chroma_alone():
 
 def test_averages_are_what_the_file_states():
     luma, _, small = surfaces()
-    found = averaged(upsample_chroma(luma, small, CENTER))
-    assert error(found, small) < 0.25 * error(averaged(plain(small)), small)
+    upsampled = averaged(upsample_chroma(luma, small, CENTER))
+    assert error(upsampled, small) < 0.25 * error(averaged(plain(small)), small)
 
 
 @pytest.mark.parametrize(
@@ -68,9 +68,9 @@ def test_odd_sizes_and_one_halved_axis(shape, offsets):
     steps = [1 if offset is None else 2 for offset in offsets]
     small = np.indices([-(-size // step) for size, step in zip(shape, steps, strict=True)]).astype(np.float32)
     places = [place * step + (offset or 0) for place, step, offset in zip(small, steps, offsets, strict=True)]
-    found = upsample_chroma(np.full(shape, 0.5, np.float32), np.stack(places, 2) / 2000, offsets)
-    assert found.shape == (*shape, 2) and found.dtype == np.float32
-    np.testing.assert_allclose(found, ramp, atol=1.1 / 2000)
+    upsampled = upsample_chroma(np.full(shape, 0.5, np.float32), np.stack(places, 2) / 2000, offsets)
+    assert upsampled.shape == (*shape, 2) and upsampled.dtype == np.float32
+    np.testing.assert_allclose(upsampled, ramp, atol=1.1 / 2000)
     inside = tuple(slice(4, -4) for _ in shape)
     if min(shape) > 8:
-        np.testing.assert_allclose(found[inside], ramp[inside], atol=3e-5)
+        np.testing.assert_allclose(upsampled[inside], ramp[inside], atol=3e-5)

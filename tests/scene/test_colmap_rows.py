@@ -9,9 +9,9 @@ from sehdr_warp.scene.colmap_rows import COUNT_ROWS, counted_rows
 
 
 def test_rows_are_counted_while_they_are_written(tmp_path):
-    path, seen = tmp_path / "a folder" / "database.db", []
+    path, counts = tmp_path / "a folder" / "database.db", []
     path.parent.mkdir()
-    with counted_rows(path, "keypoints", seen.append):
+    with counted_rows(path, "keypoints", counts.append):
         database = sqlite3.connect(path)
         database.execute("PRAGMA journal_mode=WAL")
         database.execute("CREATE TABLE keypoints (data BLOB)")
@@ -19,11 +19,11 @@ def test_rows_are_counted_while_they_are_written(tmp_path):
             database.execute("INSERT INTO keypoints VALUES (zeroblob(100000))")
             database.commit()
             deadline = time.monotonic() + 20
-            while count not in seen and time.monotonic() < deadline:
+            while count not in counts and time.monotonic() < deadline:
                 time.sleep(0.05)
-            assert count in seen
+            assert count in counts
     database.close()
-    assert seen == sorted(seen)
+    assert counts == sorted(counts)
 
 
 def test_the_counter_ends_with_the_process_that_started_it(tmp_path):

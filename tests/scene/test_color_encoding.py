@@ -31,11 +31,11 @@ def s15(values):
 def icc_profile(space: str, gamma: float | None = None, *, name="test", curve: bytes | None = None) -> bytes:
     """A matrix profile of a space of colour-science; gamma None is sRGB's curve."""
     d50 = np.array([0.9642, 1, 0.8249])
-    found = colour.RGB_COLOURSPACES[space].copy()
-    found.use_derived_transformation_matrices(True)
-    white = colour.xy_to_XYZ(found.whitepoint)
+    colourspace = colour.RGB_COLOURSPACES[space].copy()
+    colourspace.use_derived_transformation_matrices(True)
+    white = colour.xy_to_XYZ(colourspace.whitepoint)
     adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(white, d50, "Bradford")
-    matrix = adapt @ found.matrix_RGB_to_XYZ
+    matrix = adapt @ colourspace.matrix_RGB_to_XYZ
     if curve is None:
         numbers = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
         curve = b"para\0\0\0\0" + (struct.pack(">HH", 0, 0) + s15([gamma]) if gamma else b"\0\3\0\0" + s15(numbers))
@@ -57,11 +57,11 @@ def icc_profile(space: str, gamma: float | None = None, *, name="test", curve: b
 def rec709_of(space, gamma, codes):
     value = codes / 255
     light = value**gamma if gamma else srgb_to_linear(value)
-    found = colour.RGB_COLOURSPACES[space].copy()
-    found.use_derived_transformation_matrices(True)
+    colourspace = colour.RGB_COLOURSPACES[space].copy()
+    colourspace.use_derived_transformation_matrices(True)
     target = colour.RGB_COLOURSPACES["ITU-R BT.709"].copy()
     target.use_derived_transformation_matrices(True)
-    return light @ colour.matrix_RGB_to_RGB(found, target, "Bradford").T
+    return light @ colour.matrix_RGB_to_RGB(colourspace, target, "Bradford").T
 
 
 def light_of(view, scene):
@@ -276,12 +276,12 @@ def test_photos_of_one_name_in_several_folders_are_counted_each(tmp_path):
     assert notes == ["colors: 6 of 6 photos are in P3 (ICC profile) and are converted to Rec.709 (0000.png ...)"]
 
 
-@pytest.mark.parametrize("stated", [{0xA001: 2}, {0xA001: 0xFFFF, "index": "R03"}])
-def test_adobe_rgb_of_exif(tmp_path, stated):
+@pytest.mark.parametrize("interop", [{0xA001: 2}, {0xA001: 0xFFFF, "index": "R03"}])
+def test_adobe_rgb_of_exif(tmp_path, interop):
     exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA001] = stated[0xA001]
-    if "index" in stated:
-        exif.get_ifd(0x8769)[0xA005] = {1: stated["index"]}
+    exif.get_ifd(0x8769)[0xA001] = interop[0xA001]
+    if "index" in interop:
+        exif.get_ifd(0x8769)[0xA005] = {1: interop["index"]}
     Image.fromarray(np.full((8, 8, 3), PATCHES[0], np.uint8)).save(tmp_path / "a.jpg", exif=exif, quality=100)
     with open_image(tmp_path / "a.jpg") as image:
         encoding = stated_encoding(image)

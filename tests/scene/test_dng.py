@@ -164,8 +164,8 @@ def test_opcodes_that_change_values(tmp_path):
         expected = EVEN + (1 if name == "delta by row" else 0)
         light = np.clip(inverse(mosaic(EVEN)), 0, 1)
         write_tagged_dng(tmp_path / "a.dng", stored(light), LEVELS | {51009: opcodes((number, body))})
-        found = light_of(tmp_path / "a.dng")
-        np.testing.assert_allclose(found, np.minimum(expected, 1), rtol=0.02, err_msg=name)
+        developed = light_of(tmp_path / "a.dng")
+        np.testing.assert_allclose(developed, np.minimum(expected, 1), rtol=0.02, err_msg=name)
 
 
 def test_bad_pixels_are_filled(tmp_path):

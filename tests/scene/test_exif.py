@@ -38,13 +38,13 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_exposures(tmp_path, case):
     tags, expected = CASES[case]
-    found = exif_exposure(photo(tmp_path / "a.jpg", tags))
-    assert [None if a is None else pytest.approx(a, rel=1e-4) for a in expected] == list(found)
+    exposure = exif_exposure(photo(tmp_path / "a.jpg", tags))
+    assert [None if a is None else pytest.approx(a, rel=1e-4) for a in expected] == list(exposure)
 
 
 def test_tags_in_the_first_table(tmp_path):
-    found = exif_exposure(photo(tmp_path / "a.tif", {}, first={TIME: 0.25, NUMBER: 4.0}))
-    assert found[::2] == pytest.approx((0.25, 4.0))
+    exposure = exif_exposure(photo(tmp_path / "a.tif", {}, first={TIME: 0.25, NUMBER: 4.0}))
+    assert exposure[::2] == pytest.approx((0.25, 4.0))
 
 
 @pytest.mark.parametrize(

@@ -67,32 +67,32 @@ def photographed(gains, vignetting, focal=lambda name: 60.0) -> Scene:
 
 def test_gains_and_falloff_are_found(gains, points):
     scene = photographed(gains, everywhere(VIGNETTING))
-    hidden, seen = points.copy(), np.ones((PHOTOS, len(points)), bool)
+    hidden, visible = points.copy(), np.ones((PHOTOS, len(points)), bool)
     hidden[::10, 2] = 2.0  # points that are none
-    hidden[1::2, 2], seen[1:, 1::2] = 7.0, False  # behind the wall, and known to be
-    found = fit_gains(scene.train_views, scene.test_views, hidden, seen, SRGB)
+    hidden[1::2, 2], visible[1:, 1::2] = 7.0, False  # behind the wall, and known to be
+    fitted = fit_gains(scene.train_views, scene.test_views, hidden, visible, SRGB)
     for name, gain in gains.items():
-        np.testing.assert_allclose(found.gains[name], gain, rtol=0.02)
-    assert found.corner_loss == pytest.approx(1 - np.exp(-sum(VIGNETTING)), abs=0.03)
-    assert found.stops > 0.3
+        np.testing.assert_allclose(fitted.gains[name], gain, rtol=0.02)
+    assert fitted.corner_loss == pytest.approx(1 - np.exp(-sum(VIGNETTING)), abs=0.03)
+    assert fitted.stops > 0.3
     rough = initial_gains(scene.train_views, SRGB)
     np.testing.assert_allclose([rough.gains[v.name] for v in scene.train_views], list(gains.values())[:-1], rtol=0.25)
-    rough, known = rough_gains(scene.train_views, hidden, seen, SRGB), (scene.train_views, hidden, seen, SRGB)
-    assert (rough.stops, rough.white_balance) == pytest.approx((found.stops, found.white_balance), rel=0.15)
-    assert rough.corner_loss == pytest.approx(found.corner_loss, abs=0.1)
+    rough, known = rough_gains(scene.train_views, hidden, visible, SRGB), (scene.train_views, hidden, visible, SRGB)
+    assert (rough.stops, rough.white_balance) == pytest.approx((fitted.stops, fitted.white_balance), rel=0.15)
+    assert rough.corner_loss == pytest.approx(fitted.corner_loss, abs=0.1)
     for colors in (False, True):
-        before, after = (disagreement(*known, taken, colors=colors) for taken in (None, found))
+        before, after = (disagreement(*known, corrected, colors=colors) for corrected in (None, fitted))
         assert after < 0.1 * before
-    wrong = replace(found, vignetting=everywhere((0.0, 0.8)))
-    assert remaining_vignetting(*known, found) < 0.15 and remaining_vignetting(*known, wrong) > 0.8
+    wrong = replace(fitted, vignetting=everywhere((0.0, 0.8)))
+    assert remaining_vignetting(*known, fitted) < 0.15 and remaining_vignetting(*known, wrong) > 0.8
 
 
-@pytest.mark.parametrize("told", ["times", "places"])
-def test_what_follows_stated_times_or_places_is_told_apart(told):
+@pytest.mark.parametrize("cause", ["times", "places"])
+def test_what_follows_stated_times_or_places_is_told_apart(cause):
     """A wrong curve makes gains of the times themselves, what is brighter from one side those of places; what a camera
     rounds is beside them."""
     views = [replace(v, exposure_time=2.0 ** (k % 4)) for k, v in enumerate(photographed({}, {}).train_views)]
-    stops = [np.log2(v.exposure_time) if told == "times" else v.camera.position @ [1.5, 3, 0] for v in views]
+    stops = [np.log2(v.exposure_time) if cause == "times" else v.camera.position @ [1.5, 3, 0] for v in views]
     shared = 2 ** (0.4 * np.array(stops))
     along = ExposureCompensation({v.name: (gain, gain, gain) for v, gain in zip(views, shared, strict=True)})
     assert along.stops > 0.2 and along.unexplained_stops(views) == pytest.approx(0, abs=1e-9)
@@ -110,18 +110,18 @@ def test_what_follows_stated_times_or_places_is_told_apart(told):
 def test_each_lens_has_its_falloff(gains, points):
     dark = everywhere(VIGNETTING, range(0, PHOTOS, 2))
     scene = photographed(gains, dark, lambda name: 60.0 if name in dark else 70.0)
-    views, seen = scene.train_views, np.ones((PHOTOS, len(points)), bool)
-    found = fit_gains(views, scene.test_views, points, seen, SRGB)
-    corners = {name: 1 - np.exp(-sum(found.vignetting.get(name, (0, 0)))) for name in gains}
+    views, visible = scene.train_views, np.ones((PHOTOS, len(points)), bool)
+    fitted = fit_gains(views, scene.test_views, points, visible, SRGB)
+    corners = {name: 1 - np.exp(-sum(fitted.vignetting.get(name, (0, 0)))) for name in gains}
     for name, lacking in corners.items():
         assert lacking == pytest.approx(1 - np.exp(-sum(dark.get(name, (0, 0)))), abs=0.03)
-    rough = rough_gains(views, points, seen, SRGB)
-    assert rough.corner_loss == pytest.approx(found.corner_loss, abs=0.1)
-    assert remaining_vignetting(views, points, seen, SRGB, found) < 0.15
+    rough = rough_gains(views, points, visible, SRGB)
+    assert rough.corner_loss == pytest.approx(fitted.corner_loss, abs=0.1)
+    assert remaining_vignetting(views, points, visible, SRGB, fitted) < 0.15
 
 
 def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
-    def taken(index, model, focal=35, aperture=2.8):
+    def exif_photo(index, model, focal=35, aperture=2.8):
         exif, path = Image.Exif(), tmp_path / f"{index}.jpg"
         exif[272] = model
         exif.get_ifd(0x8769).update({37386: focal, 33437: aperture})
@@ -131,26 +131,28 @@ def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
     views = photographed({}, {}).views
 
     def lenses(sources, focals=(60.0,) * PHOTOS):
-        given = zip(views, sources, focals, strict=True)
-        return lens_groups([replace(v, source=s, camera=replace(v.camera, fx=f, fy=f)) for v, s, f in given]).tolist()
+        exif_facts = zip(views, sources, focals, strict=True)
+        return lens_groups(
+            [replace(v, source=s, camera=replace(v.camera, fx=f, fy=f)) for v, s, f in exif_facts]
+        ).tolist()
 
-    one, two = taken(0, "One"), taken(1, "Two")
+    one, two = exif_photo(0, "One"), exif_photo(1, "Two")
     assert lenses([None] * PHOTOS) == [0] * PHOTOS == lenses([tmp_path / "none.jpg"] * PHOTOS)
-    assert lenses([one, two] * 3) == [0, 1] * 3 == lenses([one, taken(2, "One", aperture=8)] * 3)
-    assert lenses([one, taken(3, "One", focal=70)] * 3) == [0, 1] * 3
+    assert lenses([one, two] * 3) == [0, 1] * 3 == lenses([one, exif_photo(2, "One", aperture=8)] * 3)
+    assert lenses([one, exif_photo(3, "One", focal=70)] * 3) == [0, 1] * 3
     # Structure from motion finds a focal length a little differently for each photo.
     assert lenses([one] * PHOTOS, (60.0, 61.0, 62.5, 59.0, 60.5, 61.5)) == [0] * PHOTOS
     assert lenses([one] * PHOTOS, (60.0, 70.0) * 3) == [0, 1] * 3
     # Too few of a lens are one with others, and none where those are few too.
-    zoomed = [taken(4 + k, "One", focal=35 + k) for k in range(PHOTOS)]
+    zoomed = [exif_photo(4 + k, "One", focal=35 + k) for k in range(PHOTOS)]
     assert lenses(zoomed) == [0] * PHOTOS and lenses([one] * 4 + [two, None]) == [0, 0, 0, 0, -1, -1]
 
 
 def test_exposure_white_balance_and_falloff_are_parts(gains):
     whole = ExposureCompensation(gains, everywhere(VIGNETTING))
     values, exposure, white_balance = (
-        np.array(list(found.gains.values()))
-        for found in (whole, whole.parts(white_balance=False), whole.parts(exposure=False))
+        np.array(list(fitted.gains.values()))
+        for fitted in (whole, whole.parts(white_balance=False), whole.parts(exposure=False))
     )
     np.testing.assert_allclose(exposure, values[:, 1:2].repeat(3, 1))
     np.testing.assert_allclose(exposure * white_balance, values)
@@ -159,8 +161,8 @@ def test_exposure_white_balance_and_falloff_are_parts(gains):
 
 def test_photos_that_do_not_drift_have_no_gains(points):
     scene = photographed({}, {})
-    found = fit_gains(scene.train_views, scene.test_views, points, np.ones((PHOTOS, len(points)), bool), SRGB)
-    assert found.stops < 0.02 and abs(found.corner_loss) < 0.02
+    fitted = fit_gains(scene.train_views, scene.test_views, points, np.ones((PHOTOS, len(points)), bool), SRGB)
+    assert fitted.stops < 0.02 and abs(fitted.corner_loss) < 0.02
 
 
 def test_evened_photos_hold_the_light_without_gains(gains):
@@ -168,9 +170,9 @@ def test_evened_photos_hold_the_light_without_gains(gains):
     evened = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
     assert ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(evened, SRGB) is evened
     for ours, truth in zip(evened.views, plain.views, strict=True):
-        told = (truth.image > 0.1) & (ours.image < 0.95)
+        measurable = (truth.image > 0.1) & (ours.image < 0.95)
         light = SRGB.decode(ours.image) / ours.exposure_time
-        np.testing.assert_allclose(light[told], SRGB.decode(truth.image)[told], rtol=0.04)
+        np.testing.assert_allclose(light[measurable], SRGB.decode(truth.image)[measurable], rtol=0.04)
         assert ours.exposure_time == pytest.approx(max(gains[ours.name]))
 
 
@@ -194,12 +196,12 @@ def test_photos_are_evened_row_by_row_as_by_their_light(gains, vignetting):
     tall = np.random.default_rng(5).integers(0, 256, (3 * BAND_ROWS + 5, 20, 3), dtype=np.uint8)
     camera = Camera(20, len(tall), 60.0, 60.0, 10.0, len(tall) / 2, np.eye(4))
     view = View("p_0", tall, camera, 2.0, "train")
-    found = ExposureCompensation(gains, {} if vignetting is None else {"p_0": vignetting})
-    (evened,) = found.normalize_photos(
+    fitted = ExposureCompensation(gains, {} if vignetting is None else {"p_0": vignetting})
+    (evened,) = fitted.normalize_photos(
         Scene("tall", "hand-made", (view,), np.zeros((0, 3)), np.zeros((0, 3))), SRGB
     ).views
     largest = max(gains["p_0"])
-    light = SRGB.decode(view.image.astype(np.float64)) / (found.light(view) / largest)
+    light = SRGB.decode(view.image.astype(np.float64)) / (fitted.light(view) / largest)
     expected = codes_of(SRGB.encode(light), 16)
     expected[tall == 255] = 65535
     assert evened.exposure_time == 2.0 * largest

@@ -7,9 +7,9 @@ from sehdr_warp.scene.float_table import FloatTable
 
 def test_values_are_those_of_the_function_at_nearly_the_same_place():
     values = np.exp(np.random.default_rng(0).uniform(np.log(1e-7), np.log(1e5), (40, 25, 3))).astype(np.float32)
-    found = FloatTable(lambda value: value**0.5)(values)
-    assert found.shape == values.shape and found.dtype == np.float32
-    np.testing.assert_allclose(found, np.sqrt(values), rtol=4e-5)
+    looked_up = FloatTable(lambda value: value**0.5)(values)
+    assert looked_up.shape == values.shape and looked_up.dtype == np.float32
+    np.testing.assert_allclose(looked_up, np.sqrt(values), rtol=4e-5)
 
 
 def test_white_and_ends_are_exact_and_codes_nearly():

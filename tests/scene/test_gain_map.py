@@ -40,13 +40,13 @@ def pair(apple=False, channels=1):
     """The photo clipped at white, and what the map holds: [h, w(, 3)] uint8 at half of the size."""
     light = scene()
     base = np.rint(255 * encoded(light)).astype(np.uint8)
-    shown = linear(base)
+    base_light = linear(base)
     if apple:
-        share = (light.max(2) / shown.max(2) - 1) / (2**STOPS - 1)
+        share = (light.max(2) / base_light.max(2) - 1) / (2**STOPS - 1)
         share = np.clip(share, 0, 1)
         stored = np.where(share <= 0.0181, 4.5 * share, 1.099 * np.maximum(share, 1e-9) ** 0.45 - 0.099)
     else:
-        gains = np.log2((light + 1 / 64) / (shown + 1 / 64)) / STOPS
+        gains = np.log2((light + 1 / 64) / (base_light + 1 / 64)) / STOPS
         stored = gains if channels == 3 else gains[..., 0]
     small = np.clip(stored, 0, 1)
     small = small.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, -1).mean((1, 3)).squeeze()
@@ -57,12 +57,12 @@ def decoded(path):
     return read_gain_map(path).light(linear(read_ldr(path).pixels))
 
 
-def assert_light(found, expected, channels=1):
+def assert_light(result, expected, channels=1):
     """Within 3 %, where the map was not averaged over the edge of what is clipped."""
     channel = slice(None) if channels == 3 else slice(0, 1)
-    error = np.abs(found / expected - 1)[..., channel]
+    error = np.abs(result / expected - 1)[..., channel]
     assert np.percentile(error[8:-8, 8:-8], 98) < 0.03, np.percentile(error, [50, 90, 98, 100])
-    assert found[..., 0].max() == pytest.approx(expected[..., 0].max(), rel=0.03)
+    assert result[..., 0].max() == pytest.approx(expected[..., 0].max(), rel=0.03)
 
 
 def iso_segment(**options):
@@ -94,21 +94,21 @@ def test_libultrahdr_writes_what_is_read(tmp_path):
     light = scene()
     pixels = np.concatenate([light, np.ones((HEIGHT, WIDTH, 1))], 2).astype(np.float16)
     (tmp_path / "a.jpg").write_bytes(imagecodecs.ultrahdr_encode(pixels, level=97))
-    found = decoded(tmp_path / "a.jpg")
+    result = decoded(tmp_path / "a.jpg")
     theirs = imagecodecs.ultrahdr_decode((tmp_path / "a.jpg").read_bytes())[..., :3].astype(float)
     inside = slice(4, -4), slice(4, -4)
-    np.testing.assert_allclose(found[inside], theirs[inside], rtol=0.05)
-    assert np.abs(found / theirs - 1)[inside].mean() < 0.015
-    median, high = np.percentile(np.abs(found / light - 1)[inside], [50, 90])
+    np.testing.assert_allclose(result[inside], theirs[inside], rtol=0.05)
+    assert np.abs(result / theirs - 1)[inside].mean() < 0.015
+    median, high = np.percentile(np.abs(result / light - 1)[inside], [50, 90])
     assert median < 0.015 and high < 0.035
 
 
-@pytest.mark.parametrize("stated", ["xmp", "maker note"])
-def test_apples_gain_map_in_jpeg(tmp_path, stated):
+@pytest.mark.parametrize("states_headroom", ["xmp", "maker note"])
+def test_apples_gain_map_in_jpeg(tmp_path, states_headroom):
     light, base, gain = pair(apple=True)
     fields = {"HDRGainMapVersion": "131072"}
     exif = Image.Exif()
-    if stated == "xmp":
+    if states_headroom == "xmp":
         fields["HDRGainMapHeadroom"] = str(2**STOPS)
     else:  # 2.5 stops: -70 x + 3 with x = 1 / 140
         exif.get_ifd(0x8769)[0x927C] = apple_note(1.01, 1 / 140)
@@ -152,9 +152,9 @@ def test_apples_gain_map_in_heic_is_turned_with_its_photo(tmp_path):
     other = saved(tmp_path / "g.heic", np.repeat(gain[..., None], 3, 2))
     _, body = xmp_segment({"HDRGainMapHeadroom": str(2**STOPS)}, "HDRGainMap", "http://ns.apple.com/HDRGainMap/1.0/")
     write_heif_pair(tmp_path / "a.heic", stored, other, apple_xmp=body.partition(b"\0")[2])
-    found = decoded(tmp_path / "a.heic")
-    assert found.shape == (WIDTH, HEIGHT, 3)
-    assert_light(found, np.rot90(light, -1))
+    result = decoded(tmp_path / "a.heic")
+    assert result.shape == (WIDTH, HEIGHT, 3)
+    assert_light(result, np.rot90(light, -1))
 
 
 def test_photos_without_a_gain_map(tmp_path):
@@ -241,8 +241,8 @@ def test_a_gain_map_is_turned_with_its_photo(tmp_path):
     exif[0x0112] = 8
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [iso_segment()], exif=exif.tobytes())
     photo = light_of(read_ldr(tmp_path / "a.jpg", oriented=True), read_gain_map(tmp_path / "a.jpg", oriented=True))
-    found = np.where(photo.pixels == 65535, photo.above_white, linear(photo.pixels))
-    assert_light(found, np.rot90(light))
+    result = np.where(photo.pixels == 65535, photo.above_white, linear(photo.pixels))
+    assert_light(result, np.rot90(light))
 
 
 def test_light_of_a_display_p3_photo_ends_in_rec709(tmp_path):
@@ -302,8 +302,8 @@ def test_values_as_elements_and_sequences(tmp_path):
     listed = "".join(f"<rdf:li>{value}</rdf:li>" for value in (1.0, 2.0, 3.0))
     inner = f"<hdrgm:GainMapMax><rdf:Seq>{listed}</rdf:Seq></hdrgm:GainMapMax><hdrgm:Gamma>2</hdrgm:Gamma>"
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [(0xFFE1, b"http://ns.adobe.com/xap/1.0/\0" + inner.encode())])
-    found = read_gain_map(tmp_path / "a.jpg")
-    assert found.maximum.tolist() == [1, 2, 3] and found.gamma.tolist() == [2, 2, 2]
+    result = read_gain_map(tmp_path / "a.jpg")
+    assert result.maximum.tolist() == [1, 2, 3] and result.gamma.tolist() == [2, 2, 2]
 
 
 @pytest.mark.parametrize("behind", [b"", b"a film" * 50], ids=["alone", "motion photo"])

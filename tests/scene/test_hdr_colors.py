@@ -30,9 +30,9 @@ def planes(rgb=RGB, shape=(6, 8)):
 
 
 def space(name):
-    found = colour.RGB_COLOURSPACES[name].copy()
-    found.use_derived_transformation_matrices(True)
-    return found
+    copied = colour.RGB_COLOURSPACES[name].copy()
+    copied.use_derived_transformation_matrices(True)
+    return copied
 
 
 def rec709(name, rgb=RGB):
@@ -41,8 +41,8 @@ def rec709(name, rgb=RGB):
 
 @pytest.mark.parametrize("interop", SPACES)
 def test_primaries_by_chromaticities_and_by_interop_id(tmp_path, interop):
-    found, expected = space(SPACES[interop]), rec709(SPACES[interop])
-    places = tuple(map(float, (*np.ravel(found.primaries), *found.whitepoint)))
+    copied, expected = space(SPACES[interop]), rec709(SPACES[interop])
+    places = tuple(map(float, (*np.ravel(copied.primaries), *copied.whitepoint)))
     for header in ({"chromaticities": places}, {"colorInteropID": interop}):
         read = read_hdr(write_exr(tmp_path / "a.exr", planes(), **header))
         np.testing.assert_allclose(read[2, 3], expected, rtol=2e-3, atol=1e-4)

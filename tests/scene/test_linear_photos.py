@@ -86,9 +86,9 @@ def test_linear_16_bit_photos(tmp_path):
 
 def test_what_clips_in_a_noisy_sensor_is_clipped():
     random = np.random.default_rng(0)
-    seen = np.array(noisy(np.full((64, 64, 3), 3.0), 1.0, SensorNoise(), random))
-    codes = linear_codes(np.rint(seen * 16383) / 16383)
-    assert (seen < 1).mean() > 0.3 and (codes == 65535).all()
+    samples = np.array(noisy(np.full((64, 64, 3), 3.0), 1.0, SensorNoise(), random))
+    codes = linear_codes(np.rint(samples * 16383) / 16383)
+    assert (samples < 1).mean() > 0.3 and (codes == 65535).all()
 
 
 def test_raw_files_clip_by_channel_in_the_sensors_colors(tmp_path):
@@ -97,10 +97,10 @@ def test_raw_files_clip_by_channel_in_the_sensors_colors(tmp_path):
     light = BALANCE * np.linspace(0.02, 3, 96)[None, :, None] * np.ones((64, 1, 1))
     write_dng(tmp_path / "a.dng", light, balance=BALANCE)
     codes = raw_codes(tmp_path / "a.dng", oriented=False)
-    found, expected = np.zeros(codes.shape), np.clip(light, 0, 1)
-    found = np.where(codes / 65535 <= 0.04045, codes / 65535 / 12.92, ((codes / 65535 + 0.055) / 1.055) ** 2.4)
+    decoded, expected = np.zeros(codes.shape), np.clip(light, 0, 1)
+    decoded = np.where(codes / 65535 <= 0.04045, codes / 65535 / 12.92, ((codes / 65535 + 0.055) / 1.055) ** 2.4)
     inside = slice(4, -4), slice(4, -4)
-    np.testing.assert_allclose(found[inside], expected[inside], rtol=0.03)
+    np.testing.assert_allclose(decoded[inside], expected[inside], rtol=0.03)
     assert ((codes == 65535) == (expected >= 0.99))[inside].mean() > 0.999
     assert raw_exposure(tmp_path / "a.dng")[0] == pytest.approx(1 / 60, rel=1e-4)
     matrix = color_matrix([tmp_path / "a.dng"])
@@ -133,8 +133,8 @@ def test_cameras_whose_colors_libraw_knows(tmp_path, suffix, maker, white):
     rawpy = pytest.importorskip("rawpy")
     file, light = tmp_path / f"a{suffix}", BALANCE * np.linspace(0.02, 0.9, 96)[None, :, None] * np.ones((64, 1, 1))
     write_dng(file, light, black=0, white=white, maker=maker)
-    found = response_by_name("srgb").decode(raw_codes(file, oriented=False) / 65535)
-    np.testing.assert_allclose(found[4:-4, 4:-4], light[4:-4, 4:-4], rtol=0.03)
+    decoded = response_by_name("srgb").decode(raw_codes(file, oriented=False) / 65535)
+    np.testing.assert_allclose(decoded[4:-4, 4:-4], light[4:-4, 4:-4], rtol=0.03)
     with rawpy.imread(str(file)) as raw:
         daylight = np.array(raw.daylight_whitebalance[:3])
     matrix = color_matrix([file])
@@ -235,8 +235,8 @@ def test_a_scene_in_a_sensors_colors_is_rendered_in_rec709(tmp_path):
     assert dark.mean() > 0.5
     np.testing.assert_allclose(scene.render(camera()).hdr.numpy()[dark], expected[dark], rtol=1e-5)
     options = {"focal_length": 50.0, "pixel_angle": 0.0}
-    seen = scene.render_directions(np.zeros(3), np.array([[[0.0, 0, 1]]]), **options)
-    assert seen.hdr.shape == (1, 1, 3)
+    samples = scene.render_directions(np.zeros(3), np.array([[[0.0, 0, 1]]]), **options)
+    assert samples.hdr.shape == (1, 1, 3)
 
 
 def test_structure_from_motion_asks_linear_photos_for_no_exif(tmp_path):

@@ -41,8 +41,8 @@ def test_a_photo_takes_three_bytes_a_pixel_and_none_on_the_disk(tmp_path):
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_ARENA_MAX": "1"}
     call = [sys.executable, "-c", LOAD, str(tmp_path)]
     ended = subprocess.run(call, capture_output=True, text=True, check=True, env=environment)
-    told = [list(map(int, line.split())) for line in ended.stdout.splitlines()]
-    (_, grown, *_), (memory, more, *photos), (disk, _, *same_photos) = told
+    figures = [list(map(int, line.split())) for line in ended.stdout.splitlines()]
+    (_, grown, *_), (memory, more, *photos), (disk, _, *same_photos) = figures
     codes = photos[0]
     assert photos == same_photos and codes == 3 * 1600 * 1200 * 3
     assert 0.9 * codes < memory < 1.1 * codes and disk < 0.1 * codes
@@ -52,22 +52,22 @@ def test_a_photo_takes_three_bytes_a_pixel_and_none_on_the_disk(tmp_path):
 
 def test_arrays_are_kept_shared_and_gone(tmp_path):
     photos = PhotoFile(1 << 20, tmp_path)
-    given = np.arange(30_000, dtype=np.uint16).reshape(100, 100, 3)
-    kept = photos.keep(given)
-    assert photos.keep(kept) is kept and photos.end < 2 * given.nbytes
+    original = np.arange(30_000, dtype=np.uint16).reshape(100, 100, 3)
+    stored = photos.keep(original)
+    assert photos.keep(stored) is stored and photos.end < 2 * original.nbytes
     assert list(tmp_path.iterdir()) == [], "no name"
     if sys.platform == "linux":
         value = open_shared(
-            photos.share({"photo": kept, "mask": np.ones((80, 80), np.float32), "name": "a", "small": given[:1]})
+            photos.share({"photo": stored, "mask": np.ones((80, 80), np.float32), "name": "a", "small": original[:1]})
         )
-        np.testing.assert_array_equal(value["photo"], given)
+        np.testing.assert_array_equal(value["photo"], original)
         assert value["mask"].sum() == 6400 and value["name"] == "a" and value["small"].shape == (1, 100, 3)
-        assert photos.end < given.nbytes + 6400 * 4 + 4096, "what lies there is not copied"
+        assert photos.end < original.nbytes + 6400 * 4 + 4096, "what lies there is not copied"
     handle = photos._file.fileno()
     del photos
     gc.collect()
     os.fstat(handle)  # An array still lies in it.
-    np.testing.assert_array_equal(kept, given)
+    np.testing.assert_array_equal(stored, original)
 
 
 def test_too_large_for_the_disk_is_one_line(tmp_path, monkeypatch):

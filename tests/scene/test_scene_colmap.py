@@ -148,8 +148,8 @@ def test_distortion_is_undone_where_pycolmap_projects(tmp_path, model, params, s
     camera, lens = view.camera, pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     rows, columns = np.mgrid[2 : camera.height - 2 : 3, 2 : camera.width - 2 : 3].reshape(2, -1)
     rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, 0 * rows + 1.0], 1)
-    shown = view.image[rows, columns, :2] * 255 * step + 0.5
-    np.testing.assert_allclose(shown, lens.img_from_cam(rays), atol=0.02 if scale == 1 else 2)
+    colors = view.image[rows, columns, :2] * 255 * step + 0.5
+    np.testing.assert_allclose(colors, lens.img_from_cam(rays), atol=0.02 if scale == 1 else 2)
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
     if scale == 1:
         assert (camera.width, camera.height) == (pinhole.width, pinhole.height)

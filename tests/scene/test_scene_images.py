@@ -117,7 +117,7 @@ RGB = Image.fromarray(RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8))
 
 
 @pytest.mark.parametrize(
-    "kind, told",
+    "kind, message",
     [
         ("EPS", "is not a readable image, which is one of PNG"),
         ("GIF", "is a GIF, which is not read as a photo; export it as RGB or grey"),
@@ -131,7 +131,7 @@ RGB = Image.fromarray(RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8))
         ("pages", "holds several pictures"),
     ],
 )
-def test_other_formats_and_colors_are_refused_and_no_program_is_started(tmp_path, monkeypatch, kind, told):
+def test_other_formats_and_colors_are_refused_and_no_program_is_started(tmp_path, monkeypatch, kind, message):
     """Whatever the name says. A stand-in on the PATH would tell that Ghostscript was asked for."""
     (tmp_path / "gs").write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
     (tmp_path / "gs").chmod(0o755)
@@ -147,7 +147,7 @@ def test_other_formats_and_colors_are_refused_and_no_program_is_started(tmp_path
         image = Image.new("LAB", (8, 6)) if kind == "LAB" else RGB.convert("L").convert(kind)
         image.save(path, format="TIFF")
     for read in (read_ldr, image_sizes):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             read(path)
     assert not (tmp_path / "started").exists()
     if kind == "1":

@@ -80,12 +80,12 @@ def test_one_photo_without_time_does_not_stop_a_set_and_a_list_helps(tmp_path):
 
 def test_listed_times_of_no_photo_are_named(tmp_path):
     write_colmap(tmp_path, name="{:03d}.jpg")
-    stated, table = {f"{i:03d}.jpg": 0.01 for i in range(6)}, tmp_path / "exposures.json"
-    table.write_text(json.dumps(stated))
+    times, table = {f"{i:03d}.jpg": 0.01 for i in range(6)}, tmp_path / "exposures.json"
+    table.write_text(json.dumps(times))
     assert not [note for note in load(tmp_path).notes if "exposures.json" in note]
-    table.write_text(json.dumps(stated | {"000.JPG.bak": 0.01}))
+    table.write_text(json.dumps(times | {"000.JPG.bak": 0.01}))
     assert "exposures.json: 1 of its 7 names belong to no photo: 000.JPG.bak" in load(tmp_path).notes
-    table.write_text(json.dumps({name.replace("5.jpg", "5x.jpg"): time for name, time in stated.items()}))
+    table.write_text(json.dumps({name.replace("5.jpg", "5x.jpg"): time for name, time in times.items()}))
     notes = load(tmp_path).notes
     assert "exposures.json: 1 of its 6 names belong to no photo: 005x.jpg" in notes
     assert any(note.startswith("005 states no exposure time: ") for note in notes)
@@ -124,8 +124,8 @@ def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
     assert [view.name for view in scene.test_views] == ["r_4"], "not the last of the arc"
     assert "1 of 13 views is held out for testing: r_4" in scene.notes
     (tmp_path / "images" / "r_4.png").rename(tmp_path / "images" / "r 4 (2).png")
-    told = (tmp_path / "transforms.json").read_text()
-    (tmp_path / "transforms.json").write_text(told.replace("r_4", "r 4 (2)"))
+    content = (tmp_path / "transforms.json").read_text()
+    (tmp_path / "transforms.json").write_text(content.replace("r_4", "r 4 (2)"))
     scene = load(tmp_path)
     named = scene.test_views[0].name  # As files, --at camera:NAME and summary.json have it.
     assert f"1 of 13 views is held out for testing: {named}" in scene.notes and " " not in named
@@ -222,9 +222,9 @@ def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
     for i, photo in enumerate(photos):
         with Image.open(photo) as image:
             image.reduce(4 if i < 3 else 5).save(tmp_path / photo.name, quality=95)
-    found = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
-    assert {(image.lens.width, image.lens.height) for image in found.model.images} == {(567, 426), (708, 532)}
-    assert 0 < found.error < MOST_ERROR and not found.notes(photos)
+    reconstruction = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
+    assert {(image.lens.width, image.lens.height) for image in reconstruction.model.images} == {(567, 426), (708, 532)}
+    assert 0 < reconstruction.error < MOST_ERROR and not reconstruction.notes(photos)
 
 
 def test_poor_placement_is_named_with_its_photos():

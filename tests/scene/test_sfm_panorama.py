@@ -52,10 +52,10 @@ def test_bare_panoramas_are_placed(tmp_path):
     scene = load_scene(tmp_path / "set", response="srgb", cache=tmp_path / "cache", holdout=0, max_size=128)
     assert len(scene.views) == 4 and len(scene.points) > 100
     assert all(view.camera.projection == "equirectangular" for view in scene.views)
-    found = np.stack([view.camera.position for view in scene.views])
+    positions = np.stack([view.camera.position for view in scene.views])
     truth = np.stack([camera.position for camera in cameras])
     # Equal up to a similarity (Umeyama 1991).
-    a, b = found - found.mean(0), truth - truth.mean(0)
+    a, b = positions - positions.mean(0), truth - truth.mean(0)
     u, values, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     rotation = u @ sign @ vt

@@ -33,8 +33,8 @@ def write_photos(folder, times, shift=0):
     for index, time in enumerate(times):
         codes = 255 * np.clip(0.1 * np.roll(light, shift * index, 1) * (time or 1.0), 0, 1) ** (1 / 2.2)
         Image.fromarray(codes.round().astype(np.uint8)).convert("RGB").save(folder / f"{index}.png")
-    stated = {f"{index}.png": time for index, time in enumerate(times) if time}
-    (folder / "exposures.json").write_text(json.dumps(stated))
+    times_by_name = {f"{index}.png": time for index, time in enumerate(times) if time}
+    (folder / "exposures.json").write_text(json.dumps(times_by_name))
     return folder
 
 
@@ -42,9 +42,9 @@ def test_a_stack_from_one_place_is_told_before_it_is_matched(tmp_path):
     folder = write_photos(tmp_path / "my stack", (8.0, 0.125, 1.0))
     with pytest.raises(InputError) as caught:
         load_scene(folder)
-    told = str(caught.value)
-    assert "3 photos are an exposure stack from one place (1/8 s to 8 s)" in told
-    assert f"`sehdr-warp calibrate '{folder}' --out camera.csv`" in told
+    message = str(caught.value)
+    assert "3 photos are an exposure stack from one place (1/8 s to 8 s)" in message
+    assert f"`sehdr-warp calibrate '{folder}' --out camera.csv`" in message
 
 
 @pytest.mark.parametrize(

@@ -122,8 +122,8 @@ def test_names_of_windows_and_in_latin_1(tmp_path, binary):
     assert len(load(tmp_path, holdout=0).views) == 6
 
 
-@pytest.mark.parametrize("stated, stored", [(".PNG", ".png"), (".jpg", ".png"), (".jpg", ".exr")])
-def test_photos_under_another_suffix_than_the_model_states(tmp_path, stated, stored):
+@pytest.mark.parametrize("suffix, stored", [(".PNG", ".png"), (".jpg", ".png"), (".jpg", ".exr")])
+def test_photos_under_another_suffix_than_the_model_states(tmp_path, suffix, stored):
     """As after a conversion, or structure from motion on JPEGs of an OpenEXR set."""
     import OpenEXR
 
@@ -135,10 +135,10 @@ def test_photos_under_another_suffix_than_the_model_states(tmp_path, stated, sto
             channels = dict(zip("RGB", planes, strict=True))
             OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(file.with_suffix(".exr")))
     path = tmp_path / "sparse" / "0" / "images.txt"
-    path.write_text(path.read_text().replace(".png", stated))
+    path.write_text(path.read_text().replace(".png", suffix))
     scene = load_scene(tmp_path, response="auto" if stored == ".exr" else "srgb", holdout=0)
-    note = f"6 photos have another suffix than the set states: 000{stated} is 000{stored}"
-    assert len(scene.views) == 6 and said(scene, "another suffix") == [note] * (stated != ".PNG")
+    note = f"6 photos have another suffix than the set states: 000{suffix} is 000{stored}"
+    assert len(scene.views) == 6 and said(scene, "another suffix") == [note] * (suffix != ".PNG")
 
 
 @pytest.mark.parametrize("before", ["/home/other/sets/room/", "C:\\sets\\room\\", ""])

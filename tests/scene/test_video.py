@@ -43,14 +43,16 @@ def test_ten_bits_and_the_curve_that_a_stream_states(tmp_path, tags, metadata, c
     write_clip(file, frames, tags=tags, metadata=metadata, full=full)
     clip = open_clip(file)
     assert (clip.color.curve, clip.color.response, clip.color.bits) == (curve, response, 10)
-    found = codes(next(decode(clip))[1], clip.color) / 65535
+    frame_pixels = codes(next(decode(clip))[1], clip.color) / 65535
     inside = np.s_[4:20, 4:-4], np.s_[28:44, 4:12], np.s_[28:44, 20:28]
     for part in inside:
-        assert np.abs(found[part] - frames[0][part]).max() < 0.01
-        assert np.abs(found[part] - frames[0][part]).mean() < 1.5 / 1023
+        assert np.abs(frame_pixels[part] - frames[0][part]).max() < 0.01
+        assert np.abs(frame_pixels[part] - frames[0][part]).mean() < 1.5 / 1023
     if response is not None:
         light = response_by_name(response).decode(frames[0][10, 4:-4])
-        np.testing.assert_allclose(response_by_name(response).decode(found[10, 4:-4]), light, rtol=0.08, atol=2e-3)
+        np.testing.assert_allclose(
+            response_by_name(response).decode(frame_pixels[10, 4:-4]), light, rtol=0.08, atol=2e-3
+        )
 
 
 def test_primaries_lead_to_rec709(tmp_path):
@@ -65,9 +67,9 @@ def test_primaries_lead_to_rec709(tmp_path):
 def test_eight_bits_stay_eight(tmp_path):
     write_clip(tmp_path / "a.mp4", still(), pixels="yuv444p", codec="libx264")
     clip = open_clip(tmp_path / "a.mp4")
-    found = codes(next(decode(clip))[1], clip.color)
-    assert found.dtype == np.uint8
-    assert np.abs(found[10, 4:-4] / 255 - still()[0][10, 4:-4]).max() < 0.015
+    frame_pixels = codes(next(decode(clip))[1], clip.color)
+    assert frame_pixels.dtype == np.uint8
+    assert np.abs(frame_pixels[10, 4:-4] / 255 - still()[0][10, 4:-4]).max() < 0.015
 
 
 @pytest.mark.parametrize("layout, bits, shift", [
@@ -86,18 +88,18 @@ def test_greys_of_full_range_keep_their_codes(layout, bits, shift):
         if number == 0:
             samples[:, :256] = values << shift
         plane.update(samples.tobytes())
-    found = codes(frame, VideoColor("Rec.709", None, None, (0.2126, 0.0722), True, bits))[32]
+    frame_pixels = codes(frame, VideoColor("Rec.709", None, None, (0.2126, 0.0722), True, bits))[32]
     expected = values if bits == 8 else np.rint(values / top * 65535)
-    assert np.abs(found - expected[:, None]).max() <= (0 if bits == 8 else 1)
+    assert np.abs(frame_pixels - expected[:, None]).max() <= (0 if bits == 8 else 1)
 
 
 def test_frames_are_upright(tmp_path):
     write_clip(tmp_path / "a.mp4", still(), rotation=90)
     clip = open_clip(tmp_path / "a.mp4")
-    found = codes(next(decode(clip))[1], clip.color)
-    assert clip.size == (48, 64) and found.shape == (64, 48, 3)
+    frame_pixels = codes(next(decode(clip))[1], clip.color)
+    assert clip.size == (48, 64) and frame_pixels.shape == (64, 48, 3)
     expected = np.rot90(still()[0], 1)
-    assert np.abs(found / 65535 - expected).mean() < 0.01
+    assert np.abs(frame_pixels / 65535 - expected).mean() < 0.01
 
 
 def test_the_sharpest_frame_of_each_interval_of_movement(tmp_path):
@@ -218,8 +220,8 @@ def test_an_hlg_clip_of_a_room_becomes_a_scene(tmp_path):
     for view in scene.views[::4]:
         number = int(view.name.removeprefix("frame_"))
         expected = response.decode(frames[number]).mean((0, 1))
-        found = response.decode(view.codes / 65535)
-        np.testing.assert_allclose(np.asarray(found).mean((0, 1)), expected, rtol=0.05)
+        frame_pixels = response.decode(view.codes / 65535)
+        np.testing.assert_allclose(np.asarray(frame_pixels).mean((0, 1)), expected, rtol=0.05)
     # The camera went along x.
     places = np.stack([view.camera.position for view in scene.views])
     steps = np.diff(places, axis=0)

@@ -40,9 +40,11 @@ def colored(camera):
 @pytest.mark.parametrize("camera", [panorama(), fisheye()], ids=["panorama", "fisheye"])
 def test_pixels_and_directions_are_inverse(camera):
     places = pixels_of_directions(pixel_directions(camera), camera)
-    shown = np.isfinite(places).all(2)
-    assert shown.mean() > 0.95
-    np.testing.assert_allclose(places[shown], np.stack(np.mgrid[: camera.height, : camera.width], 2)[shown], atol=1e-4)
+    inside = np.isfinite(places).all(2)
+    assert inside.mean() > 0.95
+    np.testing.assert_allclose(
+        places[inside], np.stack(np.mgrid[: camera.height, : camera.width], 2)[inside], atol=1e-4
+    )
 
 
 def test_directions_are_those_of_colmap():
@@ -70,8 +72,8 @@ def test_cut_views_show_the_same_directions(camera, count):
     assert len(faces) >= count and all(face.camera.is_pinhole for face in faces)
     for face in faces:
         along = pixel_directions(face.camera) @ face.camera.world_to_camera[:3, :3]
-        shown = np.ones(along.shape[:2], bool) if face.mask is None else face.mask > 0.99
-        assert np.abs(face.image - (along + 1) / 2)[shown].max() < 0.02, face.name
+        inside = np.ones(along.shape[:2], bool) if face.mask is None else face.mask > 0.99
+        assert np.abs(face.image - (along + 1) / 2)[inside].max() < 0.02, face.name
 
 
 def test_a_mask_of_a_panorama_reaches_its_cut_views():

@@ -50,9 +50,9 @@ def textured():
 def test_noise_goes_and_texture_stays(textured):
     truth, rendered, albedo = textured
     facing = np.broadcast_to(np.float32([0, 0, 1]), truth.shape)
-    found = denoise(rendered, albedo, facing, np.zeros_like(truth))
-    assert found.dtype == np.float32 and found.min() >= 0
-    before, after = (np.sqrt(np.mean((image / truth - 1) ** 2)) for image in (rendered, found))
+    denoised = denoise(rendered, albedo, facing, np.zeros_like(truth))
+    assert denoised.dtype == np.float32 and denoised.min() >= 0
+    before, after = (np.sqrt(np.mean((image / truth - 1) ** 2)) for image in (rendered, denoised))
     assert after < 0.25 * before
     blind = denoise(rendered, np.ones_like(albedo), facing, np.zeros_like(truth))
     assert after < 0.5 * np.sqrt(np.mean((blind / truth - 1) ** 2)), "the guides hold the texture"
@@ -64,9 +64,9 @@ def test_light_seen_itself_is_kept(textured):
     straight = np.zeros_like(rendered)
     straight[40:43, 40:43] = 4000.0
     straight[10, 10] = 0.4 * rendered[10, 10]
-    found = denoise(rendered, albedo, np.zeros_like(albedo), straight)
-    np.testing.assert_array_equal(found[40:43, 40:43], rendered[40:43, 40:43])
-    assert (found[10, 10] != rendered[10, 10]).any()
+    denoised = denoise(rendered, albedo, np.zeros_like(albedo), straight)
+    np.testing.assert_array_equal(denoised[40:43, 40:43], rendered[40:43, 40:43])
+    assert (denoised[10, 10] != rendered[10, 10]).any()
 
 
 def test_an_unknown_or_missing_denoiser_is_refused(monkeypatch):

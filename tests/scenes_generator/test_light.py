@@ -31,10 +31,13 @@ def test_the_first_map_shows_what_the_nearest_view_does(name):
     inside = (z > 0) & (first.seen == 1) & (column >= edge) & (row >= edge)
     inside &= (column < camera.width - edge) & (row < camera.height - edge)
     blurred = uniform_filter(view.hdr.mean(2), 6)
-    shown, mapped = np.log(blurred[row[inside], column[inside]] + 1e-4), np.log(first.radiance.mean(2)[inside] + 1e-4)
+    photo_light, mapped = (
+        np.log(blurred[row[inside], column[inside]] + 1e-4),
+        np.log(first.radiance.mean(2)[inside] + 1e-4),
+    )
     assert inside.sum() > 300
-    assert np.corrcoef(shown, mapped)[0, 1] > 0.6
-    assert abs(np.median(shown - mapped)) < 0.15
+    assert np.corrcoef(photo_light, mapped)[0, 1] > 0.6
+    assert abs(np.median(photo_light - mapped)) < 0.15
 
 
 def test_refusals(tmp_path, truth):

@@ -93,12 +93,12 @@ def test_a_rendered_scene_loads(rendered):
 def test_finished_views_are_not_rendered_again(rendered, mitsuba, monkeypatch, caplog):
     folder, settings = rendered
     path = folder / "train_hdr" / "hdr_001.exr"
-    kept, before = (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns, load(folder).views
+    modified, before = (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns, load(folder).views
     path.unlink()
     with caplog.at_level("INFO", logger="scenes.generator"):
         render.render_scene(mitsuba, RECIPES["night"], folder.parent, settings)
     assert "view 34" in caplog.text and "view 0 of" not in caplog.text
-    assert (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns == kept
+    assert (folder / "train_hdr" / "hdr_000.exr").stat().st_mtime_ns == modified
     again = {view.name: view.hdr for view in load(folder).views}
     for view in before:
         if view.name == "r_34":  # The same things, the same light; Mitsuba may number its lights in another order.

@@ -50,35 +50,35 @@ def pairs(a, b):
     return cKDTree(b.means).query(a.means)[1]
 
 
-def assert_alike(given, read, *, harmonics=0.03):
-    index = pairs(given, read)
-    assert len(set(index.tolist())) == given.count == read.count
-    np.testing.assert_allclose(read.means[index], given.means, atol=2e-2)
-    np.testing.assert_allclose(read.opacities[index], given.opacities, atol=3e-3)
-    a, b = covariances(given), covariances(read)[index]
+def assert_alike(original, read, *, harmonics=0.03):
+    index = pairs(original, read)
+    assert len(set(index.tolist())) == original.count == read.count
+    np.testing.assert_allclose(read.means[index], original.means, atol=2e-2)
+    np.testing.assert_allclose(read.opacities[index], original.opacities, atol=3e-3)
+    a, b = covariances(original), covariances(read)[index]
     error = np.linalg.norm(a - b, axis=(1, 2)) / np.linalg.norm(a, axis=(1, 2))
     assert np.median(error) < 0.08 and np.percentile(error, 99) < 0.3
-    np.testing.assert_allclose(read.harmonics[index][:, 0], given.harmonics[:, 0], atol=0.03)
-    if given.degree:
-        assert np.abs(read.harmonics[index][:, 1:] - given.harmonics[:, 1:]).mean() < harmonics
+    np.testing.assert_allclose(read.harmonics[index][:, 0], original.harmonics[:, 0], atol=0.03)
+    if original.degree:
+        assert np.abs(read.harmonics[index][:, 1:] - original.harmonics[:, 1:]).mean() < harmonics
 
 
 @pytest.mark.parametrize("suffix", LOSSY_SUFFIXES)
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_what_is_written_is_read(tmp_path, suffix, degree):
-    given = natural(degree=degree)
+    original = natural(degree=degree)
     path = tmp_path / f"a{suffix}"
-    write_gaussians(path, given)
+    write_gaussians(path, original)
     read = read_gaussians(path)
     assert (read.degree, read.color_model) == (degree, "display")
     # The palette of SOG is small beside so few and so random Gaussians.
-    assert_alike(given, read, harmonics=0.06 if suffix == ".sog" else 0.03)
+    assert_alike(original, read, harmonics=0.06 if suffix == ".sog" else 0.03)
     if suffix != ".spz":
         assert read.base_time == 0.25
     with pytest.raises(InputError, match="exists already"):
-        write_gaussians(path, given)
+        write_gaussians(path, original)
     first = path.read_bytes()
-    write_gaussians(path, given, overwrite=True)
+    write_gaussians(path, original, overwrite=True)
     assert path.read_bytes() == first
 
 
@@ -92,10 +92,10 @@ def test_the_transform_is_stored(tmp_path, suffix):
 @pytest.mark.parametrize("suffix", LOSSY_SUFFIXES)
 def test_splat_transform_reads_them(tmp_path, suffix):
     tool = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
-    given = natural()
-    write_gaussians(tmp_path / f"a{suffix}", given)
+    original = natural()
+    write_gaussians(tmp_path / f"a{suffix}", original)
     subprocess.run(["node", tool, tmp_path / f"a{suffix}", tmp_path / "b.ply"], check=True, capture_output=True)
-    assert_alike(given, read_gaussians(tmp_path / "b.ply"), harmonics=0.06)
+    assert_alike(original, read_gaussians(tmp_path / "b.ply"), harmonics=0.06)
 
 
 def test_files_of_other_programs():
@@ -142,10 +142,10 @@ def test_bounds_beyond_all_numbers_are_one_line_without_warnings(tmp_path):
 
 
 def test_damage_and_other_versions_are_one_line(tmp_path):
-    given = natural(64)
+    original = natural(64)
     for suffix in LOSSY_SUFFIXES:
         whole = tmp_path / f"whole{suffix}"
-        write_gaussians(whole, given)
+        write_gaussians(whole, original)
         data = whole.read_bytes()
         for length in (0, 3, 40, len(data) // 2, len(data) - 30):
             cut = tmp_path / f"cut{suffix}"

@@ -23,10 +23,10 @@ validator.validateBytes(new Uint8Array(file)).then(report => console.log(JSON.st
 def package(name):
     """The folder of an npm package; skips where node or it is missing."""
     folders = [Path(folder) / name for folder in os.environ.get("NODE_PATH", "").split(os.pathsep) if folder]
-    found = next((folder for folder in folders if folder.is_dir()), None)
-    if shutil.which("node") is None or found is None:
+    folder_of_package = next((folder for folder in folders if folder.is_dir()), None)
+    if shutil.which("node") is None or folder_of_package is None:
         pytest.skip(f"{name} is not in NODE_PATH")
-    return found
+    return folder_of_package
 
 
 def node(*words):
@@ -39,10 +39,10 @@ def test_the_khronos_validator_knows_everything_but_the_extension(tmp_path, degr
     write_gaussians(tmp_path / "a.glb", gaussians(degree=degree, color_model="display"))
     report = json.loads(node("-e", VALIDATE, tmp_path / "a.glb"))
     assert report["info"]["totalVertexCount"] == 50
-    told = report["issues"]["messages"]
+    messages = report["issues"]["messages"]
     # It is older than the extension, whose attributes it takes for names that are none.
-    own = [m for m in told if "KHR_gaussian_splatting:" in m["pointer"] and m["code"].endswith("INVALID_ATTRIBUTE")]
-    assert [m["code"] for m in told if m not in own] == ["UNSUPPORTED_EXTENSION"]
+    own = [m for m in messages if "KHR_gaussian_splatting:" in m["pointer"] and m["code"].endswith("INVALID_ATTRIBUTE")]
+    assert [m["code"] for m in messages if m not in own] == ["UNSUPPORTED_EXTENSION"]
     assert len(own) == 3 + (degree + 1) ** 2
 
 

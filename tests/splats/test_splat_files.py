@@ -17,8 +17,8 @@ def gaussians(count=50, degree=3, color_model="log", seed=0) -> GaussianArrays:
     harmonics = 0.3 * random.normal(size=(count, (degree + 1) ** 2, 3))
     harmonics[:, 0] -= 2
     shapes = ((count, 3), (count, 3), (count, 4), (count,))
-    drawn = (random.normal(size=shape).astype(np.float32) for shape in shapes)
-    return GaussianArrays(*drawn, harmonics.astype(np.float32), color_model, 0.5)
+    arrays = (random.normal(size=shape).astype(np.float32) for shape in shapes)
+    return GaussianArrays(*arrays, harmonics.astype(np.float32), color_model, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,10 @@ def test_usd_is_of_the_schema_and_tagged(tmp_path):
     constant = np.array(splat.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(-1, 16, 3)[:, 0]
     np.testing.assert_allclose(constant * 0.28209479 + 0.5, written.harmonics[:, 0] * 0.28209479, atol=1e-6)
     np.testing.assert_allclose(splat.GetScalesAttr().Get(), np.exp(written.log_scales), rtol=1e-5)
-    found = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(stage)
-    assert [str(error.GetMessage()) for error in found] == []
+    result = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(
+        stage
+    )
+    assert [str(error.GetMessage()) for error in result] == []
 
 
 def test_glb_is_laid_out_as_the_extension_says(tmp_path):
@@ -169,14 +171,14 @@ def test_bad_files_are_refused_in_one_line(tmp_path, name):
 
 
 def test_what_is_not_finite_is_left_out_and_odd_harmonics_are_refused(tmp_path, logged):
-    given = gaussians(degree=1)
-    write_gaussians(tmp_path / "a.ply", given)
+    original = gaussians(degree=1)
+    write_gaussians(tmp_path / "a.ply", original)
     data = PlyData.read(tmp_path / "a.ply", mmap=False)
     data["vertex"]["x"][3], data["vertex"]["opacity"][4] = np.nan, np.inf  # An opacity of 1.
     data["vertex"]["scale_0"][5], data["vertex"]["scale_1"][5] = 300, -np.inf  # Drawn as the largest and smallest are.
     data.write(tmp_path / "b.ply")
-    found = read_gaussians(tmp_path / "b.ply")
-    assert found.count == 49 and "1 of 50" in logged[0] and found.log_scales[4, :2].tolist() == [20, -20]
+    result = read_gaussians(tmp_path / "b.ply")
+    assert result.count == 49 and "1 of 50" in logged[0] and result.log_scales[4, :2].tolist() == [20, -20]
     data["vertex"]["y"][:] = np.inf
     data.write(tmp_path / "c.ply")
     with pytest.raises(InputError, match="all of its Gaussians"):

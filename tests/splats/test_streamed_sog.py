@@ -26,8 +26,8 @@ def leaves(node):
 
 
 def test_chunks_are_read_as_one(tmp_path, small_chunks):
-    given, path = natural(), tmp_path / "town" / "lod-meta.json"
-    write_gaussians(path, given)
+    original, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, original)
     meta = json.loads(path.read_text())
     assert (meta["version"], meta["lodLevels"], meta["count"], meta["counts"]) == (1, 1, 600, [600])
     nodes = list(leaves(meta["tree"]))
@@ -38,19 +38,19 @@ def test_chunks_are_read_as_one(tmp_path, small_chunks):
         assert chunk["version"] == 2 and chunk["count"] == part["count"] == 150 and part["offset"] == 0
     read = read_gaussians(path)
     assert (read.degree, read.base_time) == (3, 0.25)
-    assert_alike(given, read, harmonics=0.06)
+    assert_alike(original, read, harmonics=0.06)
     with pytest.raises(InputError, match="exists already"):
-        write_gaussians(path, given)
-    write_gaussians(path, given, overwrite=True)
+        write_gaussians(path, original)
+    write_gaussians(path, original, overwrite=True)
 
 
 def test_bounds_hold_the_gaussians_of_their_chunks(tmp_path, small_chunks):
-    given, path = natural(), tmp_path / "town" / "lod-meta.json"
-    write_gaussians(path, given)
+    original, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, original)
     meta, volume = json.loads(path.read_text()), 0.0
     for node in leaves(meta["tree"]):
         low, high = (np.array(node["bound"][name]) for name in ("min", "max"))
-        inside = ((given.means >= low) & (given.means <= high)).all(1)
+        inside = ((original.means >= low) & (original.means <= high)).all(1)
         assert inside.sum() >= 150
         volume += np.prod(high - low)
     whole = meta["tree"]["bound"]
@@ -59,8 +59,8 @@ def test_bounds_hold_the_gaussians_of_their_chunks(tmp_path, small_chunks):
 
 def test_levels_of_other_programs(tmp_path, small_chunks):
     """The finest level is read, also where nodes share a chunk; a damaged index is refused."""
-    given, path = natural(), tmp_path / "town" / "lod-meta.json"
-    write_gaussians(path, given)
+    original, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, original)
     meta = json.loads(path.read_text())
     node = next(leaves(meta["tree"]))
     first = {"file": node["lods"]["0"]["file"], "offset": 0, "count": 40}
@@ -104,8 +104,8 @@ def test_a_chunk_is_read_once(tmp_path, small_chunks):
 
 def test_splat_transform_reads_them(tmp_path, small_chunks):
     tool = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
-    given, path = natural(), tmp_path / "town" / "lod-meta.json"
-    write_gaussians(path, given)
+    original, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, original)
     chunk = path.parent / "0_0" / "meta.json"
     subprocess.run(["node", tool, chunk, tmp_path / "b.ply"], check=True, capture_output=True)
     assert read_gaussians(tmp_path / "b.ply").count == 150

@@ -30,8 +30,8 @@ def trained(scene, tmp_path_factory):
     def train(variant: str) -> Path:
         folder, config = tmp_path_factory.mktemp("trained"), VARIANTS[variant]
         # What trains without truth trains without any there.
-        given = scene if config.loss.uses_hdr else without_truth(scene)
-        for step in create_trainer(given, folder / "run", config, device="cpu", data={"path": "somewhere"}):
+        training_scene = scene if config.loss.uses_hdr else without_truth(scene)
+        for step in create_trainer(training_scene, folder / "run", config, device="cpu", data={"path": "somewhere"}):
             if step.iteration == 66:
                 shutil.copytree(folder / "run", folder / "killed")
         return folder / "run"

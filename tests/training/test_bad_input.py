@@ -28,8 +28,8 @@ def test_points_that_mislead(tmp_path, device):
     }
     for name, points in clouds.items():
         colors = np.full(points.shape, 0.5, np.float32)
-        given = replace(scene, points=points, point_colors=colors)
-        assert decibels(train(given, tmp_path / name, SHORT, device=device), scene) > 26, name
+        odd_scene = replace(scene, points=points, point_colors=colors)
+        assert decibels(train(odd_scene, tmp_path / name, SHORT, device=device), scene) > 26, name
 
 
 def test_two_photos_are_refused(tmp_path):
@@ -42,8 +42,8 @@ def test_a_lamp_in_the_dark(tmp_path, device):
     scene = photographed(lambda position, rays: 1e3 * in_lamp(position, rays)[..., None].repeat(3, -1))
     run = train(scene, tmp_path / "run", SHORT | {"schedule.iterations": 200}, device=device)
     for view in scene.views:
-        shown, lit = run.render_ldr(view.camera, 1.0).cpu().numpy(), view.codes.min(2) > 0
-        assert shown[lit].mean() > 0.7 and shown[~lit].mean() < 0.02
+        picture, lit = run.render_ldr(view.camera, 1.0).cpu().numpy(), view.codes.min(2) > 0
+        assert picture[lit].mean() > 0.7 and picture[~lit].mean() < 0.02
 
 
 def test_a_sky_that_fills_the_photo(tmp_path, device):

@@ -38,9 +38,9 @@ def found_in(*args):
 def test_drift_is_found_where_there_is_some(device):
     scene, times = drifting()
     gains, matcher, _ = found_in(scene, CONFIG, LINEAR, device)
-    found = np.array([gains.gains[view.name] for view in scene.views])
+    fitted = np.array([gains.gains[view.name] for view in scene.views])
     np.testing.assert_allclose(
-        found, np.repeat(np.array(times)[:, None], 3, 1) / np.exp(np.log(times).mean()), rtol=0.03
+        fitted, np.repeat(np.array(times)[:, None], 3, 1) / np.exp(np.log(times).mean()), rtol=0.03
     )
     assert len(matcher.match(matcher.pixels(400, np.random.default_rng(0))).points) > 200
 
@@ -68,9 +68,9 @@ def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
         darkened.append(replace(view, codes=codes_of(view.image * corners, 8)))
     gains, _, decision = found_in(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
     assert "stay as stated" in decision.choice and "white balance" in decision.reason and gains.corner_loss == 0
-    found = np.log2([gains.gains[view.name] for view in views])
-    np.testing.assert_allclose(found, light, atol=0.06)
-    assert (found[:, 1] == 0).all()
+    fitted = np.log2([gains.gains[view.name] for view in views])
+    np.testing.assert_allclose(fitted, light, atol=0.06)
+    assert (fitted[:, 1] == 0).all()
     gains, _, decision = found_in(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
     assert "stay as stated" in decision.choice and gains.corner_loss == pytest.approx(0.5, abs=0.1) and not gains.stops
 
@@ -82,8 +82,8 @@ def test_times_that_a_camera_rounds_are_put_right(device):
     views = [replace(v, exposure_time=v.exposure_time * 2**-e) for v, e in zip(scene.views, off, strict=True)]
     gains, _, decision = found_in(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
     assert "over the times they state" in decision.choice and "white balance" not in decision.reason
-    found = np.log2([gains.gains[view.name] for view in views])
-    np.testing.assert_allclose(found, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
+    fitted = np.log2([gains.gains[view.name] for view in views])
+    np.testing.assert_allclose(fitted, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
 
 
 def test_a_wall_that_is_brighter_from_one_side_is_no_drift(device):
@@ -141,7 +141,7 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
         if step.iteration == 10:
             training.stop()
     run = load_run(tmp_path / "run")
-    decision = next(made for made in run.decisions() if made["name"] == "exposure-compensation")
+    decision = next(entry for entry in run.decisions() if entry["name"] == "exposure-compensation")
     assert "out of the photos" in decision["choice"] and "stops" in decision["reason"]
     evened = run.normalize_photos(scene)
     assert (run.color_matrix == scene.color_matrix).all()
@@ -150,9 +150,9 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
     resumed = create_trainer(scene, tmp_path / "run", resume=True, device="cpu")
     for views in (training.scene.views, resumed.scene.views):
         assert [view.exposure_time for view in views] == pytest.approx([view.exposure_time for view in evened.views])
-    for value, known, asked in (("never", False, False), ("unstated", True, False), ("unstated", False, True)):
+    for value, known, is_named in (("never", False, False), ("unstated", True, False), ("unstated", False, True)):
         config = load_config("default", {"model.exposure_compensation": value})
-        assert estimates_compensation(replace(scene, exposure_times_known=known), config, LINEAR) == asked
+        assert estimates_compensation(replace(scene, exposure_times_known=known), config, LINEAR) == is_named
 
 
 def test_large_photos_are_matched_and_evened_small(monkeypatch):

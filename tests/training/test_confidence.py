@@ -32,10 +32,10 @@ def test_a_training_leaves_its_confidence(trained, scene):
     confidence = load_run(trained.path).model.confidence
     assert torch.equal(confidence, trained.field.confidence)
     assert confidence.shape == (trained.gaussian_count,) and 0 <= confidence.min() < confidence.max() <= 1
-    kept = load_file(trained.folder.confidence)
-    assert sorted(kept) == ["clipped", "confidence", "peak", "seen", "stops"]
-    shown = trained.render_confidence(scene.test_views[0].camera)
-    assert shown.shape == (32, 32) and 0 < shown.max() <= 1
+    saved = load_file(trained.folder.confidence)
+    assert sorted(saved) == ["clipped", "confidence", "peak", "seen", "stops"]
+    confidence_image = trained.render_confidence(scene.test_views[0].camera)
+    assert confidence_image.shape == (32, 32) and 0 < confidence_image.max() <= 1
 
 
 def test_an_older_run_gets_it_on_demand(run, scene, caplog):

@@ -23,10 +23,10 @@ RESULTS = Path(__file__).resolve().parents[2] / "docs" / "reports" / "results"
 SURVEY = Workload(20_000, 20e6, 76e6, 1_500_000)
 
 
-def rows(name, **wanted):
+def rows(name, **fields):
     result = json.loads((RESULTS / f"{name}.json").read_text())
     for part in result if isinstance(result, list) else [result]:
-        yield from (row for row in part["rows"] if all(row.get(key) == value for key, value in wanted.items()))
+        yield from (row for row in part["rows"] if all(row.get(key) == value for key, value in fields.items()))
 
 
 def error(estimate, measured):

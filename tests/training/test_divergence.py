@@ -48,8 +48,8 @@ def test_while_the_loss_is_not_finite_the_last_checkpoint_stays(scene, tmp_path,
     monkeypatch.setattr(Trainer, "loss", property(lambda self: float("inf") if self.iteration == 20 else 0.1))
     train(scene, tmp_path / "run", config(**{"schedule.keep_checkpoints": 9}), device="cpu")
     assert "iteration 20: the loss is inf; no checkpoint is written" in caplog.text
-    kept = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
-    assert kept == ["iteration_00000000", "iteration_00000010", "iteration_00000030"]
+    names = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
+    assert names == ["iteration_00000000", "iteration_00000010", "iteration_00000030"]
 
 
 def test_huge_gradients_leave_finite_parameters(scene):

@@ -54,9 +54,9 @@ def test_a_training_starts_from_a_file_of_gaussians(scene, tmp_path, radiance, d
     expected = field_of(written).render(camera).hdr
     if radiance == "display":  # Colors of the scene's own photos.
         expected = expected * written.base_time / base_time(scene)
-    found = field.render(camera).hdr
+    rendered = field.render(camera).hdr
     assert float(expected.max()) > 0.01
-    assert float((found - expected).abs().mean()) < 0.02 * float(expected.mean())
+    assert float((rendered - expected).abs().mean()) < 0.02 * float(expected.mean())
     few = load_config("default", config | {"densification.cap_max": 50})
     assert make_field(scene, few, response, "cpu").gaussians.count == 50
 
@@ -64,8 +64,8 @@ def test_a_training_starts_from_a_file_of_gaussians(scene, tmp_path, radiance, d
 def test_drawn_points_are_seen_and_repeat(scene):
     points, colors = random_points(scene, 500, np.random.default_rng(0))
     again, _ = random_points(scene, 500, np.random.default_rng(0))
-    seen, mean = colors_in_views(points, scene.train_views)
-    assert len(points) == len(colors) == 500 and (seen >= 2).all() and np.array_equal(points, again)
+    view_counts, mean = colors_in_views(points, scene.train_views)
+    assert len(points) == len(colors) == 500 and (view_counts >= 2).all() and np.array_equal(points, again)
     np.testing.assert_allclose(mean, colors)
 
 
@@ -74,8 +74,8 @@ def test_colors_are_those_at_the_projections(scene):
     camera = orbit_camera(0.0)
     point = camera.camera_to_world @ [0.5 / camera.fx * 4, 0.5 / camera.fy * 4, 4.0, 1.0]
     behind = camera.camera_to_world @ [0.0, 0.0, -4.0, 1.0]
-    seen, mean = colors_in_views(np.stack([point[:3], behind[:3]]), (view,))
-    assert seen.tolist() == [1, 0]
+    view_counts, mean = colors_in_views(np.stack([point[:3], behind[:3]]), (view,))
+    assert view_counts.tolist() == [1, 0]
     np.testing.assert_allclose(mean[0], view.image[16, 16], rtol=1e-6)
 
 
@@ -95,12 +95,12 @@ def test_cameras_back_to_back_share_nothing():
 def test_start_colors_invert_the_colour_model(radiance):
     srgb, encoded = response_by_name("srgb"), np.array([[0.2, 0.5, 0.9]])
     value = make_color_model(radiance).start(encoded, srgb)
-    shown = {
+    cases = {
         "log": lambda: srgb.encode(np.exp(value)),
         "linear": lambda: srgb.encode(value),
         "display": lambda: value + 0.5,
     }
-    np.testing.assert_allclose(shown[radiance](), encoded, atol=1e-6)
+    np.testing.assert_allclose(cases[radiance](), encoded, atol=1e-6)
     # Black and white say a bound only; their start values are finite and inside it.
     for extreme in (0.0, 1.0):
         assert np.isfinite(

@@ -54,12 +54,12 @@ def test_masked_pixels_cost_nothing():
 
 
 def test_the_psnr_of_a_step_leaves_out_what_the_mask_does():
-    shown, _ = images()
-    target = target_of(shown + 0.1 * (0.5 - shown).sign())
+    image, _ = images()
+    target = target_of(image + 0.1 * (0.5 - image).sign())
     mask = torch.ones(12, 14, 1)
     mask[:, :5] = 0
-    hidden = torch.where(mask > 0, shown, 1 - shown)
-    assert target.psnr(shown) == pytest.approx(20, abs=0.3)
+    hidden = torch.where(mask > 0, image, 1 - image)
+    assert target.psnr(image) == pytest.approx(20, abs=0.3)
     assert target.psnr(hidden) < 12 and replace(target, mask=mask).psnr(hidden) == pytest.approx(20, abs=0.3)
 
 

@@ -30,22 +30,22 @@ def matched(scene, device, count=700):
 
 @pytest.mark.parametrize("times", [(1.0,), (1.0, 0.5, 0.7)], ids=["one exposure", "exposures that drift"])
 def test_matched_points_lie_on_wall_and_lamp(device, times):
-    found = matched(wall_and_lamp(times), device)
-    depth, white = found.points[:, 2].cpu().numpy(), (found.colors > 0.99).all(1).cpu().numpy()
+    matches = matched(wall_and_lamp(times), device)
+    depth, white = matches.points[:, 2].cpu().numpy(), (matches.colors > 0.99).all(1).cpu().numpy()
     assert len(depth) > 280
     assert (np.abs(depth[~white] - WALL) < 0.1 * WALL).mean() > 0.9
     if len(times) == 1:
         assert white.sum() >= 3 and (np.abs(depth[white] - LAMP) < 0.1 * LAMP).mean() > 0.8
-    np.testing.assert_allclose(found.footprints.cpu(), depth / 70, rtol=1e-4)
+    np.testing.assert_allclose(matches.footprints.cpu(), depth / 70, rtol=1e-4)
 
 
 def test_dark_photos_are_matched_as_bright_ones_are(device):
     """Photos of 16 bits at a sixteenth of their values; colors of the points stay those of the photos."""
     scene = wall_and_lamp()
     dark = replace(scene, views=tuple(replace(v, codes=v.codes.astype(np.uint16) * 16) for v in scene.views))
-    bright, found = matched(scene, device), matched(dark, device)
-    assert len(found.points) > 0.8 * len(bright.points)
-    depth, colors = found.points[:, 2].cpu().numpy(), found.colors.cpu().numpy()
+    bright, matches = matched(scene, device), matched(dark, device)
+    assert len(matches.points) > 0.8 * len(bright.points)
+    depth, colors = matches.points[:, 2].cpu().numpy(), matches.colors.cpu().numpy()
     wall = colors.max(1) < 0.05
     assert (np.abs(depth[wall] - WALL) < 0.1 * WALL).mean() > 0.9
     assert colors.max() == pytest.approx(255 * 16 / 65535, abs=0.004)
@@ -56,8 +56,8 @@ def test_points_that_mislead_do_no_harm(device):
     scene, rng = wall_and_lamp(), np.random.default_rng(0)
     clouds = rng.normal(0, 1, (200, 3)) - [0, 0, 5], np.tile([0.0, 0.0, 3.0], (200, 1)), rng.normal(0, 9, (200, 3)) + 40
     for points in clouds:
-        found = matched(replace(scene, points=points, point_colors=np.full(points.shape, 0.5, np.float32)), device)
-        depth = found.points[:, 2]
+        matches = matched(replace(scene, points=points, point_colors=np.full(points.shape, 0.5, np.float32)), device)
+        depth = matches.points[:, 2]
         assert len(depth) > 190 and ((depth - WALL).abs() < 0.1 * WALL).float().mean() > 0.8
 
 
@@ -82,11 +82,13 @@ def test_start_points_are_the_scenes_and_matched_ones():
     scene, config = wall_and_lamp(), load_config("default", {"model.initial_density": 4.0})
     assert start_count(config, 9 * 64 * 64) == 768
     own = np.array([[0.0, 0.0, 3.0]] * 300)
-    given = replace(scene, points=own, point_colors=np.full((300, 3), 0.5, np.float32))
-    points, colors = start_points(given, config, partial(make_matcher, given, LINEAR, "cpu"), np.random.default_rng(0))
+    inputs = replace(scene, points=own, point_colors=np.full((300, 3), 0.5, np.float32))
+    points, colors = start_points(
+        inputs, config, partial(make_matcher, inputs, LINEAR, "cpu"), np.random.default_rng(0)
+    )
     assert 300 < len(points) == len(colors) <= 800 and np.array_equal(points[:300], own)
     none = load_config("default", {"model.initial_density": 0.0})
-    assert len(start_points(given, none, never, np.random.default_rng(0))[0]) == 300
+    assert len(start_points(inputs, none, never, np.random.default_rng(0))[0]) == 300
     # Without any, they are drawn where cameras look.
     assert len(start_points(scene, none, never, np.random.default_rng(0))[0]) == 5000
 
@@ -104,15 +106,15 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     with torch.no_grad():
         # Opaque, so that the wall is explained from the start.
         field.gaussians.opacity_logits.fill_(4.0)
-        shown = field.render_train_view(views[0].camera, views[0].exposure_time, degree=0).encoded
-    wanted = torch.tensor(200, device=device)
-    given = field, matcher, shown, views[0], 0
-    (rows, born), (again, roomy) = (seed_gaussians(*given, wanted, room, random_seed=3) for room in (200, 300))
+        photo = field.render_train_view(views[0].camera, views[0].exposure_time, degree=0).encoded
+    budget = torch.tensor(200, device=device)
+    inputs = field, matcher, photo, views[0], 0
+    (rows, born), (again, roomy) = (seed_gaussians(*inputs, budget, room, random_seed=3) for room in (200, 300))
     assert 0 < int(born) < 200 and born == roomy
     rows, again = ({name: values[: int(born)] for name, values in each.items()} for each in (rows, again))
     assert all(torch.equal(values, again[name]) for name, values in rows.items())
     assert all(values.isfinite().all() for values in rows.values())
-    none = seed_gaussians(*given, torch.tensor(0, device=device), 10, random_seed=3)
+    none = seed_gaussians(*inputs, torch.tensor(0, device=device), 10, random_seed=3)
     assert not int(none[1])
     white = rows["harmonics_dc"].amax((1, 2)) == rows["harmonics_dc"].max()
     depth = torch.from_numpy(field.normalization.scene_points(rows["means"][white].cpu().numpy())[:, 2])

@@ -29,15 +29,15 @@ def test_what_is_brought_is_the_view(device, truth):
     assert len(stream) == len(source) == len(views)
     for index, following in zip(order, [*order[1:], None], strict=True):
         stream.bring(index)
-        seen, whole = stream.at(torch.tensor([index], device=device)), source[index]
-        encoded, mask = seen.target.encoded, seen.target.mask
+        streamed, whole = stream.at(torch.tensor([index], device=device)), source[index]
+        encoded, mask = streamed.target.encoded, streamed.target.mask
         stream.release(following)
-        assert torch.equal(encoded, whole.target.encoded) and float(seen.exposure_time) == whole.exposure_time
-        assert torch.equal(seen.camera.world_to_camera, whole.camera.world_to_camera)
+        assert torch.equal(encoded, whole.target.encoded) and float(streamed.exposure_time) == whole.exposure_time
+        assert torch.equal(streamed.camera.world_to_camera, whole.camera.world_to_camera)
         assert torch.equal(mask, torch.ones_like(mask) if whole.target.mask is None else whole.target.mask)
-        assert (seen.target.exposure_truth is None) == (not truth)
+        assert (streamed.target.exposure_truth is None) == (not truth)
         if truth:
-            assert torch.equal(seen.target.exposure_truth, whole.target.exposure_truth)
+            assert torch.equal(streamed.target.exposure_truth, whole.target.exposure_truth)
 
 
 def test_photos_of_several_sizes_have_no_common_place(device):
@@ -48,9 +48,9 @@ def test_photos_of_several_sizes_have_no_common_place(device):
 
 def test_a_training_on_a_file_is_the_same_bits(scene, trained, tmp_path):
     keeper = PhotoKeeper("disk", len(scene.views), len(scene.views) * 32 * 32)
-    kept = dataclasses.replace(scene, views=tuple(keeper.store(view) for view in scene.views))
+    stored = dataclasses.replace(scene, views=tuple(keeper.store(view) for view in scene.views))
     assert "read from a nameless file" in keeper.note
-    train(kept, tmp_path / "disk", VARIANTS["default"], device="cpu")
+    train(stored, tmp_path / "disk", VARIANTS["default"], device="cpu")
     first, second = (RunFolder(run).newest_checkpoint().tensors for run in (trained("default"), tmp_path / "disk"))
     for name, value in first.items():
         assert torch.equal(value, second[name]), name

@@ -129,13 +129,13 @@ def test_photos_that_clip_below_white_get_a_line(scene):
 def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     shares = iter(np.linspace(0.1, 0.9, len(scene.views)))
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
-    for known, told in ((False, 1), (True, 0)):
+    for known, line_count in ((False, 1), (True, 0)):
         plan = make_plan(replace(drifting, exposure_times_known=known), config_of())
-        found = plan.with_decision(
+        with_gains = plan.with_decision(
             Decision("exposure-compensation", {}, "taken out of the photos", "", always_log=True)
         )
-        for given, count in ((plan, told), (found, 0)):
-            lines = [line for line in given.lines() if "no exposure times" in line and "exposures.json" in line]
+        for case, count in ((plan, line_count), (with_gains, 0)):
+            lines = [line for line in case.lines() if "no exposure times" in line and "exposures.json" in line]
             assert len(lines) == count
     plain = make_plan(replace(scene, exposure_times_known=False), config_of())
     assert not any("exposure times" in line for line in plain.lines())
@@ -170,11 +170,11 @@ def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
 def test_a_cpu_short_of_time_gets_half_the_gaussians_unless_steps_are_asked_for(facts, monkeypatch):
     monkeypatch.setattr("sehdr_warp.training.plan.thread_count", lambda: 2)
     large, rule = replace(facts, photos=18, pixels=18 * 200 * 200), RULES["densification"]
-    asked = config_of(schedule__iterations=4000, plan__keep=["schedule.iterations"])
+    named = config_of(schedule__iterations=4000, plan__keep=["schedule.iterations"])
     assert rule(large, config_of(), CPU)[0] == {"mcmc.cap_density": 60.0}
     assert "at most 50911" in rule(large, config_of(), CPU)[1]
-    for given, config, device in ((facts, config_of(), CPU), (large, config_of(), GPU), (large, asked, CPU)):
-        assert rule(given, config, device)[0] == {}
+    for case, config, device in ((facts, config_of(), CPU), (large, config_of(), GPU), (large, named, CPU)):
+        assert rule(case, config, device)[0] == {}
 
 
 def test_brackets_of_one_base_become_a_scaling(scene):

@@ -81,20 +81,20 @@ def test_a_rank_that_does_not_answer_ends_the_others(together):
 @pytest.fixture
 def command(tmp_path, monkeypatch, capfd):
     """Trains on two ranks and does what is given to them once there is a checkpoint; exit status and lines."""
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     monkeypatch.setenv("SEHDR_RANK_TIMEOUT", "60")
 
     def train(disturb, *words):
         flags = "--device cpu --gpus 2 --max-size 24 --preset fast --response srgb --iterations 20000"
         flags += " --schedule.checkpoint-every 30 --model.initial-density 0 --mcmc.seed-fraction 0"
-        seen = threading.Thread(target=once_saved, args=(tmp_path / "run", disturb))
-        seen.start()
+        watcher = threading.Thread(target=once_saved, args=(tmp_path / "run", disturb))
+        watcher.start()
         status = call("train", "embedded", "--out", tmp_path / "run", *flags.split(), *words)
-        seen.join()
+        watcher.join()
         return status, capfd.readouterr().err
 
     yield train
-    for number, handler in kept.items():
+    for number, handler in handlers.items():
         signal.signal(number, handler)
 
 
@@ -155,15 +155,15 @@ def test_harmonics_go_as_their_factors():
     field, count = toy_field(), 3
     optimizer, means = make_optimizer(field, VARIANTS["adc"], 1.0), field.gaussians.means
     ranks = [FlatGradients(optimizer, place, count, defer_sh=True) for place in range(count)]
-    seen = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
-    for flat, harmonics in zip(ranks, seen, strict=True):
+    factors = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
+    for flat, harmonics in zip(ranks, factors, strict=True):
         means.grad = torch.ones_like(means)
         flat.collect(torch.tensor(2.0), None, harmonics)
     ranks[1].buffer.copy_(torch.stack([flat.buffer for flat in ranks]).mean(0))
     _, _, harmonics = ranks[1].distribute()
     assert harmonics.degree == 1 and ranks[1].buffer.numel() < 4 * count * means.numel() + 11 * len(means)
-    assert torch.allclose(harmonics.grad_colors, torch.cat([one.grad_colors for one in seen]) / count)
-    assert torch.allclose(harmonics.positions, torch.cat([one.positions for one in seen]))
+    assert torch.allclose(harmonics.grad_colors, torch.cat([one.grad_colors for one in factors]) / count)
+    assert torch.allclose(harmonics.positions, torch.cat([one.positions for one in factors]))
 
 
 @pytest.mark.parametrize("photos", [1, 2, 3, 8])

@@ -13,9 +13,9 @@ def replay(capacity, pairs):
     """Recorded steps that need so many pairs each; the capacity that they were given."""
     loss = torch.zeros((), device=capacity.step_counters.device)
     for needed in pairs:
-        given, needed = capacity.capacity(), torch.tensor(needed, device=loss.device)
-        check_finite(loss, loss[None], needed > given, capacity.step_counters, needed)
-    return given
+        fixed_capacity, needed = capacity.capacity(), torch.tensor(needed, device=loss.device)
+        check_finite(loss, loss[None], needed > fixed_capacity, capacity.step_counters, needed)
+    return fixed_capacity
 
 
 def test_room_follows_the_most_pairs_seen(device):
@@ -47,9 +47,9 @@ def test_a_lack_of_room_is_noticed_and_mended(device):
 def test_room_stays_while_it_is_enough(device):
     capacity = GraphCapacity(device)
     capacity.observe(MANY)
-    given = replay(capacity, [MANY])
-    assert capacity.rescale(1.05, keep=True) and capacity.capacity() == given
-    assert replay(capacity, [MANY * 21 // 20]) == given
+    fixed_capacity = replay(capacity, [MANY])
+    assert capacity.rescale(1.05, keep=True) and capacity.capacity() == fixed_capacity
+    assert replay(capacity, [MANY * 21 // 20]) == fixed_capacity
     assert capacity.rescale(1.05, keep=True)
     replay(capacity, [MANY * 11 // 10])
     assert not capacity.rescale(1.1, keep=True)

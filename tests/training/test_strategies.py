@@ -239,12 +239,12 @@ def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
 def proposer(colors):
     """A function that proposes Gaussians of these colors at the origin."""
 
-    def propose(wanted, room):
-        made = cloud(len(colors)).tensors()
-        given = torch.tensor(colors)[:, None, None].expand(-1, 1, 3)
-        made |= {"means": torch.zeros_like(made["means"]), "harmonics_dc": given}
-        rows = {name: values[:room].contiguous() for name, values in made.items()}
-        return Proposals(rows, wanted.clamp_max(len(colors)))
+    def propose(asked_count, room):
+        proposed = cloud(len(colors)).tensors()
+        dc = torch.tensor(colors)[:, None, None].expand(-1, 1, 3)
+        proposed |= {"means": torch.zeros_like(proposed["means"]), "harmonics_dc": dc}
+        rows = {name: values[:room].contiguous() for name, values in proposed.items()}
+        return Proposals(rows, asked_count.clamp_max(len(colors)))
 
     return propose
 
@@ -262,20 +262,20 @@ def test_the_born_come_first_and_take_the_places_of_the_dead(rooms, dead, colors
     )
     assert gaussians.count == 13
     places = [*gone, 10, 11, 12][: min(colors, (dead + 3) // 2)]
-    found = gaussians.harmonics_dc.detach()[:, 0, 0]
-    assert found[places].tolist() == [10.0 + k for k in range(len(places))]
+    colors_after = gaussians.harmonics_dc.detach()[:, 0, 0]
+    assert colors_after[places].tolist() == [10.0 + k for k in range(len(places))]
     assert not gaussians.means.detach()[places].any()
     for name in PARAMETER_NAMES:
         assert not optimizer.state[getattr(gaussians, name)]["exp_avg"][places].any()
     if dead == 10:  # Nobody can be copied but the born.
-        assert torch.equal(found[gone[len(places) :]], before["harmonics_dc"][gone[len(places) :], 0, 0])
+        assert torch.equal(colors_after[gone[len(places) :]], before["harmonics_dc"][gone[len(places) :], 0, 0])
         return
     others = [place for place in [*gone, 10, 11, 12] if place not in places]
-    kept = [place for place in range(10) if place not in gone]
-    sources = {tuple(row) for row in gaussians.means.detach()[[*kept, *places]].tolist()}
+    survivors = [place for place in range(10) if place not in gone]
+    sources = {tuple(row) for row in gaussians.means.detach()[[*survivors, *places]].tolist()}
     assert all(tuple(row) in sources for row in gaussians.means.detach()[others].tolist())
     assert (gaussians.opacities() > 0.005 - 1e-6).all()
-    assert torch.equal(gaussians.means.detach()[kept], before["means"][kept])
+    assert torch.equal(gaussians.means.detach()[survivors], before["means"][survivors])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="the CPU is never waited for")
@@ -337,6 +337,6 @@ def test_noise_comes_with_the_iteration():
 
 
 def test_draws_follow_the_weights():
-    drawn = sample_rows(torch.tensor([1.0, 0.0, 3.0]), 40_000, torch.Generator().manual_seed(0))
-    counts = torch.bincount(drawn.rows, minlength=3) / 40_000
+    sampled = sample_rows(torch.tensor([1.0, 0.0, 3.0]), 40_000, torch.Generator().manual_seed(0))
+    counts = torch.bincount(sampled.rows, minlength=3) / 40_000
     torch.testing.assert_close(counts, torch.tensor([0.25, 0.0, 0.75]), atol=0.01, rtol=0)

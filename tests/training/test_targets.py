@@ -26,15 +26,15 @@ def test_a_stacked_view_is_the_view(device):
     for i, view in enumerate(alone):
         late = stack.at(torch.tensor([i], device=device))
         assert late.target.codes is stack.targets.codes
-        for taken in (stack[i], late):
-            assert float(taken.exposure_time) == view.exposure_time
+        for each in (stack[i], late):
+            assert float(each.exposure_time) == view.exposure_time
             for name in ("world_to_camera", "intrinsics", "position"):
-                assert torch.equal(getattr(taken.camera, name), getattr(view.camera, name))
-            assert torch.equal(taken.target.encoded, view.target.encoded)
-            assert torch.equal(taken.target.exposure_truth, view.target.exposure_truth)
+                assert torch.equal(getattr(each.camera, name), getattr(view.camera, name))
+            assert torch.equal(each.target.encoded, view.target.encoded)
+            assert torch.equal(each.target.exposure_truth, view.target.exposure_truth)
             # One without a mask counts everywhere.
-            whole = torch.ones_like(taken.target.mask)
-            assert torch.equal(taken.target.mask, whole if view.target.mask is None else view.target.mask)
+            whole = torch.ones_like(each.target.mask)
+            assert torch.equal(each.target.mask, whole if view.target.mask is None else view.target.mask)
 
 
 def test_equal_times_stay_numbers_and_differing_sizes_do_not_stack(device):
@@ -50,10 +50,10 @@ def test_codes_stay_codes_and_come_back_exactly(device):
     words = np.random.default_rng(0).integers(0, 65536, (32, 32, 3)).astype(np.uint16)
     plain, deep = (dataclasses.replace(view, codes=codes) for codes in (bytes_, words))
     for views, dtype in (((plain,), torch.uint8), ((plain, deep), torch.int16)):
-        made = views_of(views, device)
-        assert {one.target.codes.dtype for one in made} == {dtype}
-        for one, given in zip(made, views, strict=True):
-            np.testing.assert_array_equal(one.target.encoded.cpu().numpy(), given.image)
+        stacked = views_of(views, device)
+        assert {one.target.codes.dtype for one in stacked} == {dtype}
+        for one, original in zip(stacked, views, strict=True):
+            np.testing.assert_array_equal(one.target.encoded.cpu().numpy(), original.image)
 
 
 @pytest.mark.parametrize("deep", [False, True])

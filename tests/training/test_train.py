@@ -53,9 +53,9 @@ def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_
     caplog.set_level("INFO")
     config = quick(**{"schedule.iterations": 40, "mcmc.growth_rate": 0.5, "model.initial_density": 0.0} | options)
     run = train(scene, tmp_path / "run", config, device="cpu")
-    told = caplog.text
-    assert ("60 Gaussians are more than the cap of 7" in told) == ("mcmc.cap_density" in options)
-    assert ("60 start points: 50 of them are used" in told) == ("densification.cap_max" in options)
+    logged_text = caplog.text
+    assert ("60 Gaussians are more than the cap of 7" in logged_text) == ("mcmc.cap_density" in options)
+    assert ("60 start points: 50 of them are used" in logged_text) == ("densification.cap_max" in options)
     count = run.gaussian_count
     assert count == options.get("densification.cap_max", 60) if options else count > 60
 
@@ -305,14 +305,16 @@ def test_held_out_figures_are_told_in_words(scene, tmp_path, logged):
 
 def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path):
     training = create_trainer(scene, tmp_path / "run", quick(), device="cpu")
-    seen = []
+    progress_lines = []
     for step in training:
-        seen.append((step.iteration, step.seconds, step.seconds_left))
+        progress_lines.append((step.iteration, step.seconds, step.seconds_left))
         if step.iteration == 12:
             assert step.loss > 0 and step.psnr > 5 and step.gaussians >= 60 and step.total == 90
             break
-    assert [iteration for iteration, *_ in seen] == list(range(1, 13))
-    assert seen[0][2] is None and 0 < seen[-1][2] < 78 * (seen[-1][1] - seen[0][1])
+    assert [iteration for iteration, *_ in progress_lines] == list(range(1, 13))
+    assert progress_lines[0][2] is None and 0 < progress_lines[-1][2] < 78 * (
+        progress_lines[-1][1] - progress_lines[0][1]
+    )
     assert training.run.iterations == 12 and not training.run.summary()["finished"]
     training = create_trainer(scene, tmp_path / "run", device="cpu", resume=True)
     for step in training:

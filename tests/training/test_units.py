@@ -56,7 +56,7 @@ def test_far_coordinates_are_exported_relative_to_the_scene(tmp_path, caplog):
     # Gaussians in the coordinates of the set keep what float32 would lose.
     gaussians = gaussians_of(run.field, "linear", np.zeros((0, 3)))
     camera = scene.test_views[0].camera
-    shown = field_of(gaussians).render(camera).hdr
-    torch.testing.assert_close(shown, run.render(camera).hdr, rtol=0.1, atol=0.02)
+    image = field_of(gaussians).render(camera).hdr
+    torch.testing.assert_close(image, run.render(camera).hdr, rtol=0.1, atol=0.02)
     export(run, tmp_path / "scene.ply", axes="scene", kind="ldr")
     assert "too large for the float32" in caplog.text

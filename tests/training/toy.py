@@ -60,15 +60,15 @@ def stated(iteration: float, iterations: int) -> int:
 def load_unscaled(preset: str = "default", overrides: dict | None = None, length: int | None = None) -> Config:
     """load_config without a plan, with iteration numbers as they stand in a training of `length` iterations, by default
     its own."""
-    given = {"plan.enabled": False} | (overrides or {})
+    fields = {"plan.enabled": False} | (overrides or {})
     plain = load_config(preset).model_dump()
-    iterations = length or given.get("schedule.iterations", plain["schedule"]["iterations"])
+    iterations = length or fields.get("schedule.iterations", plain["schedule"]["iterations"])
     for path in NUMBERS:
         part, name = path.split(".")
-        value = given.get(path, plain[part][name])
+        value = fields.get(path, plain[part][name])
         many = isinstance(value, list | tuple)
-        given[path] = [stated(n, iterations) for n in value] if many else stated(value, iterations)
-    return load_config(preset, given)
+        fields[path] = [stated(n, iterations) for n in value] if many else stated(value, iterations)
+    return load_config(preset, fields)
 
 
 QUICK = {

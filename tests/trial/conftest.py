@@ -26,8 +26,8 @@ def prepared(tmp_path_factory) -> Path:
     shutil.rmtree(folder / "new")
     for suffix in (".glb", ".spz", ".sog", ".compressed.ply"):
         assert call("export", "run", "--out", f"files/a{suffix}", folder=folder).code == 0
-    seen = call(*VIEW, folder=folder, prepare=browse(folder, ever=False))
-    changes |= {"train": again.changes, "train anew": anew.changes, "view": seen.changes}
+    viewed = call(*VIEW, folder=folder, prepare=browse(folder, ever=False))
+    changes |= {"train": again.changes, "train anew": anew.changes, "view": viewed.changes}
     shutil.rmtree(folder / "tmp")
     (folder / "run" / "took.json").write_text(json.dumps(again.seconds))
     (folder / "run" / "changes.json").write_text(json.dumps(changes))

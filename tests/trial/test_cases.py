@@ -249,9 +249,9 @@ def test_surroundings(space, name):
     ended = subprocess.run(
         ["bash", "-c", SURROUNDINGS[name]], cwd=space, env=environment, capture_output=True, timeout=LATEST, check=False
     )
-    told = ended.stderr.decode(errors="replace")
-    assert "Traceback" not in told and "Error:" not in told and ended.returncode in (0, 1, 141), told
-    assert ended.returncode != 1 or "closed" in name or told.splitlines()[-1].startswith("sehdr-warp: "), told
+    output = ended.stderr.decode(errors="replace")
+    assert "Traceback" not in output and "Error:" not in output and ended.returncode in (0, 1, 141), output
+    assert ended.returncode != 1 or "closed" in name or output.splitlines()[-1].startswith("sehdr-warp: "), output
     assert files_in(space / "run") == before
 
 
@@ -271,7 +271,7 @@ def test_interrupts(space, number):
     for _ in range(3 if number % 2 and kind == signal.SIGINT else 1):
         child.send_signal(kind)
         time.sleep(0.02)
-    told = child.communicate(timeout=LATEST)[1].decode()
-    assert "Traceback" not in told and child.returncode in (128 + kind, -kind), told
+    output = child.communicate(timeout=LATEST)[1].decode()
+    assert "Traceback" not in output and child.returncode in (128 + kind, -kind), output
     if (space / "new" / "run.json").exists():
         assert RunFolder(space / "new").newest_checkpoint() is not None

@@ -43,8 +43,8 @@ def finish(space: Path) -> None:
     if ended.code:
         assert not out.exists() or not list(out.glob("[!.]*")), ended.err
         assert call(*ANEW, folder=space).code == 0
-    for (tensors, *told), (expected, *stated) in [(result(out), result(space / "run"))]:
-        assert told == stated and tensors.keys() == expected.keys()
+    for (tensors, *result_values), (expected, *expected_values) in [(result(out), result(space / "run"))]:
+        assert result_values == expected_values and tensors.keys() == expected.keys()
         assert all(torch.equal(tensors[name], expected[name]) for name in expected)
     assert left_over(space) == []
 
@@ -92,7 +92,7 @@ def test_commands_killed_at_a_change_of_the_disk(space, name, number):
     """What is replaced is whole, before or after; what a user keeps beside it stays; the next call ends the work."""
     changes = json.loads((space / "run" / "changes.json").read_text())[name]
     words = COMMANDS[name] + (["--seeds", "0,1"] if name == "quality" else [])
-    kept = {path: path.read_bytes() for path in space.rglob("result.json")}
+    stored = {path: path.read_bytes() for path in space.rglob("result.json")}
     (space / "made" / "notes.txt").write_text("mine")
     run = shutil.copytree(space / "run", space / "copy")
     assert call(*words, folder=space, kill_at=1 + number * changes // KILLS_EACH).code in (0, -9)
@@ -101,7 +101,7 @@ def test_commands_killed_at_a_change_of_the_disk(space, name, number):
         assert theirs is None or theirs.name == "notes.txt" or path.name == "jobs", f"{theirs} is not whole"
     assert call(*words, folder=space).code == 0
     assert (space / "made" / "notes.txt").read_text() == "mine"
-    assert {path: path.read_bytes() for path in kept} == kept, "finished jobs were run again"
+    assert {path: path.read_bytes() for path in stored} == stored, "finished jobs were run again"
     assert left_over(space) == []
     assert sorted(path.name for path in run.rglob("*")) == sorted(path.name for path in (space / "run").rglob("*"))
 
@@ -148,9 +148,11 @@ def test_training_on_a_video_killed_at_a_change_of_the_disk(filmed, tmp_path, nu
     ):
         assert not list((space / "new").glob("[!.]*"))
         assert call(*VIDEO, folder=space, prepare=prepare).code == 0
-    made, known = files_in(space / "cache"), number % 3 > 0
+    files, known = files_in(space / "cache"), number % 3 > 0
     cache = {name: data for name, data in cache.items() if known or name.startswith("video-")}
-    assert {name: made.get(name) for name in cache} == cache
+    assert {name: files.get(name) for name in cache} == cache
     assert left_over(space / "new") == [] and (space / "new" / "summary.json").exists()
-    for (tensors, *told), (expected, *stated) in [(result(space / "new"), result(space / "run"))]:
-        assert not known or (told == stated and all(torch.equal(tensors[name], expected[name]) for name in expected))
+    for (tensors, *result_values), (expected, *expected_values) in [(result(space / "new"), result(space / "run"))]:
+        assert not known or (
+            result_values == expected_values and all(torch.equal(tensors[name], expected[name]) for name in expected)
+        )

@@ -57,15 +57,15 @@ def test_50_trainings(space, live):
 
 def test_an_hour_of_the_viewer(space, live):
     run = load_run(space / "run")
-    asked = json.dumps({"camera": run.cameras[0].camera.to_dict()})
+    body = json.dumps({"camera": run.cameras[0].camera.to_dict()})
 
     def look(number: int) -> None:
         client = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=60)
         for _ in range(FRAMES_EACH):
-            client.request("POST", "/frame", asked, {"Content-Type": "application/json"})
+            client.request("POST", "/frame", body, {"Content-Type": "application/json"})
             assert len(client.getresponse().read()) > 1000
         if number % 2:  # Goes before the answer.
-            client.request("POST", "/frame", asked, {"Content-Type": "application/json"})
+            client.request("POST", "/frame", body, {"Content-Type": "application/json"})
         client.close()
 
     with Server(Viewer([ViewerScene(run, "run", None)]), port=0) as server:

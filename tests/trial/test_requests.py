@@ -47,8 +47,8 @@ def answer_to(port: int, data: bytes, seconds: float = 20.0, ends: bool = False)
             while part := client.recv(1 << 16):
                 said += part
                 if length is None and (end := said.find(b"\r\n\r\n")) >= 0:
-                    stated = re.search(rb"Content-Length: (\d+)", said[:end])
-                    length = end + 4 + int(stated[1]) if stated else math.inf
+                    content_length = re.search(rb"Content-Length: (\d+)", said[:end])
+                    length = end + 4 + int(content_length[1]) if content_length else math.inf
                 if length is not None and len(said) >= length:
                     break
         except OSError:  # The server has closed it.
@@ -144,8 +144,8 @@ CAMERAS = {
 @pytest.mark.parametrize("path", ["/frame", "/save"])
 def test_cameras_that_are_asked_for(served, path, name):
     camera = served.camera | CAMERAS[name]
-    asked = {"camera": camera} if path == "/frame" else {"cameras": [camera], "kind": "exr"}
-    said = answer_to(served.server_address[1], posted(path, asked), 60)
+    payload = {"camera": camera} if path == "/frame" else {"cameras": [camera], "kind": "exr"}
+    said = answer_to(served.server_address[1], posted(path, payload), 60)
     assert re.match(rb"HTTP/1\.1 (200|400|413|500)", said) and b"Traceback" not in said
 
 
@@ -217,8 +217,8 @@ def test_a_viewer_among_silent_and_deaf_clients(prepared, record_property):
         camera = camera.get("camera", camera)
         scale = 1600 / camera["width"]
         large = {name: camera[name] * scale for name in ("fx", "fy", "cx", "cy")} | {"width": 1600, "height": 1200}
-        asked = posted("/frame", {"camera": camera | large, "clipped": True})
-        texts = [*[asked] * 16, *[SILENT[number % len(SILENT)] for number in range(100)]]
+        payload = posted("/frame", {"camera": camera | large, "clipped": True})
+        texts = [*[payload] * 16, *[SILENT[number % len(SILENT)] for number in range(100)]]
         clients, waits, largest, end = [begin(port, text) for text in texts], [], 0.0, time.monotonic() + lasts
         back = dict.fromkeys(range(len(texts)), 0.0)
         while time.monotonic() < end:
@@ -239,11 +239,11 @@ def test_a_viewer_among_silent_and_deaf_clients(prepared, record_property):
             client.close()
     finally:
         viewer.send_signal(signal.SIGTERM)
-        told = viewer.communicate(timeout=60)[1].decode()
+        output = viewer.communicate(timeout=60)[1].decode()
     waits.sort()
     record_property("memory", f"up to {largest:.0f}")
     parts = ", ".join(f"{share} %: {waits[len(waits) * share // 100]:.3f} s" for share in (50, 95, 99))
     print(f"{lasts:.0f} s, {len(waits)} requests: {parts}, longest {waits[-1]:.3f} s, "
           f"{largest:.0f} MiB at most")  # fmt: skip
-    assert "Traceback" not in told and largest < 600
+    assert "Traceback" not in output and largest < 600
     assert waits[len(waits) * 99 // 100] < 1, waits[-9:]

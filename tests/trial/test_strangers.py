@@ -103,9 +103,9 @@ def test_films(space, name):
     before = files_in(space)
     place = name if "/" in name or name.startswith("pipe:") else f"d/{name}"
     ended = call("render", "run", "--video", place, "--cameras", "all", "--device", "cpu", folder=space)
-    made = {path: files_in(space)[path] for path in files_in(space) if path not in before and LIST not in path}
+    created = {path: files_in(space)[path] for path in files_in(space) if path not in before and LIST not in path}
     assert ended.code == FILMS[name], ended.err
-    assert list(made) == ([f"d/{name}"] if ended.code == 0 else [])
+    assert list(created) == ([f"d/{name}"] if ended.code == 0 else [])
     assert {path: text for path, text in files_in(space).items() if path in before} == before
 
 
@@ -267,8 +267,8 @@ def test_names_of_output(space, command, name):
     new = [f"{flag}={name}" if word == flag else word for word in words if word != place]
     before = files_in(space)
     ended = call(*new, folder=space)
-    made = {Path(path).parts[0] for path in files_in(space) if path not in before} - {LIST}
-    assert ended.code == 0 and made == {name}, ended.err
+    created = {Path(path).parts[0] for path in files_in(space) if path not in before} - {LIST}
+    assert ended.code == 0 and created == {name}, ended.err
 
 
 ENVIRONMENTS = {

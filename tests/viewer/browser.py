@@ -17,20 +17,20 @@ ARGUMENTS = ["--enable-unsafe-swiftshader", *["--no-sandbox"] * (os.geteuid() ==
 def browser():
     """A Chromium; contexts and pages are the caller's."""
     playwright = pytest.importorskip("playwright.sync_api")
-    found = next(filter(None, map(shutil.which, NAMES)), None)
-    if found is None:
+    executable = next(filter(None, map(shutil.which, NAMES)), None)
+    if executable is None:
         pytest.skip("Chromium is not installed")
     with playwright.sync_playwright() as driver:
-        made = driver.chromium.launch(executable_path=found, args=ARGUMENTS)
-        yield made
-        made.close()
+        chromium_browser = driver.chromium.launch(executable_path=executable, args=ARGUMENTS)
+        yield chromium_browser
+        chromium_browser.close()
 
 
 @contextmanager
-def page_of(made, url, width=700, height=420, script=""):
+def page_of(chromium_browser, url, width=700, height=420, script=""):
     """A page that may reach nothing but its own server or file, and must not complain. script: runs before its own."""
     complaints = []
-    context = made.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
+    context = chromium_browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
     context.add_init_script(script)
     page = context.new_page()
     page.on("console", lambda line: complaints.append(line.text) if line.type in ("error", "warning") else None)

@@ -22,8 +22,8 @@ def serve(tmp_path):
         run, scene = make(tmp_path)
         run.field = SimpleNamespace(render_mean=lambda camera, values: torch.full((camera.height, camera.width), 0.25))
         runs = [run, AnalyticRun()][:count]
-        shown = [ViewerScene(each, f"run {i}", torch.ones(1) if i == 0 else None) for i, each in enumerate(runs)]
-        viewer = Viewer(shown, lambda index: {view.name: view for view in scene.views}, **options)
+        scenes = [ViewerScene(each, f"run {i}", torch.ones(1) if i == 0 else None) for i, each in enumerate(runs)]
+        viewer = Viewer(scenes, lambda index: {view.name: view for view in scene.views}, **options)
         server = Server(viewer, port=18080)
         servers.append(server)
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()

@@ -49,8 +49,8 @@ def lamps(tmp_path):
 def test_a_light_is_listed_and_made_brighter(lamps):
     view = lamps.viewer.runs[0].cameras[1].camera
     before = frame(lamps, view)[0]
-    found = json.loads(ask(lamps, "/lights", {})[2])
-    assert found["unit"] is None and found["lights"][0] == {
+    light_list = json.loads(ask(lamps, "/lights", {})[2])
+    assert light_list["unit"] is None and light_list["lights"][0] == {
         "shape": "sphere",
         "position": [1, 0, 0],
         "size": 0.3,
@@ -93,8 +93,8 @@ def test_the_page_flies_to_a_light_and_sets_its_gain(lamps):
         page.wait_for_selector("#stage[data-frame=full]")
         listed = page.text_content(".light")
         assert "lamp 1: 40 % of the light" in listed and "0.8 stops" in listed
-        seen = Camera.from_dict(page.evaluate("window.viewer.camera()"))
-        x, y, z, _ = seen.world_to_camera @ np.array([1, 0, 0, 1])
+        page_camera = Camera.from_dict(page.evaluate("window.viewer.camera()"))
+        x, y, z, _ = page_camera.world_to_camera @ np.array([1, 0, 0, 1])
         assert z > 0 and abs(x) < 1e-6 and abs(y) < 1e-6
         with page.expect_response("**/gain") as answer:
             page.locator(".light input").evaluate(move)
@@ -127,11 +127,11 @@ def test_up_and_scale_are_kept_with_the_run(server, tmp_path):
     status, _, content = ask(server, "/orientation", {"up": [0, 0, 1]})
     assert status == 200 and np.allclose(np.array(json.loads(content)["upright"])[1, :3], [0, 0, 1])
     assert ask(server, "/orientation", {"scale": 0.25})[0] == 200
-    kept = json.loads((tmp_path / "orientation.json").read_text())
-    assert kept == {"up": [0, 0, 1], "scale": 0.25}
+    orientation = json.loads((tmp_path / "orientation.json").read_text())
+    assert orientation == {"up": [0, 0, 1], "scale": 0.25}
     for request in ({"scale": -1}, {"up": [0, 0, 0]}, {"up": [1]}):
         assert ask(server, "/orientation", request)[0] == 409
-    assert json.loads((tmp_path / "orientation.json").read_text()) == kept
+    assert json.loads((tmp_path / "orientation.json").read_text()) == orientation
 
 
 def test_a_page_to_share_is_saved(server):

@@ -35,14 +35,14 @@ def ask(address, path, body=None):
 def test_the_result_is_that_without_a_viewer(tmp_path, logged):
     scene = toy_scene()
     alone = train(scene, tmp_path / "alone", CONFIG, device="cpu")
-    training, seen = create_trainer(scene, tmp_path / "seen", CONFIG, device="cpu"), []
+    training, answers = create_trainer(scene, tmp_path / "seen", CONFIG, device="cpu"), []
 
     def look(address):
         camera = scene.views[0].camera.resized(48, 48).to_dict()
         while not done.is_set():
             status, content = ask(address, "/frame", {"camera": camera})
-            told = json.loads(ask(address, "/training")[1])
-            seen.append((status, np.frombuffer(content, "<f2") if status == 200 else content, told))
+            status_json = json.loads(ask(address, "/training")[1])
+            answers.append((status, np.frombuffer(content, "<f2") if status == 200 else content, status_json))
 
     done = threading.Event()
     with viewed(training, "toy") as steps:
@@ -59,10 +59,10 @@ def test_the_result_is_that_without_a_viewer(tmp_path, logged):
         done.set()
         looking.join()
     assert training.run.checkpoint_hash == alone.checkpoint_hash
-    frames = [frame for status, frame, _ in seen if status == 200]
+    frames = [frame for status, frame, _ in answers if status == 200]
     assert len(frames) >= 2 and all(frame.size == 48 * 48 * 5 for frame in frames)
     assert np.abs(frames[-1][:100] - frames[0][:100]).max() > 0
-    assert seen[-1][2]["iteration"] > 2 and len(seen[-1][2]["curve"]) >= 2
+    assert answers[-1][2]["iteration"] > 2 and len(answers[-1][2]["curve"]) >= 2
     assert ask_fails(address)
 
 
@@ -84,9 +84,9 @@ def test_a_sensors_colors_are_shown_in_rec709_as_the_run_shows_them(tmp_path, lo
             pass
         status, photo = ask(address, "/photo/0/1")
     camera, run = scene.views[1].camera, training.run
-    shown = training.render(camera).hdr.detach()
-    np.testing.assert_allclose(shown, run.render(camera).hdr, atol=1e-5)
-    assert (shown - run.field.render(camera, degree=run.degree).hdr).abs().max() > 0.1
+    rendered = training.render(camera).hdr.detach()
+    np.testing.assert_allclose(rendered, run.render(camera).hdr, atol=1e-5)
+    assert (rendered - run.field.render(camera, degree=run.degree).hdr).abs().max() > 0.1
     assert status == 200
     np.testing.assert_array_equal(Image.open(io.BytesIO(photo)), quantize(shown_photo(run, scene.views[1])))
 

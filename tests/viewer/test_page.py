@@ -16,8 +16,8 @@ FULL = "#stage[data-frame=full]"
 
 @pytest.fixture(scope="module")
 def chromium():
-    with browser() as made:
-        yield made
+    with browser() as chromium_browser:
+        yield chromium_browser
 
 
 def settle(page, action=lambda: None):
@@ -72,14 +72,14 @@ def test_exposure_probe_and_saved_exr_agree(chromium, serve, tmp_path):
             assert page.input_value("#seconds") == "1/16 s"
         assert run.rendered == rendered  # Exposure renders nothing.
         page.mouse.move(130, 90)
-        probed, told = page.evaluate("window.viewer.probed()"), page.text_content("#probe")
+        probed, probe_text = page.evaluate("window.viewer.probed()"), page.text_content("#probe")
         with page.expect_download() as download:
             page.click("[data-save=exr]")
         download.value.save_as(tmp_path / "view.exr")
         saved, _, _ = read_exr(tmp_path / "view.exr")
         x, y = 130 / light.shape[1], 90 / light.shape[0]
         np.testing.assert_allclose(probed, saved[int(y * saved.shape[0]), int(x * saved.shape[1]), :3], rtol=0.01)
-        assert "radiance" in told and "%" in told and "EV" in told
+        assert "radiance" in probe_text and "%" in probe_text and "EV" in probe_text
 
 
 def test_looks_overlays_and_the_photo_beside(chromium, serve):
@@ -154,17 +154,17 @@ def test_an_exposure_is_none_of_the_shader_s_work_in_software(chromium, serve):
             for overlay in ("none", "stops", "depth", "error", "clipped"):
                 page.select_option("#overlay", overlay)
                 rest(page)
-                shown = [pixels(page, "#picture")]
+                screenshots = [pixels(page, "#picture")]
                 page.evaluate("window.shaded = 0")
                 slide(page, "#stops", -2)
-                shown.append(pixels(page, "#picture"))
+                screenshots.append(pixels(page, "#picture"))
                 assert page.evaluate("shaded") == 0, (left, overlay)
                 page.select_option("#overlay", "stops")
                 page.select_option("#overlay", overlay)
                 rest(page)
-                np.testing.assert_array_equal(pixels(page, "#picture"), shown[1])
+                np.testing.assert_array_equal(pixels(page, "#picture"), screenshots[1])
                 moves = overlay in ("none", "stops", "clipped")
-                assert (np.abs(shown[0] - shown[1]).max() > 0.02) == moves, (left, overlay)
+                assert (np.abs(screenshots[0] - screenshots[1]).max() > 0.02) == moves, (left, overlay)
                 slide(page, "#stops", 0)
 
 
@@ -276,5 +276,5 @@ def test_the_dial_of_a_notebook_exposes_in_a_static_page(chromium, tmp_path):
                 "(range, value) => { range.value = value; range.dispatchEvent(new Event('input')); }", str(stops)
             )
             page.wait_for_timeout(300)  # It may be coarser while it moves.
-            shown = pixels(frame, "canvas")
-            np.testing.assert_allclose(shown, encode_srgb(light * 2.0**stops), atol=2.5 / 255)
+            screenshots = pixels(frame, "canvas")
+            np.testing.assert_allclose(screenshots, encode_srgb(light * 2.0**stops), atol=2.5 / 255)

@@ -43,8 +43,8 @@ def test_origin_lets_a_proxy_in_and_nobody_else(statuses):
 
 
 def test_a_viewer_of_the_network_answers_https_of_the_same_host(statuses):
-    found = statuses(host="0.0.0.0")
-    assert found["proxy"] == 200 and found["another site"] == 403 and found["proxy that rewrites the host"] == 403
+    codes = statuses(host="0.0.0.0")
+    assert codes["proxy"] == 200 and codes["another site"] == 403 and codes["proxy that rewrites the host"] == 403
 
 
 def test_queries_are_ignored_and_addresses_are_relative(serve):

@@ -78,22 +78,27 @@ def test_the_page_its_facts_and_photos(serve):
 def test_what_is_saved_is_what_render_writes(serve, tmp_path):
     server, view = serve(), camera(24, 16)
     hdr = server.viewer.runs[0].run.render(view).hdr
-    asked = {"cameras": [view.to_dict()], "kind": "exr"}
-    (tmp_path / "view.exr").write_bytes(ask(server, "/save", asked)[2])
+    payload = {"cameras": [view.to_dict()], "kind": "exr"}
+    (tmp_path / "view.exr").write_bytes(ask(server, "/save", payload)[2])
     pixels, names, header = read_exr(tmp_path / "view.exr")
     np.testing.assert_allclose(pixels[..., :3], hdr, rtol=1e-3)
     assert names[:4] == ("R", "G", "B", "A") and "worldToCamera" in header
-    with zipfile.ZipFile(io.BytesIO(ask(server, "/save", asked | {"kind": "brackets", "evs": "-2,0,2"})[2])) as packed:
+    with zipfile.ZipFile(
+        io.BytesIO(ask(server, "/save", payload | {"kind": "brackets", "evs": "-2,0,2"})[2])
+    ) as packed:
         assert sum(name.endswith(".exr") for name in packed.namelist()) == 4
     other = view.to_dict() | {"world_to_camera": look_at((1, 0, -3)).tolist()}
     path = json.loads(ask(server, "/path", {"cameras": [view.to_dict(), other], "count": 9})[2])
     assert len(path["cameras"]) == 9 and path["cameras"][0]["name"] == "view_000"
     if pytest.importorskip("av"):
-        told, tell = [], server.viewer._tell
-        server.viewer._tell = lambda line: (tell(line), told.append(ask(server, "/saving")[2].decode()))
+        progress_lines, tell = [], server.viewer._tell
+        server.viewer._tell = lambda line: (tell(line), progress_lines.append(ask(server, "/saving")[2].decode()))
         film = ask(server, "/save", {"cameras": [view.to_dict(), other], "kind": "film", "count": 3, "stops": -1})
         assert film[:2] == (200, "video/mp4") and b"ftyp" in film[2][:16]
-        assert [line.partition(", ")[0] for line in told] == ["film.mp4: frames: 1 of 3", "film.mp4: frames: 2 of 3"]
+        assert [line.partition(", ")[0] for line in progress_lines] == [
+            "film.mp4: frames: 1 of 3",
+            "film.mp4: frames: 2 of 3",
+        ]
         assert ask(server, "/saving")[2] == b""
 
 
@@ -123,8 +128,8 @@ def test_what_is_saved_is_what_render_writes(serve, tmp_path):
 )
 def test_bad_questions_are_answered_in_a_line(serve, path, body, status):
     server = serve()
-    found, kind, content = ask(server, path, body)
-    assert found == status and kind == "text/plain" and b"\n" not in content and len(content) < 400
+    replies, kind, content = ask(server, path, body)
+    assert replies == status and kind == "text/plain" and b"\n" not in content and len(content) < 400
     assert ask(server, "/scene")[0] == 200
 
 
@@ -153,7 +158,7 @@ def test_sizes_are_bounded(serve):
 
 
 def test_twenty_clients_and_some_that_leave(serve):
-    server, view, found = serve(), camera(64, 48), []
+    server, view, replies = serve(), camera(64, 48), []
     body = json.dumps({"camera": view.to_dict()})
 
     def look(number):
@@ -162,14 +167,14 @@ def test_twenty_clients_and_some_that_leave(serve):
                 head = "POST /frame HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
                 connection.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n{body}".encode())
             return
-        found.append(frame(server, view)[0])
+        replies.append(frame(server, view)[0])
 
     clients = [threading.Thread(target=look, args=(number,)) for number in range(20)]
     for client in clients:
         client.start()
     for client in clients:
         client.join(60)
-    assert len(found) == 15 and all((each == found[0]).all() for each in found)
+    assert len(replies) == 15 and all((each == replies[0]).all() for each in replies)
     assert ask(server, "/scene")[0] == 200
 
 
@@ -199,19 +204,19 @@ def test_what_a_training_writes_meanwhile_is_shown(tmp_path, logged):
         train(toy_scene(), path, options, device="cpu")
     watch = Watch(paths, lambda path: open_scene(path, "cpu"))
     watch.look()
-    shown = watch.shown[0]
-    assert [run.version for run in watch.shown] == [0, 0] and shown.facts()["iterations"] == 2
+    scene_shown = watch.scenes[0]
+    assert [run.version for run in watch.scenes] == [0, 0] and scene_shown.facts()["iterations"] == 2
     train(toy_scene(), paths[0], options | {"schedule.iterations": 4}, device="cpu", overwrite=True)
     watch.look()
-    assert [run.version for run in watch.shown] == [1, 0] and shown.facts()["iterations"] == 4
-    assert shown.clipped is not None
+    assert [run.version for run in watch.scenes] == [1, 0] and scene_shown.facts()["iterations"] == 4
+    assert scene_shown.clipped is not None
     for damage in (lambda: (paths[0] / "scene.json").unlink(), lambda: shutil.rmtree(paths[0])):
         damage()
         for file in paths[0].glob("checkpoints/*/checkpoint.json"):
             os.utime(file, (1, 1))
         watch.look()
-        assert "keeps what it has read" in logged[-1] and shown.version == 1
-    assert shown.frame(camera(8, 8)).nbytes == 8 * 8 * 5 * 2
+        assert "keeps what it has read" in logged[-1] and scene_shown.version == 1
+    assert scene_shown.frame(camera(8, 8)).nbytes == 8 * 8 * 5 * 2
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")

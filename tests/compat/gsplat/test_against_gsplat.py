@@ -20,16 +20,16 @@ def test_projections_are_gsplats(model, compensated):
     means, quats, scales = leaves[:3]
     covars, _ = reference._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
     true = reference._fully_fused_projection(means, covars, *place, calc_compensations=compensated, camera_model=model)
-    found = ours.fully_fused_projection(
+    result = ours.fully_fused_projection(
         means, None, quats, scales, *place, calc_compensations=compensated, camera_model=model
     )
     # Radii of gsplat's torch function are round, and ours are 3.33 standard deviations and not 3 wide.
-    visible = (found[0] > 0).all(-1) & (true[0] > 0).all(-1)
+    visible = (result[0] > 0).all(-1) & (true[0] > 0).all(-1)
     assert int(visible.sum()) > COUNT
-    for mine, its in zip(found[1:4], true[1:4], strict=True):
+    for mine, its in zip(result[1:4], true[1:4], strict=True):
         torch.testing.assert_close(mine[visible], its[visible], rtol=1e-4, atol=1e-4)
     if compensated:
-        torch.testing.assert_close(found[4][visible], true[4][visible], rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(result[4][visible], true[4][visible], rtol=1e-3, atol=1e-4)
 
 
 def test_intersections_are_gsplats():
@@ -38,10 +38,12 @@ def test_intersections_are_gsplats():
     frame = 16, 3, 2
     inputs = info["means2d"].detach(), info["radii"], info["depths"].detach()
     true = reference._isect_tiles(*inputs, *frame)
-    found = ours.isect_tiles(*inputs, *frame)
-    assert torch.equal(found[0], true[0].int()) and torch.equal(found[1], true[1]) and found[2].shape == true[2].shape
+    result = ours.isect_tiles(*inputs, *frame)
+    assert (
+        torch.equal(result[0], true[0].int()) and torch.equal(result[1], true[1]) and result[2].shape == true[2].shape
+    )
     offsets = reference._isect_offset_encode(true[1], 2, 3, 2)
-    assert torch.equal(ours.isect_offset_encode(found[1], 2, 3, 2), offsets.int())
+    assert torch.equal(ours.isect_offset_encode(result[1], 2, 3, 2), offsets.int())
 
 
 def test_harmonics_are_gsplats():
@@ -100,11 +102,11 @@ def test_images_and_gradients_are_gsplats(options, packed):
         colors, alphas, info = module.rasterization(*leaves, *place, packed=packed, absgrad=True, **options)
         info["means2d"].retain_grad()
         results.append((colors, alphas, gradients(colors, leaves), info["means2d"].absgrad))
-    (colors, alphas, found, absolute), (mine, my_alphas, my_found, my_absolute) = results
+    (colors, alphas, result, absolute), (mine, my_alphas, my_found, my_absolute) = results
     assert colors.shape == (2, HEIGHT, WIDTH, colors.shape[-1])
     torch.testing.assert_close(mine, colors, rtol=1e-2, atol=2e-3)
     torch.testing.assert_close(my_alphas, alphas, rtol=1e-2, atol=2e-3)
-    for one, two in zip(my_found, found, strict=True):
+    for one, two in zip(my_found, result, strict=True):
         assert float((one - two).norm() / two.norm()) < (0.05 if "rasterize_mode" in options else 0.01)
     if not packed:
         assert float((my_absolute - absolute).norm() / absolute.norm()) < 0.01
@@ -155,5 +157,5 @@ def test_mcmc_changes_gaussians_and_moments_as_gsplats_does(monkeypatch):
         moments = [optimizers[name].state[params[name]]["exp_avg"] for name in params]
         results.append([value.detach() for value in params.values()] + moments)
     assert len(results[0][0]) > COUNT
-    for true, found in zip(*results, strict=True):
-        torch.testing.assert_close(found, true, rtol=1e-4, atol=1e-5)
+    for true, result in zip(*results, strict=True):
+        torch.testing.assert_close(result, true, rtol=1e-4, atol=1e-5)

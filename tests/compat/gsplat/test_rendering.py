@@ -21,11 +21,11 @@ def scene(device="cpu", count=COUNT, coefficients=0):
 
     colors = random(count, coefficients, 3) - 0.5 if coefficients else random(count, 3)
     quaternions = torch.randn(count, 4, generator=generator)
-    given = [random(count, 3) * 2 - 1, quaternions, 0.05 + 0.1 * random(count, 3), random(count), colors]
+    values = [random(count, 3) * 2 - 1, quaternions, 0.05 + 0.1 * random(count, 3), random(count), colors]
     poses = torch.eye(4).repeat(2, 1, 1)
     poses[:, 2, 3] = torch.tensor([3.0, 4.0])
     lenses = torch.tensor([[40.0, 0, 20], [0, 42.0, 15], [0, 0, 1]]).repeat(2, 1, 1)
-    leaves = [tensor.to(device).requires_grad_() for tensor in given]
+    leaves = [tensor.to(device).requires_grad_() for tensor in values]
     return leaves, [poses.to(device), lenses.to(device), WIDTH, HEIGHT]
 
 
@@ -56,8 +56,8 @@ def test_cameras_in_one_call_are_those_of_each_alone(device):
         torch.testing.assert_close(info["radii"][camera], own.extents.ceil().int())
         whole.square().sum().backward()
         torch.testing.assert_close(info["means2d"].grad[camera], own.means2d.grad, rtol=1e-3, atol=1e-4)
-    for given, leaf in zip(together, leaves, strict=True):
-        torch.testing.assert_close(given, leaf.grad, rtol=1e-3, atol=1e-3)
+    for values, leaf in zip(together, leaves, strict=True):
+        torch.testing.assert_close(values, leaf.grad, rtol=1e-3, atol=1e-3)
 
 
 def test_harmonics_depths_and_the_far_plane(device):
@@ -70,8 +70,8 @@ def test_harmonics_depths_and_the_far_plane(device):
     depths, _, _ = rasterization(*leaves, *place, sh_degree=2, render_mode="D", far_plane=3.0)
     assert depths.shape == (2, HEIGHT, WIDTH, 1)
     near = (means[:, 2] + 3.0 <= 3.0).nonzero()[:, 0]
-    kept = [leaf[near] for leaf in leaves]
-    torch.testing.assert_close(depths[0, ..., 0], alone(kept, place, 0, lit[near], depth=True).depth)
+    near_leaves = [leaf[near] for leaf in leaves]
+    torch.testing.assert_close(depths[0, ..., 0], alone(near_leaves, place, 0, lit[near], depth=True).depth)
     assert info["n_cameras"] == 2 and info["width"] == WIDTH and info["means2d"].shape == (2, COUNT, 2)
 
 
@@ -135,10 +135,10 @@ def test_packed_results_are_the_visible_of_the_others(options, device):
         colors, alphas, info = rasterization(*leaves, *place, packed=packed, **options)
         info["means2d"].retain_grad()
         results.append((colors, alphas, info, gradients(colors, leaves)))
-    (colors, alphas, info, found), (other_colors, other_alphas, other, expected) = results
+    (colors, alphas, info, grads), (other_colors, other_alphas, other, expected) = results
     torch.testing.assert_close(colors, other_colors)
     torch.testing.assert_close(alphas, other_alphas)
-    for one, two in zip(found, expected, strict=True):
+    for one, two in zip(grads, expected, strict=True):
         torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4)
     rows = info["camera_ids"], info["gaussian_ids"]
     assert (info["batch_ids"] == 0).all() and 0 < len(rows[0]) < 2 * COUNT - 40
@@ -214,9 +214,9 @@ def test_sizes_of_nothing_and_opacities_beyond_one_are_gsplats(device):
         leaves[2][0], leaves[2][1] = 0.0, -leaves[2][1]
         leaves[3][:] = torch.linspace(0, 1.4, COUNT)
     colors, _, info = rasterization(*leaves, *place, packed=False)
-    found = gradients(colors, leaves)
-    assert all(bool(gradient.isfinite().all()) for gradient in found)
-    assert bool((found[2][0] == 0).all()) and bool((info["radii"][0, 1] > 0).all())
+    grads = gradients(colors, leaves)
+    assert all(bool(gradient.isfinite().all()) for gradient in grads)
+    assert bool((grads[2][0] == 0).all()) and bool((info["radii"][0, 1] > 0).all())
     assert bool((info["radii"][:, 0] == 0).all()), "an opacity of 0"
     with torch.no_grad():
         leaves[2][1] = -leaves[2][1]
@@ -331,9 +331,9 @@ def test_antialiasing_is_differentiated_whole(device):
         means, quats, scales, opacities, colors = leaves
         covars, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
         shapes = (None, None) if by_covariances else (quats, scales)
-        given = {"covars": covars} if by_covariances else {}
+        values = {"covars": covars} if by_covariances else {}
         image, _, _ = rasterization(
-            means, *shapes, opacities, colors, *place, rasterize_mode="antialiased", packed=False, **given
+            means, *shapes, opacities, colors, *place, rasterize_mode="antialiased", packed=False, **values
         )
         gradients_of.append(torch.autograd.grad(image.square().sum(), leaves))
     for ours, true in zip(*gradients_of, strict=True):

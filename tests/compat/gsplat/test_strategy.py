@@ -62,11 +62,11 @@ def test_a_training_as_gsplats_simple_trainer_makes_one(name, packed, device):
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        given = {"params": params, "optimizers": optimizers, "state": state, "step": step, "info": info}
+        arguments = {"params": params, "optimizers": optimizers, "state": state, "step": step, "info": info}
         if isinstance(strategy, DefaultStrategy):
-            strategy.step_post_backward(**given, packed=packed)
+            strategy.step_post_backward(**arguments, packed=packed)
         else:
-            strategy.step_post_backward(**given, lr=1e-6)
+            strategy.step_post_backward(**arguments, lr=1e-6)
         losses.append(float(loss.detach()))
         counts.append(len(params["means"]))
         assert all(len(value) == counts[-1] for value in params.values())
@@ -98,13 +98,13 @@ def test_rows_change_with_their_optimizers():
     optimizers["means"].step()
     moment = optimizers["means"].state[params["means"]]["exp_avg"].clone()
     statistics = {"count": torch.arange(4.0), "scene_scale": 2.0}
-    kept = torch.tensor([True, False, True, True])
+    mask = torch.tensor([True, False, True, True])
     before = params["means"].detach().clone()
     more = {"means": torch.full((2, 2), 9.0), "fixed": torch.zeros(2)}
-    change_rows(params, optimizers, statistics, kept, more, torch.tensor([0, 3]))
-    assert torch.equal(params["means"].detach(), torch.cat([before[kept], more["means"]]))
+    change_rows(params, optimizers, statistics, mask, more, torch.tensor([0, 3]))
+    assert torch.equal(params["means"].detach(), torch.cat([before[mask], more["means"]]))
     state = optimizers["means"].state[params["means"]]
-    assert torch.equal(state["exp_avg"], torch.cat([moment[kept], torch.zeros(2, 2)])) and int(state["step"]) == 1
+    assert torch.equal(state["exp_avg"], torch.cat([moment[mask], torch.zeros(2, 2)])) and int(state["step"]) == 1
     assert optimizers["means"].param_groups[0]["params"] == [params["means"]] and not params["fixed"].requires_grad
     assert statistics["count"].tolist() == [0, 2, 3, 0, 3] and statistics["scene_scale"] == 2.0
     write_rows(params, optimizers, {"means": torch.zeros(5, 2)}, torch.tensor([0]))
