@@ -152,7 +152,7 @@ class BlockPlan:
 
     def write(self, folder: Path) -> None:
         """Write blocks.json."""
-        gains = self.shared.gains
+        compensation = self.shared.compensation
         values = {
             "format": FORMAT,
             "scene": self.scene,
@@ -160,7 +160,7 @@ class BlockPlan:
             "response": self.response.to_dict(),
             "base_time": self.shared.base_time,
             "normalization": self.normalization.to_dict(),
-            "exposure_compensation": None if gains is None else gains.to_dict(),
+            "exposure_compensation": None if compensation is None else compensation.to_dict(),
             "exposure_times": dict(self.exposure_times),
             "photo_bytes": dict(self.photo_bytes),
             "config": self.config.model_dump(),
@@ -185,8 +185,10 @@ class BlockPlan:
             raise InputError(path, str(error), remedy) from None
         if values["format"] != FORMAT:
             raise InputError(path, f"is of format {values['format']}, not {FORMAT}", remedy)
-        gains = values["exposure_compensation"]
-        shared = SharedDecisions(values["base_time"], None if gains is None else ExposureCompensation.from_dict(gains))
+        compensation = values["exposure_compensation"]
+        shared = SharedDecisions(
+            values["base_time"], None if compensation is None else ExposureCompensation.from_dict(compensation)
+        )
         return BlockPlan(
             values["scene"],
             values["data"],
@@ -211,7 +213,7 @@ def make_block_plan(
         config: Options of the training.
         device: Device to measure on.
         count: Number of blocks; None chooses it.
-        selection: Further arguments of load_scene(): method, candidates, photos.
+        selection: Further arguments of load_scene(): method, candidates, photo_storage.
 
     Returns:
         The plan; None if `count` is None and one training does.
@@ -226,13 +228,13 @@ def make_block_plan(
     response = response_for_training(scene, config)
     times = {view.name: view.exposure_time for view in scene.views}
     normalization = normalization_of(scene)
-    gains = None
+    compensation = None
     if config.plan.enabled and estimates_compensation(scene, config, response):
         result = estimate_compensation(normalization.scene(scene), config, response, device)
-        gains = result.gains
+        compensation = result.compensation
         log.info("plan: %s: %s (%s)", result.decision.name, result.decision.choice, result.decision.reason)
-    compensated = scene if gains is None else gains.normalize_photos(scene, response)
-    shared = SharedDecisions(base_time(compensated), gains)
+    compensated = scene if compensation is None else compensation.normalize_photos(scene, response)
+    shared = SharedDecisions(base_time(compensated), compensation)
     views = scene.train_views
     cameras = [view.camera for view in views]
     points = _places(compensated, response, device)

@@ -49,14 +49,14 @@ def is_finished(folder: Path) -> bool:
     return run.info.is_file() and run.confidence.is_file() and bool(run.read_summary().get("finished"))
 
 
-def train_block(out: Path, index: int, device: str | None, photos: str, versions: str) -> BlockResult:
+def train_block(out: Path, index: int, device: str | None, photo_storage: str, versions: str) -> BlockResult:
     """Train a block to its end, or continue its training.
 
     Args:
         out: Folder of the merged run, with blocks.json.
         index: Number of the block.
         device: Device to train on; None for the first GPU.
-        photos: Where its photos are stored, see load_scene().
+        photo_storage: Where its photos are stored, see load_scene().
         versions: installed_versions() of the machine that merges the blocks.
 
     Returns:
@@ -64,7 +64,7 @@ def train_block(out: Path, index: int, device: str | None, photos: str, versions
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     try:
-        _train(out, index, device, photos, versions)
+        _train(out, index, device, photo_storage, versions)
     except Exception as error:
         message = as_user_error(error)
         if message is None:
@@ -73,7 +73,7 @@ def train_block(out: Path, index: int, device: str | None, photos: str, versions
     return BlockResult(index, None, platform.node())
 
 
-def _train(out: Path, index: int, device: str | None, photos: str, versions: str) -> None:
+def _train(out: Path, index: int, device: str | None, photo_storage: str, versions: str) -> None:
     """Train a block; raise SehdrError if this machine has other versions or photos than that which divided the set."""
     from ..training.train import create_trainer
 
@@ -86,7 +86,7 @@ def _train(out: Path, index: int, device: str | None, photos: str, versions: str
     data = plan.data | {"views": list(block.views)}
     config = plan.config_of(block)
     response = response_for_loading(config, plan.response)
-    scene = shared_scene(plan, index, load_photos(data, response=response, photos=photos))
+    scene = shared_scene(plan, index, load_photos(data, response=response, photo_storage=photo_storage))
     plan.check_photos(scene.views)
     trainer = create_trainer(scene, folder, config, device=device, resume=True, data=data, shared=plan.shared)
     for _ in trainer:

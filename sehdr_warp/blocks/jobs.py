@@ -39,7 +39,7 @@ def run_blocks(
     *,
     device: torch.device,
     gpus: int = 1,
-    photos: str = "auto",
+    photo_storage: str = "auto",
     slurm: Mapping[str, str] | None = None,
 ) -> None:
     """Train all blocks of a plan that are not finished.
@@ -50,7 +50,7 @@ def run_blocks(
         device: The CPU, or the first GPU to use.
         gpus: Blocks to train at once on this machine, each on a GPU of its own from `device` on. SLURM gets all at
             once.
-        photos: Where photos are stored, see load_scene().
+        photo_storage: Where photos are stored, see load_scene().
         slurm: Parameters of SLURM jobs, such as {"partition": "gpu"}; None for this machine.
 
     Raises:
@@ -66,7 +66,7 @@ def run_blocks(
         return
     slots = min(gpus, len(waiting)) if slurm is None else len(waiting)
     executors = _executors(out, device, slots, slurm)
-    arguments = ("cpu" if device.type == "cpu" else None), photos, installed_versions()
+    arguments = ("cpu" if device.type == "cpu" else None), photo_storage, installed_versions()
     # Jobs that run beside each other on this machine share its processors.
     job = BlockJob(max(1, thread_count() // slots) if slurm is None and slots > 1 else None)
     tries, errors = dict.fromkeys(waiting, 0), {}

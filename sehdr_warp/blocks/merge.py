@@ -80,7 +80,7 @@ def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
     info = {name: blocks[0].info[name] for name in ("base_time", "response")}
     info |= {"scene": plan.scene, "data": plan.data, "normalization": plan.normalization.to_dict()}
     info |= {"color_matrix": matrix} if (matrix := blocks[0].info.get("color_matrix")) else {}
-    info |= {"exposure_compensation": gains.to_dict()} if (gains := plan.shared.gains) else {}
+    info |= {"exposure_compensation": compensation.to_dict()} if (compensation := plan.shared.compensation) else {}
     if all(block.info.get("up") for block in blocks):  # Each block found its own from its photos.
         direction = np.mean([block.info["up"]["direction"] for block in blocks], axis=0)
         info |= {"up": {"direction": direction.tolist(), "source": blocks[0].info["up"]["source"]}}

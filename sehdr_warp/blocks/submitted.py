@@ -12,7 +12,7 @@ class BlockJob:
         """Set the threads that the job may use on the CPU; None for all of its machine."""
         self.threads = threads
 
-    def __call__(self, out: Path, index: int, device: str | None, photos: str, versions: str) -> Any:
+    def __call__(self, out: Path, index: int, device: str | None, photo_storage: str, versions: str) -> Any:
         """Train the block; arguments and result as of train_block()."""
         from ..process import calm_threads, collect_late
 
@@ -22,7 +22,7 @@ class BlockJob:
         collect_late()
         from .job import train_block
 
-        return train_block(out, index, device, photos, versions)
+        return train_block(out, index, device, photo_storage, versions)
 
     def checkpoint(self, *arguments: Any) -> Any:
         """Return the same job: its training continues from its newest checkpoint."""

@@ -42,7 +42,7 @@ def train_in_blocks(
     slurm: Mapping[str, str] | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    photos: str = "auto",
+    photo_storage: str = "auto",
 ) -> Run | None:
     """Train a set of photos in blocks and merge them into one run.
 
@@ -56,7 +56,7 @@ def train_in_blocks(
         slurm: Parameters of SLURM jobs; None trains on this machine.
         resume: Continue; finished blocks are not run again.
         overwrite: Replace a training in blocks in `out`.
-        photos: Where photos are stored, see load_scene().
+        photo_storage: Where photos are stored, see load_scene().
 
     Returns:
         The merged run; None if `count` is None and one training does for the set.
@@ -68,7 +68,7 @@ def train_in_blocks(
     plan = _continued(out, data, config, count) if _check(out, resume=resume, overwrite=overwrite) else None
     if plan is None:
         options = config.response
-        selection = {"method": options.method, "candidates": options.candidates, "photos": photos}
+        selection = {"method": options.method, "candidates": options.candidates, "photo_storage": photo_storage}
         plan = make_block_plan(data, config, device, count, **selection)
         if plan is None:
             return None
@@ -78,10 +78,10 @@ def train_in_blocks(
         with writing(out):
             make_parents(out / FILE)
         plan.write(out)
-    run_blocks(out, plan, device=device, gpus=gpus, photos=photos, slurm=slurm)
+    run_blocks(out, plan, device=device, gpus=gpus, photo_storage=photo_storage, slurm=slurm)
     folder = merge_blocks(out, plan)
     run = load_run(out, device=device)
-    errors = _measure(run, plan, photos)
+    errors = _measure(run, plan, photo_storage)
     if errors is not None:
         line = {"iteration": run.iterations, "seconds": round(run.train_seconds, 3), "split": "test"}
         folder.append_metrics(line | {"psnr_ldr": round(errors.psnr, 4), "gaussians": run.gaussian_count})
@@ -130,13 +130,13 @@ def _continued(out: Path, data: LoadArguments, config: Config, count: int | None
     return plan
 
 
-def _measure(run: Run, plan: BlockPlan, photos: str) -> SeamErrors | None:
+def _measure(run: Run, plan: BlockPlan, photo_storage: str) -> SeamErrors | None:
     """Return the errors of the merged run on held-out photos; None if there are none."""
     names = [entry.name for entry in run.cameras if entry.split == "test" and entry.camera.is_pinhole]
     names = names[:: -(-len(names) // MOST_VIEWS) or 1]
     if not names:
         return None
     response = response_for_loading(plan.config, plan.response)
-    scene = load_photos(plan.data | {"views": names}, response=response, photos=photos)
+    scene = load_photos(plan.data | {"views": names}, response=response, photo_storage=photo_storage)
     views = tuple(replace(view, exposure_time=plan.exposure_times[view.name]) for view in scene.views)
     return measure_seams(run, run.normalize_photos(replace(scene, views=views)).views, plan.division)

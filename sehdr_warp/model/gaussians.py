@@ -111,7 +111,7 @@ class Gaussians(nn.Module):
         """Return copies of the parameters at an index or mask [N]."""
         return {name: value[index].clone() for name, value in self.tensors().items()}
 
-    def keep(self, index: Tensor, optimizer: Optimizer | None = None) -> None:
+    def keep_only(self, index: Tensor, optimizer: Optimizer | None = None) -> None:
         """Remove all Gaussians but those at an index or mask [N]; the others keep their optimizer state."""
         if index.dtype == torch.bool:
             index = index.nonzero()[:, 0]  # Once, because indexing by a mask waits for the device.
@@ -164,8 +164,8 @@ class Gaussians(nn.Module):
         self._reserved = None
 
     @property
-    def reserved(self) -> int:
-        """Number of rows that there is memory for."""
+    def row_count(self) -> int:
+        """Number of rows of the parameters in memory: the count, or more if rows are reserved."""
         return self.count if self._reserved is None else self._reserved.rows
 
     @contextmanager
@@ -193,7 +193,7 @@ class Gaussians(nn.Module):
     def resize(self, count: int, optimizer: Optimizer | None = None) -> None:
         """Change the number of rows to `count`; new rows are zero, and the caller writes their values."""
         if count < self.count:
-            self.keep(torch.arange(count, device=self.means.device), optimizer)
+            self.keep_only(torch.arange(count, device=self.means.device), optimizer)
         elif count > self.count:
             more = count - self.count
             self.append({name: old.new_zeros(more, *old.shape[1:]) for name, old in self.tensors().items()}, optimizer)

@@ -18,35 +18,35 @@ from .warp_launch.threads import torch_threads
 @torch.no_grad()
 def check_finite(
     loss: Tensor,
-    norms: Tensor,
+    finite: Tensor,
     incomplete: Tensor | None = None,
     step_counters: Tensor | None = None,
     intersections: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return two scalars, 1 or 0: whether a step is skipped, and whether it is made.
 
-    It is skipped if the loss or a norm is not finite or `incomplete` is true. loss: float32 scalar; norms: [K] float32;
-    incomplete: bool scalar.
+    It is skipped if the loss or one of the values of `finite` is not finite, or if `incomplete` is true. loss: float32
+    scalar; finite: [K] float32, the result of finiteness(); incomplete: bool scalar.
 
     step_counters: [3] int64, counts steps that are not finite; with intersections, an int64 scalar, it also holds the
     most intersections and counts the incomplete steps.
     """
-    step_flags = norms.new_empty(2)
+    step_flags = finite.new_empty(2)
     if incomplete is None:
-        incomplete = torch.empty(0, dtype=torch.bool, device=norms.device)
+        incomplete = torch.empty(0, dtype=torch.bool, device=finite.device)
     none = (
-        torch.empty(0, dtype=torch.int64, device=norms.device)
+        torch.empty(0, dtype=torch.int64, device=finite.device)
         if step_counters is None or intersections is None
         else None
     )
     counters = (none if step_counters is None else step_counters), (none if intersections is None else intersections)
-    launch(kernels.check_finite, 1, loss.detach(), norms, incomplete, *counters, step_flags)
+    launch(kernels.check_finite, 1, loss.detach(), finite, incomplete, *counters, step_flags)
     return step_flags[0], step_flags[1]
 
 
 @torch.no_grad()
-def norms(gradients: Sequence[Tensor]) -> Tensor:
-    """[K] float32, finite where all the gradients are: on a CPU their norms, on a GPU one number, 0 or infinity."""
+def finiteness(gradients: Sequence[Tensor]) -> Tensor:
+    """Return [K] float32, all finite if all gradients are: on a CPU their norms; on a GPU one number, 0 or infinity."""
     if gradients[0].device.type == "cuda":
         return _nonfinite_by_kernel(gradients)
     with torch_threads(gradients[0].device):  # Threads change the last bits, but only finiteness counts.

@@ -128,7 +128,7 @@ class RunWriter(RunFolder):
         plan: dict | None,
         state: tuple[dict[str, Tensor], dict],
         *,
-        gains: ExposureCompensation | None = None,
+        compensation: ExposureCompensation | None = None,
         overwrite: bool = False,
     ) -> None:
         """Lock the folder and write all that does not change during the training, and a checkpoint of the start.
@@ -145,8 +145,8 @@ class RunWriter(RunFolder):
         info["normalization"] = field.normalization.to_dict()
         if scene.color_matrix is not None:
             info["color_matrix"] = scene.color_matrix.tolist()
-        if gains is not None:
-            info["exposure_compensation"] = gains.to_dict()
+        if compensation is not None:
+            info["exposure_compensation"] = compensation.to_dict()
         info["up"] = find_up(scene).to_dict()
         self.begin_described(describe_scene(scene), info, config, plan, state)
 

@@ -27,7 +27,7 @@ def load_scene(
     max_size: int | None = None,
     holdout: int | None = None,
     cache: Path | str | None = None,
-    photos: str = "auto",
+    photo_storage: str = "auto",
     views: Collection[str] | None = None,
 ) -> Scene:
     """Read a folder of posed or bare photos, whatever its layout.
@@ -50,8 +50,8 @@ def load_scene(
             the protocol of its layout, or takes the middle of every eight. Sets of fewer than 5 views have no test
             view.
         cache: a folder for results of structure from motion; None is the user's ($SEHDR_CACHE).
-        photos: where they are stored: "memory", "disk" (in a nameless file beside the cache, removed with the process),
-            or "auto" for the disk if they would take more than half of the free memory.
+        photo_storage: where photos are stored: "memory", "disk" (in a nameless file beside the cache, removed with the
+            process), or "auto" for the disk if they would take more than half of the free memory.
         views: names of the views to read; None reads all. Response, splits and colors are those of the whole set.
 
     Returns:
@@ -82,7 +82,7 @@ def load_scene(
             raise InputError(path, problem, "put the photos back as they were")
         names = [names[index] for index in indices]
         dataset = replace(dataset, records=tuple(dataset.records[index] for index in indices))
-    scene = preprocess(dataset, curve, max_size, photos, names)
+    scene = preprocess(dataset, curve, max_size, photo_storage, names)
     named_views = zip(names, dataset.records, strict=True)
     if guessed := {name for name, record in named_views if not record.time_known}:
         from .exposure_estimate import with_estimated_times

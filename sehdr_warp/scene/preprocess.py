@@ -44,7 +44,7 @@ def preprocess(
     dataset: DataparserOutputs,
     response: "Response",
     max_size: int | None = None,
-    photos: str = "auto",
+    photo_storage: str = "auto",
     names: Sequence[str] | None = None,
 ) -> Scene:
     """Undistort and resize the photos of a dataset.
@@ -55,7 +55,7 @@ def preprocess(
         dataset: what parse_dataset returned.
         response: decodes codes to the light in which averages are taken.
         max_size: longest side of the views in pixels; None keeps the photos' sizes.
-        photos: where views are stored, see PhotoKeeper.
+        photo_storage: where views are stored, see PhotoKeeper.
         names: of the views; by default unique_names() of the records.
 
     Raises:
@@ -63,7 +63,9 @@ def preprocess(
     """
     preprocessor = _Preprocessor(max_size, response, dataset.alpha)
     names = unique_names(dataset.records) if names is None else names
-    keeper = PhotoKeeper(photos, len(names), sum(record.lens.width * record.lens.height for record in dataset.records))
+    keeper = PhotoKeeper(
+        photo_storage, len(names), sum(record.lens.width * record.lens.height for record in dataset.records)
+    )
     # OpenEXR and LibRaw are read one at a time: their output to the terminal is suppressed for the whole process.
     quiet = any(record.hdr is not None or kind_of(record.image) != "encoded" for record in dataset.records)
     most = 1 if quiet else _PIXELS_AT_ONCE // max(record.lens.width * record.lens.height for record in dataset.records)

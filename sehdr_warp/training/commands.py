@@ -113,29 +113,29 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     """
     from .launch import device_of_rank, launched_as
 
-    gpus, info = args.machine.gpus, launched_as()
+    gpus, rank_info = args.machine.gpus, launched_as()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
     _refuse_run(args)
     if _in_blocks(args):
-        if info is not None:
+        if rank_info is not None:
             raise UsageError("--blocks starts its own processes; leave torchrun out")
         if _train_blocks(args):
             return
         argv = _without_blocks(argv)
-    if info is None and gpus > 1 and not args.training.plan_only:
+    if rank_info is None and gpus > 1 and not args.training.plan_only:
         from .launch import launch
 
         device_of_rank(gpus - 1, args.machine.device)
         launch(gpus, _run_as_rank, list(argv))
-    elif info is None or args.training.plan_only:
+    elif rank_info is None or args.training.plan_only:
         _train(args)
-    elif gpus not in (1, info.local_count):
-        raise UsageError(f"--gpus {gpus}, but {info.local_count} ranks were started; leave it out")
+    elif gpus not in (1, rank_info.local_count):
+        raise UsageError(f"--gpus {gpus}, but {rank_info.local_count} ranks were started; leave it out")
     else:
         from .ranks import join_ranks
 
-        with join_ranks(info, device_of_rank(info.local_rank, args.machine.device)) as ranks:
+        with join_ranks(rank_info, device_of_rank(rank_info.local_rank, args.machine.device)) as ranks:
             if ranks.leads:
                 _train(args, ranks)
             else:
@@ -172,7 +172,7 @@ def _train(args: Train, ranks=None) -> None:
     config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     options = config.response
-    selection = {"method": options.method, "candidates": options.candidates, "photos": _photo_storage(config)}
+    selection = {"method": options.method, "candidates": options.candidates, "photo_storage": _photo_storage(config)}
     if out is not None:
         check_dataset_truth(data, config)
     with nullcontext() if out is None or device.type != "cpu" else _precompiling(config):
@@ -285,7 +285,7 @@ def _train_blocks(args: Train) -> bool:
         slurm=parse_pairs("--slurm", machine.slurm),
         resume=output.resume,
         overwrite=output.overwrite,
-        photos=_photo_storage(config),
+        photo_storage=_photo_storage(config),
     )
     if run is not None:
         _print_result(args, run)

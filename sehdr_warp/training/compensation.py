@@ -85,9 +85,9 @@ class Parts:
     white_balance: bool
     vignetting: bool
 
-    def of(self, gains: ExposureCompensation) -> ExposureCompensation:
-        """Return gains with these parts alone."""
-        return gains.parts(exposure=self.exposure, white_balance=self.white_balance, vignetting=self.vignetting)
+    def of(self, compensation: ExposureCompensation) -> ExposureCompensation:
+        """Return a compensation with these parts alone."""
+        return compensation.parts(exposure=self.exposure, white_balance=self.white_balance, vignetting=self.vignetting)
 
 
 @dataclass(frozen=True)
@@ -95,12 +95,12 @@ class Compensation:
     """Result of estimate_compensation.
 
     Attributes:
-        gains: The compensation to apply to the photos; None if there is no drift.
+        compensation: Correction of the photos; None if there is no drift.
         matcher: Matcher of the corrected training photos.
         decision: Line of the plan.
     """
 
-    gains: ExposureCompensation | None
+    compensation: ExposureCompensation | None
     matcher: Matcher
     decision: Decision
 
@@ -111,13 +111,13 @@ class PreparedPhotos:
 
     Attributes:
         scene: The scene, with drift of exposure, white balance and vignetting taken out of its photos.
-        gains: The drift; None if there is none.
+        compensation: What was taken out; None if there is no drift.
         matcher: Returns the matcher of the training photos, which is created once.
         decision: Line of the plan; None if nothing was estimated.
     """
 
     scene: Scene
-    gains: ExposureCompensation | None
+    compensation: ExposureCompensation | None
     matcher: Callable[[], Matcher]
     decision: Decision | None
 
@@ -128,18 +128,20 @@ class SharedDecisions:
 
     Attributes:
         base_time: Exposure time dt_1 that colors refer to, seconds.
-        gains: The compensation of all photos; None if there is no drift.
+        compensation: Correction of all photos; None if there is no drift.
     """
 
     base_time: float
-    gains: ExposureCompensation | None
+    compensation: ExposureCompensation | None
 
-    def gains_of(self, views: Sequence[View]) -> ExposureCompensation | None:
+    def compensation_of(self, views: Sequence[View]) -> ExposureCompensation | None:
         """Return the compensation of some views alone."""
-        if self.gains is None:
+        if self.compensation is None:
             return None
         names = {view.name for view in views}
-        parts = ({name: value for name, value in part.items() if name in names} for part in vars(self.gains).values())
+        parts = (
+            {name: value for name, value in part.items() if name in names} for part in vars(self.compensation).values()
+        )
         return ExposureCompensation(*parts)
 
 
@@ -165,13 +167,13 @@ def prepare_photos(
     normalization = normalization_of(scene)
     if shared is None and estimate and estimates_compensation(scene, config, response):
         result = estimate_compensation(normalization.scene(scene), config, response, device)
-        gains, decision, matcher = result.gains, result.decision, lambda: result.matcher
+        compensation, decision, matcher = result.compensation, result.decision, lambda: result.matcher
     else:
-        gains, decision, matcher = None if shared is None else shared.gains_of(scene.views), None, None
-    if gains is not None:
-        scene = gains.normalize_photos(scene, response)
+        compensation, decision, matcher = None if shared is None else shared.compensation_of(scene.views), None, None
+    if compensation is not None:
+        scene = compensation.normalize_photos(scene, response)
     matcher = matcher or cache(partial(make_matcher, normalization.scene(scene), response, device))
-    return PreparedPhotos(scene, gains, matcher, decision)
+    return PreparedPhotos(scene, compensation, matcher, decision)
 
 
 def estimates_compensation(scene: Scene, config: Config, response: Response) -> bool:
@@ -217,15 +219,17 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
         shared = max(shared, match(matcher_of(guess.normalize_photos(small, response))), key=len)
     if len(shared) < MIN_POINTS:
         return no_drift(matcher)
-    gains = fit(shared)
-    parts = _explanatory_parts(gains, views, shared, response, times_stated)
+    compensation = fit(shared)
+    parts = _explanatory_parts(compensation, views, shared, response, times_stated)
     if not (parts.exposure or parts.white_balance or parts.vignetting):
         return no_drift(matcher)
     # Match again in photos that are already similar: more points are found.
-    matcher = matcher_of(parts.of(gains).normalize_photos(small, response))
-    gains = parts.of(fit(match(matcher)))
+    matcher = matcher_of(parts.of(compensation).normalize_photos(small, response))
+    compensation = parts.of(fit(match(matcher)))
     return Compensation(
-        gains, matcher_of(gains.normalize_photos(small, response)), _decision(gains, parts, times_stated)
+        compensation,
+        matcher_of(compensation.normalize_photos(small, response)),
+        _decision(compensation, parts, times_stated),
     )
 
 
@@ -239,29 +243,42 @@ def _may_drift(views: Sequence[View], shared: SharedPoints, response: Response) 
 
 
 def _explanatory_parts(
-    gains: ExposureCompensation, views: Sequence[View], shared: SharedPoints, response: Response, times_stated: bool
+    compensation: ExposureCompensation,
+    views: Sequence[View],
+    shared: SharedPoints,
+    response: Response,
+    times_stated: bool,
 ) -> Parts:
     """Return the parts of gains that explain how photos differ at shared points."""
     before = shared.disagreement(views, response, None)
-    after = shared.disagreement(views, response, gains.parts(vignetting=False))
+    after = shared.disagreement(views, response, compensation.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
-    exposure = white_balance = not times_stated and gains.stops >= MIN_STOPS and explains
-    if not exposure and (gains.white_balance >= MIN_WHITE_BALANCE or (times_stated and _exceeds_stated(gains, views))):
+    exposure = white_balance = not times_stated and compensation.stops >= MIN_STOPS and explains
+    if not exposure and (
+        compensation.white_balance >= MIN_WHITE_BALANCE or (times_stated and _exceeds_stated(compensation, views))
+    ):
         drift, colors = _cross_validate(views, shared, response)
         exposure = (
-            times_stated and gains.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS and drift <= MAX_REMAINING_CROSS
+            times_stated
+            and compensation.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS
+            and drift <= MAX_REMAINING_CROSS
         )
-        white_balance = (exposure or gains.white_balance >= MIN_WHITE_BALANCE) and colors <= MAX_REMAINING_WHITE_BALANCE
-    vignetting = gains.corner_loss >= MIN_CORNER_LOSS
+        white_balance = (
+            exposure or compensation.white_balance >= MIN_WHITE_BALANCE
+        ) and colors <= MAX_REMAINING_WHITE_BALANCE
+    vignetting = compensation.corner_loss >= MIN_CORNER_LOSS
     if vignetting:
-        remaining = remaining_vignetting(views, shared.points, shared.visible, response, gains)
+        remaining = remaining_vignetting(views, shared.points, shared.visible, response, compensation)
         vignetting = remaining <= MAX_REMAINING_VIGNETTING
     return Parts(exposure, white_balance, vignetting)
 
 
-def _exceeds_stated(gains: ExposureCompensation, views: Sequence[View]) -> bool:
+def _exceeds_stated(compensation: ExposureCompensation, views: Sequence[View]) -> bool:
     """Return whether gains, beyond what stated times and positions explain, are large enough to be considered."""
-    return gains.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS or gains.white_balance >= MIN_WHITE_BALANCE
+    return (
+        compensation.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS
+        or compensation.white_balance >= MIN_WHITE_BALANCE
+    )
 
 
 def _cross_validate(views: Sequence[View], shared: SharedPoints, response: Response) -> tuple[float, float]:
@@ -287,15 +304,15 @@ def _cross_validate(views: Sequence[View], shared: SharedPoints, response: Respo
     return float(drift), float(colors)
 
 
-def _decision(gains: ExposureCompensation, parts: Parts, times_stated: bool) -> Decision:
+def _decision(compensation: ExposureCompensation, parts: Parts, times_stated: bool) -> Decision:
     """Return the line of the plan for gains that are corrected."""
     figures = []
     if parts.exposure:
-        figures.append(f"{gains.stops:.2f} stops between photos")
-    if parts.white_balance and gains.white_balance >= MIN_WHITE_BALANCE:
-        figures.append(f"{gains.white_balance:.2f} stops of white balance between photos")
+        figures.append(f"{compensation.stops:.2f} stops between photos")
+    if parts.white_balance and compensation.white_balance >= MIN_WHITE_BALANCE:
+        figures.append(f"{compensation.white_balance:.2f} stops of white balance between photos")
     if parts.vignetting:
-        figures.append(f"{gains.corner_loss:.0%} towards the corners")
+        figures.append(f"{compensation.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
     choice = f"taken out of the photos{over if times_stated else ''}"
     return Decision(

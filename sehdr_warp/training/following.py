@@ -32,7 +32,7 @@ class PhotoRequest:
 
     Attributes:
         data: Arguments of load_scene() as a run saves them.
-        options: Further arguments of load_scene(): response, method, candidates, photos.
+        options: Further arguments of load_scene(): response, method, candidates, photo_storage.
     """
 
     data: LoadArguments
@@ -58,8 +58,11 @@ class SharedTraining:
     scene: dict | None
 
 
-def send_training(ranks: Ranks, trainer: Trainer, gains: ExposureCompensation | None) -> None:
-    """Send a training from rank 0 to the others, in the form of a checkpoint; gains: already taken from its photos."""
+def send_training(ranks: Ranks, trainer: Trainer, compensation: ExposureCompensation | None) -> None:
+    """Send a training from rank 0 to the others, in the form of a checkpoint.
+
+    Its photos are corrected by `compensation` already.
+    """
     if ranks.info.several_nodes and not ranks.photos_are_requested:
         raise SehdrError("ranks on several nodes read their own photos: train by the command line")
     state = state_of(trainer)
@@ -67,8 +70,8 @@ def send_training(ranks: Ranks, trainer: Trainer, gains: ExposureCompensation | 
     field = trainer.field
     info = {"response": field.response.to_dict(), "base_time": field.base_time}
     info["normalization"] = field.normalization.to_dict()
-    if gains is not None:
-        info["exposure_compensation"] = gains.to_dict()
+    if compensation is not None:
+        info["exposure_compensation"] = compensation.to_dict()
     layout = {name: (tensor.shape, tensor.dtype) for name, tensor in tensors.items()}
     scene = _training_part(trainer.scene)
     description = describe_scene(scene) if ranks.info.several_nodes else None
@@ -105,8 +108,8 @@ def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
     checkpoint = Checkpoint(Path("rank 0"), tensors, shared.values)
     field = field_from_checkpoint(checkpoint, config, shared.info)
     if scene is not None:
-        gains = exposure_compensation(shared.info)
-        scene = _training_part(scene if gains is None else gains.normalize_photos(scene, field.response))
+        compensation = exposure_compensation(shared.info)
+        scene = _training_part(scene if compensation is None else compensation.normalize_photos(scene, field.response))
         _check_same_photos(ranks, shared, scene)
         ranks.share_photos(scene, _bytes_of(scene))
     else:

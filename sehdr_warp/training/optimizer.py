@@ -15,7 +15,7 @@ from ..model.adam import BETAS, FIRST_HARMONIC, Adam
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients
-from ..rasterizer.training_step import check_finite, norms
+from ..rasterizer.training_step import check_finite, finiteness
 from ..runs.checkpoint import under
 from ..runs.config import Config
 
@@ -93,7 +93,7 @@ def guarded_step(
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.grad_colors]
-    skipped, applied = check_finite(loss, norms(gradients), incomplete, step_counters, intersections)
+    skipped, applied = check_finite(loss, finiteness(gradients), incomplete, step_counters, intersections)
     optimizer.step(skipped, applied, harmonics, active_count)
     return applied
 
@@ -222,11 +222,11 @@ class MovingAverage:
         self.means: dict[str, Tensor] = {}
 
     @torch.no_grad()
-    def update(self, iteration: int, photos: int, gaussians: Gaussians) -> None:
-        """Update the average after a step of `photos` iterations; at the last iteration, copy it to the Gaussians."""
+    def update(self, iteration: int, step_batch: int, gaussians: Gaussians) -> None:
+        """Update the average after a step of `step_batch` iterations; after the last one, copy it to the Gaussians."""
         if self.weight == 1 or iteration <= self.first:
             return
-        if iteration % self.every < photos or iteration >= self.total:
+        if iteration % self.every < step_batch or iteration >= self.total:
             now = gaussians.tensors()
             if self.means:
                 # A plain mean at first, so that the first sample does not weigh more than others.

@@ -38,16 +38,16 @@ class RunOutput:
         folder: The run folder.
     """
 
-    def __init__(self, folder: RunWriter, config: Config, *, tensorboard: bool = False, part: bool = False):
+    def __init__(self, folder: RunWriter, config: Config, *, tensorboard: bool = False, is_block: bool = False):
         """Prepare to write to a run folder, which need not exist yet.
 
         Args:
             folder: The run folder.
             config: Options of the training.
             tensorboard: Write event files.
-            part: The run is a part of a larger one, whose photos are not compared with it at the end.
+            is_block: The run is a block of a larger one, whose photos are not compared with it at the end.
         """
-        self.folder, self._part = folder, part
+        self.folder, self._is_block = folder, is_block
         total = config.schedule.iterations
         self._evaluate_at = {config.scaled(n) for n in config.schedule.evaluate_at} | {total}
         self._checkpoint_every = config.scaled(config.schedule.checkpoint_every)
@@ -128,14 +128,14 @@ class RunOutput:
         if not complete:
             return
         checkpoint_hash = self.folder.checkpoint_hash
-        if self._part and evidence is not None and checkpoint_hash is not None:
+        if self._is_block and evidence is not None and checkpoint_hash is not None:
             write_confidence(self.folder, evidence, checkpoint_hash)
             return
         run = self.load_run(trainer.device)
         evidence = evidence or run.measure_confidence(trainer.scene)
         run.field.confidence = evidence.confidence()
         write_confidence(self.folder, evidence, run.checkpoint_hash)
-        if not self._part:
+        if not self._is_block:
             self._report_residuals(run, trainer)
 
     def _write_summary(self, trainer: Trainer) -> None:
@@ -192,7 +192,7 @@ def remove_unseen(trainer: Trainer) -> Evidence:
     remaining = int(contributes.sum())
     if remaining == count or remaining == 0:
         return evidence
-    trainer.field.gaussians.keep(contributes, trainer.optimizer)
+    trainer.field.gaussians.keep_only(contributes, trainer.optimizer)
     log.info("removed %d of %d Gaussians, which no training photo shows", count - remaining, count)
     return evidence.rows(contributes)
 

@@ -157,8 +157,12 @@ class GraphCapacity:
         self._intersections, self._capacity = needed, 0
         return skipped, True
 
-    def rescale(self, growth: float, *, keep: bool) -> bool:
-        """Adapt the capacity after densification changed the count by `growth`; with `keep` it stays if it suffices.
+    def rescale(self, growth: float, *, same_memory: bool) -> bool:
+        """Adapt the capacity after densification changed the count by the factor `growth`.
+
+        Args:
+            growth: New count over the old.
+            same_memory: Whether the Gaussians stayed in the same memory, so that captured graphs are still valid.
 
         Returns:
             True if the current capacity, and with it the captured graphs, can be kept.
@@ -168,7 +172,7 @@ class GraphCapacity:
         self._intersections = math.ceil(max(needed * growth, MIN_SHRINK * self._intersections))
         self.step_counters[1].zero_()
         self._largest = 0
-        if keep and self._capacity >= MIN_HEADROOM * self._intersections:
+        if same_memory and self._capacity >= MIN_HEADROOM * self._intersections:
             return True
         self._capacity = 0
         return False

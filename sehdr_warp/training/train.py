@@ -95,7 +95,9 @@ def create_trainer(
         resumes = folder.check(resume=resume, overwrite=overwrite)
         try:
             if resumes:
-                trainer = _resumed_trainer(scene, folder, config, device, ranks, tensorboard, part=shared is not None)
+                trainer = _resumed_trainer(
+                    scene, folder, config, device, ranks, tensorboard, is_block=shared is not None
+                )
             else:
                 config, data = config or Config(), data or LoadArguments()
                 trainer = _new_trainer(
@@ -131,23 +133,25 @@ def _new_trainer(
     check_scene_truth(scene, config.loss)
     response = response_for_training(scene, config)
     with watch:
-        photos = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
+        prepared = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
         base_time = None if shared is None else shared.base_time
-        field = make_field(photos.scene, config, response, device, photos.matcher, base_time)
-    output = RunOutput(folder, config, tensorboard=tensorboard, part=shared is not None)
-    trainer = Trainer(photos.scene, config, field, matcher=photos.matcher, ranks=ranks, output=output)
+        field = make_field(prepared.scene, config, response, device, prepared.matcher, base_time)
+    output = RunOutput(folder, config, tensorboard=tensorboard, is_block=shared is not None)
+    trainer = Trainer(prepared.scene, config, field, matcher=prepared.matcher, ranks=ranks, output=output)
     with watch:
         held = trainer.views.held_estimates
         if held is not None and not config.model.init_file:
-            brighten_clipped(field, normalization_of(scene).scene(photos.scene).train_views, held)
+            brighten_clipped(field, normalization_of(scene).scene(prepared.scene).train_views, held)
     trainer.seconds = watch.seconds
-    if plan is not None and photos.decision is not None:
-        plan = plan.with_decision(photos.decision)
+    if plan is not None and prepared.decision is not None:
+        plan = plan.with_decision(prepared.decision)
     # The folder is begun last, when the scene is known to be usable.
     state = state_of(trainer)
     state.values["seconds"] = trainer.seconds
     plan_values = None if plan is None else plan.to_dict()
-    folder.begin(scene, config, field, data, plan_values, state, gains=photos.gains, overwrite=overwrite)
+    folder.begin(
+        scene, config, field, data, plan_values, state, compensation=prepared.compensation, overwrite=overwrite
+    )
     for line in plan.lines() if plan is not None else ():
         log.info("%s", line)
     return trainer
@@ -161,7 +165,7 @@ def _resumed_trainer(
     ranks: Ranks | None,
     tensorboard: bool,
     *,
-    part: bool,
+    is_block: bool,
 ) -> Trainer:
     """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run."""
     folder.lock()
@@ -177,10 +181,10 @@ def _resumed_trainer(
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, with --overwrite")
     field = field_from_checkpoint(checkpoint, saved, info).to(device)
-    gains = exposure_compensation(info)
-    scene = scene if gains is None else gains.normalize_photos(scene, field.response)
+    compensation = exposure_compensation(info)
+    scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     before, saved = saved.schedule.iterations, extended or saved
-    output = RunOutput(folder, saved, tensorboard=tensorboard, part=part)
+    output = RunOutput(folder, saved, tensorboard=tensorboard, is_block=is_block)
     trainer = Trainer(scene, saved, field, ranks=ranks, output=output)
     try:
         load_state(trainer, TrainingState(checkpoint.tensors, checkpoint.values))

@@ -124,7 +124,7 @@ class Trainer:
         self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
         self._device_index = torch.zeros(1, dtype=torch.int64, device=self.device)
         # Captured steps run on reserved rows, so that the number of Gaussians can change without a new capture.
-        self.reserves_rows, self._rows = self.graphs.enabled and not config.deterministic, 0
+        self.reserves_rows, self._reserved_rows = self.graphs.enabled and not config.deterministic, 0
         field.gaussians.release()
         self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, self.capacity, ranks)
         self.interrupted, self._stopped, self._pace = threading.Event(), False, Pace()
@@ -135,10 +135,10 @@ class Trainer:
         """Train to the end and return the trained run; warn if held-out photos were better before."""
         for _ in self:
             pass
-        points = evaluations(self.run.metrics())
-        if best := best_if_overfitted(points):
+        scores = evaluations(self.run.metrics())
+        if best := best_if_overfitted(scores):
             message = "held-out photos scored best at iteration %d (%.2f dB), now %.2f dB: train fewer iterations"
-            log.warning(message, best.iteration, best.psnr, points[-1].psnr)
+            log.warning(message, best.iteration, best.psnr, scores[-1].psnr)
         return self.run
 
     def __iter__(self) -> Iterator[TrainingProgress]:
@@ -208,15 +208,15 @@ class Trainer:
         index = self._view_index = self.order.next()
         means_lr = means_rate(self.config, self.extent, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
-        if self.reserves_rows and not self._rows:
+        if self.reserves_rows and not self._reserved_rows:
             self._reserve_rows()
         step, options = self.gradient_step, self._step_options()
         if options.needs_means2d_grad:
-            self.strategy.prepare(gaussians.reserved, self.device)
+            self.strategy.prepare(gaussians.row_count, self.device)
 
         # Gradient step; as a CUDA graph if a step with this key has been launched before. Small counts use other
         # kernels: a sort in a single pass, and an exact learned response.
-        small = gaussians.reserved < EXACT_BELOW, gaussians.reserved <= MAX_SINGLE_SORT
+        small = gaussians.row_count < EXACT_BELOW, gaussians.row_count <= MAX_SINGLE_SORT
         graph_key = (options.degree, options.needs_means2d_grad, options.opacity_weight > 0, *small)
         # Display colors are rendered at the photo's exposure by a branch of the host, so that time must be a number.
         fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
@@ -261,14 +261,15 @@ class Trainer:
             return
         count, reallocations = gaussians.count, gaussians.reallocations
         propose = self._propose_gaussians if self.can_seed else None
-        randomness, photos = self.generator, self.step_batch
-        refine = partial(strategy.refine, self.iteration, gaussians, self.optimizer, randomness, propose, photos)
+        refine = partial(
+            strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch
+        )
         changed = refine() if ranks is None else ranks.refine_on_leader(refine, strategy, gaussians, self.optimizer)
         if changed and self.reserves_rows:
             self._reserve_rows()
         if changed and self.graphs.enabled:
             valid = self.capacity.rescale(
-                gaussians.count / max(1, count), keep=gaussians.reallocations == reallocations
+                gaussians.count / max(1, count), same_memory=gaussians.reallocations == reallocations
             )
             if not valid:
                 self.graphs.invalidate()
@@ -289,10 +290,10 @@ class Trainer:
         """Reserve rows for the Gaussians that refinements will add; the same number on all ranks."""
         gaussians, count = self.field.gaussians, self.field.gaussians.count
         rows = self.strategy.reserved_rows(self.iteration, count)
-        if rows == count or not count <= self._rows <= MAX_RESERVE * count:
-            self._rows = rows
-        if gaussians.reserved != self._rows:
-            gaussians.reserve(self._rows, self.optimizer)
+        if rows == count or not count <= self._reserved_rows <= MAX_RESERVE * count:
+            self._reserved_rows = rows
+        if gaussians.row_count != self._reserved_rows:
+            gaussians.reserve(self._reserved_rows, self.optimizer)
 
     @property
     def degree(self) -> int:

@@ -23,4 +23,4 @@ def test_a_block_is_trained_with_the_decisions_of_the_set(tmp_path):
 
 
 def test_without_drift_nothing_is_compensated():
-    assert SharedDecisions(1.0, None).gains_of(toy_scene().views) is None
+    assert SharedDecisions(1.0, None).compensation_of(toy_scene().views) is None

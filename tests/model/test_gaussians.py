@@ -62,7 +62,7 @@ def test_keep_and_append_carry_adams_state():
     optimizer = adam(gaussians)
     moments = {name: optimizer.state[getattr(gaussians, name)]["exp_avg"].clone() for name in PARAMETER_NAMES}
     before = gaussians.rows(torch.arange(8))
-    gaussians.keep(torch.tensor([5, 1, 2]), optimizer)
+    gaussians.keep_only(torch.tensor([5, 1, 2]), optimizer)
     gaussians.append(gaussians.rows(torch.tensor([0])), optimizer)
     for name in PARAMETER_NAMES:
         parameter = getattr(gaussians, name)
@@ -83,10 +83,10 @@ def test_reserved_rows_keep_gaussians_where_they_are_and_change_nothing_else():
         held = {name: getattr(roomy, name).data_ptr() for name in PARAMETER_NAMES}
         assert roomy.means.shape == (11, 3) and roomy.active_count.tolist() == [8]
     for change in (
-        lambda g, o: g.keep(torch.tensor([5, 1, 2, 7, 0, 3]), o),
+        lambda g, o: g.keep_only(torch.tensor([5, 1, 2, 7, 0, 3]), o),
         lambda g, o: g.append(g.rows(torch.tensor([0, 4, 4])), o),
         lambda g, o: g.overwrite({"opacity_logits": torch.tensor([7.0])}, torch.tensor([8]), o),
-        lambda g, o: g.keep(torch.arange(9) < 7, o),
+        lambda g, o: g.keep_only(torch.arange(9) < 7, o),
         lambda g, o: g.resize(10, o),
     ):
         for gaussians, optimizer in zip((plain, roomy), optimizers, strict=True):
@@ -108,7 +108,7 @@ def test_reserved_rows_keep_gaussians_where_they_are_and_change_nothing_else():
                 assert torch.equal(optimizers[1].state[ours][key], moment)
     assert roomy.reallocations == moves and len(optimizers[1].state) == len(PARAMETER_NAMES)
     roomy.append(roomy.rows(torch.tensor([0, 1])), optimizers[1])
-    assert roomy.reallocations > moves and roomy.reserved == roomy.count == 12
+    assert roomy.reallocations > moves and roomy.row_count == roomy.count == 12
 
 
 def test_overwrite_forgets_where_it_wrote():

@@ -15,8 +15,8 @@ from sehdr_warp.rasterizer.training_step import (
     add_position_noise,
     check_finite,
     differentiate,
+    finiteness,
     harmonics_adam_step,
-    norms,
 )
 
 OPTIONS = {"betas": (0.9, 0.999), "epsilon": 1e-15}
@@ -81,9 +81,9 @@ def test_many_parameters_step_as_each_by_itself(device, function):
         assert all(torch.equal(a, b) for a, b in zip(together[:4], alone[:4], strict=True))
 
 
-@pytest.mark.parametrize("function", [norms, training_step._nonfinite_by_kernel])
+@pytest.mark.parametrize("function", [finiteness, training_step._nonfinite_by_kernel])
 @pytest.mark.parametrize("place", [None, 0, 9])
-def test_one_number_that_is_not_finite_shows_in_the_norms(device, place, function):
+def test_one_number_that_is_not_finite_shows_in_the_result(device, place, function):
     gradients = [torch.ones(7 * k + 1, 3, device=device) for k in range(10)]
     if place is not None:
         gradients[place][-1, 2] = float("inf")

@@ -23,7 +23,7 @@ from sehdr_warp.scene import load_scene
 bytes_of = lambda name: 1024 * int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 for where in ("disk", "memory", "disk"):  # The first loads libraries, too.
     held, peak = bytes_of("RssAnon"), bytes_of("VmHWM")
-    scene = load_scene(sys.argv[1], response="srgb", photos=where)
+    scene = load_scene(sys.argv[1], response="srgb", photo_storage=where)
     codes = [view.codes for view in scene.views]
     grown = bytes_of("VmHWM") - peak
     held = bytes_of("RssAnon") - held
@@ -77,7 +77,7 @@ def test_too_large_for_the_disk_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda folder: usage(10, 10, 0))
     assert load_scene(tmp_path, response="srgb").notes is not None
     with pytest.raises(InputError, match="the photos take .* of this disk; use smaller photos"):
-        load_scene(tmp_path, response="srgb", photos="disk")
+        load_scene(tmp_path, response="srgb", photo_storage="disk")
     monkeypatch.setattr("sehdr_warp.scene.photo_file.available_memory", lambda: 0)
     with pytest.raises(InputError, match="of this disk"):
         load_scene(tmp_path, response="srgb")

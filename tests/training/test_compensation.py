@@ -32,13 +32,13 @@ def drifting():
 
 def found_in(*args):
     result = estimate_compensation(*args)
-    return result.gains, result.matcher, result.decision
+    return result.compensation, result.matcher, result.decision
 
 
 def test_drift_is_found_where_there_is_some(device):
     scene, times = drifting()
-    gains, matcher, _ = found_in(scene, CONFIG, LINEAR, device)
-    fitted = np.array([gains.gains[view.name] for view in scene.views])
+    drift, matcher, _ = found_in(scene, CONFIG, LINEAR, device)
+    fitted = np.array([drift.gains[view.name] for view in scene.views])
     np.testing.assert_allclose(
         fitted, np.repeat(np.array(times)[:, None], 3, 1) / np.exp(np.log(times).mean()), rtol=0.03
     )
@@ -47,13 +47,13 @@ def test_drift_is_found_where_there_is_some(device):
 
 def test_stated_times_are_doubted_where_photos_contradict_them(device):
     scene, _ = drifting()
-    gains, _, decision = found_in(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
-    assert gains.stops > 0.4 and "over the times they state" in decision.choice and decision.always_log
+    drift, _, decision = found_in(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
+    assert drift.stops > 0.4 and "over the times they state" in decision.choice and decision.always_log
     right = wall_and_lamp(TIMES)
     # A curve that is not the photos' makes right times look wrong, and evened photos would not agree.
     for curve in (LINEAR, response_by_name("gamma")):
-        gains, _, decision = found_in(right, CONFIG, curve, device)
-        assert gains is None and "do not contradict" in decision.reason
+        drift, _, decision = found_in(right, CONFIG, curve, device)
+        assert drift is None and "do not contradict" in decision.reason
 
 
 def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
@@ -66,13 +66,13 @@ def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
     for view, white_balance in zip(views, light, strict=True):
         tinted.append(replace(view, codes=codes_of(view.image * 2**white_balance, 8)))
         darkened.append(replace(view, codes=codes_of(view.image * corners, 8)))
-    gains, _, decision = found_in(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
-    assert "stay as stated" in decision.choice and "white balance" in decision.reason and gains.corner_loss == 0
-    fitted = np.log2([gains.gains[view.name] for view in views])
+    drift, _, decision = found_in(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
+    assert "stay as stated" in decision.choice and "white balance" in decision.reason and drift.corner_loss == 0
+    fitted = np.log2([drift.gains[view.name] for view in views])
     np.testing.assert_allclose(fitted, light, atol=0.06)
     assert (fitted[:, 1] == 0).all()
-    gains, _, decision = found_in(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
-    assert "stay as stated" in decision.choice and gains.corner_loss == pytest.approx(0.5, abs=0.1) and not gains.stops
+    drift, _, decision = found_in(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
+    assert "stay as stated" in decision.choice and drift.corner_loss == pytest.approx(0.5, abs=0.1) and not drift.stops
 
 
 def test_times_that_a_camera_rounds_are_put_right(device):
@@ -80,9 +80,9 @@ def test_times_that_a_camera_rounds_are_put_right(device):
     off = np.array([0.15, -0.2, 0.05, 0.1, -0.1, -0.15, 0.2, 0.0, -0.05])
     scene = wall_and_lamp(TIMES)
     views = [replace(v, exposure_time=v.exposure_time * 2**-e) for v, e in zip(scene.views, off, strict=True)]
-    gains, _, decision = found_in(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
+    drift, _, decision = found_in(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
     assert "over the times they state" in decision.choice and "white balance" not in decision.reason
-    fitted = np.log2([gains.gains[view.name] for view in views])
+    fitted = np.log2([drift.gains[view.name] for view in views])
     np.testing.assert_allclose(fitted, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
 
 
@@ -93,8 +93,8 @@ def test_a_wall_that_is_brighter_from_one_side_is_no_drift(device):
         ahead = rays[..., :2] / rays[..., 2:]
         return 0.5 * texture(position[:2] + ahead * WALL) * 2 ** (2 * ahead[..., :1] - ahead[..., 1:])
 
-    gains, _, decision = found_in(photographed(light_at, TIMES), CONFIG, LINEAR, device)
-    assert gains is None and "do not contradict" in decision.reason
+    drift, _, decision = found_in(photographed(light_at, TIMES), CONFIG, LINEAR, device)
+    assert drift is None and "do not contradict" in decision.reason
 
 
 def test_no_gains_are_fitted_where_a_rough_look_finds_none(device, monkeypatch):
@@ -102,13 +102,13 @@ def test_no_gains_are_fitted_where_a_rough_look_finds_none(device, monkeypatch):
     monkeypatch.setattr(compensation, "fit_gains", lambda *_: pytest.fail("fitted"))
     right = wall_and_lamp(TIMES)
     for scene, curve in ((wall_and_lamp(), LINEAR), (right, LINEAR), (right, response_by_name("gamma"))):
-        assert estimate_compensation(scene, CONFIG, curve, device).gains is None
+        assert estimate_compensation(scene, CONFIG, curve, device).compensation is None
 
 
 def test_halves_are_compared_only_where_drift_is_large_enough(device, monkeypatch):
     monkeypatch.setattr(compensation, "_cross_validate", lambda *_: pytest.fail("compared"))
     scene = replace(wall_and_lamp(), exposure_times_known=False)
-    assert estimate_compensation(scene, CONFIG, LINEAR, device).gains is None
+    assert estimate_compensation(scene, CONFIG, LINEAR, device).compensation is None
 
 
 def test_a_lamp_that_moves_is_no_drift(device):
@@ -119,7 +119,7 @@ def test_a_lamp_that_moves_is_no_drift(device):
         side = 1 if position[1] > 0.1 else -1
         return texture(places) * (0.7 + 0.5 * np.tanh(1.5 * side * places[..., :1]))
 
-    assert estimate_compensation(photographed(light_at), CONFIG, LINEAR, device).gains is None
+    assert estimate_compensation(photographed(light_at), CONFIG, LINEAR, device).compensation is None
 
 
 def test_a_clear_sky_is_no_drift(device):
@@ -130,7 +130,7 @@ def test_a_clear_sky_is_no_drift(device):
         return 0.04 + 0.6 * np.exp(-(away**2).sum(-1, keepdims=True) / 0.2) * [0.7, 0.8, 1]
 
     scene = replace(photographed(light_at, turn=0.3), exposure_times_known=False)
-    assert estimate_compensation(scene, CONFIG, LINEAR, device).gains is None
+    assert estimate_compensation(scene, CONFIG, LINEAR, device).compensation is None
 
 
 def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
@@ -174,8 +174,8 @@ def test_large_photos_are_matched_and_evened_small(monkeypatch):
         return even(gains, view, response)
 
     monkeypatch.setattr(ExposureCompensation, "_view", watched)
-    gains, matcher, _ = found_in(replace(scene, views=large), CONFIG, LINEAR, "cpu")
-    assert gains is not None and max(large[0].codes.shape) > most
+    drift, matcher, _ = found_in(replace(scene, views=large), CONFIG, LINEAR, "cpu")
+    assert drift is not None and max(large[0].codes.shape) > most
     assert sizes and max(sizes) <= most
     assert max(matcher.size(0)) <= most
 

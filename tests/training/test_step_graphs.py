@@ -26,11 +26,11 @@ def test_room_follows_the_most_pairs_seen(device):
     most = MANY * 6 // 5
     assert replay(capacity, [MANY, most, MANY]) == HEADROOM * MANY
     assert capacity.poll() == (0, False)
-    assert not capacity.rescale(1.0, keep=False)
+    assert not capacity.rescale(1.0, same_memory=False)
     assert replay(capacity, [MANY] * 2) == HEADROOM * most
-    assert not capacity.rescale(1.1, keep=False)
+    assert not capacity.rescale(1.1, same_memory=False)
     assert replay(capacity, [MANY]) == pytest.approx(HEADROOM * MIN_SHRINK * most, abs=3)
-    assert not capacity.rescale(2.5, keep=True)
+    assert not capacity.rescale(2.5, same_memory=True)
     assert replay(capacity, [MANY]) == pytest.approx(HEADROOM * 2.5 * MANY, abs=3)
 
 
@@ -48,11 +48,11 @@ def test_room_stays_while_it_is_enough(device):
     capacity = GraphCapacity(device)
     capacity.observe(MANY)
     fixed_capacity = replay(capacity, [MANY])
-    assert capacity.rescale(1.05, keep=True) and capacity.capacity() == fixed_capacity
+    assert capacity.rescale(1.05, same_memory=True) and capacity.capacity() == fixed_capacity
     assert replay(capacity, [MANY * 21 // 20]) == fixed_capacity
-    assert capacity.rescale(1.05, keep=True)
+    assert capacity.rescale(1.05, same_memory=True)
     replay(capacity, [MANY * 11 // 10])
-    assert not capacity.rescale(1.1, keep=True)
+    assert not capacity.rescale(1.1, same_memory=True)
     assert capacity.capacity() == pytest.approx(HEADROOM * 1.1 * 1.1 * MANY, abs=3)
 
 

@@ -77,12 +77,12 @@ class AdcStrategy(Strategy):
         optimizer: Optimizer | None,
         generator: torch.Generator,
         propose: Propose | None = None,
-        photos: int = 1,
+        step_batch: int = 1,
     ) -> bool:
         """Duplicate, split and remove Gaussians, and reset opacities, if this iteration is due."""
         changed = False
         total, count = self.gradient_sum, self.visible_count
-        if self.schedule.is_due(iteration, photos) and total is not None and count is not None:
+        if self.schedule.is_due(iteration, step_batch) and total is not None and count is not None:
             changed = True
             small, large = self._select(gaussians, (total / count.clamp_min(1))[: gaussians.count])
             added = [self.duplicate(gaussians, small), *self.split(gaussians, large, generator)]
@@ -91,19 +91,19 @@ class AdcStrategy(Strategy):
             # In place, because captured steps add to these tensors.
             total.zero_()
             count.zero_()
-        if self._resets(iteration, photos):
+        if self._resets(iteration, step_batch):
             self.reset_opacities(gaussians, optimizer)
         return changed
 
-    def is_due(self, iteration: int, photos: int = 1) -> bool:
-        """Return whether a step of `photos` iterations that ends at `iteration` refines or resets opacities."""
-        return self.schedule.is_due(iteration, photos) or self._resets(iteration, photos)
+    def is_due(self, iteration: int, step_batch: int = 1) -> bool:
+        """Return whether a step of `step_batch` iterations that ends at `iteration` refines or resets opacities."""
+        return self.schedule.is_due(iteration, step_batch) or self._resets(iteration, step_batch)
 
-    def _resets(self, iteration: int, photos: int) -> bool:
+    def _resets(self, iteration: int, step_batch: int) -> bool:
         """Return whether opacities are reset after this step."""
         past = iteration % self.reset_every
         before_stop = iteration - past < self.schedule.stop
-        return past < photos and before_stop and self.reset_every >= MIN_RESET_INTERVAL
+        return past < step_batch and before_stop and self.reset_every >= MIN_RESET_INTERVAL
 
     def _select(self, gaussians: Gaussians, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Return masks [N] of the Gaussians to duplicate and of those to split, by their mean gradient [N].
@@ -149,7 +149,7 @@ class AdcStrategy(Strategy):
         if len(index) or bool(good.any()):
             remaining, appended = good, {name: values[index] for name, values in added.items()}
         if not bool(remaining.all()):
-            gaussians.keep(remaining, optimizer)
+            gaussians.keep_only(remaining, optimizer)
         if len(appended["means"]):
             gaussians.append(appended, optimizer)
 

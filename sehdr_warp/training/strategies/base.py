@@ -52,10 +52,10 @@ class Schedule:
             every=max(config.scaled(options.refine_every), MIN_INTERVAL),
         )
 
-    def is_due(self, iteration: int, photos: int) -> bool:
-        """Return whether a step of `photos` iterations that ends at `iteration` came to a refinement."""
+    def is_due(self, iteration: int, step_batch: int) -> bool:
+        """Return whether a step of `step_batch` iterations that ends at `iteration` came to a refinement."""
         past = iteration % self.every
-        return past < photos and self.start < iteration - past < self.stop
+        return past < step_batch and self.start < iteration - past < self.stop
 
     def refinements_left(self, iteration: int) -> int:
         """Return the number of refinements from the one at `iteration` on."""
@@ -97,9 +97,9 @@ class Strategy:
             usable: Scalar tensor; 0 ignores the step.
         """
 
-    def is_due(self, iteration: int, photos: int = 1) -> bool:
-        """Return whether refine() does anything after a step of `photos` iterations that ends at `iteration`."""
-        return self.schedule.is_due(iteration, photos)
+    def is_due(self, iteration: int, step_batch: int = 1) -> bool:
+        """Return whether refine() does anything after a step of `step_batch` iterations that ends at `iteration`."""
+        return self.schedule.is_due(iteration, step_batch)
 
     def refine(
         self,
@@ -108,7 +108,7 @@ class Strategy:
         optimizer: Optimizer | None,
         generator: torch.Generator,
         propose: Propose | None = None,
-        photos: int = 1,
+        step_batch: int = 1,
     ) -> bool:
         """Change the Gaussians and their optimizer state if this iteration is due.
 
@@ -118,7 +118,7 @@ class Strategy:
             optimizer: Their optimizer.
             generator: Source of random numbers, on the Gaussians' device.
             propose: Returns new Gaussians where photos are reproduced worst.
-            photos: Photos of the step, one for each rank; each counts as an iteration.
+            step_batch: Photos of the step, one for each rank; each counts as an iteration.
 
         Returns:
             True if the number of Gaussians, or any parameter tensor, changed.

@@ -73,13 +73,13 @@ class McmcStrategy(Strategy):
         optimizer: Optimizer | None,
         generator: torch.Generator,
         propose: Propose | None = None,
-        photos: int = 1,
+        step_batch: int = 1,
     ) -> bool:
         """Relocate dead Gaussians and add new ones, if this iteration is due.
 
         Only the device knows how many Gaussians are dead, so all counts stay there.
         """
-        if not self.is_due(iteration, photos):
+        if not self.is_due(iteration, step_batch):
             return False
         count = gaussians.count
         added = self.next_count(iteration, count) - count
