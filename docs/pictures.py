@@ -71,7 +71,9 @@ def _beside(run: sw.Run, photo_view: sw.View, scene: sw.Scene) -> Image.Image:
     comparison, time = compare(run, photo_view, scene.views), photo_view.exposure_time
     assert comparison.truth is not None
     darker = darker_stops([comparison], time)
-    dark = [expose_light(light, darker, scale=time) for light in (comparison.from_photo, comparison.hdr, comparison.truth)]
+    dark = [
+        expose_light(light, darker, scale=time) for light in (comparison.from_photo, comparison.hdr, comparison.truth)
+    ]
     height, width = dark[0].shape[:2]
     side = round(CROPPED * min(height, width))
     gain = uniform_filter(np.abs(dark[1] - dark[0]).mean(2), side, mode="constant")

@@ -125,7 +125,7 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     # White ones are born at the light that the photo is expected to hold.
     held = torch.full((16, 16, 6), math.log(50), dtype=torch.float16, device=device)
     lit = replace(views[0], target=replace(views[0].target, estimates=held))
-    brighter = seed_gaussians(field, matcher, shown, lit, 0, wanted, 200, random_seed=3).rows["harmonics_dc"]
+    brighter = seed_gaussians(field, matcher, photo, lit, 0, budget, 200, random_seed=3).rows["harmonics_dc"]
     rise = (brighter[: int(born)] - rows["harmonics_dc"])[:, 0] * HARMONIC_0
     torch.testing.assert_close(rise, math.log(50) * white[:, None].expand_as(rise), rtol=2e-3, atol=1e-5)
 
