@@ -87,9 +87,16 @@ def _train_gsplat(scene: Scene, config: Config, device: str) -> dict:
     def look(model: GsplatScene, snapshot: Snapshot) -> None:
         seconds.append(snapshot.seconds)
 
-    options = {"steps": steps, "fewest_points": 0, "cap_max": config.densification.cap_max}
-    looks = {"look_at": (steps // WARM_UP, steps), "look": look}
-    trained = train_gsplat(normalized.scene(scene), "mcmc", device, **options, **looks)
+    trained = train_gsplat(
+        normalized.scene(scene),
+        "mcmc",
+        device,
+        steps=steps,
+        fewest_points=0,
+        cap_max=config.densification.cap_max,
+        look_at=(steps // WARM_UP, steps),
+        look=look,
+    )
     row = {"method": "gsplat mcmc", "gaussians": trained.count, "seconds": seconds[1] - seconds[0]}
     row["memory"] = torch.cuda.max_memory_allocated(device)
     with torch.no_grad():

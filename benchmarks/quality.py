@@ -273,7 +273,7 @@ def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpip
             executor.update_parameters(timeout_min=MONTH, name="sehdr-warp")
             one = {"gpus_per_node": 1} if device == "cuda" else {}
             own = {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
-            executor.update_parameters(**one, **own)
+            executor.update_parameters(**one | own)
         workers.append(executor.submit(work, jobs, out.absolute(), device, shared, lpips))
     try:
         for worker in workers:

@@ -29,7 +29,7 @@ def _response_readings(curve: Response, device, exposures, **options) -> list[Re
     settings = {"elementwise": True, "floor": 1e-6, "label": f"{curve.name} {{}}"}
     # A filmic curve's derivative is the difference of terms that are up to 50 times as large (x near its white).
     options["extra"] = 64 * UNIT if curve.name in ("filmic", "aces") else 0.0
-    encoded = compare(lambda x: {"f": curve.encode(x)}, {"x": exposures}, device, **settings, **options)
+    encoded = compare(lambda x: {"f": curve.encode(x)}, {"x": exposures}, device, **settings | options)
     return encoded + compare(lambda v: {"decode": curve.decode(v)}, {"v": values}, device, **settings)
 
 

@@ -117,7 +117,7 @@ def _continued(out: Path, data: LoadArguments, config: Config, count: int | None
         refuse_links(folder_of(out, plan, index), out)
     remedy = "continue with the same photos and options, or train anew with --overwrite"
     if data != plan.data:
-        name = next(name for name in {**data, **plan.data} if data.get(name) != plan.data.get(name))
+        name = next(name for name in data | plan.data if data.get(name) != plan.data.get(name))
         problem = f"{name} = {plan.data.get(name)!r}, but {data.get(name)!r} was asked for"
         raise InputError(out / FILE, problem, remedy)
     if count is not None and count != len(plan.blocks):

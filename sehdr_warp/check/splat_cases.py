@@ -83,14 +83,14 @@ class Splats:
 
 def compare_splats(splats: Splats, device: torch.device) -> list[Reading]:
     """Compare image, alpha and gradients of rasterize() with the float64 reference."""
-    size, settings = {"width": splats.width, "height": splats.height}, splats.options
+    options = {"width": splats.width, "height": splats.height} | splats.options
 
     def ours(*tensors):
-        rendering = rasterize(*tensors, **size, **settings)
+        rendering = rasterize(*tensors, **options)
         return {"image": rendering.image, "alpha": rendering.alpha}
 
     def project(means, log_scales, quaternions, opacities, features, pose, intrinsics):
-        return project_reference(means, log_scales, quaternions, opacities, pose, intrinsics, **size, **settings)
+        return project_reference(means, log_scales, quaternions, opacities, pose, intrinsics, **options)
 
     exact_depths = project(*as_float32(splats.tensors.values()))[2]
 
@@ -98,7 +98,9 @@ def compare_splats(splats: Splats, device: torch.device) -> list[Reading]:
         means2d, conics, depths, opacities2d, extents = project(*tensors)
         depths = exact_depths if splats.ties else disturb(depths.detach())
         crossing = disturb(means2d), disturb(conics), disturb(opacities2d), tensors[4], depths, extents
-        image, transmittance = blend_reference(*crossing, **size, alpha_threshold=settings["alpha_threshold"])
+        image, transmittance = blend_reference(
+            *crossing, width=splats.width, height=splats.height, alpha_threshold=splats.options["alpha_threshold"]
+        )
         return {"image": image, "alpha": 1.0 - transmittance}
 
     options = {"gradients": NAMES[:5], "label": splats.label, "extra": splats.extra}

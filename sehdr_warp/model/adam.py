@@ -93,10 +93,18 @@ class Adam:
                     AdamStep(values, parameter.grad.contiguous(), first, second, step, group["lr"], width)
                 )
             elif harmonics is not None:
-                state, rate = (first, second, step, skipped), {"rate": group["lr"]}
                 start = FIRST_HARMONIC[group["name"]]
-                interval = self.sh_update_interval if start else 1
                 harmonics_adam_step(
-                    values, start, harmonics, *state, **rate, **options, active_count=active_count, turns=interval
+                    values,
+                    start,
+                    harmonics,
+                    first,
+                    second,
+                    step,
+                    skipped,
+                    rate=group["lr"],
+                    active_count=active_count,
+                    turns=self.sh_update_interval if start else 1,
+                    **options,
                 )
         adam_steps(steps_with_gradient, skipped, **options, active_count=active_count)

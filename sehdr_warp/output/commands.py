@@ -274,9 +274,8 @@ def run_render(args: Render) -> None:
     usual = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
     path = {"cameras": args.cameras, "camera": args.camera, "count": usual if args.count is None else args.count}
     if args.out is not None:
-        files = render_views(
-            run, args.out, **path, size=args.size, overwrite=args.overwrite, **vars(args.world), **vars(args.pictures)
-        )
+        options = path | vars(args.world) | vars(args.pictures)
+        files = render_views(run, args.out, size=args.size, overwrite=args.overwrite, **options)
         summary = f"{args.out}: {len(files)} files"
     if args.video is not None:
         from .film import write_film

@@ -131,8 +131,8 @@ def run_mesh(args: Mesh) -> None:
     from .proxy_mesh import check_mesh, write_proxy_mesh
 
     check_mesh(args.out, args.resolution, args.crop, args.overwrite)  # Before the scene is opened.
-    options = {"resolution": args.resolution, "crop": args.crop, "overwrite": args.overwrite}
-    print(write_proxy_mesh(open_run(args.run, args.device), args.out, **options, **vars(args.world)))
+    options = {"resolution": args.resolution, "crop": args.crop, "overwrite": args.overwrite} | vars(args.world)
+    print(write_proxy_mesh(open_run(args.run, args.device), args.out, **options))
 
 
 def run_export(args: Export) -> None:
@@ -155,9 +155,17 @@ def run_export(args: Export) -> None:
         edits = _with_masks(edits, args.edits, run)
         print(write_scene_page(run, args.out, edits=edits, overwrite=args.overwrite))
         return
-    flags = {"cameras": args.cameras, "overwrite": args.overwrite}
-    options = {"world": args.world, "edits": args.edits, "merge": args.merge}
-    _export(args.run, args.out, args.file, args.device, **options, **flags)  # pyright: ignore[reportArgumentType]
+    _export(
+        args.run,
+        args.out,
+        args.file,
+        args.device,
+        world=args.world,
+        edits=args.edits,
+        merge=args.merge,
+        cameras=args.cameras,
+        overwrite=args.overwrite,
+    )
 
 
 def run_convert(args: Convert) -> None:
@@ -200,6 +208,6 @@ def _export(
     if len(times) > 1:
         raise UsageError(f"--exposure {options.exposure}: a splat file holds the colors of one exposure; name one")
     time = times[0] if times else None
-    frame: dict[str, Any] = {"axes": None} if world is None else vars(world)
-    colors: dict[str, Any] = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
-    print(export(run, out, **colors, **frame, edits=splat_edits, merge=others, **flags))
+    arguments: dict[str, Any] = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
+    arguments |= ({"axes": None} if world is None else vars(world)) | flags
+    print(export(run, out, edits=splat_edits, merge=others, **arguments))

@@ -137,9 +137,10 @@ def _match_rigs(database: Path, images: Path, count: int) -> None:
     turns = face_rotations()
     cameras = []
     for number, turn in enumerate(turns):
-        from_rig = None if number == 0 else pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
         options = {"ref_sensor": number == 0, "image_prefix": f"face{number}/"}
-        cameras.append(pycolmap.RigConfigCamera(**options, **({} if from_rig is None else {"cam_from_rig": from_rig})))
+        if number > 0:
+            options["cam_from_rig"] = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
+        cameras.append(pycolmap.RigConfigCamera(**options))
     matching = pycolmap.FeatureMatchingOptions(rig_verification=True, skip_image_pairs_in_same_frame=True)
     options = matching_options()
     with quiet_colmap():

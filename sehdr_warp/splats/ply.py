@@ -69,8 +69,12 @@ def read_ply(path: Path) -> GaussianArrays:
         names = {each.name for each in vertex.properties}
         if "packed_position" in names:
             facts = _facts(read.comments, path)
-            color = {"color_model": "display", "base_time": facts.base_time, "world_matrix": facts.world_matrix}
-            return GaussianArrays(**unpack_ply(read, path), **color)
+            return GaussianArrays(
+                **unpack_ply(read, path),
+                color_model="display",
+                base_time=facts.base_time,
+                world_matrix=facts.world_matrix,
+            )
         missing = [name for group in _GROUPS for name in group.split() if name not in names]
         if missing:
             raise InputError(path, _without(missing, names), "export 3D Gaussians as an uncompressed PLY")

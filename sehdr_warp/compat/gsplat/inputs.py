@@ -93,21 +93,20 @@ class Inputs(NamedTuple):
             check_degree("sh_degree", integer("sh_degree", sh_degree, 0, 4))
             inner = ("N", "K", 3)
         by_camera = isinstance(colors, Tensor) and colors.ndim == len(batch) + len(inner) + 1
-        shapes = {} if covars is None else {"covars": (covars, (*batch, "N", 3, 3))}
+        shapes: dict[str, Any] = {"means": (means, (*batch, "N", 3))}
         if covars is None:
-            shapes = {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
-        behind = {}
+            shapes |= {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
+        else:
+            shapes["covars"] = (covars, (*batch, "N", 3, 3))
+        shapes |= {
+            "opacities": (opacities, (*batch, "N")),
+            "viewmats": (viewmats, (*batch, "C", 4, 4)),
+            "Ks": (Ks, (*batch, "C", 3, 3)),
+            "colors": (colors, (*batch, *(("C",) if by_camera else ()), *inner)),
+        }
         if backgrounds is not None:
-            behind = {"backgrounds": (backgrounds, (*batch, "C", 3 if sh_degree is not None else "D"))}
-        check_tensors(
-            means=(means, (*batch, "N", 3)),
-            **shapes,
-            opacities=(opacities, (*batch, "N")),
-            viewmats=(viewmats, (*batch, "C", 4, 4)),
-            Ks=(Ks, (*batch, "C", 3, 3)),
-            colors=(colors, (*batch, *(("C",) if by_camera else ()), *inner)),
-            **behind,
-        )
+            shapes["backgrounds"] = (backgrounds, (*batch, "C", 3 if sh_degree is not None else "D"))
+        check_tensors(**shapes)
         if sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
             raise ValueError(
                 f"colors has shape {list(colors.shape)}, but sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} "
