@@ -177,8 +177,8 @@ class RadianceField(nn.Module):
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-            return TrainRender(image, None, None, rendering, None, penalty)
-        base, fused = self._exposures(values)
+            return TrainRender(encoded=image, exposure=None, base=None, rendering=rendering, opacity_penalty=penalty)
+        base, fused = self._exposures(values)  # The same tensor without fusion.
         color_sets = {"fused": fused}
         if self.tone_map == "gaussian":
             needs_exposure = "exposure" in also or ("base" in also and self.fusion is None)
@@ -199,7 +199,14 @@ class RadianceField(nn.Module):
             # Usually the ratio is 1.
             photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(photo_exposure) if encode else None
-        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure, penalty)
+        return TrainRender(
+            encoded=encoded,
+            exposure=exposure,
+            base=images.get("base", exposure),
+            rendering=rendering,
+            photo_exposure=photo_exposure,
+            opacity_penalty=penalty,
+        )
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:

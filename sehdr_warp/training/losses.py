@@ -131,13 +131,13 @@ def _distance_weight(form: str, weight: float) -> float:
     return 1.0 if form == "sum" else 1 - weight
 
 
-def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
+def ldr_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor:
     """Return L_LDR on the target's scale.
 
     If exposures are compared, the light of clipped pixels, which the photo does not determine, is smoothed and held at
     estimates.
     """
-    image = compared_image(photo, target)
+    image = compared_image(render, target)
     codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
     clipped = clipped_weights(config, target) if target.scale.mu and config.clipping else ClippedWeights()
     if target.mask is None and weight:
@@ -159,9 +159,9 @@ def ldr_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor:
     return loss
 
 
-def compared_image(photo: TrainRender, target: Target) -> Tensor:
+def compared_image(render: TrainRender, target: Target) -> Tensor:
     """Return the image that is compared with the photo: exposures if the target has them, else encoded values."""
-    image = photo.photo_exposure if target.scale.mu else photo.encoded
+    image = render.photo_exposure if target.scale.mu else render.encoded
     assert image is not None
     return image
 
@@ -197,27 +197,27 @@ def anchor_loss(mapper: ToneMapper) -> Tensor:
     return (mapper.encode_log(mapper.weights[0].new_zeros(1, 3)) - ANCHOR).square().mean()
 
 
-def linear_loss(photo: TrainRender, target: Target, config: LossConfig) -> Tensor | None:
+def linear_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor | None:
     """Return SeHDR's L_linear: base exposure against HDR truth or the fused exposure; None without a reference."""
     truth = target.exposure_truth if config.hdr_truth else None
-    if truth is None and photo.base is photo.exposure:
+    if truth is None and render.base is render.exposure:
         return None
-    assert photo.base is not None
+    assert render.base is not None
     if truth is None:
-        assert photo.exposure is not None
+        assert render.exposure is not None
         # Detached, so that the base follows the fused exposure; else both would drift to a trivial agreement.
-        truth = photo.exposure.detach()
-    return image_loss(photo.base, truth, target.mask, config.form, config.ssim_weight)
+        truth = render.exposure.detach()
+    return image_loss(render.base, truth, target.mask, config.form, config.ssim_weight)
 
 
-def hdr_loss(photo: TrainRender, target: Target, config: LossConfig, largest: float) -> Tensor:
+def hdr_loss(render: TrainRender, target: Target, config: LossConfig, largest: float) -> Tensor:
     """Return the loss of the HDR color's exposure against HDR truth in the mu-law.
 
     Both are divided by the largest truth of all views. HDR-GS divides each image by its own maximum, which leaves the
     scale of the scene undetermined.
     """
-    assert photo.exposure is not None and target.exposure_truth is not None
-    prediction, truth = (mu_law(image / largest, 1.0) for image in (photo.exposure, target.exposure_truth))
+    assert render.exposure is not None and target.exposure_truth is not None
+    prediction, truth = (mu_law(image / largest, 1.0) for image in (render.exposure, target.exposure_truth))
     return image_loss(prediction, truth, target.mask, config.form, config.ssim_weight)
 
 
@@ -230,16 +230,16 @@ def extra_images(config: LossConfig, has_truth: bool) -> frozenset[str]:
 
 
 def data_loss(
-    field: RadianceField, photo: TrainRender, target: Target, config: LossConfig, largest_truth: float = 1.0
+    field: RadianceField, render: TrainRender, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
     """Return L_LDR + beta L_linear (SeHDR, equation 20) + the HDR loss + the anchor, each if it has a weight."""
-    loss = ldr_loss(photo, target, config) if config.ldr_weight > 0 else 0.0
+    loss = ldr_loss(render, target, config) if config.ldr_weight > 0 else 0.0
     if config.ldr_weight not in (0, 1):
         loss = config.ldr_weight * loss
     if config.hdr_weight > 0 and target.exposure_truth is not None:
-        loss = loss + config.hdr_weight * hdr_loss(photo, target, config, largest_truth)
+        loss = loss + config.hdr_weight * hdr_loss(render, target, config, largest_truth)
     if config.linear_weight > 0:
-        linear = linear_loss(photo, target, config)
+        linear = linear_loss(render, target, config)
         loss = loss if linear is None else loss + config.linear_weight * linear
     if config.anchor_weight > 0 and isinstance(field.response, ToneMapper):
         loss = loss + config.anchor_weight * anchor_loss(field.response)
@@ -247,9 +247,9 @@ def data_loss(
     return loss
 
 
-def with_opacity_penalty(loss: Tensor, photo: TrainRender) -> Tensor:
+def with_opacity_penalty(loss: Tensor, render: TrainRender) -> Tensor:
     """Return the loss plus the opacity penalty, if the view was rendered with an opacity weight."""
-    return loss if photo.opacity_penalty is None else loss + photo.opacity_penalty
+    return loss if render.opacity_penalty is None else loss + render.opacity_penalty
 
 
 def largest_hdr_truth(scene: Scene, loss: LossConfig) -> float:
