@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from .errors import visible
-from .progress import LINE_INTERVAL, Stage, format_seconds, shown_by
+from .progress import LINE_INTERVAL, Stage, display_stages, format_seconds
 
 BAR_INTERVAL = 0.25
 """Least seconds between updates of the bar. Each reads the loss, which waits for the device."""
@@ -108,7 +108,7 @@ def stages_on_terminal() -> Iterator[None]:
         return
     lines = _StageLines()
     try:
-        with shown_by(lines.show):
+        with display_stages(lines.show):
             yield
     finally:
         lines.close()

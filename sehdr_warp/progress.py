@@ -92,7 +92,7 @@ def stage(activity: str, total: int, logger: logging.Logger) -> Iterator[Stage]:
         started.end()
 
 
-def tracked(activity: str, items: Sequence[Item], logger: logging.Logger) -> Iterator[tuple[int, Item]]:
+def track_progress(activity: str, items: Sequence[Item], logger: logging.Logger) -> Iterator[tuple[int, Item]]:
     """Enumerate items as a stage, of which each item is a step."""
     with stage(activity, len(items), logger) as progress:
         for index, item in enumerate(items):
@@ -101,7 +101,7 @@ def tracked(activity: str, items: Sequence[Item], logger: logging.Logger) -> Ite
 
 
 @contextmanager
-def shown_by(display: Display) -> Iterator[None]:
+def display_stages(display: Display) -> Iterator[None]:
     """Show stages by a function instead of log lines, within the block; it gets the stage at every change."""
     _displays.append(display)
     try:

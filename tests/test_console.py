@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from sehdr_warp import console
-from sehdr_warp.progress import stage, tracked
+from sehdr_warp.progress import stage, track_progress
 
 
 class Terminal(io.StringIO):
@@ -105,7 +105,7 @@ def test_a_stage_on_a_terminal_is_one_line(monkeypatch):
     console.show_logs()
     log = logging.getLogger("sehdr_warp.scene")
     with console.stages_on_terminal():
-        for i, _ in tracked("reading photos", range(40), log):
+        for i, _ in track_progress("reading photos", range(40), log):
             if i == 20:
                 log.info("a note")
         with stage("matching", 10, log) as matching:

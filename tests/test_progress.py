@@ -18,7 +18,7 @@ def clock(monkeypatch):
 
 
 def test_log_lines_are_ten_seconds_apart(clock, logged):
-    for _ in progress.tracked("placing photos", range(57), LOG):
+    for _ in progress.track_progress("placing photos", range(57), LOG):
         clock[0] += 1.0
     assert logged[0] == "placing photos: 57" and len(logged) == 6
     assert logged[1] == "placing photos: 10 of 57, 0:47 left"
@@ -42,8 +42,8 @@ def test_an_unknown_total_promises_nothing(clock, logged):
 
 def test_a_display_replaces_lines(logged):
     fractions = []
-    with progress.shown_by(lambda stage: fractions.append((stage.done, stage.ended))):
-        for _ in progress.tracked("reading photos", range(2), LOG):
+    with progress.display_stages(lambda stage: fractions.append((stage.done, stage.ended))):
+        for _ in progress.track_progress("reading photos", range(2), LOG):
             pass
     assert fractions == [(0, False), (1, False), (2, False), (2, True)] and logged == []
 
@@ -52,7 +52,7 @@ def test_quiet_shows_nothing():
     before, fractions = LOG.level, []
     LOG.setLevel(logging.WARNING)
     try:
-        with progress.shown_by(fractions.append), progress.stage("reading photos", 2, LOG) as reading:
+        with progress.display_stages(fractions.append), progress.stage("reading photos", 2, LOG) as reading:
             reading.update(1)
     finally:
         LOG.setLevel(before)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..progress import stage, tracked
+from ..progress import stage, track_progress
 from ..response import response_by_name
 from ..scene import Camera
 from ..scene.normalization import Normalization
@@ -228,7 +228,7 @@ def refine(
     field = field_of(gaussians).to(device)
     fitted = {name: getattr(field.gaussians, name).requires_grad_() for name in RATES}
     optimizer = Adam([{"params": [value]} for value in fitted.values()])
-    for step, index in tracked("fitting colors and opacities to pictures of the scene, steps", order, log):
+    for step, index in track_progress("fitting colors and opacities to pictures of the scene, steps", order, log):
         decay = 0.5 * (1 + math.cos(math.pi * step / len(order)))
         for group, rate in zip(optimizer.param_groups, RATES.values(), strict=True):
             group["lr"] = rate * decay

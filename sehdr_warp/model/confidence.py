@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..progress import tracked
+from ..progress import track_progress
 from ..response import Response
 from ..response.curve import HALF_CODE
 from ..scene import View
@@ -125,7 +125,7 @@ def gather_evidence(
     total = torch.zeros(field.gaussians.count, 3, device=home)
     peak = torch.zeros(field.gaussians.count, device=home)
     every = -(-len(views) // MAX_VIEWS) or 1
-    for index, view in tracked("measuring confidence on photos", views, log):
+    for index, view in track_progress("measuring confidence on photos", views, log):
         if index % every:
             peak = torch.maximum(peak, blending_weights(field, view.camera, view.mask))
             continue

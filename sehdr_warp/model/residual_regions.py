@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..progress import tracked
+from ..progress import track_progress
 from ..response import Response
 from ..response.curve import HALF_CODE
 from ..scene import View
@@ -70,7 +70,7 @@ def compare_photos(field: RadianceField, views: Sequence[View], *, degree: int |
     """
     regions, medians = [], {}
     compared = every_nth(views, MAX_VIEWS)
-    for _, view in tracked("comparing photos with the scene", compared, log):
+    for _, view in track_progress("comparing photos with the scene", compared, log):
         exposure = field.render(view.camera, degree=degree).hdr * view.exposure_time
         photo = view.image
         stops, code = _differences(view, photo, exposure, field.response)

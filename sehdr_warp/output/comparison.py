@@ -10,7 +10,7 @@ from sehdr_warp.scene import View
 
 from .camera_paths import interpolate
 from .images import as_array
-from .light_pictures import photo_light, shown_photo
+from .light_pictures import photo_for_display, photo_light
 
 if TYPE_CHECKING:
     from ..runs.run import LoadedScene
@@ -59,4 +59,4 @@ def compare(run: "LoadedScene", view: View, views: Sequence[View]) -> Comparison
         nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
         new = as_array(run.render(interpolate([view.camera, nearest], 3)[1]).hdr)
     confidence = None if confidence is None else as_array(confidence)
-    return Comparison(view.name, shown_photo(run, view), photo_light(run, view), hdr, view.hdr, confidence, new)
+    return Comparison(view.name, photo_for_display(run, view), photo_light(run, view), hdr, view.hdr, confidence, new)

@@ -12,7 +12,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.wide_camera import face_cameras, face_size
 
-from ..progress import tracked
+from ..progress import track_progress
 from .images import as_array
 from .splat_edits import Box, Sphere
 from .world_transform import WorldTransform
@@ -118,7 +118,7 @@ def fuse_depth(
     distance, weight = torch.zeros(count), torch.zeros(count)
     light, near = torch.zeros(count, 3), torch.zeros(count)
     reach = _TRUNCATION * float(voxel.max())
-    for _, view in tracked("fusing depth of views", views, log):
+    for _, view in track_progress("fusing depth of views", views, log):
         camera = view.camera
         turn = torch.tensor(camera.world_to_camera, dtype=torch.float32)
         for start, points in _chunks(low, voxel, shape):

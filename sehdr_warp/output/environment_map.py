@@ -321,7 +321,7 @@ class MapCenter(NamedTuple):
 
 def map_center(photos: list[Camera]) -> MapCenter:
     """Return the mean place of the training cameras, or, if they walk around something, what surrounds that."""
-    focus = walked_around(photos)
+    focus = subject_of_walk(photos)
     if focus is None:
         return MapCenter(np.mean([camera.position for camera in photos], axis=0), 0.0)
     nearest = min(float(np.linalg.norm(camera.position - focus)) for camera in photos)
@@ -351,7 +351,7 @@ def _point(
     return transform.inverse().points(position)
 
 
-def walked_around(photos: list[Camera]) -> np.ndarray | None:
+def subject_of_walk(photos: list[Camera]) -> np.ndarray | None:
     """Return the point that cameras stand around and look at; None if they do not, as in a room seen from within."""
     focus = common_focus(photos) if len(photos) > 3 else None
     if focus is None:

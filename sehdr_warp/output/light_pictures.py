@@ -67,15 +67,15 @@ def photo_light(run: "LoadedScene", view: View) -> np.ndarray:
     return as_array(rec709_of(torch.from_numpy(light), run.color_matrix, run.base_time))
 
 
-def shown_photo(run: "LoadedScene", view: View) -> np.ndarray:
+def photo_for_display(run: "LoadedScene", view: View) -> np.ndarray:
     """Return [H, W, 3] in [0, 1] as a photo is looked at: encoded values, or the light of a RAW photo as sRGB."""
     if run.color_matrix is None:
         return view.image
     return encode_srgb(np.clip(photo_light(run, view) * view.exposure_time, 0, 1))
 
 
-def photographed(run: "LoadedScene", exposure: np.ndarray) -> np.ndarray:
-    """Return [H, W, 3] in [0, 1]: Rec.709 exposures as a photo of the run would show them (see shown_photo)."""
+def simulated_photo(run: "LoadedScene", exposure: np.ndarray) -> np.ndarray:
+    """Return [H, W, 3] in [0, 1]: Rec.709 exposures as a photo of the run would show them (see photo_for_display)."""
     if run.color_matrix is None:
         return np.clip(run.response.encode(exposure), 0, 1)
     return encode_srgb(np.clip(exposure, 0, 1))

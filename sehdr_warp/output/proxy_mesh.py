@@ -16,7 +16,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import Camera
 
 from ..files import atomic_path, check_absent
-from ..progress import tracked
+from ..progress import track_progress
 from ..splats.usd import pxr
 from .camera_paths import evenly, training_cameras
 from .depth_fusion import (
@@ -162,7 +162,7 @@ def proxy_mesh(
     if not cameras:
         raise SehdrError(f"{run.path}: has no training cameras whose depth could be fused")
     cameras = evenly(cameras, MOST_VIEWS)
-    rendered = [depth_views(run, camera, transform) for _, camera in tracked("depth of views", cameras, log)]
+    rendered = [depth_views(run, camera, transform) for _, camera in track_progress("depth of views", cameras, log)]
     views = [view for faces in rendered for view in faces]
     low, high = mesh_bounds(views, region)
     longest = float((high - low).max()) / resolution

@@ -18,7 +18,7 @@ from sehdr_warp.scene.images import MAX_PIXELS
 
 from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
-from ..progress import tracked
+from ..progress import track_progress
 from .aovs import ViewData, data_parts, read_aovs
 from .brackets import Brackets, bracket_exposures
 from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
@@ -141,7 +141,7 @@ def render_views(
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
         bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if bracketed else None
         tone_map = look or shared_tone_map(run, [camera for _, camera in views])
-        for index, (name, view_camera) in tracked("rendering views", views, log):
+        for index, (name, view_camera) in track_progress("rendering views", views, log):
             rendered, confidence = run.render(view_camera), run.render_confidence(view_camera)
             hdr = as_array(rendered.hdr)
             if confidence is None and index == 0:

@@ -14,7 +14,7 @@ from sehdr_warp.scene import Scene, View
 from sehdr_warp.scene.exposure import shutter
 
 from ..files import atomic_path, check_absent
-from ..progress import tracked
+from ..progress import track_progress
 from .camera_paths import evenly
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare, darker_stops
@@ -69,7 +69,7 @@ def write_report(
     if not candidates:
         raise SehdrError("the scene has no views to report on; check its splits")
     views = evenly(candidates, max(view_count, 1))
-    comparisons = [compare(run, view, scene.views) for _, view in tracked("comparing views", views, log)]
+    comparisons = [compare(run, view, scene.views) for _, view in track_progress("comparing views", views, log)]
     brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
     time = views[0].exposure_time
     compared = comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out)

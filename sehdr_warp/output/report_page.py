@@ -24,9 +24,9 @@ from .light_pictures import (
     img,
     jpeg,
     jpeg_source,
-    photographed,
-    shown_photo,
+    photo_for_display,
     side_choices,
+    simulated_photo,
 )
 from .light_unit import luminance_of_one, read_light_unit
 from .tonemap import expose, fit_tone_map
@@ -152,7 +152,7 @@ def _pictures(run: "Run", comparisons: Sequence[Comparison], times: Mapping[str,
                 data = jpeg(smaller(each.photo, _PICTURE))
             else:
                 exposure = smaller(light * times[each.name], _PICTURE)
-                data = ultra_hdr(exposure * gain, photographed(run, exposure))
+                data = ultra_hdr(exposure * gain, simulated_photo(run, exposure))
             tags.append(img(data, f"{name} of {each.name}", size, data_name=name))
         pair = '<div class="pair" style="aspect-ratio: {} / {}" tabindex="0" role="group">{}{}</div>'
         choices = side_choices(list(lights), "Photo", "Scene")
@@ -260,7 +260,7 @@ def _unexplained(run: "Run", scene: Scene) -> Markup:
             photos.setdefault(region["photo"], []).append(region)
     figures = []
     for name, regions in list(photos.items())[:_MOST_PHOTOS]:
-        svg = _boxed_photo(shown_photo(run, views[name]), name, regions)
+        svg = _boxed_photo(photo_for_display(run, views[name]), name, regions)
         figures.append(_figure(svg, f"{name}: {len(regions)} of the worst regions"))
     summary = (
         f"{unexplained['regions']} regions in {unexplained['photos']} training photos"

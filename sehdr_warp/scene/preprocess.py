@@ -13,7 +13,7 @@ from PIL import Image
 
 from ..errors import InputError
 from ..parallel import prefetch_map
-from ..progress import tracked
+from ..progress import track_progress
 from .camera import Camera
 from .color_encoding import DEVIATION, ColorEncoding
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
@@ -69,7 +69,7 @@ def preprocess(
     # OpenEXR and LibRaw are read one at a time: their output to the terminal is suppressed for the whole process.
     quiet = any(record.hdr is not None or kind_of(record.image) != "encoded" for record in dataset.records)
     most = 1 if quiet else _PIXELS_AT_ONCE // max(record.lens.width * record.lens.height for record in dataset.records)
-    jobs = ((record, names[i]) for i, record in tracked("reading views", dataset.records, _log))
+    jobs = ((record, names[i]) for i, record in track_progress("reading views", dataset.records, _log))
     views, problems = [], []
     for view in prefetch_map(lambda job: preprocessor.view_or_error(*job), jobs, most):
         if isinstance(view, InputError):

@@ -23,7 +23,7 @@ from PIL import Image
 
 from ..errors import InputError, SehdrError
 from ..parallel import run_interruptibly, signals_kept
-from ..progress import Stage, stage, tracked
+from ..progress import Stage, stage, track_progress
 from .cached_folder import cached_folder
 from .colmap_model import SparseModel, read_model
 from .colmap_rows import counted_rows
@@ -187,7 +187,7 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
     """
     folder.mkdir()
     sizes, small, problems, visible = [], [], [], False
-    for i, photo in tracked("reading photos", photos, _log):
+    for i, photo in track_progress("reading photos", photos, _log):
         try:
             codes = read_photo(photo, oriented=True).pixels
         except InputError as error:

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ..parallel import run_interruptibly
-from ..progress import stage, tracked
+from ..progress import stage, track_progress
 from .colmap_model import ModelImage, SparseModel, read_points
 from .colmap_rows import counted_rows
 from .dataparser import PointCloud
@@ -117,7 +117,7 @@ def _write_faces(photos: Sequence[Path], folder: Path) -> None:
     """Write the cut views of each photo: face0/00000.png, face1/00000.png, ..."""
     for number in range(len(face_rotations())):
         (folder / f"face{number}").mkdir(parents=True)
-    for index, photo in tracked("cutting panoramas", photos, _log):
+    for index, photo in track_progress("cutting panoramas", photos, _log):
         pixels = read_photo(photo, oriented=True).pixels
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
         height, width = pixels.shape[:2]

@@ -111,9 +111,9 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
 
     `argv` are the words of the command line, with which --gpus starts the other ranks.
     """
-    from .launch import device_of_rank, launched_as
+    from .launch import device_of_rank, rank_from_environment
 
-    gpus, rank_info = args.machine.gpus, launched_as()
+    gpus, rank_info = args.machine.gpus, rank_from_environment()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
     _refuse_run(args)
@@ -191,7 +191,7 @@ def _train(args: Train, ranks=None) -> None:
             print(json.dumps(values) if output.json else plan.table() + estimate.table(*cost))
             return
         from ..console import follow
-        from ..viewer.live import viewed
+        from ..viewer.live import serve_training
         from .advice import advice
         from .train import create_trainer
 
@@ -208,7 +208,7 @@ def _train(args: Train, ranks=None) -> None:
         )
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
-        with viewed(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
+        with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
             follow(steps, trainer.total)
     photos = len(trainer.scene.train_views)
     _print_result(args, trainer.run, partial(advice, train_photos=photos, scene=data.get("path") or "SCENE"))

@@ -71,7 +71,7 @@ class RankInfo:
         return rank // self.local_count
 
 
-def launched_as() -> RankInfo | None:
+def rank_from_environment() -> RankInfo | None:
     """Return the info that a launcher sets for this process; None if there is no launcher, or one process."""
 
     def number(name: str, default: int) -> int:

@@ -170,7 +170,7 @@ class _Picture:
 
 
 @contextmanager
-def viewed(training: Any, name: str) -> Iterator[Iterator]:
+def serve_training(training: Any, name: str) -> Iterator[Iterator]:
     """Serve a page that shows a training while its steps are made; the context is an iterator of the steps."""
     live = LiveTraining(training, name)
     photos = {view.name: view for view in training.scene.views}

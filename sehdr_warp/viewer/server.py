@@ -26,7 +26,7 @@ from ..output.camera_paths import interpolate
 from ..output.film import write_film
 from ..output.html import page_file
 from ..output.images import quantize
-from ..output.light_pictures import shown_photo
+from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
 from .clients import Client, Refusal
@@ -183,7 +183,7 @@ class Viewer:
             if photo is None or self._closed.is_set():
                 raise Refusal(404, "no such photo")
             buffer = io.BytesIO()
-            picture = Image.fromarray(quantize(shown_photo(cast(Any, self._run({"run": run})), photo)))
+            picture = Image.fromarray(quantize(photo_for_display(cast(Any, self._run({"run": run})), photo)))
             picture.save(buffer, "PNG", compress_level=1)
         client.reserve(buffer.tell())
         return buffer.getvalue()

@@ -15,7 +15,7 @@ from sehdr_warp.output.environment_map import (
     latlong,
     render_map,
     solid_angles,
-    walked_around,
+    subject_of_walk,
     write_environment_map,
 )
 from sehdr_warp.output.exr import write_radiance
@@ -305,8 +305,8 @@ def test_cameras_that_look_outward_or_stand_on_one_side_walk_around_nothing():
     turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     outward = [camera(position=(0, 0, 0.1 * t), target=(np.sin(t), 0, 5 * np.cos(t))) for t in turns]
     one_side = [camera(position=(x, 0, -4), target=(0, 0, 0)) for x in np.linspace(-1, 1, 9)]
-    assert walked_around(outward) is None and walked_around(one_side) is None
-    assert walked_around(around()) == pytest.approx([0, 0, 0], abs=0.05)
+    assert subject_of_walk(outward) is None and subject_of_walk(one_side) is None
+    assert subject_of_walk(around()) == pytest.approx([0, 0, 0], abs=0.05)
 
 
 @pytest.mark.parametrize("beyond", [-1.0, np.inf, np.nan])

@@ -17,7 +17,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder, describe_scene
 from sehdr_warp.training.following import _check_same_photos
-from sehdr_warp.training.launch import RankInfo, launched_as
+from sehdr_warp.training.launch import RankInfo, rank_from_environment
 
 from ..refusals import call
 from .toy import toy_scene
@@ -143,6 +143,6 @@ def test_nodes_start_as_many_processes_each(monkeypatch):
     for name, value in {"RANK": 2, "WORLD_SIZE": 3, "LOCAL_WORLD_SIZE": 1, "GROUP_WORLD_SIZE": 2}.items():
         monkeypatch.setenv(name, str(value))
     with pytest.raises(SehdrError, match="3 ranks on 2 nodes, and 1 on this one"):
-        launched_as()
+        rank_from_environment()
     monkeypatch.setenv("GROUP_WORLD_SIZE", "3")
-    assert launched_as() == RankInfo(2, 3, 0, 1, 2, 3)
+    assert rank_from_environment() == RankInfo(2, 3, 0, 1, 2, 3)

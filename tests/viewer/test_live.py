@@ -14,9 +14,9 @@ from PIL import Image
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.images import quantize
-from sehdr_warp.output.light_pictures import shown_photo
+from sehdr_warp.output.light_pictures import photo_for_display
 from sehdr_warp.training.train import create_trainer, train
-from sehdr_warp.viewer.live import SHARE, LiveTraining, viewed
+from sehdr_warp.viewer.live import SHARE, LiveTraining, serve_training
 
 from ..training.toy import toy_scene
 from .browser import browser
@@ -45,7 +45,7 @@ def test_the_result_is_that_without_a_viewer(tmp_path, logged):
             answers.append((status, np.frombuffer(content, "<f2") if status == 200 else content, status_json))
 
     done = threading.Event()
-    with viewed(training, "toy") as steps:
+    with serve_training(training, "toy") as steps:
         address = re.search(r"http://([^/]*)/", logged[-1])[1]
         looking = threading.Thread(target=look, args=(address,))
         looking.start()
@@ -78,7 +78,7 @@ def test_a_sensors_colors_are_shown_in_rec709_as_the_run_shows_them(tmp_path, lo
     matrix = np.array([[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.6, 1.6]])
     scene = replace(toy_scene(), color_matrix=matrix, light_known=True)
     training = create_trainer(scene, tmp_path / "raw", CONFIG | {"schedule.iterations": 3}, device="cpu")
-    with viewed(training, "raw") as steps:
+    with serve_training(training, "raw") as steps:
         address = re.search(r"http://([^/]*)/", logged[-1])[1]
         for _ in steps:
             pass
@@ -88,7 +88,7 @@ def test_a_sensors_colors_are_shown_in_rec709_as_the_run_shows_them(tmp_path, lo
     np.testing.assert_allclose(rendered, run.render(camera).hdr, atol=1e-5)
     assert (rendered - run.field.render(camera, degree=run.degree).hdr).abs().max() > 0.1
     assert status == 200
-    np.testing.assert_array_equal(Image.open(io.BytesIO(photo)), quantize(shown_photo(run, scene.views[1])))
+    np.testing.assert_array_equal(Image.open(io.BytesIO(photo)), quantize(photo_for_display(run, scene.views[1])))
 
 
 class Steps:
@@ -158,7 +158,7 @@ def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
     served, paused = threading.Event(), threading.Event()
 
     def work():
-        with viewed(training, "toy") as steps:
+        with serve_training(training, "toy") as steps:
             served.set()
             for _ in steps:
                 paused.wait(60)  # The first step's, or a training this short ends while the page opens.
