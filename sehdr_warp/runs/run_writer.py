@@ -81,7 +81,7 @@ class RunWriter(RunFolder):
                     (self.path / _LOCK).unlink()
                     self.path.rmdir()
 
-    def check(self, *, resume: bool, overwrite: bool) -> bool:
+    def can_resume(self, *, resume: bool, overwrite: bool) -> bool:
         """Return whether there is a run to continue, after finishing what a killed training had begun.
 
         Raises InputError if the folder holds something other than a run, if neither resume nor overwrite was asked
@@ -139,7 +139,7 @@ class RunWriter(RunFolder):
             require_text(name)
         require_readable(data)
         self.lock()
-        self.check(resume=False, overwrite=overwrite)  # Reading the photos took time.
+        self.can_resume(resume=False, overwrite=overwrite)  # Reading the photos took time.
         info = {"scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
         info["normalization"] = field.normalization.to_dict()

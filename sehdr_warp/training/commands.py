@@ -158,16 +158,17 @@ def _train(args: Train, ranks=None) -> None:
     from ..runs.run_writer import RunWriter
     from .losses import check_dataset_truth
 
-    output, resumed, out = args.output, None, args.output.out
-    if args.training.plan_only:
-        out = None
-    elif out is None:
+    output, resumed = args.output, None
+    out = None if args.training.plan_only else output.out
+    if out is None and not args.training.plan_only:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
-    # What can be refused is refused before the photos are read, which may take minutes.
-    elif (folder := RunWriter(out)).check(resume=output.resume, overwrite=output.overwrite):
-        resumed = folder
-    elif output.resume:
-        log.info("%s holds no run yet: a training begins there", out)
+    if out is not None:
+        # What can be refused is refused before the photos are read, which may take minutes.
+        folder = RunWriter(out)
+        if folder.can_resume(resume=output.resume, overwrite=output.overwrite):
+            resumed = folder
+        elif output.resume:
+            log.info("%s holds no run yet: a training begins there", out)
     data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
     config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(args.machine.device) if ranks is None else ranks.device

@@ -51,7 +51,7 @@ MIN_POINTS = 100  # Fewest points for a fit
 
 
 @dataclass(frozen=True)
-class SharedPoints:
+class MatchedPoints:
     """Points that several photos show.
 
     Attributes:
@@ -66,9 +66,9 @@ class SharedPoints:
         """Return the number of points."""
         return len(self.points)
 
-    def subset(self, part: slice) -> "SharedPoints":
+    def subset(self, part: slice) -> "MatchedPoints":
         """Return some of the points."""
-        return SharedPoints(self.points[part], self.visible[:, part])
+        return MatchedPoints(self.points[part], self.visible[:, part])
 
     def disagreement(
         self, views: Sequence[View], response: Response, gains: ExposureCompensation | None, *, colors: bool = False
@@ -196,13 +196,13 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     def matcher_of(scene: Scene) -> Matcher:
         return make_matcher(scene, response, device)
 
-    def match(matcher: Matcher, count: int = POINTS) -> SharedPoints:
+    def match(matcher: Matcher, count: int = POINTS) -> MatchedPoints:
         matches = matcher.match(matcher.pixels(count, np.random.default_rng(0)))
         visible = matcher.near(cameras)[:, matches.views.cpu().numpy()]
-        return SharedPoints(matches.points.double().cpu().numpy(), visible)
+        return MatchedPoints(matches.points.double().cpu().numpy(), visible)
 
-    def fit(shared: SharedPoints) -> ExposureCompensation:
-        return fit_gains(views, others, shared.points, shared.visible, response)
+    def fit(matched: MatchedPoints) -> ExposureCompensation:
+        return fit_gains(views, others, matched.points, matched.visible, response)
 
     def no_drift(matcher: Matcher) -> Compensation:
         least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
@@ -214,13 +214,13 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     matcher = matcher_of(small)
     if times_stated and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
         return no_drift(matcher)
-    shared, guess = match(matcher), initial_gains(small.views, response)
-    if not times_stated and len(shared) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
-        shared = max(shared, match(matcher_of(guess.normalize_photos(small, response))), key=len)
-    if len(shared) < MIN_POINTS:
+    matched, guess = match(matcher), initial_gains(small.views, response)
+    if not times_stated and len(matched) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
+        matched = max(matched, match(matcher_of(guess.normalize_photos(small, response))), key=len)
+    if len(matched) < MIN_POINTS:
         return no_drift(matcher)
-    compensation = fit(shared)
-    parts = _explanatory_parts(compensation, views, shared, response, times_stated)
+    compensation = fit(matched)
+    parts = _explanatory_parts(compensation, views, matched, response, times_stated)
     if not (parts.exposure or parts.white_balance or parts.vignetting):
         return no_drift(matcher)
     # Match again in photos that are already similar: more points are found.
@@ -233,31 +233,31 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     )
 
 
-def _may_drift(views: Sequence[View], shared: SharedPoints, response: Response) -> bool:
+def _may_drift(views: Sequence[View], matched: MatchedPoints, response: Response) -> bool:
     """Return whether photos with stated times may drift, by a rough fit to few points."""
-    rough = rough_gains(views, shared.points, shared.visible, response)
+    rough = rough_gains(views, matched.points, matched.visible, response)
     if _exceeds_stated(rough, views):
         return True
-    remaining = remaining_vignetting(views, shared.points, shared.visible, response, rough)
+    remaining = remaining_vignetting(views, matched.points, matched.visible, response, rough)
     return rough.corner_loss >= MIN_CORNER_LOSS and remaining < 1
 
 
 def _explanatory_parts(
     compensation: ExposureCompensation,
     views: Sequence[View],
-    shared: SharedPoints,
+    matched: MatchedPoints,
     response: Response,
     times_stated: bool,
 ) -> Parts:
     """Return the parts of gains that explain how photos differ at shared points."""
-    before = shared.disagreement(views, response, None)
-    after = shared.disagreement(views, response, compensation.parts(vignetting=False))
+    before = matched.disagreement(views, response, None)
+    after = matched.disagreement(views, response, compensation.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
     exposure = white_balance = not times_stated and compensation.stops >= MIN_STOPS and explains
     if not exposure and (
         compensation.white_balance >= MIN_WHITE_BALANCE or (times_stated and _exceeds_stated(compensation, views))
     ):
-        drift, colors = _cross_validate(views, shared, response)
+        drift, colors = _cross_validate(views, matched, response)
         exposure = (
             times_stated
             and compensation.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS
@@ -268,7 +268,7 @@ def _explanatory_parts(
         ) and colors <= MAX_REMAINING_WHITE_BALANCE
     vignetting = compensation.corner_loss >= MIN_CORNER_LOSS
     if vignetting:
-        remaining = remaining_vignetting(views, shared.points, shared.visible, response, compensation)
+        remaining = remaining_vignetting(views, matched.points, matched.visible, response, compensation)
         vignetting = remaining <= MAX_REMAINING_VIGNETTING
     return Parts(exposure, white_balance, vignetting)
 
@@ -281,7 +281,7 @@ def _exceeds_stated(compensation: ExposureCompensation, views: Sequence[View]) -
     )
 
 
-def _cross_validate(views: Sequence[View], shared: SharedPoints, response: Response) -> tuple[float, float]:
+def _cross_validate(views: Sequence[View], matched: MatchedPoints, response: Response) -> tuple[float, float]:
     """Return the fractions of the disagreement at half of the points that gains of the other half leave.
 
     Returns:
@@ -289,7 +289,7 @@ def _cross_validate(views: Sequence[View], shared: SharedPoints, response: Respo
     """
     halves, remaining = (slice(0, None, 2), slice(1, None, 2)), []
     for fitted, evaluated in (halves, halves[::-1]):
-        part, rest = shared.subset(fitted), shared.subset(evaluated)
+        part, rest = matched.subset(fitted), matched.subset(evaluated)
         drift = fit_gains(views, (), part.points, part.visible[: len(views)], response).parts(vignetting=False)
         exposure = (
             rest.disagreement(views, response, drift),

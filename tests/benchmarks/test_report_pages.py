@@ -13,6 +13,26 @@ from sehdr_warp.errors import InputError
 from .test_quality import made_up
 
 
+def trained(method, decibels, **options):
+    """Rows of trainings of a method on the embedded scene, one for each PSNR."""
+    planned = plan_jobs(["embedded"], [method], iterations=10, **{"responses": ("known",), **options})
+    return [row_of(made_up(job, float(psnr))) for job, psnr in zip(planned, decibels, strict=True)]
+
+
+def quality_page(folder, rows):
+    """Write the reports of a quality result with these rows; return the text of its page."""
+    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
+    result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
+    (folder / "results").mkdir()
+    (folder / "results" / "quality.json").write_text(json.dumps(result))
+    assert {path.name for path in write_reports(folder)} == {"quality.md", "quality.png", "README.md"}
+    return (folder / "quality.md").read_text()
+
+
+def cells_of(line):
+    return [cell.strip() for cell in line.split("|")[1:-1]]
+
+
 def test_the_pages_are_what_the_results_make(tmp_path):
     """Pages may not be edited by hand: `make reports` makes them."""
     (tmp_path / "results").mkdir()
@@ -40,24 +60,13 @@ def test_the_readme_shows_the_page_of_quality(tmp_path):
 
 
 def test_quality_is_paired_with_the_upper_bound(tmp_path):
-    scenes = {"exposures": (1, 2), "responses": ("known",), "iterations": 10}
-    rows = []
-    for method, decibels in (("default", (30.0, 28.0)), ("hdr-gs", (20.0, 22.0)), ("truth", (33.0, 32.0))):
-        planned = plan_jobs(["embedded"], [method], **scenes)
-        rows += [row_of(made_up(job, psnr)) for job, psnr in zip(planned, decibels, strict=True)]
-    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
-    result = {
-        "command": "python -m benchmarks quality",
-        "machine": machine,
-        "date": "2026-01-01",
-        "rows": rows,
-        "notes": [],
-    }
-    (tmp_path / "results").mkdir()
-    (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
-    assert {path.name for path in write_reports(tmp_path)} == {"quality.md", "quality.png", "README.md"}
-    lines = (tmp_path / "quality.md").read_text().splitlines()
-    cells = {line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]] for line in lines if "|" in line}
+    rows = [
+        *trained("default", (30, 28), exposures=(1, 2)),
+        *trained("hdr-gs", (20, 22), exposures=(1, 2)),
+        *trained("truth", (33, 32), exposures=(1, 2)),
+    ]
+    lines = quality_page(tmp_path, rows).splitlines()
+    cells = {name: values for name, *values in map(cells_of, (line for line in lines if "|" in line))}
     # n, mean, worst, difference to the bound.
     assert cells["default"][:4] == ["2", "29.00", "28.00", "-3.50"]
     assert cells["hdr-gs"][:4] == ["2", "21.00", "20.00", "-11.50"], "a learned curve stands beside the known one"
@@ -82,20 +91,14 @@ def test_what_is_no_result_is_named(tmp_path):
 
 
 def test_means_over_the_whole_are_told_by_seed(tmp_path):
-    rows = []
-    for method, seed, decibels in (("default", 0, (30, 28)), ("default", 1, (31, 29)), ("truth", 0, (33, 32))):
-        planned = plan_jobs(
-            ["embedded"], [method], exposures=(1, 2), seeds=(seed,), responses=("known",), iterations=10
-        )
-        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(planned, decibels, strict=True)]
-    rows += [row_of(made_up(plan_jobs(["embedded"], ["default"], seeds=(2,), iterations=10)[0], 20.0))]
-    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
-    result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
-    (tmp_path / "results").mkdir()
-    (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
-    write_reports(tmp_path)
-    section = (tmp_path / "quality.md").read_text().split("by seed:")[1]
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.startswith("| ")]
+    rows = [
+        *trained("default", (30, 28), exposures=(1, 2), seeds=(0,)),
+        *trained("default", (31, 29), exposures=(1, 2), seeds=(1,)),
+        *trained("truth", (33, 32), exposures=(1, 2), seeds=(0,)),
+        *trained("default", (20,), seeds=(2,)),
+    ]
+    section = quality_page(tmp_path, rows).split("by seed:")[1]
+    cells = [cells_of(line) for line in section.splitlines() if line.startswith("| ")]
     assert cells[2:] == [
         ["default", "0", "29.00", "-3.50"],
         ["default", "1", "30.00", "-"],
@@ -104,20 +107,10 @@ def test_means_over_the_whole_are_told_by_seed(tmp_path):
 
 
 def test_methods_are_compared_where_all_were_trained(tmp_path):
-    rows = []
-    for method, exposures, decibels in (("default", (1, 2, 3), (30, 28, 20)), ("3dgs", (2,), (26,))):
-        planned = plan_jobs(["embedded"], [method], exposures=exposures, responses=("known",), iterations=10)
-        rows += [row_of(made_up(job, float(psnr))) for job, psnr in zip(planned, decibels, strict=True)]
-    machine = {"cpu": "stub", "cores": 2, "gpu": None, "versions": {"torch": "2"}}
-    result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
-    (tmp_path / "results").mkdir()
-    (tmp_path / "results" / "quality.json").write_text(json.dumps(result))
-    write_reports(tmp_path)
-    table = (tmp_path / "quality.md").read_text().split("response known")[1]
+    rows = trained("default", (30, 28, 20), exposures=(1, 2, 3)) + trained("3dgs", (26,), exposures=(2,))
+    table = quality_page(tmp_path, rows).split("response known")[1]
     assert "at which every method was trained" in table
     cells = {
-        line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:5]]
-        for line in table.splitlines()[:12]
-        if "|" in line
+        name: values[:3] for name, *values in map(cells_of, (line for line in table.splitlines()[:12] if "|" in line))
     }
     assert cells["default"] == ["1", "28.00", "28.00"] and cells["3dgs"] == ["1", "26.00", "26.00"]
