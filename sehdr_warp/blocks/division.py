@@ -22,7 +22,7 @@ MARGIN = 0.1  # Enlargement of a core for the choice of its photos, as a fractio
 LEAST_PART = 0.15  # A block trains on photos of which its enlarged core fills at least this part
 MAX_PART = 0.8  # If a block needs a larger part of all photos, dividing saves nothing
 FEWEST_PLACES, MOST_PLACES, PLACES_PER_PHOTO = 20_000, 200_000, 20
-"""Points that photos are described by: so many for each photo, within the first two."""
+"""Number of points that describe what photos show: PLACES_PER_PHOTO for each photo, within the first two bounds."""
 MOST_OF_PHOTO = 4096  # Points that one photo is described by, so that 20,000 photos need 0.7 GB at most
 MOVES = 12  # Divisions that are tried to find blocks of equal numbers of photos
 LEAST_PHOTOS = max(FEWEST_PHOTOS, 6)  # Photos that a block needs at least

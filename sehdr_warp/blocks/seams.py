@@ -1,4 +1,4 @@
-"""Measure a run on photos: of pixels near the borders of blocks, and of the others."""
+"""Measure a run on photos: the errors of pixels near the borders of blocks, and of all other pixels."""
 
 from dataclasses import dataclass
 

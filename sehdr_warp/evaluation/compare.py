@@ -181,7 +181,7 @@ def _row(label: str, figures: dict, suffix: str = "") -> list[str]:
 
 
 def format_figure(value: float | None, digits: int) -> str:
-    """Return a figure with so many digits after the point, or a dash for None."""
+    """Return a figure with this number of digits after the point, or a dash for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 

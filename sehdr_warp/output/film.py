@@ -151,7 +151,7 @@ def write_film(
 
 
 def _encoder_options(kind: Transfer, side: int) -> dict[str, str]:
-    """Return options of the encoder for pictures whose shorter side has so many pixels."""
+    """Return options of the encoder for pictures whose shorter side has this number of pixels."""
     if kind.codec != "libx265" or side >= _X265_SMALLEST_SIDE:
         return kind.options
     return kind.options | {"x265-params": kind.options["x265-params"] + _X265_SMALL}

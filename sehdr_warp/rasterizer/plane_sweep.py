@@ -13,7 +13,7 @@ from .warp_launch.launching import launch
 BORDER = int(plane_sweep.RADIUS)
 """Pixels nearer to the border than this cannot be matched: a patch would leave the photo."""
 NEIGHBORS = plane_sweep.MOST_NEIGHBORS
-"""A photo is compared with so many others at most."""
+"""Largest number of photos that a photo is compared with."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ def select_folder() -> None:
 
 
 def discard_damaged() -> None:
-    """Discards what is damaged; after wp.init(), before the first launch."""
+    """Discard damaged modules; call it after wp.init(), before the first launch."""
     cache = Path(wp.config.kernel_cache_dir or "")
     now, before = _lines(cache), listed(cache)
     names = {line[66:] for line in now}
