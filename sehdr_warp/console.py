@@ -63,7 +63,7 @@ def show_logs(level: str = "info") -> None:
         logging.getLogger("PIL").setLevel(logging.CRITICAL)
 
 
-def follow(steps: Iterable[Any], total: int) -> None:
+def run_with_progress(steps: Iterable[Any], total: int) -> None:
     """Run the steps of a training and show its progress, unless the log is quiet.
 
     Args:

@@ -40,7 +40,7 @@ def printed(monkeypatch, stream, columns="80", level="info"):
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setattr(Step, "read", 0)
     console.show_logs(level)
-    console.follow(steps(300), 300)
+    console.run_with_progress(steps(300), 300)
     return stream.getvalue()
 
 
@@ -93,7 +93,7 @@ def test_psnr_is_a_running_mean(monkeypatch):
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setattr(console.time, "monotonic", lambda: next(clock) / 10)
     console.show_logs()
-    console.follow((Uneven(iteration=i) for i in range(1, 301)), 300)
+    console.run_with_progress((Uneven(iteration=i) for i in range(1, 301)), 300)
     psnrs = [float(line.split("PSNR ")[1].split(" dB")[0]) for line in stream.getvalue().splitlines()]
     assert psnrs[0] == 10 and len(psnrs) > 2 and all(19 <= value <= 21 for value in psnrs[2:])
 

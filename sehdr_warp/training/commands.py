@@ -191,7 +191,7 @@ def _train(args: Train, ranks=None) -> None:
             values = plan.to_dict() | {"cost": estimate.to_dict(*cost)}
             print(json.dumps(values) if output.json else plan.table() + estimate.table(*cost))
             return
-        from ..console import follow
+        from ..console import run_with_progress
         from ..viewer.live import serve_training
         from .advice import advice
         from .train import create_trainer
@@ -210,7 +210,7 @@ def _train(args: Train, ranks=None) -> None:
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
         with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
-            follow(steps, trainer.total)
+            run_with_progress(steps, trainer.total)
     photos = len(trainer.scene.train_views)
     _print_result(args, trainer.run, partial(advice, train_photos=photos, scene=data.get("path") or "SCENE"))
 
