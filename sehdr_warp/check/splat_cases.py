@@ -83,14 +83,14 @@ class Splats:
 
 def compare_splats(splats: Splats, device: torch.device) -> list[Reading]:
     """Compare image, alpha and gradients of rasterize() with the float64 reference."""
-    options = {"width": splats.width, "height": splats.height} | splats.options
+    render_options = {"width": splats.width, "height": splats.height} | splats.options
 
     def ours(*tensors):
-        rendering = rasterize(*tensors, **options)
+        rendering = rasterize(*tensors, **render_options)
         return {"image": rendering.image, "alpha": rendering.alpha}
 
     def project(means, log_scales, quaternions, opacities, features, pose, intrinsics):
-        return project_reference(means, log_scales, quaternions, opacities, pose, intrinsics, **options)
+        return project_reference(means, log_scales, quaternions, opacities, pose, intrinsics, **render_options)
 
     exact_depths = project(*as_float32(splats.tensors.values()))[2]
 
@@ -103,8 +103,9 @@ def compare_splats(splats: Splats, device: torch.device) -> list[Reading]:
         )
         return {"image": image, "alpha": 1.0 - transmittance}
 
-    options = {"gradients": NAMES[:5], "label": splats.label, "extra": splats.extra}
-    return compare(ours, splats.tensors, device, truth=truth, **options)
+    return compare(
+        ours, splats.tensors, device, truth=truth, gradients=NAMES[:5], label=splats.label, extra=splats.extra
+    )
 
 
 def compared(make: Callable[[], Splats | Iterable[Splats]]) -> Callable[[torch.device], Iterator[Reading]]:

@@ -382,8 +382,7 @@ def smaller(picture: np.ndarray, longest: int) -> np.ndarray:
 
 def _size(picture: np.ndarray, longest: int) -> tuple[int, int]:
     """Return width and height of a picture reduced to a longest side."""
-    height, width = picture.shape[:2]
-    return limited_size(width, height, longest)
+    return limited_size(picture.shape[1], picture.shape[0], longest)
 
 
 def stops_text(stops: float) -> str:

@@ -123,7 +123,8 @@ def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
             sources = [
                 torch.zeros((), device=next(part.device for part in parts if part is not None), requires_grad=True)
             ]
-        return _Once.apply(len(parts), *parts, *sources)
+        tensors = [*parts, *sources]
+        return _Once.apply(len(parts), *tensors)
 
     return call
 

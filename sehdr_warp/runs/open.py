@@ -84,7 +84,7 @@ def load_photos(data: LoadArguments, **options: Any) -> Scene:
 
     path = data.get("path")
     assert path is not None, "who has no path says so before"
-    saved = {name: data.get(name) for name in (*LOAD_OPTIONS, "views")}
+    saved: dict[str, Any] = {name: data.get(name) for name in (*LOAD_OPTIONS, "views")}
     scene = load_scene(path, **saved | options)
     for note in scene.notes:
         log.info("%s", note)

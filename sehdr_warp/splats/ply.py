@@ -11,7 +11,7 @@ import json
 import logging
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -69,12 +69,8 @@ def read_ply(path: Path) -> GaussianArrays:
         names = {each.name for each in vertex.properties}
         if "packed_position" in names:
             facts = _facts(read.comments, path)
-            return GaussianArrays(
-                **unpack_ply(read, path),
-                color_model="display",
-                base_time=facts.base_time,
-                world_matrix=facts.world_matrix,
-            )
+            arguments: dict[str, Any] = {**unpack_ply(read, path), "color_model": "display"}
+            return GaussianArrays(**arguments, base_time=facts.base_time, world_matrix=facts.world_matrix)
         missing = [name for group in _GROUPS for name in group.split() if name not in names]
         if missing:
             raise InputError(path, _without(missing, names), "export 3D Gaussians as an uncompressed PLY")
