@@ -113,9 +113,8 @@ def test_the_map_is_the_mean_of_what_is_seen(device):
     confidence_image = model.render_confidence(CAMERA)
     assert confidence_image.shape == (12, 20)
     alpha = model.render(CAMERA).alpha
-    assert float(confidence_image[6, 7]) == pytest.approx(0.9, abs=1e-4) and float(
-        confidence_image[6, 12]
-    ) == pytest.approx(0.2, abs=1e-4)
+    assert float(confidence_image[6, 7]) == pytest.approx(0.9, abs=1e-4)
+    assert float(confidence_image[6, 12]) == pytest.approx(0.2, abs=1e-4)
     assert bool((confidence_image[alpha <= 1e-3] == 0).all()) and bool((alpha <= 1e-3).any())
     assert not [name for name in model.state_dict() if "confidence" in name]
 
@@ -132,12 +131,10 @@ def test_doubt_of_clipped_light_is_the_deviation_of_its_estimate():
 
 def test_estimates_of_views_reach_the_confidence_of_what_they_show():
     model = field()
-    confidence_image = replace(view(model), codes=np.full((12, 20, 3), 255, np.uint8))
+    white_view = replace(view(model), codes=np.full((12, 20, 3), 255, np.uint8))
     high, low, none = (
-        gather_evidence(
-            model, [confidence_image], certainties=[torch.full((3, 5, 3), value, dtype=torch.float16)]
-        ).stops[0]
+        gather_evidence(model, [white_view], certainties=[torch.full((3, 5, 3), value, dtype=torch.float16)]).stops[0]
         for value in (8.0, 0.8, 0.0)
     )
     assert low - high == pytest.approx((1 / 0.8 - 1 / 8) / np.log(2), rel=1e-2)
-    assert none == gather_evidence(model, [confidence_image]).stops[0]
+    assert none == gather_evidence(model, [white_view]).stops[0]
