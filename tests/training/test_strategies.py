@@ -236,6 +236,20 @@ def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
     assert (after - before).abs().mean() < 0.05 * before.abs().mean()
 
 
+@pytest.mark.parametrize("growing", [True, False])
+def test_sources_of_copies_lose_their_second_moments_while_the_count_grows(growing):
+    gaussians = cloud(40)
+    optimizer = adam(gaussians)
+    gaussians.overwrite({"opacity_logits": torch.tensor([-8.0] * 10 + [2.0] * 30)})
+    strategy = mcmc_strategy(seed_fraction=0.0)
+    strategy.cap_max = 400 if growing else 40
+    strategy.refine(600, gaussians, optimizer, torch.Generator().manual_seed(0))
+    first, second = (optimizer.state[gaussians.means][name][10:40].sum(1) for name in ("exp_avg", "exp_avg_sq"))
+    sources = first == 0
+    assert 0 < sources.sum() < 30
+    assert torch.equal(second == 0, sources if growing else torch.zeros_like(sources))
+
+
 def proposer(colors):
     """A function that proposes Gaussians of these colors at the origin."""
 

@@ -26,7 +26,7 @@ class RelocationSlots:
 
     Attributes:
         numbers: [N] int32, position of each row in that order; negative for rows that stay.
-        changed: [N] bool, rows whose optimizer state is to be cleared.
+        changed: [N] bool, rows whose optimizer state is to be cleared, see moments_to_clear().
     """
 
     numbers: Tensor
@@ -92,9 +92,19 @@ class McmcStrategy(Strategy):
         self.relocate(gaussians, slots, opacities.masked_fill(dead, 0), seeded, dead_count, generator)
         if added > 0:
             self.sample_add(gaussians, slots, torch.maximum(dead_count, seeded), dead_count + added, added, generator)
-        moments = [m for p in gaussians.parameters() for m in moments_of(optimizer, p).values()]
-        clear_rows(moments, slots.changed)
+        clear_rows(self.moments_to_clear(gaussians, optimizer, growing=count < self.cap_max), slots.changed)
         return added > 0
+
+    def moments_to_clear(self, gaussians: Gaussians, optimizer: Optimizer | None, growing: bool) -> list[Tensor]:
+        """Return Adam's moments that the sources of copies lose, [N, ...] each.
+
+        The authors clear both moments. Adam then moves a source by 3 to 6 times its rate for about 50 steps. While the
+        count grows, that parts sources from their copies. At the cap the same rows are sources again and again, and in
+        dense scenes they become floaters; so the second moments stay there.
+        """
+        names = ("exp_avg", "exp_avg_sq") if growing else ("exp_avg",)
+        states = [moments_of(optimizer, parameter) for parameter in gaussians.parameters()]
+        return [state[name] for state in states for name in names if name in state]
 
     def next_count(self, iteration: int, count: int) -> int:
         """Return the count after the refinement at an iteration.
