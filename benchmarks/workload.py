@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sehdr_warp.kernels.blend_cuda import BLOCKS_PER_TILE
 from sehdr_warp.kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
-from sehdr_warp.rasterizer.blending import blend_blocks, pad_features
+from sehdr_warp.rasterizer.block_blending import blend_blocks, pad_features
 from sehdr_warp.rasterizer.projection import RasterInputs, project_to_camera
 from sehdr_warp.rasterizer.rasterization import list_splats
 from sehdr_warp.rasterizer.render_options import RenderOptions

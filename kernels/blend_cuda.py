@@ -39,20 +39,22 @@ def padded_channels(channels: int) -> int:
 
 @cache
 def pad_rows_kernel(dtype, channels: int):
-    """Return pad_rows() for one scalar type and features [N, channels], launched over the numbers of the rows."""
-    real = dtype
-    columns = padded_channels(channels)
+    """Return pad_rows() for one scalar type and features [N, channels], launched over the rows of four numbers."""
+    g = geometry(dtype)
+    real, vec4 = g.real, g.vec4
+    quads = padded_channels(channels) // 4
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def pad_rows(first: int, features: wp.array2d(dtype=real), rows: wp.array2d(dtype=real)):
-        """Copy features to rows [N, columns] and fill the columns behind them with zeros."""
+    def pad_rows(first: int, features: wp.array2d(dtype=real), rows: wp.array(dtype=vec4)):
+        """Copy features to rows [N quads] of four numbers, of which the last are filled with zeros."""
         i = first + wp.tid()
-        row = i // wp.static(columns)
-        column = i - row * wp.static(columns)
-        value = real(0.0)
-        if column < wp.static(channels):
-            value = features[row, column]
-        rows[row, column] = value
+        gaussian = i // wp.static(quads)
+        begin = 4 * (i - gaussian * wp.static(quads))
+        four = vec4()
+        for k in range(4):
+            if begin + k < wp.static(channels):
+                four[k] = features[gaussian, begin + k]
+        g.write_row(rows, i, four)
 
     return pad_rows
 

@@ -55,7 +55,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         first: int,
         means2d: vec2s, conics: wp.array(dtype=vec3), opacities: reals, features: reals2d,
         channels: int, alpha_threshold: real, columns: int, rows: int,
-        extents: vec2s, means_opacities: vec4s, conics_cutoffs: vec4s, counts: int64s,
+        extents: vec2s, means_opacities: vec4s, conics_cutoffs: vec4s, counts: int64s, padded: vec4s,
     ):
         """Pack 2D Gaussians and count the tiles, of columns x rows, that each one touches.
 
@@ -64,11 +64,24 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
         extents: set to 0 for a Gaussian with a feature that is not finite, because the CPU blend multiplies what a
         pixel does not show by 0, and 0 times NaN would be visible.
+
+        padded: [N quads], the features in rows of four numbers, of which the last are filled with zeros; or None.
         """
         i = first + wp.tid()
-        for channel in range(channels):
-            if not wp.isfinite(features[i, channel]):
-                extents[i] = vec2(real(0.0), real(0.0))
+        if padded:
+            quads = (channels + 3) // 4
+            for quad in range(quads):
+                four = vec4()
+                for k in range(4):
+                    if 4 * quad + k < channels:
+                        four[k] = features[i, 4 * quad + k]
+                        if not wp.isfinite(four[k]):
+                            extents[i] = vec2(real(0.0), real(0.0))
+                g.write_row(padded, i * quads + quad, four)
+        else:
+            for channel in range(channels):
+                if not wp.isfinite(features[i, channel]):
+                    extents[i] = vec2(real(0.0), real(0.0))
         mean = means2d[i]
         conic = conics[i]
         opacity = opacities[i]

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from ..kernels.absolute_gradient import absolute_gradient_kernel
 from ..kernels.constants import TILE_SIZE
-from .blending import gather_by_gaussian
 from .tile_lists import PackedSplats, TileLists
 from .torch_contract import once_differentiable
 from .warp_launch.launching import launch, warp_scalar
@@ -74,5 +73,5 @@ class _Watch(torch.autograd.Function):
             rows,
             ranges=even_ranges(tiles, 1) * _PIXELS,
         )
-        ctx.store(rows if emit_order is None else gather_by_gaussian(emit_order, rows))
+        ctx.store(rows if emit_order is None else emit_order.sum_by_gaussian(rows))
         return grad_image, grad_transmittance, None, None, None, None, None

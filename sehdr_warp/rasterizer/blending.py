@@ -2,19 +2,18 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..kernels import blend_cpu, blend_cuda, blend_cuda_backward
+from ..kernels import blend_cpu
 from ..kernels.constants import TILE_SIZE
-from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
-from .tile_lists import MAX_SINGLE_SORT, EmitOrder, PackedSplats, TileLists
+from .block_blending import blend_on_cuda
+from .tile_lists import PackedSplats, TileLists
 from .torch_contract import direct_apply, keeps_graph, once_differentiable
-from .warp_launch.launching import fixed_launch, launch, warp_scalar, warp_stream
+from .warp_launch.launching import launch, warp_scalar
 
 PIECES_PER_THREAD = 16  # Of the image, on the CPU: their work differs by more than their intersections.
 Backward = Callable[[Tensor, Tensor | None], Tensor]
@@ -180,7 +179,7 @@ def blend_on_cpu(
             grad_intersections,
             ranges=pieces,
         )
-        return gather_by_gaussian(emit_order, grad_intersections)
+        return emit_order.sum_by_gaussian(grad_intersections)
 
     return backward
 
@@ -201,179 +200,3 @@ def balanced_pieces(lists: TileLists) -> Tensor:
     bounds = torch.searchsorted(work, goals, out_int32=True)
     bounds[0], bounds[-1] = 0, tile_count
     return bounds
-
-
-def blend_on_cuda(
-    features: Tensor,
-    lists: TileLists,
-    packed: PackedSplats,
-    image: Tensor,
-    transmittance: Tensor,
-    alpha_threshold: float,
-    deterministic: bool,
-) -> "BlockBackward":
-    """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also in Warp's CPU block emulation)."""
-    rows = pad_features(features)
-    last_contributor = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
-    # Padded features take more memory; few Gaussians keep them, so that they need not be padded again.
-    saved = rows if len(features) <= MAX_SINGLE_SORT else features
-    return BlockBackward(
-        saved, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
-    )
-
-
-@dataclass(frozen=True)
-class BlockBackward:
-    """The backward pass of blend_on_cuda(); see Backward.
-
-    Attributes:
-        features: [N, C] or, padded, [N, more].
-        channels: C.
-        lists: that were blended.
-        packed: Gaussians that were blended.
-        transmittance: [H, W], the result.
-        last_contributor: of blend_blocks().
-        alpha_threshold: contributions with a smaller alpha were left out.
-        deterministic: sum in a fixed order.
-    """
-
-    features: Tensor
-    channels: int
-    lists: TileLists
-    packed: PackedSplats
-    transmittance: Tensor
-    last_contributor: Tensor
-    alpha_threshold: float
-    deterministic: bool
-
-    def __call__(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
-        """Return the gradients by Gaussian."""
-        if grad_transmittance is None:
-            grad_transmittance = self.transmittance.view(-1)[:0]
-        lists = self.lists
-        if not self.deterministic:
-            gathered = self._zeros()
-            arguments = *self._arguments(grad_image, grad_transmittance), 0, lists.gaussians, gathered
-            launch_blocks(self._kernel(), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
-            return gathered
-        grad_intersections = self.transmittance.new_zeros(lists.intersection_count, self.channels + 6)
-        emit_order, arguments = lists.emit_order, self._arguments(grad_image, grad_transmittance)
-        assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
-        for subtile in range(blend_cuda.BLOCKS_PER_TILE):
-            launch_blocks(self._kernel(), lists, 1, *arguments, subtile, emit_order.emit_indices, grad_intersections)
-        return gather_by_gaussian(emit_order, grad_intersections)
-
-    def on_fixed_memory(self) -> Backward:
-        """Return the backward pass for less host time; for use while all tensors stay where they are."""
-        assert not self.deterministic, "sums in a fixed order are several launches"
-        grad_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
-        grad_transmittance, gathered = torch.empty_like(self.transmittance), self._zeros()
-        fixed = fixed_launch(
-            self._kernel(),
-            block_threads(self.lists, blend_cuda.BLOCKS_PER_TILE),
-            *self._arguments(grad_image, grad_transmittance),
-            0,
-            self.lists.gaussians,
-            gathered,
-            whole=(grad_image, grad_transmittance, gathered),
-            block_dim=blend_cuda.BLOCK_DIM,
-        )
-        device, shape = gathered.device, gathered.shape
-
-        def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
-            gathered = grad_image.new_zeros(shape)
-            fixed.launch((), (grad_image, grad_transmittance, gathered), warp_stream(device))
-            return gathered
-
-        return backward
-
-    def _zeros(self) -> Tensor:
-        columns = self.channels + 6
-        if blend_cuda_backward.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
-            columns = blend_cuda.padded_channels(columns)
-        return self.transmittance.new_zeros(len(self.features), columns)
-
-    @property
-    def _cuda(self) -> bool:
-        return self.features.device.type == "cuda"
-
-    def _kernel(self) -> Any:
-        scalar = warp_scalar(self.features.dtype)
-        return blend_cuda_backward.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
-
-    def _arguments(self, grad_image: Tensor, grad_transmittance: Tensor) -> tuple:
-        lists, packed = self.lists, self.packed
-        height, width = self.transmittance.shape
-        return (
-            *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
-            pad_features(self.features).reshape(-1, 4),
-            *(lists.columns, width, height, self.alpha_threshold, self.transmittance, self.last_contributor),
-            *(grad_image, grad_transmittance, blend_cuda_backward.ROWS, self.channels + 6),
-        )
-
-
-def blend_blocks(
-    rows: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
-) -> Tensor:
-    """Fill image [H, W, C] and transmittance [H, W] from pad_features(); return the last Gaussian of each pixel.
-
-    That is [H W] int32, 1 + its place in the tile's list, or 0.
-    """
-    assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
-    height, width, channels = image.shape
-    last_contributor = torch.empty(height * width, dtype=torch.int32, device=rows.device)
-    kernel = blend_cuda.forward_kernel(warp_scalar(rows.dtype), channels, rows.device.type == "cuda")
-    launch_blocks(
-        kernel,
-        lists,
-        blend_cuda.BLOCKS_PER_TILE,
-        lists.tile_ranges,
-        lists.gaussians,
-        lists.subtile_masks,
-        packed.means_opacities,
-        packed.conics_cutoffs,
-        rows.reshape(-1, 4),
-        lists.columns,
-        width,
-        height,
-        alpha_threshold,
-        image,
-        transmittance,
-        last_contributor,
-    )
-    return last_contributor
-
-
-def launch_blocks(kernel: Any, lists: TileLists, blocks_per_tile: int, *arguments: Any) -> None:
-    """Launch a block kernel over the tiles."""
-    launch(kernel, block_threads(lists, blocks_per_tile), *arguments, block_dim=blend_cuda.BLOCK_DIM)
-
-
-def block_threads(lists: TileLists, blocks_per_tile: int) -> int:
-    """Return the number of threads of a block kernel over the tiles."""
-    return lists.columns * lists.rows * blocks_per_tile * blend_cuda.BLOCK_DIM
-
-
-def pad_features(features: Tensor) -> Tensor:
-    """Return features [N, C] with columns for whole rows of four, which block kernels read at once."""
-    count, channels = features.shape
-    if channels != (columns := blend_cuda.padded_channels(channels)):
-        rows = features.new_empty(count, columns)
-        launch(blend_cuda.pad_rows_kernel(warp_scalar(rows.dtype), channels), rows.numel(), features, rows)
-        return rows
-    return features.clone() if features.data_ptr() % 16 else features
-
-
-def gather_by_gaussian(emit_order: EmitOrder, grad_intersections: Tensor) -> Tensor:
-    """Return [N, columns]: for each Gaussian the sum of its rows of grad_intersections, in the order of tiles.
-
-    grad_intersections: rows in the order of intersections before the sort by tile.
-    """
-    length, columns = grad_intersections.shape
-    count = emit_order.order.shape[0]
-    gathered = grad_intersections.new_zeros(count, columns)
-    if length:
-        cumulative_counts = emit_order.cumulative_counts.clamp(0, length)  # Beyond max_intersections there are no rows.
-        kernel = tile_kernels(warp_scalar(grad_intersections.dtype)).gather_intersections
-        launch(kernel, count, emit_order.order, cumulative_counts, grad_intersections, columns, gathered)
-    return gathered

@@ -9,7 +9,6 @@ graph (training/step_graphs.py); within it, and with max_intersections, calls ar
 """
 
 import atexit
-import ctypes
 import logging
 import threading
 from collections import OrderedDict
@@ -21,27 +20,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..kernels.project import projection_kernel
-from .blending import Backward, BlendResult, BlockBackward, blend_on_cuda
-from .cuda_graphs import CudaGraphRunner, is_capturing
-from .projection import (
-    ProjectedGaussians,
-    ProjectionAdjoint,
-    RasterInputs,
-    adjoint_arguments,
-    project_to_camera,
-    projection_parameters,
-)
-from .render_options import MAX_INTERSECTIONS, RenderOptions
-from .tile_lists import (
-    MAX_SINGLE_SORT,
-    IntersectionOffsets,
-    PackedSplats,
-    build_tile_lists,
-    order_intersections,
-    pack_splats,
-)
-from .warp_launch.launching import fixed_launch, stream_handle, warp_scalar, warp_stream
+from .blending import BlendResult
+from .captured_render import CapturedRender
+from .cuda_graphs import is_capturing
+from .projection import Gradients, ProjectedGaussians, with_projection_gradient
+from .render_options import RenderOptions
+from .tile_lists import MAX_SINGLE_SORT
+from .warp_launch.launching import stream_handle
 
 LOG = logging.getLogger(__name__)
 
@@ -50,8 +35,6 @@ MAX_SIZES = 3  # Sizes of calls with CUDA graphs, the most recent ones.
 MAX_GRAPHS = 4  # CUDA graphs of a size: each holds a render until its backward pass.
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
 MAX_GAUSSIANS = 1 << 21  # Without a backward pass; with one the host is the bottleneck only up to MAX_SINGLE_SORT.
-HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
-MIN_INTERSECTIONS = 1 << 12
 
 
 class _Signature(NamedTuple):
@@ -106,40 +89,47 @@ def on_gpu(tensor: Tensor) -> bool:
 
 
 def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> _Signature:
-    differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    layouts = tuple((tensor.shape, tensor.dtype, tensor.device) for tensor in tensors)
-    return _Signature(options, stream_handle(tensors[0].device), differentiable, layouts)
-
-
-FEATURES = 4
-"""Index of features among a call's seven tensors, those that rasterize() takes first."""
+    layouts, requires_grad = [], False
+    for tensor in tensors:
+        layouts += tensor.shape, tensor.dtype, tensor.device
+        requires_grad = requires_grad or tensor.requires_grad
+    differentiable = requires_grad and torch.is_grad_enabled()
+    return _Signature(options, stream_handle(layouts[2]), differentiable, tuple(layouts))
 
 
 class ReplayedRender:
     """A render by a CUDA graph, which no other call uses for as long as the backward passes of this render exist.
 
-    They hold a lease of the graph. It ends with the last reference to `result` or `projection_adjoint`: when the
-    autograd graph of the render is freed, or at once for a render without gradients.
+    They hold a lease of the graph. It ends when the autograd graph of the render is freed, or with this object for a
+    render without gradients.
 
     Attributes:
-        projected: 2D Gaussians; None if the CUDA graph began with them. Their conics and opacities are its memory.
         result: of the blend.
+        intersections: of the render; 0 before fits().
     """
 
     def __init__(self, pool: "GraphPool", graph: "CapturedRender", result: Sequence[Tensor]) -> None:
         """Lease the CUDA graph."""
         self._pool, self._graph = pool, graph
-        lease = _Lease(pool.idle, graph)
-        image, transmittance, *others = result
-        self.result = BlendResult(image, transmittance, lease.backward)
-        self.projected: ProjectedGaussians | None = None
-        if graph.projection_adjoint is not None:
-            means2d, depths, extents = others
-            fixed = graph.splats.projected
-            conics, opacities = fixed.conics.detach(), fixed.opacities.detach()
-            self.projected = ProjectedGaussians(means2d, conics, depths, opacities, extents)
-        self.projection_adjoint: ProjectionAdjoint = lease.projection_adjoint
+        self._lease = _Lease(pool.idle, graph)
+        image, transmittance, *self._others = result
+        self.result = BlendResult(image, transmittance, self._lease.backward)
         self.intersections = 0
+
+    def project(self, gaussians: tuple[Tensor, ...]) -> ProjectedGaussians | None:
+        """Return the 2D Gaussians as differentiable functions of the seven tensors without the features.
+
+        None if the CUDA graph began with them. Their conics and opacities are its memory.
+        """
+        if not self._others:
+            return None
+        means2d, depths, extents = self._others
+        fixed = self._graph.splats.projected
+        outputs = means2d, fixed.conics.detach(), depths, fixed.opacities.detach(), extents
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in gaussians):
+            self._lease.differentiates_projection()
+            outputs = with_projection_gradient(gaussians, outputs, self._lease.projection_adjoint)
+        return ProjectedGaussians(*outputs)
 
     def fits(self) -> bool:
         """Wait until the GPU has counted the intersections; return whether the graph has memory for them.
@@ -151,125 +141,6 @@ class ReplayedRender:
             return True
         self._pool.grow(self.intersections)
         return False
-
-
-class CapturedRender:
-    """One render on fixed memory, in two CUDA graphs, between which the number of intersections is copied to the host.
-
-    Args:
-        tensors: the seven tensors of a call, or flatten() of RasterInputs.
-        options: of the image.
-        intersections: the least number to allocate memory for.
-        differentiable: whether its backward passes may be called.
-    """
-
-    def __init__(
-        self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
-    ) -> None:
-        """Launch the render once, then capture it."""
-        width, height, threshold = options.width, options.height, options.alpha_threshold
-        inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
-        device = inputs[0].device
-        projects = len(inputs) == 7
-        channels = inputs[FEATURES].shape[1] + options.depth if projects else inputs[-1].shape[1]
-        image, transmittance = inputs[0].new_empty(height, width, channels), inputs[0].new_empty(height, width)
-        counter = torch.empty(1, dtype=torch.int64, device="cpu", pin_memory=True)
-        self._counter, self._count = counter, ctypes.c_int64.from_address(counter.data_ptr())
-        self._counted, self._stream = torch.cuda.Event(), torch.cuda.current_stream(device)
-        self._counting = CudaGraphRunner(device)
-        self._blending = CudaGraphRunner(device, self._counting.stream)
-
-        def count() -> tuple[RasterInputs, PackedSplats, IntersectionOffsets]:
-            splats = _project(inputs, options) if projects else unflatten(inputs)
-            packed = pack_splats(splats, threshold, width, height)
-            depths, extents = splats.projected.depths, splats.projected.extents
-            offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
-            counter.copy_(offsets.cumulative_counts[-1:], non_blocking=True)
-            return splats, packed, offsets
-
-        def blend(
-            splats: RasterInputs, packed: PackedSplats, offsets: IntersectionOffsets, limit: int
-        ) -> BlockBackward:
-            depths, extents = splats.projected.depths, splats.projected.extents
-            lists = build_tile_lists(packed, offsets, depths, extents, width, height, limit, keep_emit_order=False)
-            return blend_on_cuda(splats.features, lists, packed, image, transmittance, threshold, False)
-
-        # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
-        with self._counting.on_capture_stream():
-            splats, packed, offsets = count()
-            limit = int(HEADROOM * max(intersections, int(offsets.cumulative_counts[-1])))
-            self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
-            blend(splats, packed, offsets, self.max_intersections)
-            del splats, packed, offsets
-        self.splats, packed, offsets = self._counting.capture(None, count)
-        limit = self.max_intersections
-        backward = self._blending.capture(None, lambda: blend(self.splats, packed, offsets, limit))
-        self.backward: Backward = backward.on_fixed_memory() if differentiable else backward
-        """Backward pass of the last render; one launch, which needs no CUDA graph."""
-        projected = self.splats.projected
-        self.projection_adjoint = _projection_adjoint(inputs, options, projected) if projects else None
-        outputs = projected.means2d, projected.depths, projected.extents
-        self._inputs = inputs
-        self._outputs = [image, transmittance, *(outputs if projects else outputs[2:])]
-
-    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> list[Tensor]:
-        """Render; return image and transmittance, and what follows them among the outputs.
-
-        outputs: to write the latter to. By default they are new tensors.
-        """
-        torch._foreach_copy_(self._inputs, tuple(tensors))  # pyright: ignore[reportPrivateImportUsage]
-        self._counting.replay()
-        self._counted.record(self._stream)
-        self._blending.replay()
-        known = len(self._outputs) - len(outputs)
-        results = [*map(torch.empty_like, self._outputs[:known]), *outputs]
-        torch._foreach_copy_(results, self._outputs)  # pyright: ignore[reportPrivateImportUsage]
-        return results
-
-    def count_intersections(self) -> int:
-        """Wait for the last render's count; return it. Those beyond max_intersections were left out."""
-        self._counted.synchronize()
-        return self._count.value
-
-
-def _project(inputs: Sequence[Tensor], options: RenderOptions) -> RasterInputs:
-    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = inputs
-    projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
-    if options.depth:
-        features = torch.cat([features, projected.depths[:, None]], 1)
-    return RasterInputs(projected, features)
-
-
-def flatten(inputs: RasterInputs) -> tuple[Tensor, ...]:
-    """Return the six tensors of RasterInputs."""
-    return *inputs.projected, inputs.features
-
-
-def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
-    """Return the RasterInputs of flatten()."""
-    return RasterInputs(ProjectedGaussians(*tensors[:-1]), tensors[-1])
-
-
-def _projection_adjoint(
-    inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians
-) -> ProjectionAdjoint:
-    """Return the adjoint of _project() on fixed memory; it reads the copies of its first and second argument there."""
-    copies = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
-    rows = [torch.empty_like(tensor) for tensor in projected[:-1]]
-    whole = [torch.empty_like(tensor) for tensor in copies]
-    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
-    parameters = projection_parameters(options)
-    arguments, gradients = adjoint_arguments(copies, parameters, projected.extents, (*rows, None), whole)
-    count = len(projected.depths)
-    fixed = fixed_launch(kernel, count, *arguments, gradients=gradients, rows=rows, whole=whole)
-    device = projected.depths.device
-
-    def adjoint(
-        inputs: Sequence[Tensor], culling: Tensor, upstream: Sequence[Tensor | None], results: Sequence[Tensor | None]
-    ) -> None:
-        fixed.launch(upstream[:-1], results, warp_stream(device))
-
-    return adjoint
 
 
 @dataclass
@@ -335,14 +206,30 @@ class _Lease:
 
     def __init__(self, idle: list[CapturedRender], graph: CapturedRender) -> None:
         self._idle, self._graph = idle, graph
+        self._zeros: list[Tensor] = []  # For the projection's gradients, from the blend's last backward pass.
+        self._of_projection = False
+
+    def differentiates_projection(self) -> None:
+        """Let backward() allocate memory for projection_adjoint() too: one allocation, one launch that fills it."""
+        self._of_projection = True
 
     def backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
-        return self._graph.backward(grad_image, grad_transmittance)
+        graph, fixed = self._graph, self._graph.backward
+        assert fixed is not None, "the CUDA graph is not differentiable"
+        zeros = graph.zero_gradients(grad_image, of_projection=self._of_projection)
+        if self._of_projection:
+            self._zeros[:] = [zeros]
+        return fixed.add_to(zeros, grad_image, grad_transmittance)
 
-    def projection_adjoint(self, *arguments: Any) -> None:
-        adjoint = self._graph.projection_adjoint
-        assert adjoint is not None, "the CUDA graph begins with 2D Gaussians"
-        adjoint(*arguments)
+    def projection_adjoint(
+        self, inputs: Sequence[Tensor], culling: Tensor, upstream: Gradients, needed: Sequence[bool]
+    ) -> Gradients:
+        graph = self._graph
+        try:
+            zeros = self._zeros.pop()
+        except IndexError:  # The image has no gradient, only the 2D Gaussians.
+            zeros = graph.zero_gradients(culling, of_projection=True)
+        return graph.add_projection_gradients(zeros, upstream[:-1], needed)
 
     def __del__(self) -> None:
         self._idle.append(self._graph)

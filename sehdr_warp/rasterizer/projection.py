@@ -83,9 +83,10 @@ def projection_parameters(options: RenderOptions) -> tuple:
     return options.width, options.height, options.near_plane, options.eps2d, options.alpha_threshold
 
 
-ProjectionAdjoint = Callable[[Sequence[Tensor], Tensor, Sequence[Tensor | None], Sequence[Tensor | None]], None]
-"""Takes inputs, the last output, the gradients by all outputs (None for 0) and those by the inputs (None if they are
-not needed), to which it adds."""
+Gradients = Sequence[Tensor | None]
+ProjectionAdjoint = Callable[[Sequence[Tensor], Tensor, Gradients, Sequence[bool]], Gradients]
+"""Takes inputs, the last output, the gradients by all outputs (None for 0) and which of those by the inputs are needed;
+returns these, None for the others."""
 
 
 def launch_projection(
@@ -105,27 +106,23 @@ def launch_projection(
     arguments = *inputs, *parameters, None, *outputs
     launch(kernel, count, *arguments)
 
-    def adjoint(
-        inputs: Sequence[Tensor], culling: Tensor, upstream: Sequence[Tensor | None], results: Sequence[Tensor | None]
-    ) -> None:
+    def adjoint(inputs: Sequence[Tensor], culling: Tensor, upstream: Gradients, needed: Sequence[bool]) -> Gradients:
+        results = zero_gradients(inputs, needed, [tensor.is_leaf for tensor in inputs])
         arguments, gradients = adjoint_arguments(inputs, parameters, culling, upstream, results)
         # All Gaussians add to the camera's gradients: on the CPU one thread must.
-        ranges = None if all(result is None for result in results[4:]) else single_range(count)
+        ranges = single_range(count) if any(needed[4:]) else None
         launch(kernel, count, *arguments, gradients=gradients, ranges=ranges)
+        return results
 
     return with_projection_gradient(inputs, outputs, adjoint)
 
 
 def adjoint_arguments(
-    inputs: Sequence[Tensor],
-    parameters: tuple,
-    culling: Tensor,
-    upstream: Sequence[Tensor | None],
-    results: Sequence[Tensor | None],
+    inputs: Sequence[Tensor], parameters: tuple, culling: Tensor, upstream: Gradients, results: Gradients
 ) -> tuple[tuple, tuple]:
     """Return arguments of a projection kernel and, for each, its gradient or None, as launch() takes them.
 
-    See ProjectionAdjoint; the adjoint does not read the outputs except the last one, culling.
+    See ProjectionAdjoint; results are added to. The adjoint does not read the outputs except the last one, culling.
     """
     arguments = *inputs, *parameters, culling, *(None,) * len(upstream)
     return arguments, (*results, *(None,) * (len(parameters) + 1), *upstream)
@@ -143,7 +140,7 @@ def with_projection_gradient(
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(ctx, adjoint: ProjectionAdjoint, outputs: tuple[Tensor, ...], *inputs: Tensor):
-        ctx.adjoint, ctx.leaves = adjoint, [tensor.is_leaf for tensor in inputs]
+        ctx.adjoint = adjoint
         ctx.save_for_backward(*inputs, outputs[-1])
         ctx.mark_non_differentiable(outputs[-1])
         ctx.set_materialize_grads(False)
@@ -156,9 +153,8 @@ class _Projection(torch.autograd.Function):
         adjoint = ctx.adjoint
         if not keeps_graph():
             ctx.adjoint = None
-        results = zero_gradients(inputs, ctx.needs_input_grad[2:], ctx.leaves)
-        adjoint(inputs, culling, [kernel_layout(gradient) for gradient in upstream], results)
-        return None, None, *results
+        upstream = [kernel_layout(gradient) for gradient in upstream]
+        return None, None, *adjoint(inputs, culling, upstream, ctx.needs_input_grad[2:])
 
 
 _apply_projection = direct_apply(_Projection)

@@ -11,10 +11,11 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
+from .captured_render import FEATURES, flatten
 from .checks import check_cameras, check_opacities, check_tensors
-from .graph_cache import FEATURES, ReplayedRender, find_pool, flatten, get_or_create_pool
+from .graph_cache import ReplayedRender, find_pool, get_or_create_pool
 from .memory import oom_context
-from .projection import ProjectedGaussians, RasterInputs, project_to_camera, with_projection_gradient
+from .projection import ProjectedGaussians, RasterInputs, project_to_camera
 from .render_options import RenderOptions
 from .tile_lists import (
     PackedSplats,
@@ -215,10 +216,10 @@ def _project(tensors: Sequence[Tensor], options: RenderOptions, pool: Any) -> _V
     means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
     gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
     replayed = None if pool is None else pool.replay(tensors, options)
-    if replayed is not None and replayed.projected is not None:
-        outputs = with_projection_gradient(gaussians, replayed.projected, replayed.projection_adjoint)
-        if replayed.fits():
-            return _View(ProjectedGaussians(*outputs), replayed)
+    if replayed is not None:
+        projected = replayed.project(gaussians)
+        if projected is not None and replayed.fits():
+            return _View(projected, replayed)
     dense = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
     return _View(project_to_camera(*dense, opacities, world_to_camera, intrinsics, options), None)
 

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
-from .blending import gather_by_gaussian
 from .checks import (
     check_opacities,
     check_position,
@@ -198,7 +197,7 @@ class _Blend(torch.autograd.Function):
         ranges = even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS
         launch(ctx.kernels.blend_backward, ctx.pixels, *arguments, ranges=ranges)
         if emit_order is not None:
-            rows = gather_by_gaussian(emit_order, rows)
+            rows = emit_order.sum_by_gaussian(rows)
         grad_axis, grad_across, grad_along, grad_opacity, grad_features = rows.split((3, 3, 3, 1, channels), dim=1)
         grad_caps = torch.nn.functional.pad(grad_axis, (0, 1))
         return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None

@@ -1,7 +1,7 @@
 """The middle stages of a render: pack 2D Gaussians, order them by depth, and list for each tile those that touch it."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -9,12 +9,13 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..kernels import tiles as kernels
+from ..kernels.blend_cuda import padded_channels
 from ..kernels.constants import TILE_SIZE
 from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
 from .projection import RasterInputs
 from .render_options import MAX_INTERSECTIONS
-from .warp_launch.launching import launch, warp_scalar
+from .warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar
 from .warp_launch.sorting import sort_pairs
 from .warp_launch.threads import torch_threads
 
@@ -31,11 +32,14 @@ class PackedSplats(NamedTuple):
         conics_cutoffs: [N, 4] conic a, b, c, and the value of a dx^2 + 2 b dx dy + c dy^2 at which alpha meets the
             threshold; -1 if culled.
         counts: [N] int64 tiles that the ellipse touches.
+        padded: [N, columns] features with columns of zeros for whole rows of four, which block kernels read at once;
+            None if they do not read them from here.
     """
 
     means_opacities: Tensor
     conics_cutoffs: Tensor
     counts: Tensor
+    padded: Tensor | None = None
 
 
 class TileGrid(NamedTuple):
@@ -75,6 +79,20 @@ class EmitOrder:
     order: Tensor
     cumulative_counts: Tensor
     emit_indices: Tensor
+
+    def sum_by_gaussian(self, rows: Tensor) -> Tensor:
+        """Return [N, columns]: for each Gaussian the sum of its rows [M, columns], in the order of tiles.
+
+        rows: in the order of intersections before the sort by tile.
+        """
+        length, columns = rows.shape
+        count = self.order.shape[0]
+        sums = rows.new_zeros(count, columns)
+        if length:
+            cumulative_counts = self.cumulative_counts.clamp(0, length)  # Beyond max_intersections there are no rows.
+            kernel = tile_kernels(warp_scalar(rows.dtype)).gather_intersections
+            launch(kernel, count, self.order, cumulative_counts, rows, columns, sums)
+        return sums
 
 
 @dataclass(frozen=True)
@@ -118,34 +136,49 @@ class TileLists:
         return self.gaussians.shape[0]
 
 
-def pack_splats(inputs: RasterInputs, alpha_threshold: float, width: int, height: int) -> PackedSplats:
+def pack_splats(
+    inputs: RasterInputs, alpha_threshold: float, width: int, height: int, *, pads: bool | None = None
+) -> PackedSplats:
     """Pack 2D Gaussians for an image, and count the tiles that each one's ellipse touches.
 
     Culls Gaussians whose features are not finite: sets their rows of inputs.projected.extents to 0 in place.
+
+    pads: whether to make PackedSplats.padded; by default on a GPU, if the channels are no multiple of four.
     """
-    (means2d, conics, _, opacities, extents), features = inputs
-    count, grid = len(means2d), tile_grid(width, height)
+    features = inputs.features
+    count, channels = features.shape
+    if pads is None:
+        pads = features.device.type == "cuda" and channels % 4 > 0
     packed = PackedSplats(
-        means2d.new_empty(count, 4),
-        means2d.new_empty(count, 4),
-        torch.empty(count, dtype=torch.int64, device=means2d.device),
+        features.new_empty(count, 4),
+        features.new_empty(count, 4),
+        torch.empty(count, dtype=torch.int64, device=features.device),
+        features.new_empty(count, padded_channels(channels)) if pads else None,
     )
-    grid = tile_grid(width, height)
-    launch(
-        tile_kernels(warp_scalar(means2d.dtype)).pack_splats,
-        count,
-        means2d,
-        conics,
-        opacities,
-        features,
-        features.shape[1],
-        alpha_threshold,
-        grid.columns,
-        grid.rows,
-        extents,
-        *packed,
-    )
+    kernel = tile_kernels(warp_scalar(features.dtype)).pack_splats
+    launch(kernel, count, *_pack_arguments(inputs, packed, alpha_threshold, width, height))
     return packed
+
+
+def fixed_pack_splats(
+    inputs: RasterInputs, packed: PackedSplats, alpha_threshold: float, width: int, height: int
+) -> FixedLaunch:
+    """Return the launch that fills `packed` anew, whose tensors stay where they are but for the features."""
+    kernel = tile_kernels(warp_scalar(inputs.features.dtype)).pack_splats
+    arguments = _pack_arguments(inputs, packed, alpha_threshold, width, height)
+    return fixed_launch(kernel, len(inputs.features), *arguments, whole=(inputs.features,))
+
+
+def _pack_arguments(
+    inputs: RasterInputs, packed: PackedSplats, alpha_threshold: float, width: int, height: int
+) -> tuple[Any, ...]:
+    (means2d, conics, _, opacities, extents), features = inputs
+    means_opacities, conics_cutoffs, counts, padded = packed
+    columns, rows = tile_grid(width, height)
+    return (
+        *(means2d, conics, opacities, features, features.shape[1], alpha_threshold, columns, rows),
+        *(extents, means_opacities, conics_cutoffs, counts, None if padded is None else padded.view(-1, 4)),
+    )
 
 
 @torch.no_grad()

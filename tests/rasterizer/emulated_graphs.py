@@ -7,7 +7,7 @@ from dataclasses import fields, is_dataclass
 import torch
 import warp as wp
 
-from sehdr_warp.rasterizer import graph_cache, tile_lists
+from sehdr_warp.rasterizer import captured_render, graph_cache, tile_lists
 from sehdr_warp.rasterizer.warp_launch import packing
 
 
@@ -52,7 +52,7 @@ def tensors_of(value) -> Iterator[torch.Tensor]:
 def emulate(monkeypatch) -> None:
     """Let calls on the CPU be replayed, with block kernels emulated; ordinary kernels must not run in blocks."""
     empty = torch.empty
-    monkeypatch.setattr(graph_cache, "CudaGraphRunner", Runner)
+    monkeypatch.setattr(captured_render, "CudaGraphRunner", Runner)
     monkeypatch.setattr(graph_cache, "on_gpu", lambda tensor: True)
     monkeypatch.setattr(graph_cache, "stream_handle", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "Event", Event)

@@ -5,8 +5,9 @@ import torch
 import warp as wp
 from torch.profiler import ProfilerActivity, profile
 
-from sehdr_warp.rasterizer import blending, tile_lists
-from sehdr_warp.rasterizer.blending import blend, blend_on_cuda
+from sehdr_warp.rasterizer import blending, block_blending, tile_lists
+from sehdr_warp.rasterizer.blending import blend
+from sehdr_warp.rasterizer.block_blending import blend_on_cuda
 from sehdr_warp.rasterizer.reference import blend_reference
 from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_intersections
 
@@ -78,7 +79,7 @@ def test_a_single_pixels_gradient_may_have_any_strides(blocks):
 
 def test_nothing_more_by_gaussian_is_kept_for_the_backward_pass(blocks, monkeypatch):
     monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
-    monkeypatch.setattr(blending, "MAX_SINGLE_SORT", 0)  # few are kept padded
+    monkeypatch.setattr(block_blending, "MAX_SINGLE_SORT", 0)  # few are kept padded
     scene = random_scene(count=600, channels=3, width=44, height=26, seed=2).to(torch.float32, "cpu")
     leaves, lists_of_tiles, _ = leaves_and_lists(scene)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:

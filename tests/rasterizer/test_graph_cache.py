@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import graph_cache, rasterize, tile_lists
+from sehdr_warp.rasterizer import captured_render, graph_cache, rasterize, tile_lists
 from sehdr_warp.rasterizer.render_options import RenderOptions
 
 from .emulated_graphs import emulate
@@ -94,9 +94,12 @@ def test_pictures_stay_and_backward_passes_come_in_any_order():
 
 
 @pytest.mark.parametrize("one_sort", [1 << 18, 0])
-def test_without_gradients_pictures_stay_too(one_sort, monkeypatch):
+@pytest.mark.parametrize("most_copied", [1 << 18, 0])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_without_gradients_pictures_stay_too(one_sort, most_copied, channels, monkeypatch):
     monkeypatch.setattr(tile_lists, "MAX_SINGLE_SORT", one_sort)
-    scene = scene_of()
+    monkeypatch.setattr(captured_render, "MAX_COPIED_GAUSSIANS", most_copied)
+    scene = scene_of(channels=channels)
     with torch.no_grad():
         images = [
             rasterize(*scene.arguments[:4], scene.tensors[4] * k, *scene.arguments[5:]).image for k in range(1, 9)

@@ -143,11 +143,11 @@ class FixedLaunch:
         """Pack the values."""
         packed.prepare(dim, values)
 
-        def arrays(tensors: Sequence[Tensor]) -> list[tuple[Any, int]]:
+        def slots(tensors: Sequence[Tensor]) -> list[_Slot]:
             places = [next(k for k, value in enumerate(values) if value is tensor) for tensor in tensors]
-            return [(packed.arrays[place], packed.arrays[place].shape[0]) for place in places]
+            return [_Slot(packed.arrays[place], tensor) for place, tensor in zip(places, tensors, strict=True)]
 
-        self._rows, self._whole = arrays(rows), arrays(whole)
+        self._rows, self._whole = slots(rows), slots(whole)
         self._packed = packed
         self._values = [value for value in values if not any(value is tensor for tensor in (*rows, *whole))]
         self._lock = threading.Lock()  # A retained graph may be differentiated by several threads.
@@ -155,18 +155,40 @@ class FixedLaunch:
     def launch(self, rows: Sequence[Tensor | None], whole: Sequence[Tensor | None], stream: wp.Stream | None) -> None:
         """Launch on tensors with the layouts of the first ones; None is an empty array."""
         with self._lock:
-            for (array, length), tensor in zip(self._rows, rows, strict=True):
-                if tensor is None:
-                    array.data = array.shape[0] = 0
-                else:
-                    array.data, array.shape[0] = tensor.data_ptr(), length
-                    array.strides[0] = tensor.stride(0) * tensor.element_size()
-            for (array, length), tensor in zip(self._whole, whole, strict=True):
-                if tensor is None:
-                    array.data = array.shape[0] = 0
-                else:
-                    array.data, array.shape[0] = tensor.data_ptr(), length
+            for slot, tensor in zip(self._rows, rows, strict=True):
+                slot.put(tensor)
+                if tensor is not None and (step := tensor.stride(0)) != slot.step:
+                    slot.step, slot.strides[0] = step, step * slot.size
+            for slot, tensor in zip(self._whole, whole, strict=True):
+                slot.put(tensor)
             self._packed.run(stream)
+
+
+class _Slot:
+    """A packed array that tensors of one layout take in turn.
+
+    Attributes:
+        strides: of the array, bytes; a view of its descriptor.
+        step: numbers from row to row, as the strides have it; -1 if unknown.
+        size: bytes of a number.
+    """
+
+    __slots__ = ("_array", "_empty", "_length", "_shape", "size", "step", "strides")
+
+    def __init__(self, array: Any, tensor: Tensor) -> None:
+        self._array, self._shape, self.strides = array, array.shape, array.strides
+        self._length, self._empty = array.shape[0], False
+        self.size, self.step = tensor.element_size(), -1
+
+    def put(self, tensor: Tensor | None) -> None:
+        """Let the array be a tensor's memory, or empty."""
+        if tensor is not None:
+            self._array.data = tensor.data_ptr()
+            if self._empty:
+                self._shape[0], self._empty = self._length, False
+        elif not self._empty:
+            self._array.data = self._shape[0] = 0
+            self._empty = True
 
 
 def write_layout(array: Any, tensor: Tensor, kind: wp.array, label: str = "the kernel") -> None:

@@ -1,0 +1,195 @@
+"""Blend on a GPU by block kernels, and the backward pass of that."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels import blend_cuda, blend_cuda_backward
+from .tile_lists import MAX_SINGLE_SORT, PackedSplats, TileLists
+from .warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar, warp_stream
+
+
+def blend_on_cuda(
+    features: Tensor,
+    lists: TileLists,
+    packed: PackedSplats,
+    image: Tensor,
+    transmittance: Tensor,
+    alpha_threshold: float,
+    deterministic: bool,
+) -> "BlockBackward":
+    """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also in Warp's CPU block emulation)."""
+    rows = pad_features(features) if packed.padded is None else packed.padded
+    last_contributor = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
+    # Padded features take more memory; few Gaussians keep them, so that they need not be padded again.
+    saved, packed = rows if len(features) <= MAX_SINGLE_SORT else features, packed._replace(padded=None)
+    return BlockBackward(
+        saved, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
+    )
+
+
+@dataclass(frozen=True)
+class BlockBackward:
+    """The backward pass of blend_on_cuda(); see Backward.
+
+    Attributes:
+        features: [N, C] or, padded, [N, more].
+        channels: C.
+        lists: that were blended.
+        packed: Gaussians that were blended.
+        transmittance: [H, W], the result.
+        last_contributor: of blend_blocks().
+        alpha_threshold: contributions with a smaller alpha were left out.
+        deterministic: sum in a fixed order.
+    """
+
+    features: Tensor
+    channels: int
+    lists: TileLists
+    packed: PackedSplats
+    transmittance: Tensor
+    last_contributor: Tensor
+    alpha_threshold: float
+    deterministic: bool
+
+    def __call__(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
+        """Return the gradients by Gaussian."""
+        if grad_transmittance is None:
+            grad_transmittance = self.transmittance.view(-1)[:0]
+        lists = self.lists
+        if not self.deterministic:
+            gathered = self._zeros()
+            arguments = *self._arguments(grad_image, grad_transmittance), 0, lists.gaussians, gathered
+            launch_blocks(self._kernel(), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
+            return gathered
+        grad_intersections = self.transmittance.new_zeros(lists.intersection_count, self.channels + 6)
+        emit_order, arguments = lists.emit_order, self._arguments(grad_image, grad_transmittance)
+        assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
+        for subtile in range(blend_cuda.BLOCKS_PER_TILE):
+            launch_blocks(self._kernel(), lists, 1, *arguments, subtile, emit_order.emit_indices, grad_intersections)
+        return emit_order.sum_by_gaussian(grad_intersections)
+
+    def on_fixed_memory(self) -> "FixedBackward":
+        """Return the backward pass for less host time; for use while all tensors stay where they are."""
+        assert not self.deterministic, "sums in a fixed order are several launches"
+        grad_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
+        grad_transmittance, gathered = torch.empty_like(self.transmittance), self._zeros()
+        fixed = fixed_launch(
+            self._kernel(),
+            block_threads(self.lists, blend_cuda.BLOCKS_PER_TILE),
+            *self._arguments(grad_image, grad_transmittance),
+            0,
+            self.lists.gaussians,
+            gathered,
+            whole=(grad_image, grad_transmittance, gathered),
+            block_dim=blend_cuda.BLOCK_DIM,
+        )
+        return FixedBackward(fixed, gathered.device, len(gathered), gathered.shape[1])
+
+    def _zeros(self) -> Tensor:
+        columns = self.channels + 6
+        if blend_cuda_backward.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
+            columns = blend_cuda.padded_channels(columns)
+        return self.transmittance.new_zeros(len(self.features), columns)
+
+    @property
+    def _cuda(self) -> bool:
+        return self.features.device.type == "cuda"
+
+    def _kernel(self) -> Any:
+        scalar = warp_scalar(self.features.dtype)
+        return blend_cuda_backward.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
+
+    def _arguments(self, grad_image: Tensor, grad_transmittance: Tensor) -> tuple:
+        lists, packed = self.lists, self.packed
+        height, width = self.transmittance.shape
+        return (
+            *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
+            pad_features(self.features).reshape(-1, 4),
+            *(lists.columns, width, height, self.alpha_threshold, self.transmittance, self.last_contributor),
+            *(grad_image, grad_transmittance, blend_cuda_backward.ROWS, self.channels + 6),
+        )
+
+
+class FixedBackward(NamedTuple):
+    """A BlockBackward whose tensors stay where they are, but for the gradients.
+
+    Attributes:
+        fixed: its launch.
+        device: of the tensors.
+        count: N.
+        columns: of the gradients by Gaussian.
+    """
+
+    fixed: FixedLaunch
+    device: torch.device
+    count: int
+    columns: int
+
+    def add_to(self, zeros: Tensor, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
+        """Return the gradients by Gaussian, see Backward: a view of zeros [N * columns or more]."""
+        self.fixed.launch((), (grad_image, grad_transmittance, zeros), warp_stream(self.device))
+        return zeros.as_strided((self.count, self.columns), (self.columns, 1))
+
+
+def blend_blocks(
+    rows: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
+) -> Tensor:
+    """Fill image [H, W, C] and transmittance [H, W] from pad_features(); return the last Gaussian of each pixel.
+
+    That is [H W] int32, 1 + its place in the tile's list, or 0.
+    """
+    last_contributor = torch.empty(image.shape[:2].numel(), dtype=torch.int32, device=rows.device)
+    arguments = _blend_arguments(rows, lists, packed, image, transmittance, alpha_threshold, last_contributor)
+    launch_blocks(_blend_kernel(rows, image), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
+    return last_contributor
+
+
+def fixed_blend_blocks(
+    rows: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
+) -> FixedLaunch:
+    """Return the launch of blend_blocks(), whose tensors stay where they are but for image and transmittance."""
+    last_contributor = torch.empty(image.shape[:2].numel(), dtype=torch.int32, device=rows.device)
+    return fixed_launch(
+        _blend_kernel(rows, image),
+        block_threads(lists, blend_cuda.BLOCKS_PER_TILE),
+        *_blend_arguments(rows, lists, packed, image, transmittance, alpha_threshold, last_contributor),
+        whole=(image, transmittance),
+        block_dim=blend_cuda.BLOCK_DIM,
+    )
+
+
+def _blend_kernel(rows: Tensor, image: Tensor) -> Any:
+    return blend_cuda.forward_kernel(warp_scalar(rows.dtype), image.shape[2], rows.device.type == "cuda")
+
+
+def _blend_arguments(rows, lists, packed, image, transmittance, alpha_threshold, last_contributor) -> tuple[Any, ...]:
+    assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
+    height, width, _ = image.shape
+    return (
+        *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
+        *(rows.reshape(-1, 4), lists.columns, width, height, alpha_threshold, image, transmittance, last_contributor),
+    )
+
+
+def launch_blocks(kernel: Any, lists: TileLists, blocks_per_tile: int, *arguments: Any) -> None:
+    """Launch a block kernel over the tiles."""
+    launch(kernel, block_threads(lists, blocks_per_tile), *arguments, block_dim=blend_cuda.BLOCK_DIM)
+
+
+def block_threads(lists: TileLists, blocks_per_tile: int) -> int:
+    """Return the number of threads of a block kernel over the tiles."""
+    return lists.columns * lists.rows * blocks_per_tile * blend_cuda.BLOCK_DIM
+
+
+def pad_features(features: Tensor) -> Tensor:
+    """Return features [N, C] with columns for whole rows of four, which block kernels read at once."""
+    count, channels = features.shape
+    if channels != (columns := blend_cuda.padded_channels(channels)):
+        rows = features.new_empty(count, columns)
+        quads = rows.view(-1, 4)
+        launch(blend_cuda.pad_rows_kernel(warp_scalar(rows.dtype), channels), len(quads), features, quads)
+        return rows
+    return features.clone() if features.data_ptr() % 16 else features

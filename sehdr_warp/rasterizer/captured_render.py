@@ -1,0 +1,254 @@
+"""One render as a CUDA graph on memory of its own, and its backward passes."""
+
+import ctypes
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels.project import projection_kernel
+from .block_blending import BlockBackward, FixedBackward, blend_on_cuda, fixed_blend_blocks
+from .cuda_graphs import CudaGraphRunner
+from .projection import (
+    ProjectedGaussians,
+    RasterInputs,
+    adjoint_arguments,
+    project_to_camera,
+    projection_parameters,
+)
+from .render_options import MAX_INTERSECTIONS, RenderOptions
+from .tile_lists import (
+    MAX_SINGLE_SORT,
+    IntersectionOffsets,
+    PackedSplats,
+    TileLists,
+    build_tile_lists,
+    fixed_pack_splats,
+    order_intersections,
+    pack_splats,
+)
+from .warp_launch.launching import FixedLaunch, fixed_launch, warp_scalar, warp_stream
+
+MAX_COPIED_GAUSSIANS = MAX_SINGLE_SORT
+"""More of them, without a backward pass, are read where they are, and the image is written where it stays."""
+SPINS = 200  # Looks at the number of intersections before other threads may run in between.
+HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
+MIN_INTERSECTIONS = 1 << 12
+FEATURES = 4
+"""Index of features among a call's seven tensors, those that rasterize() takes first."""
+
+
+class CapturedRender:
+    """One render on fixed memory as a CUDA graph, which also copies the number of intersections to the host.
+
+    Inputs are copied in, results are copied out. With many Gaussians and without gradients these copies would take a
+    sixth of the time: what reads inputs and what writes the image is then launched on the caller's memory, before and
+    after the graph.
+
+    Args:
+        tensors: the seven tensors of a call, or flatten() of RasterInputs.
+        options: of the image.
+        intersections: the least number to allocate memory for.
+        differentiable: whether its backward passes may be called.
+    """
+
+    def __init__(
+        self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
+    ) -> None:
+        """Launch the render once, then capture it."""
+        width, height, threshold = options.width, options.height, options.alpha_threshold
+        projects = len(tensors) == FEATURES + 3
+        many = len(tensors[0]) > MAX_COPIED_GAUSSIANS
+        self._copies = differentiable or options.depth or not projects or not many
+        inputs = [tensor.detach().contiguous() for tensor in tensors]
+        if self._copies:
+            inputs = [tensor.clone() for tensor in inputs]
+        device = inputs[0].device
+        channels = inputs[FEATURES].shape[1] + options.depth if projects else inputs[-1].shape[1]
+        image, transmittance = inputs[0].new_empty(height, width, channels), inputs[0].new_empty(height, width)
+        counter = torch.empty(1, dtype=torch.int64, device="cpu", pin_memory=True)
+        self._counter, self._count = counter, ctypes.c_int64.from_address(counter.data_ptr())
+        self._stream = torch.cuda.current_stream(device)
+        self._runner = CudaGraphRunner(device)
+
+        def begin() -> tuple[RasterInputs, PackedSplats]:
+            splats = _project(inputs, options) if projects else unflatten(inputs)
+            pads = not self._copies or channels % 4 > 0
+            return splats, pack_splats(splats, threshold, width, height, pads=pads)
+
+        def count(splats: RasterInputs, packed: PackedSplats) -> IntersectionOffsets:
+            depths, extents = splats.projected.depths, splats.projected.extents
+            offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
+            counter.copy_(offsets.cumulative_counts[-1:], non_blocking=True)
+            return offsets
+
+        def list_tiles(splats: RasterInputs, packed: PackedSplats, offsets: IntersectionOffsets) -> TileLists:
+            depths, extents, limit = splats.projected.depths, splats.projected.extents, self.max_intersections
+            return build_tile_lists(packed, offsets, depths, extents, width, height, limit, keep_emit_order=False)
+
+        def blend(splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> BlockBackward:
+            return blend_on_cuda(splats.features, lists, packed, image, transmittance, threshold, False)
+
+        def middle(splats: RasterInputs, packed: PackedSplats) -> TileLists:
+            return list_tiles(splats, packed, count(splats, packed))
+
+        def whole() -> tuple[RasterInputs, BlockBackward]:
+            splats, packed = begin()
+            return splats, blend(splats, packed, middle(splats, packed))
+
+        splats, packed = begin()
+        # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
+        with self._runner.on_capture_stream():
+            offsets = count(splats, packed)
+            limit = int(HEADROOM * max(intersections, int(offsets.cumulative_counts[-1])))
+            self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
+            blend(splats, packed, list_tiles(splats, packed, offsets))
+            del offsets
+        self.backward: FixedBackward | None = None
+        self.projection_backward: FixedLaunch | None = None
+        if self._copies:
+            del splats, packed
+            self.splats, backward = self._runner.capture(None, whole)
+            self.backward = backward.on_fixed_memory() if differentiable else None
+            if projects:
+                self.projection_backward = _fixed_projection_backward(inputs, options, self.splats.projected)
+            self._inputs = inputs
+        else:
+            self.splats, lists = splats, self._runner.capture(None, lambda: middle(splats, packed))
+            assert packed.padded is not None
+            self._project = _fixed_projection(inputs, options, splats.projected)
+            self._pack = fixed_pack_splats(splats, packed, threshold, width, height)
+            self._blend = fixed_blend_blocks(packed.padded, lists, packed, image, transmittance, threshold)
+        projected = self.splats.projected
+        outputs = projected.means2d, projected.depths, projected.extents
+        images = [image, transmittance] if self._copies else []
+        self._outputs = [*images, *(outputs if projects else outputs[2:])]
+        self._image_shape = image.shape
+        self._slots = self._gradient_slots(inputs) if differentiable else []
+
+    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> list[Tensor]:
+        """Render; return image and transmittance, and what follows them among the outputs.
+
+        outputs: to write the latter to. By default they are new tensors.
+        """
+        self._count.value = -1
+        if not self._copies:
+            return self._launch(tensors)
+        torch._foreach_copy_(self._inputs, tuple(tensors))  # pyright: ignore[reportPrivateImportUsage]
+        self._runner.replay()
+        known = len(self._outputs) - len(outputs)
+        results = [*map(torch.empty_like, self._outputs[:known]), *outputs]
+        torch._foreach_copy_(results, self._outputs)  # pyright: ignore[reportPrivateImportUsage]
+        return results
+
+    def _launch(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """Do what replay() does without copies of the features and of the image."""
+        inputs = [tensor.contiguous() for tensor in tensors]
+        features = inputs.pop(FEATURES)
+        stream = warp_stream(features.device)
+        self._project.launch((), inputs, stream)
+        self._pack.launch((), (features,), stream)
+        self._runner.replay()
+        image, transmittance = features.new_empty(self._image_shape), features.new_empty(self._image_shape[:2])
+        self._blend.launch((), (image, transmittance), stream)
+        others = [torch.empty_like(output) for output in self._outputs]
+        torch._foreach_copy_(others, self._outputs)  # pyright: ignore[reportPrivateImportUsage]
+        return [image, transmittance, *others]
+
+    def count_intersections(self) -> int:
+        """Wait for the last render's count; return it. Those beyond max_intersections were left out."""
+        count = self._count
+        for _ in range(SPINS):
+            if count.value >= 0:
+                return count.value
+        while count.value < 0:
+            time.sleep(0)  # Lets other threads run.
+            if self._stream.query() and count.value < 0:
+                raise RuntimeError("the GPU has not counted the intersections of a render")
+        return count.value
+
+    def _gradient_slots(self, inputs: Sequence[Tensor]) -> list["_Slot"]:
+        """Return where the backward passes put the gradients by the inputs of the projection, and the size of all."""
+        assert self.backward is not None
+        slots, end = [], self.backward.count * self.backward.columns
+        tensors = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
+        for tensor in tensors if self.projection_backward is not None else ():
+            begin = _aligned(end)
+            slots.append(_Slot(tensor.shape, tensor.stride(), begin))
+            end = begin + tensor.numel()
+        return slots
+
+    def zero_gradients(self, like: Tensor, *, of_projection: bool) -> Tensor:
+        """Return zeros for the gradients of one backward pass: those by Gaussian, and by the projection's inputs."""
+        assert self.backward is not None, "the CUDA graph is not differentiable"
+        size = self.backward.count * self.backward.columns
+        if of_projection:
+            last = self._slots[-1]
+            size = last.begin + last.shape.numel()
+        return like.new_zeros(size)
+
+    def add_projection_gradients(
+        self, zeros: Tensor, upstream: Sequence[Tensor | None], needed: Sequence[bool]
+    ) -> list[Tensor | None]:
+        """Return the gradients by the projection's inputs, views of zero_gradients(); None if they are not needed.
+
+        upstream: the gradients by the projection's outputs without the extents.
+        """
+        assert self.projection_backward is not None, "the CUDA graph begins with 2D Gaussians"
+        results = [zeros.as_strided(*slot) if need else None for slot, need in zip(self._slots, needed, strict=True)]
+        self.projection_backward.launch(upstream, results, warp_stream(zeros.device))
+        return results
+
+
+class _Slot(NamedTuple):
+    """Place of a contiguous tensor in a longer one."""
+
+    shape: torch.Size
+    strides: tuple[int, ...]
+    begin: int
+
+
+def _aligned(numbers: int) -> int:
+    """Return the next multiple of 64, where memory of its own could begin."""
+    return -(-numbers // 64) * 64
+
+
+def _project(inputs: Sequence[Tensor], options: RenderOptions) -> RasterInputs:
+    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = inputs
+    projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
+    if options.depth:
+        features = torch.cat([features, projected.depths[:, None]], 1)
+    return RasterInputs(projected, features)
+
+
+def flatten(inputs: RasterInputs) -> tuple[Tensor, ...]:
+    """Return the six tensors of RasterInputs."""
+    return *inputs.projected, inputs.features
+
+
+def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
+    """Return the RasterInputs of flatten()."""
+    return RasterInputs(ProjectedGaussians(*tensors[:-1]), tensors[-1])
+
+
+def _fixed_projection(inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
+    """Return the launch of _project() for any inputs, to the same outputs."""
+    gaussians = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
+    arguments = *gaussians, *projection_parameters(options), None, *projected
+    return fixed_launch(kernel, len(projected.depths), *arguments, whole=gaussians)
+
+
+def _fixed_projection_backward(
+    inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians
+) -> FixedLaunch:
+    """Return the launch of the adjoint of _project() on the same inputs and extents, for any gradients."""
+    gaussians = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
+    rows = [torch.empty_like(tensor) for tensor in projected[:-1]]
+    whole = [torch.empty_like(tensor) for tensor in gaussians]
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
+    parameters = projection_parameters(options)
+    arguments, gradients = adjoint_arguments(gaussians, parameters, projected.extents, (*rows, None), whole)
+    return fixed_launch(kernel, len(projected.depths), *arguments, gradients=gradients, rows=rows, whole=whole)
