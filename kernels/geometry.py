@@ -67,9 +67,12 @@ def geometry(dtype) -> SimpleNamespace:
 
     @wp.func
     def ellipse_meets_rectangle(
-        x: real, y: real, a: real, b: real, c: real, cutoff: real, left: real, top: real, width: real, height: real
+        x: real, y: real, a: real, b: real, c: real, cutoff: real, x_per_y: real, y_per_x: real,
+        left: real, top: real, width: real, height: real,
     ) -> bool:
         """Return whether the ellipse a dx^2 + 2 b dx dy + c dy^2 <= cutoff around (x, y) touches the rectangle.
+
+        x_per_y, y_per_x: -b / a and -b / c, which callers divide once for many rectangles.
 
         The form is smallest on one of the edges nearest to the centre. A small allowance keeps rounding from dropping a
         border pixel.
@@ -80,8 +83,8 @@ def geometry(dtype) -> SimpleNamespace:
         y1 = y0 + height
         nearest_x = wp.clamp(real(0.0), x0, x1)
         nearest_y = wp.clamp(real(0.0), y0, y1)
-        best_y = wp.clamp(-b * nearest_x / c, y0, y1)
-        best_x = wp.clamp(-b * nearest_y / a, x0, x1)
+        best_y = wp.clamp(y_per_x * nearest_x, y0, y1)
+        best_x = wp.clamp(x_per_y * nearest_y, x0, x1)
         along_vertical = a * nearest_x * nearest_x + real(2.0) * b * nearest_x * best_y + c * best_y * best_y
         along_horizontal = a * best_x * best_x + real(2.0) * b * best_x * nearest_y + c * nearest_y * nearest_y
         return wp.min(along_vertical, along_horizontal) <= cutoff * real(1.0001) + real(1.0e-3)

@@ -43,9 +43,12 @@ def tile_kernels(dtype) -> SimpleNamespace:
         return wp.vec2i(first, last)
 
     @wp.func
-    def tile_is_touched(xy_opacity: vec4, conic_cutoff: vec4, column: int, row: int) -> bool:
+    def tile_is_touched(
+        xy_opacity: vec4, conic_cutoff: vec4, x_per_y: real, y_per_x: real, column: int, row: int
+    ) -> bool:
         return g.ellipse_meets_rectangle(
             xy_opacity[0], xy_opacity[1], conic_cutoff[0], conic_cutoff[1], conic_cutoff[2], conic_cutoff[3],
+            x_per_y, y_per_x,
             real(column) * real(size) + real(0.5), real(row) * real(size) + real(0.5),
             real(wp.static(size - 1.0)), real(wp.static(size - 1.0)),
         )
@@ -97,9 +100,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
         if extent[0] > real(0.0):
             across = tile_span(xy_opacity[0], extent[0], columns)
             down = tile_span(xy_opacity[1], extent[1], rows)
+            x_per_y = -conic_cutoff[1] / conic_cutoff[0]
+            y_per_x = -conic_cutoff[1] / conic_cutoff[2]
             for row in range(down[0], down[1]):
                 for column in range(across[0], across[1]):
-                    if tile_is_touched(xy_opacity, conic_cutoff, column, row):
+                    if tile_is_touched(xy_opacity, conic_cutoff, x_per_y, y_per_x, column, row):
                         touched += 1
         counts[i] = wp.int64(touched)
 
@@ -157,9 +162,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
                 conic_cutoff = conics_cutoffs[i]
                 across = tile_span(xy_opacity[0], extent[0], columns)
                 down = tile_span(xy_opacity[1], extent[1], rows)
+                x_per_y = -conic_cutoff[1] / conic_cutoff[0]
+                y_per_x = -conic_cutoff[1] / conic_cutoff[2]
                 for row in range(down[0], down[1]):
                     for column in range(across[0], across[1]):
-                        if entry < end and tile_is_touched(xy_opacity, conic_cutoff, column, row):
+                        if entry < end and tile_is_touched(xy_opacity, conic_cutoff, x_per_y, y_per_x, column, row):
                             keys[entry] = (key(row * columns + column) << key(wp.static(bits))) | depth
                             gaussians[entry] = i
                             entry += 1
@@ -276,12 +283,15 @@ def tile_ranges_kernel(dtype, key, shift: int):
             gaussian = gaussians[entry]
             xy_opacity = means_opacities[gaussian]
             conic_cutoff = conics_cutoffs[gaussian]
+            x_per_y = -conic_cutoff[1] / conic_cutoff[0]
+            y_per_x = -conic_cutoff[1] / conic_cutoff[2]
             row = tile // columns
             left = real((tile - row * columns) * wp.static(TILE_SIZE)) + real(0.5)
             top = real(row * wp.static(TILE_SIZE)) + real(0.5)
             for subtile in range(wp.static(across * down)):
                 if g.ellipse_meets_rectangle(
                     xy_opacity[0], xy_opacity[1], conic_cutoff[0], conic_cutoff[1], conic_cutoff[2], conic_cutoff[3],
+                    x_per_y, y_per_x,
                     left + real((subtile % wp.static(across)) * wp.static(SUBTILE[0])),
                     top + real((subtile // wp.static(across)) * wp.static(SUBTILE[1])),
                     real(wp.static(SUBTILE[0] - 1)), real(wp.static(SUBTILE[1] - 1)),
