@@ -31,6 +31,7 @@ from sehdr_warp.blocks.merge import merge_blocks
 from sehdr_warp.blocks.seams import measure_seams
 from sehdr_warp.files import write_json
 from sehdr_warp.model.gaussians import PARAMETER_NAMES
+from sehdr_warp.process import calm_threads
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import config_from_dict, load_config, override_config
 from sehdr_warp.runs.load_arguments import LoadArguments
@@ -335,6 +336,7 @@ def main(
     json: Path | None = None,
 ) -> None:
     """Run the study in a new folder; `json` is written even if a part of it fails."""
+    calm_threads()  # For the processes that this one starts
     logging.basicConfig(level=logging.INFO, format="%(relativeCreated)7d %(message)s", stream=sys.stdout)
     out.mkdir(parents=True, exist_ok=True)
     first = torch.device("cuda:0" if device == "cuda" else device)
