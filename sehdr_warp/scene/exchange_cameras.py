@@ -4,6 +4,7 @@ OpenUSD: the whole chain of parents at every frame counts, as do the stage's up 
 and offsets of the filmback. Coordinates come back with +Y up and in meters, as files of this package are written.
 """
 
+import logging
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ USD_WORLD_MATRIX = "sehdr:worldMatrix"
 """Entry of a stage's customLayerData: 16 numbers by rows, from the scene's own coordinates to the stage's."""
 CHAN_ROTATION = "zxy"
 """Order of a .chan file's rotations about fixed axes, as Nuke and Blender take it by default."""
+log = logging.getLogger(__name__)
 _SIZE = (1920, 1080)  # Pixels of a camera whose file states none
 _MOST_FRAMES = 100_000
 
@@ -59,6 +61,8 @@ def _read_usd(path: Path) -> ExchangeCameras:
             cameras.append((name, _usd_camera(lens, matrix, path, name)))
         except (ValueError, OverflowError, ZeroDivisionError) as error:
             raise InputError(path, f"camera {name} cannot be used ({error!s:.120})", "correct the camera") from None
+    if not arrays["up_stated"]:
+        log.warning("%s: states no upAxis; +Y counts as up, as in USD", path)
     world = arrays["world_matrix"]
     return ExchangeCameras(cameras, world if world.any() else None)
 
@@ -68,7 +72,7 @@ def usd_camera_arrays(path: Path) -> dict[str, Any]:
 
     `names` [n]; `lenses` [n, 7]: width and height in pixels (0 if not stated), focal length, both apertures and both of
     their offsets in one unit; `matrices` [n, 4, 4], camera to world with +Y up and in meters, acting on column vectors;
-    `world_matrix` [4, 4], zero if not stated.
+    `world_matrix` [4, 4], zero if not stated; `up_stated`, whether the stage states its up axis.
     """
     Usd, UsdGeom = pxr("Usd"), pxr("UsdGeom")
     stage = open_stage(path)
@@ -76,8 +80,10 @@ def usd_camera_arrays(path: Path) -> dict[str, Any]:
     if not 0 < to_meters < math.inf:
         raise ValueError(f"its metersPerUnit is {to_meters}")
     # A stage with +Z up is turned about X, as Blender and Houdini turn what they import and export.
-    turn = np.eye(4)
-    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
+    turn, up_axis = np.eye(4), str(UsdGeom.GetStageUpAxis(stage))
+    if up_axis not in ("Y", "Z"):
+        raise ValueError(f"its upAxis is {up_axis!r:.20}, and USD knows Y and Z")
+    if up_axis == "Z":
         turn[1:3, 1:3] = [[0, 1], [-1, 0]]
     prims = [
         prim
@@ -106,7 +112,8 @@ def usd_camera_arrays(path: Path) -> dict[str, Any]:
     world = np.zeros((4, 4)) if world is None else np.array(list(world), np.float64).reshape(4, 4)
     shapes = ("names", names, str, (-1,)), ("lenses", lenses, float, (-1, 7)), ("matrices", matrices, float, (-1, 4, 4))
     arrays = {name: np.array(values, kind).reshape(shape) for name, values, kind, shape in shapes}
-    return arrays | {"world_matrix": world}
+    stated = stage.GetPseudoRoot().HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
+    return arrays | {"world_matrix": world, "up_stated": np.array(stated)}
 
 
 def _sample_times(stage: Any, prim: Any) -> list[Any]:

@@ -129,7 +129,7 @@ def gaussians_of_files(read: Callable[[str], bytes], path: Path) -> GaussianArra
     meta = json.loads(read("meta.json"))
     if meta.get("version") != 2:
         problem = f"is SOG of version {meta.get('version', 1)!r:.20}"
-        raise InputError(path, problem, "version 2 is read; save it with a newer SplatTransform, or as PLY")
+        raise InputError(path, problem, "version 2 is read; save it as that with SplatTransform, or as PLY")
     return _gaussians(read, meta, path)
 
 

@@ -91,6 +91,19 @@ def test_up_axis_and_units_are_those_of_the_stage(tmp_path, upright):
         np.testing.assert_allclose(camera.world_to_camera, upright.world_to_camera, atol=1e-6, err_msg=name)
 
 
+def test_a_missing_up_axis_is_said_and_a_wrong_one_refused(tmp_path, upright, logged):
+    lens(stage := stage_of(tmp_path / "a.usda"), "/cam1", POSE)
+    stage.GetRootLayer().Save()
+    text = (tmp_path / "a.usda").read_text()
+    (tmp_path / "none.usda").write_text(text.replace('    upAxis = "Y"\n', ""))
+    [(_, camera)] = load_cameras(tmp_path / "none.usda")
+    np.testing.assert_allclose(camera.world_to_camera, upright.world_to_camera, atol=1e-6)
+    assert [line for line in logged if "states no upAxis; +Y counts as up" in line]
+    (tmp_path / "x.usda").write_text(text.replace('upAxis = "Y"', 'upAxis = "X"'))
+    with pytest.raises(InputError, match="its upAxis is 'X'"):
+        load_cameras(tmp_path / "x.usda")
+
+
 def test_cameras_of_one_name_get_their_path(tmp_path):
     stage = stage_of(tmp_path / "two.usda")
     for parent in ("left", "right"):
