@@ -52,6 +52,18 @@ def exr_exposure_time(path: Path) -> float | None:
     return float(time) if isinstance(time, int | float) and np.isfinite(time) and time > 0 else None
 
 
+def is_without_colors(path: Path) -> bool:
+    """Return whether an OpenEXR file holds passes such as depth alone; False for one that cannot be read."""
+    if path.suffix.lower() != ".exr":
+        return False
+    try:
+        with _exr_file(path, header_only=True) as file:
+            endings = {ending for part in file.parts for ending in _channel_endings(part)}
+    except InputError:
+        return False
+    return bool(endings) and not any(set(names) <= endings for names in _COLOR_NAMES)
+
+
 def read_hdr(path: Path) -> np.ndarray:
     """Read scene-linear radiance in Rec.709.
 
@@ -178,13 +190,19 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
     return channels, header
 
 
+def _channel_endings(part: Any) -> set[str]:
+    """Return the names of a part's channels without their layers; also if its header alone was read."""
+    names = (str(channel.name) for channel in part.header.get("channels", ()))
+    return {name.rpartition(".")[2] for name in (*part.channels, *names)}
+
+
 def _colored_part(file: Any) -> int:
     """Return the number of an opened OpenEXR file's part that is the picture, 0 if none holds colors.
 
     Passes may lie in parts of their own, also before the picture: of parts with colors the first one counts that is
     named as the picture, else the first.
     """
-    endings = [{name.rpartition(".")[2] for name in part.channels} for part in file.parts]
+    endings = [_channel_endings(part) for part in file.parts]
     colored = [
         number
         for number, own in enumerate(endings)

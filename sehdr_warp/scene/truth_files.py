@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..files import contained
 from .dataparser import ImageRecord
+from .hdr_files import is_without_colors
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
 from .names import bases_of, folded
 
@@ -21,7 +22,8 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     """Give each photo without truth the float picture that is named like it, in any layout.
 
     Truth lies beside the photo, or in `hdr/` or `exr/` of the data folder under the photo's path below the data folder
-    or below the folder of all photos, or under its file name alone if no two photos share that.
+    or below the folder of all photos, or under its file name alone if no two photos share that. Files of
+    passes such as depth, which hold no colors, are no truth.
 
     Args:
         records: the photos; truth that the set states itself stays.
@@ -51,6 +53,7 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
             found = ((place, files[place].get(key)) for key in keys for place in places)
             near = image.parent, beside[image.parent].get(folded(image.stem))
             hdr = next((_inside(place, file, folder) for place, file in (*found, near) if file), None)
+            hdr = None if hdr is not None and is_without_colors(hdr) else hdr
         result.append(replace(record, hdr=hdr))
     in_use, notes = {record.hdr for record in result}, []
     result = [record for record in result if record.hdr == record.image or record.image not in in_use]

@@ -202,7 +202,7 @@ def test_the_picture_of_a_file_of_parts(tmp_path, parts):
     written = []
     for name in parts:
         channels = {"Z": np.ones((6, 8), np.float32)} if "epth" in name else planes(RGB if name == picture else RGB * 3)
-        written.append(OpenEXR.Part({**header, "expTime": 0.5}, channels, name=name))
+        written.append(OpenEXR.Part({**header, "expTime": 0.5 if name == picture else 2.0}, channels, name=name))
     OpenEXR.File(written).write(str(tmp_path / "a.exr"))
     np.testing.assert_array_equal(read_hdr(tmp_path / "a.exr")[2, 3], RGB)
     assert exr_exposure_time(tmp_path / "a.exr") == 0.5

@@ -45,3 +45,14 @@ def test_truth_that_leads_out_of_its_folder_is_refused(tmp_path):
     (tmp_path / "set" / "hdr" / "000.exr").symlink_to(tmp_path / "private.exr")
     with pytest.raises(InputError, match="leads outside the data folder"):
         load(tmp_path / "set")
+
+
+@pytest.mark.parametrize("place", ["exr", "images"])
+def test_depth_is_no_truth(tmp_path, place):
+    write_colmap(tmp_path)
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    (tmp_path / place).mkdir(exist_ok=True)
+    OpenEXR.File(header, {"Z": np.ones((48, 64), np.float32)}).write(str(tmp_path / place / "000.exr"))
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6 and not any(view.hdr is not None for view in scene.views)
+    assert any("000.exr" in note for note in scene.notes)
