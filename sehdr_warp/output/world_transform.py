@@ -199,9 +199,10 @@ def read_direction(text: str | Sequence[float]) -> np.ndarray:
         length = np.linalg.norm(values)
         if values.shape == (3,) and np.isfinite(length) and length > 0:
             return values / length
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         pass
-    raise SehdrError(f"up {text!r} is not a direction; write x,y,z in the scene's coordinates, or an axis such as -y")
+    remedy = "write x,y,z in the scene's coordinates, or an axis such as -y"
+    raise SehdrError(f"up {text!r:.90} is not a direction; {remedy}")
 
 
 class Orientation(NamedTuple):
@@ -256,7 +257,7 @@ def _checked_scale(scale: Any) -> float:
     if scale is None:
         return 1.0
     if not isinstance(scale, int | float) or not 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE:
-        raise SehdrError(f"scale {scale} is not between 1e-6 and 1e6 meters for each unit of the scene")
+        raise SehdrError(f"scale {scale!r:.40} is not between 1e-6 and 1e6 meters for each unit of the scene")
     return float(scale)
 
 

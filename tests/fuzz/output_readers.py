@@ -100,6 +100,15 @@ def read_sog(folder: Path):
         raise problem
 
 
+def make_streamed(folder: Path) -> None:
+    count = 200
+    arrays = [np.linspace(0.1, 0.9, count * n, dtype=np.float32).reshape(count, n) for n in (3, 3, 4)]
+    opacities, harmonics = np.full(count, 0.5, np.float32), np.full((count, 4, 3), 0.25, np.float32)
+    write_gaussians(folder / "town" / "lod-meta.json", GaussianArrays(*arrays, opacities, harmonics, "display", 0.5))
+    for path in folder.rglob(LIST):
+        path.unlink()
+
+
 def make_spz(folder: Path) -> None:
     make_splats(".spz")(folder)
     (folder / "plain.spz").write_bytes(gzip.decompress((folder / "a.spz").read_bytes()))
@@ -130,6 +139,13 @@ READERS = {
     "glb": Reader(make_splats(".glb"), ("*",), each(read_gaussians), text=True, repair=fit_chunks, cost=0.5),
     "compressed-ply": Reader(make_splats(".compressed.ply"), ("*",), each(read_gaussians), text=True, cost=1.4),
     "sog": Reader(make_sog, ("*.sog", "parts/*"), read_sog, text=True, cost=7),
+    "streamed-sog": Reader(
+        make_streamed,
+        ("town/*.json", "town/*/*.json"),
+        lambda folder: read_gaussians(folder / "town" / "lod-meta.json"),
+        text=True,
+        cost=7,
+    ),
     "spz": Reader(make_spz, ("*",), each(read_gaussians), cost=1.1),
     "ocio": Reader(make_ocio, ("*",), read_ocio, text=True, cost=1.3),
     "usd": Reader(make_splats(*USD_SUFFIXES), ("*",), each(read_usd), text=True, cost=20),

@@ -7,9 +7,11 @@ import numpy as np
 from PIL import Image
 
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
+from sehdr_warp.scene import Camera, Scene, View, look_at
 from sehdr_warp.scene.color_encoding import stated_encoding
 from sehdr_warp.scene.exposure import exif_exposure
 from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
+from sehdr_warp.scene.gravity import find_up
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
 from sehdr_warp.scene.images import open_image
 from sehdr_warp.scene.linear_photos import color_matrix, raw_exposure
@@ -23,6 +25,7 @@ from tests.scene.dng_files import area, gain_map, mosaic, opcodes, write_tagged_
 from tests.scene.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
 from tests.scene.raw_files import write_dng
 from tests.scene.test_color_encoding import icc_profile
+from tests.trial.test_hostile_sets import exif_of_place
 
 from .reader import Reader, each
 
@@ -54,6 +57,27 @@ def make_photos(folder: Path) -> None:
     picture.convert("P").save(folder / "c.png")
     picture.save(folder / "a.bmp")
     Image.fromarray(np.arange(120, dtype=np.uint16).reshape(10, 12)).save(folder / "d.png")
+
+
+def make_places(folder: Path) -> None:
+    """EXIF of places as the photo has it, and as numbers of other types."""
+    picture = Image.fromarray(pattern(12, 10))
+    rational = struct.pack("<6I", 48, 1, 12, 1, 30, 1)
+    table = {1: (2, 2, b"N\0"), 2: (5, 3, rational), 3: (2, 2, b"E\0"), 4: (5, 3, rational), 5: (1, 1, b"\0")}
+    for name, altitude in (("a.jpg", (5, 1, struct.pack("<2I", 300, 2))), ("b.jpg", (12, 1, struct.pack("<d", 150.5)))):
+        picture.save(folder / name, exif=exif_of_place(table | {6: altitude}))
+
+
+def read_place(path: Path):
+    """By a flight of six photos, of which five state where they were."""
+    whole = path.with_name("b.jpg" if path.name == "a.jpg" else "a.jpg")
+    views = []
+    for number in range(6):
+        pose = look_at((number % 3, number // 3, 4.0), (number % 3, number // 3, 0.0), up=(0, 1, 0))
+        lens = Camera(12, 10, 10, 10, 6, 5, pose)
+        source = path if number % 2 else whole
+        views.append(View(str(number), np.zeros((10, 12, 3), np.uint8), lens, 1.0, "train", source=source))
+    return find_up(Scene("flight", "photos", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32)))
 
 
 def make_raw(folder: Path) -> None:
@@ -171,6 +195,7 @@ READERS = {
     "exr": Reader(make_exr, ("*.exr",), each(hdr_size, read_hdr, read_exr_channels)),
     "radiance": Reader(make_radiance, ("*.hdr",), each(read_hdr), cost=0.5),
     "photos": Reader(make_photos, ("*",), each(photo_sizes, read_mask, exif_exposure, read_upright), cost=1.2),
+    "places": Reader(make_places, ("*.jpg",), each(read_place), cost=4),
     "raw": Reader(make_raw, ("*",), each(photo_sizes, raw_exposure, read_matrix, read_upright), cost=2),
     "gain-maps": Reader(make_gain_maps, ("*",), each(read_light), cost=1.6),
     "heic": Reader(make_heic, ("*",), each(photo_sizes, exif_exposure, read_upright), cost=0.9),

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import torch
 
+from sehdr_warp.blocks.block_plan import BlockPlan
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.model.confidence import Evidence
 from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.output.light_unit import read_light_unit
+from sehdr_warp.output.world_transform import read_orientation
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import assemble_field, load_run
@@ -21,6 +24,7 @@ from sehdr_warp.training.train import create_trainer
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
 from tests.training.toy import toy_scene
+from tests.trial.test_hostile_later import PLAN as BLOCKS
 
 from .reader import Reader, each
 
@@ -90,8 +94,38 @@ def make_metrics(folder: Path) -> None:
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
+def make_blocks(folder: Path) -> None:
+    (folder / "blocks.json").write_text(json.dumps(BLOCKS))
+
+
+def make_facts(folder: Path) -> None:
+    make_run(folder)
+    (folder / "light_unit.json").write_text(
+        json.dumps({"luminance": 100.0, "pixel": [1, 2], "view": "a", "reading": "incident"})
+    )
+    (folder / "orientation.json").write_text(json.dumps({"up": [0.0, 0.0, 1.0], "scale": 2.0}))
+    (folder / "extension.json").write_text(json.dumps({"iterations": 20}))
+
+
+def read_facts(folder: Path) -> None:
+    """What users add to a run; its own files are whole."""
+    run = load_run(folder)
+    problem = None
+    for read in (read_light_unit, read_orientation, lambda run: run.folder.read_config()):
+        try:
+            read(run)
+        except SehdrError as error:
+            problem = problem or error
+    if problem:
+        raise problem
+
+
 RUN_FILES = ("*.json", "metrics.jsonl")
 READERS = {
+    "blocks": Reader(make_blocks, ("blocks.json",), BlockPlan.read, text=True),
+    "facts": Reader(
+        make_facts, ("light_unit.json", "orientation.json", "extension.json"), read_facts, text=True, cost=5
+    ),
     "config": Reader(make_config, ("*.toml",), each(load_config), text=True, cost=0.6),
     "run": Reader(make_run, RUN_FILES, read_run, text=True, repair=sign_again, cost=5),
     "checkpoint": Reader(make_run, ("checkpoints/*/*",), read_run, text=True, repair=sign_again, cost=4),

@@ -37,7 +37,7 @@ FOUND = (
     ("usd", 20, 751), ("usd", 20, 1068), ("usd", 20, 4737), ("photos", 31, 9228), ("photos", 30, 2656),
     ("resume", 30, 1091), ("colmap-text", 33, 6037), ("ocio", 1, 11), ("opensfm", 40, 22), ("opensfm", 40, 427),
     ("opensfm", 40, 471), ("opensfm", 40, 652), ("opensfm", 40, 1019), ("opensfm", 40, 1646), ("chan", 40, 795),
-    ("dng-opcodes", 41, 34),
+    ("dng-opcodes", 41, 34), ("facts", 51, 50),
 )  # fmt: skip
 
 

@@ -103,3 +103,15 @@ def test_pins_with_known_holes_are_told(tmp_path):
     )
     assert completed.returncode == 1 and completed.stdout.startswith("pillow==") and "open" in completed.stdout
     assert completed.stdout.endswith("2 advisories about them, the newest of 2026-01-02: 1 holes\n")
+
+
+def test_the_pins_are_compared_with_listed_versions(tmp_path):
+    (tmp_path / "data").mkdir()
+    listed = {"$meta": {"timestamp": 1775023247}, "Pillow": ["<1.0", ">=9,<10000"], "numpy": ["<1.22"], "other": [">0"]}
+    (tmp_path / "data" / "insecure.json").write_text(json.dumps(listed))
+    audit = [sys.executable, ROOT / ".ci" / "audit.py", tmp_path]
+    completed = subprocess.run(audit, capture_output=True, text=True, check=False)
+    assert completed.returncode == 1 and re.match(r"pillow==\S+: >=9,<10000\n", completed.stdout)
+    assert "numpy==" not in completed.stdout and completed.stdout.endswith(
+        "ranges about them, of 2026-04-01: 1 holes\n"
+    )
