@@ -21,9 +21,10 @@ def quality_tables(result: dict) -> Iterable[str]:
         row["to_bound"] = None if bound is row else row["gt_max"] - bound["gt_max"]
     yield "## In short: the middle exposure, one seed, the curve known"
     yield markdown_table(in_short(rows), SHORT)
-    known_rows = [row for row in rows if row["response"] in (KNOWN, LEARNED)]
-    yield from _irradiance_tables(known_rows)
-    yield from _energy_tables(known_rows)
+    for (curve,), mine in groups([row for row in rows if row["response"] in (KNOWN, LEARNED)], "curve").items():
+        suffix = "" if curve == rows[0]["curve"] else f", curve {curve}"
+        for tables in (_irradiance_tables, _energy_tables):
+            yield from (text + suffix if text.startswith("## ") else text for text in tables(mine))
     for curve, response in groups([row for row in rows if row["response"] != LEARNED], "curve", "response"):
         members = [row for row in rows if row["curve"] == curve and row["response"] in (response, LEARNED)]
         table, common = [], _rows_of_all_methods(members)
@@ -80,12 +81,14 @@ SHORT |= {"light energy": ".2f", "5th to 95th percentile": ""}
 
 
 def in_short(rows: Sequence[Mapping]) -> list[dict]:
-    """Return a row for each method: means over scenes of one seed at the middle exposure, with the curve known.
+    """Return a row for each method: means over scenes of one seed at the middle exposure, with the first curve known.
 
     "irradiance off" is a mean over scenes, and "worst room" the largest; "light energy" is the median over lights that
     clip, and "5th to 95th percentile" the range of the 5th to the 95th percentile. None and a dash without figures.
     """
-    middle = [row for row in rows if (row["exposure"], row["seed"]) == (EXPOSURES // 2, rows[0]["seed"])]
+    fields = ("curve", "exposure", "seed")
+    wanted = (rows[0]["curve"], EXPOSURES // 2, rows[0]["seed"])
+    middle = [row for row in rows if tuple(row[field] for field in fields) == wanted]
     return [
         {
             "method": method,
