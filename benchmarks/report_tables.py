@@ -185,6 +185,7 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "seeds": _seeds_tables,
     "readings": _readings_tables,
     "captures": _captures_tables,
+    "units": partial(_rows_table, "units"),
     "bits": _bits_tables,
     "files": partial(_rows_table, "files"),
     "panorama": partial(_rows_table, "panorama"),
