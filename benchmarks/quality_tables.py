@@ -87,8 +87,8 @@ def in_short(rows: Sequence[Mapping]) -> list[dict]:
     clip, and "5th to 95th percentile" the range of the 5th to the 95th percentile. None and a dash without figures.
     """
     fields = ("curve", "exposure", "seed")
-    wanted = (rows[0]["curve"], EXPOSURES // 2, rows[0]["seed"])
-    middle = [row for row in rows if tuple(row[field] for field in fields) == wanted]
+    common = (rows[0]["curve"], EXPOSURES // 2, rows[0]["seed"])
+    middle = [row for row in rows if tuple(row[field] for field in fields) == common]
     return [
         {
             "method": method,

@@ -13,7 +13,7 @@ from .lens import area_average
 _ALIKE = 0.97  # Correlation of two thumbnails of one picture; photos from two places have less
 _SIDE = 32  # Of a thumbnail
 _KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", ".jpg", ".jpeg", ".bmp")
-"""Of two files of one picture the one counts whose kind comes first here: it may hold more bits."""
+"""Kinds of files by preference: of two files of one picture the first kind counts, which may hold more bits."""
 
 
 def find_copies(photos: Sequence[Path]) -> dict[Path, Path]:

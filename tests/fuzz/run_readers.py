@@ -108,7 +108,7 @@ def make_facts(folder: Path) -> None:
 
 
 def read_facts(folder: Path) -> None:
-    """What users add to a run; its own files are whole."""
+    """Damage what users add to a run; its own files are whole."""
     run = load_run(folder)
     problem = None
     for read in (read_light_unit, read_orientation, lambda run: run.folder.read_config()):

@@ -95,9 +95,9 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
 )
 def test_misfits_of_a_picture_of_the_sphere_are_named(name, value, kind, message):
     tensors = random_scene(count=5).arguments[:5]
-    given = {"position": torch.zeros(3).double(), "directions": torch.ones(2, 2, 3).double(), "focal_length": 60.0}
+    arguments = {"position": torch.zeros(3).double(), "directions": torch.ones(2, 2, 3).double(), "focal_length": 60.0}
     with pytest.raises(kind, match=message):
-        rasterize_directions(*tensors, **given | {name: value})
+        rasterize_directions(*tensors, **arguments | {name: value})
 
 
 def test_a_device_without_kernels_is_named():

@@ -208,7 +208,7 @@ def test_link_out_of_the_folder_is_refused(tmp_path):
 
 
 def test_the_folder_of_photos_may_be_a_link(tmp_path):
-    """As where photos lie on another disk; what the model names stays inside it."""
+    """Photos may lie on another disk; what the model names stays inside that folder."""
     write_colmap(tmp_path / "set")
     (tmp_path / "set" / "images").rename(tmp_path / "photos")
     (tmp_path / "set" / "images").symlink_to(tmp_path / "photos")

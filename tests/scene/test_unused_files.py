@@ -221,7 +221,7 @@ def test_a_photo_of_a_kind_that_is_not_read_is_named_as_what_it_is(tmp_path):
 
 
 def test_names_without_a_suffix_may_have_dots(tmp_path):
-    """As the labels of Metashape's cameras."""
+    """Metashape labels cameras like that."""
     write_colmap(tmp_path, name="frame.{:04d}.png")
     images = tmp_path / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text().replace(".png", ""))

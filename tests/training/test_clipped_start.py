@@ -109,8 +109,8 @@ def test_pixels_beyond_a_photo_count_as_the_nearest_and_nothing_is_expected_wher
 
 
 def test_a_training_starts_above_white_and_asks_the_network_once(tmp_path, monkeypatch):
-    asked, estimate = [], LightPrior.estimate
-    monkeypatch.setattr(LightPrior, "estimate", lambda *args: (asked.append(1), estimate(*args))[1])
+    calls, estimate = [], LightPrior.estimate
+    monkeypatch.setattr(LightPrior, "estimate", lambda *args: (calls.append(1), estimate(*args))[1])
     scene, most = wall_and_lamp(response="srgb"), {}
     for weight in (0.01, 0.0):
         changes = {"schedule.iterations": 3, "response.name": "srgb", "loss.clipped_estimate": weight}
@@ -118,4 +118,4 @@ def test_a_training_starts_above_white_and_asks_the_network_once(tmp_path, monke
         most[weight] = float(exposures(trainer.field).max()) / trainer.field.response.white
         trainer.train()
     assert most[0.0] <= 1 < 1.1 < most[0.01]
-    assert len(asked) == len(scene.train_views)
+    assert len(calls) == len(scene.train_views)

@@ -131,7 +131,7 @@ LINKS = {
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("name", LINKS)
 def test_links_that_lead_out_of_a_set(space, name, layout):
-    """What is outside is neither searched nor read: the whole disk would take minutes."""
+    """Files outside are neither searched nor read: the whole disk would take minutes."""
     if layout == "colmap":
         pytest.importorskip("pycolmap")
         write_colmap(space / "set", 4, size=(24, 16), params=(20.0, 21.0, 12.0, 8.0))

@@ -375,9 +375,9 @@ def test_projections_of_batches_are_those_of_each_scene(packed, device):
 def test_misfits_of_a_projection_are_named(options, message):
     (means, quats, scales, *_), place = scene()
     names = "means", "covars", "quats", "scales", "viewmats", "Ks", "width", "height"
-    given = dict(zip(names, (means, None, quats, scales, *place), strict=True)) | options
+    arguments = dict(zip(names, (means, None, quats, scales, *place), strict=True)) | options
     with pytest.raises((ValueError, TypeError), match=message):
-        fully_fused_projection(**given)
+        fully_fused_projection(**arguments)
 
 
 @pytest.mark.parametrize(
