@@ -10,12 +10,14 @@ rendered from the disk and shown by `sehdr-warp view`. Each row is also a line o
 import json
 import logging
 import multiprocessing
+import os
 import shutil
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ import tyro
 
 from sehdr_warp.blocks.block_plan import BlockPlan, make_block_plan
 from sehdr_warp.blocks.job import FOLDER
-from sehdr_warp.blocks.jobs import run_blocks
+from sehdr_warp.blocks.jobs import run_blocks, visible_gpus
 from sehdr_warp.blocks.merge import merge_blocks
 from sehdr_warp.blocks.seams import measure_seams
 from sehdr_warp.files import write_json
@@ -44,8 +46,11 @@ from sehdr_warp.training.train import create_trainer
 from .results import new_result
 from .survey import write_survey
 
+log = logging.getLogger(__name__)
+
 AT_ONCE = 2  # Blocks that train at once
 WARM_UP = 30  # Steps of a training before the first that is timed, in which kernels are compiled
+PROGRESS = 200  # Steps of the whole between lines of its log
 FRAMES = 20
 SIZE = 1920, 1080  # Pixels of the pictures of copies
 DRAFT = 480, 270  # Of the page's pictures while it moves
@@ -135,16 +140,18 @@ def run_study(study: Study) -> None:
     _warm_up(study, plan, data, config)
     devices = study.devices
     at_once = min(AT_ONCE, len(devices))
-    arguments = data, config.model_dump(), study.out / "whole", str(devices[-1])
+    arguments = data, config.model_dump(), study.out / "whole", devices[-1].type
     whole = multiprocessing.get_context("spawn").Process(target=_train_whole, args=arguments, daemon=True)
     if len(devices) > AT_ONCE:
-        whole.start()
+        with _one_visible(devices[-1]):
+            whole.start()
     # The two longest blocks train first, beside each other.
     pair = sorted(plan.blocks, key=lambda block: -block.fraction)[:AT_ONCE]
     spans = _train_blocks(study, plan, "at_once", at_once)
     beside_whole = whole.pid is not None
     if not beside_whole:
-        whole.start()
+        with _one_visible(devices[-1]):
+            whole.start()
     both = max(spans[block.name][1] for block in pair)
     merge_blocks(study.out / "at_once", plan)
     run = load_run(study.out / "at_once", device=study.device)
@@ -196,11 +203,32 @@ def _warm_up(study: Study, plan: BlockPlan, data: LoadArguments, config: Config)
         torch.cuda.empty_cache()
 
 
+@contextmanager
+def _one_visible(device: torch.device) -> Iterator[None]:
+    """Let processes that start within the block see one GPU alone, as the job of a block does."""
+    before = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if device.type == "cuda":
+        os.environ["CUDA_VISIBLE_DEVICES"] = visible_gpus(device, 1)[0]
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["CUDA_VISIBLE_DEVICES"] = before
+        elif device.type == "cuda":
+            del os.environ["CUDA_VISIBLE_DEVICES"]
+
+
 def _train_whole(data: LoadArguments, config: Mapping[str, Any], out: Path, device: str) -> None:
-    """Train the whole survey, in a process of its own."""
+    """Train the whole survey, in a process of its own; its log has the time of steps."""
     logging.basicConfig(filename=out.with_suffix(".log"), level=logging.INFO, format="%(asctime)s %(message)s")
     scene = load_photos(data, response="srgb")
-    create_trainer(scene, out, config_from_dict(dict(config), "config"), device=device, overwrite=True).train()
+    trainer = create_trainer(scene, out, config_from_dict(dict(config), "config"), device=device, overwrite=True)
+    before = trainer.seconds
+    for progress in trainer:
+        if progress.iteration % PROGRESS == 0:
+            step_ms = 1e3 * (progress.seconds - before) / PROGRESS
+            before = progress.seconds
+            log.info("iteration %d: %.2f ms a step, %d Gaussians", progress.iteration, step_ms, progress.gaussians)
 
 
 def _train_blocks(study: Study, plan: BlockPlan, name: str, at_once: int) -> dict[str, tuple[float, float]]:
