@@ -228,6 +228,7 @@ def test_curve_that_is_no_formula_is_met_by_the_posteriors_mean():
         assert selection.response.name == "posterior mean"
         off_mean.append(stops_off(selection.response, truth))
         off_formula.append(stops_off(selection.scores[0].response, truth))
+        assert off_mean[-1] < 2 * selection.uncertainty
     assert np.mean(off_mean) < 0.15 and np.mean(off_mean) < 0.5 * np.mean(off_formula)
     again = Response.from_dict(selection.response.to_dict())
     np.testing.assert_allclose(again.decode(CODES), selection.response.decode(CODES))
