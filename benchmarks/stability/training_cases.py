@@ -16,8 +16,8 @@ from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene
 from sehdr_warp.training.initialization import make_field
-from sehdr_warp.training.losses import data_loss, with_opacity_penalty
-from sehdr_warp.training.targets import photo_source
+from sehdr_warp.training.losses import data_loss
+from sehdr_warp.training.targets import PhotoSource
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
 
@@ -70,13 +70,13 @@ def _learning_rates(device):
 def _gradient_norms(device):
     """Finite, and none drowns the photo's by 1e4."""
     field = _trainer(device).field
-    view = photo_source(_photos().train_views, field.base_time, device, truth=False)[0]
+    view = PhotoSource(_photos().train_views, field.base_time, device, truth=False)[0]
     norms, broken = {}, 0
     for name, ssim, opacity in (("L1", 0.0, 0.0), ("L1 and SSIM", 0.2, 0.0), ("opacity", 0.0, 0.01)):
         config = load_config("default", {"loss.ssim_weight": ssim, "loss.opacity_weight": opacity}).loss
         photo = field.render_train_view(view.camera, view.exposure_time, opacity_weight=config.opacity_weight)
         field.zero_grad(set_to_none=True)
-        with_opacity_penalty(data_loss(field, photo, view.target, config), photo).backward()
+        data_loss(field, photo, view.target, config).backward()
         gradients = [p.grad for p in field.gaussians.parameters() if p.grad is not None]
         broken += not_finite(*gradients)
         norms[name] = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))

@@ -144,7 +144,7 @@ class RadianceField(nn.Module):
         exposure_time: float | Tensor,
         *,
         degree: int | None = None,
-        also: frozenset[str] = frozenset(),
+        extra_images: frozenset[str] = frozenset(),
         max_intersections: int | None = None,
         encode: bool = True,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
@@ -156,7 +156,7 @@ class RadianceField(nn.Module):
             camera: The view's camera.
             exposure_time: Seconds; a float, or a scalar tensor on the device.
             degree: Highest SH degree, by default all.
-            also: Further images to render: any of "exposure" and "base".
+            extra_images: Further images to render: any of "exposure" and "base".
             max_intersections: As in rasterize().
             encode: If False, `encoded` stays None if `photo_exposure` is available.
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
@@ -169,7 +169,7 @@ class RadianceField(nn.Module):
                 gaussians.opacity_logits, opacity_weight, gaussians.active_count
             )
         ratio = exposure_time / self.base_time
-        values = self._values(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
+        values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.encoded:
@@ -181,11 +181,11 @@ class RadianceField(nn.Module):
         base, fused = self._exposures(values)  # The same tensor without fusion.
         color_sets = {"fused": fused}
         if self.tone_map == "gaussian":
-            needs_exposure = "exposure" in also or ("base" in also and self.fusion is None)
+            needs_exposure = "exposure" in extra_images or ("base" in extra_images and self.fusion is None)
             color_sets = {"encoded": self.response.encode_extended(fused * ratio)} | (
                 color_sets if needs_exposure else {}
             )
-        if "base" in also and self.fusion is not None:
+        if "base" in extra_images and self.fusion is not None:
             color_sets["base"] = base
         features = (
             torch.cat(list(color_sets.values()), dim=1) if len(color_sets) > 1 else next(iter(color_sets.values()))
@@ -220,7 +220,7 @@ class RadianceField(nn.Module):
             depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         else:
             depth = (self.gaussians.means - tensors.position).norm(dim=1, keepdim=True)
-        encoded, values = self.color_model.encoded, self._values(tensors.position, degree)
+        encoded, values = self.color_model.encoded, self._evaluate_sh(tensors.position, degree)
         colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
         rendering = self._rasterize(tensors, torch.cat([colors, depth], dim=1))
         depth = _unpremultiply(rendering.image[..., 3], rendering.alpha).mul_(self.normalization.unit)
@@ -260,7 +260,7 @@ class RadianceField(nn.Module):
         gaussians = self.gaussians
         origin = self.normalization.points(position)
         origin = torch.tensor(origin, dtype=torch.float32, device=gaussians.means.device)
-        encoded, values = self.color_model.encoded, self._values(origin, degree)
+        encoded, values = self.color_model.encoded, self._evaluate_sh(origin, degree)
         colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
         for index in without:
             colors = colors.index_fill(0, index, 0.0)
@@ -315,7 +315,7 @@ class RadianceField(nn.Module):
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
         """Return the radiance [N, 3] of each Gaussian towards a point [3] in scene coordinates."""
         place = torch.tensor(self.normalization.points(position), dtype=torch.float32)
-        values = self._values(place.to(self.gaussians.means.device), degree)
+        values = self._evaluate_sh(place.to(self.gaussians.means.device), degree)
         if self.color_model.encoded:
             return self.response.decode(self.color_model.colors(values).clamp(0, 1)) / self.base_time
         return self._exposures(values)[1] / self.base_time
@@ -331,7 +331,7 @@ class RadianceField(nn.Module):
             # The gradient of a scalar, because checking explicit gradients loads torch's compiler, two seconds.
             return torch.autograd.grad((blended * images).sum(), features)[0]
 
-    def _values(self, position: Tensor, degree: int | None, *, detach_harmonics: bool = False) -> Tensor:
+    def _evaluate_sh(self, position: Tensor, degree: int | None, *, detach_harmonics: bool = False) -> Tensor:
         """Return the sums [N, 3] of the Gaussians' harmonics towards a position [3]."""
         gaussians = self.gaussians
         sh_degree = gaussians.degree if degree is None else min(degree, gaussians.degree)

@@ -16,9 +16,9 @@ from .network import LightNetwork, network_input
 WEIGHTS = Path(__file__).with_name("clipped_light.safetensors")
 LARGEST = 160  # Pixels of the longer side that the network sees; larger photos are averaged down
 MOST_BYTES = 3_000_000  # Of a weights file
-HELD_DEVIATION = 1.5
-"""Standard deviation, stops, with which an estimate of light as bright as white holds a training."""
-HELD_POWER = 0.5
+ESTIMATE_DEVIATION = 1.5
+"""Standard deviation, stops, of an estimate of light as bright as white, by which the loss weighs it."""
+ESTIMATE_POWER = 0.5
 """Power of the expected light to which the estimates of several photos weigh. Photos disagree about a lamp by a factor,
 which is about log-normal with a deviation s. Logarithms that weigh by the root of the light then have the mean + s^2/2,
 which is the logarithm of the mean light: the mean of expected light has no bias, whatever errors photos share."""
@@ -41,12 +41,12 @@ class ClippedLight:
     """Estimates of a photo's clipped light from all sources; float16, 0 where nothing is clipped or known.
 
     Attributes:
-        held: [h, w, 6], as clipped_light_energy() takes it: for each channel the natural logarithm of the expected
+        log_light: [h, w, 6], as clipped_light_energy() takes it: for each channel the natural logarithm of the expected
             light over white, and then the root of its weight in a training.
         certainty: [h, w, 3], 1 / the deviation of that logarithm.
     """
 
-    held: Tensor
+    log_light: Tensor
     certainty: Tensor
 
 
@@ -145,7 +145,7 @@ def combined_estimates(
     mean = torch.where(some, total / precision.clamp_min(1e-12), 0)
     weight = stated_precision
     if prior is not None:
-        weight = weight + torch.exp(HELD_POWER * mean) / (HELD_DEVIATION * math.log(2)) ** 2
+        weight = weight + torch.exp(ESTIMATE_POWER * mean) / (ESTIMATE_DEVIATION * math.log(2)) ** 2
     roots = [torch.where(some, values.sqrt(), 0) for values in (weight, precision)]
     return ClippedLight(torch.cat([mean, roots[0]], 2).half(), roots[1].half())
 

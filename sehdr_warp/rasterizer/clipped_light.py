@@ -20,16 +20,16 @@ from .warp_launch.launching import launch, warp_scalar
 class ClippedWeights:
     """Weights of the parts of clipped_light_energy(), each at least 0.
 
-    smoothness: of squared differences to the mean of clipped neighbours. hold: of the squared distance from an
+    smoothness: of squared differences to the mean of clipped neighbours. estimate: of the squared distance from an
     estimate, in its deviations.
     """
 
     smoothness: float = 0.0
-    hold: float = 0.0
+    estimate: float = 0.0
 
     def __bool__(self) -> bool:
         """Return whether any part counts."""
-        return self.smoothness > 0 or self.hold > 0
+        return self.smoothness > 0 or self.estimate > 0
 
 
 def clipped_light_energy(
@@ -44,10 +44,10 @@ def clipped_light_energy(
     """Return the energy of the clipped values of an image, a scalar, differentiable once with respect to the image.
 
     It is the mean over all values of the image. With v = log(value / white), and m the mean of v over the clipped
-    values of its channel within a few pixels, which is held constant, a clipped value has
+    values of its channel within a few pixels, which is constant in the derivative, a clipped value has
 
         smoothness / 2 (v - m)^2              light is smooth
-        + hold / 2 ((v - mean) / deviation)^2   an estimate of its light
+        + estimate / 2 ((v - mean) / deviation)^2   an estimate of its light
 
     Args:
         image: [H, W, 3] exposures, float32 or float64.
@@ -73,7 +73,7 @@ def add_clipped_light(image, codes, white, weights, index, mask, estimates, term
     rows, columns = (0, 0) if estimates is None else estimates.shape[:2]
     estimates = None if estimates is None else estimates.contiguous().view(-1)
     # The mean is in the weights: it costs no launch, here and for the gradient.
-    scaled = [weight / image.numel() for weight in (weights.smoothness, weights.hold)]
+    scaled = [weight / image.numel() for weight in (weights.smoothness, weights.estimate)]
     energy = [image.shape[0], image.shape[1], *scaled, estimates, rows, columns, terms, slopes]
     scalar, code = warp_scalar(image.dtype), CODES[codes.dtype]
     if patches.in_patches(image.device):

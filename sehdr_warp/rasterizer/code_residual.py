@@ -58,6 +58,11 @@ class CodeScale:
     white: float = 1.0
     wide: Tensor | None = None
 
+    @property
+    def compares_exposures(self) -> bool:
+        """True if images are exposures; False if they are encoded values."""
+        return self.mu > 0
+
     def widen(self) -> None:
         """Treat bright codes as intervals from now on; in place, so that captured CUDA graphs do too."""
         if self.wide is not None:
@@ -74,7 +79,7 @@ def code_residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor 
     Args:
         image: [H, W, 3] float32 or float64.
         codes: code_tensor()'s of the photo, [H, W, 3], or of a stack of photos [V, H, W, 3].
-        scale: values of codes: exposures in the mu-law if scale.mu > 0, else encoded values.
+        scale: values of codes: exposures in the mu-law, or encoded values.
         index: [1] int64, of the photo in a stack.
 
     Raises:
@@ -99,8 +104,8 @@ def residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | Non
     """code_residual()'s two of a contiguous image, and the derivatives of the first by it, [H, W, 3], with no graph."""
     prediction, slopes, target = (torch.empty_like(image) for _ in range(3))
     photos, index = photo_stack(codes, index)
-    law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.mu else (0.0, 0.0)
-    kernel = code_residual_kernel(warp_scalar(image.dtype), CODES[codes.dtype], scale.mu > 0)
+    law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.compares_exposures else (0.0, 0.0)
+    kernel = code_residual_kernel(warp_scalar(image.dtype), CODES[codes.dtype], scale.compares_exposures)
     launch(kernel, image.numel(), image, photos, index, scale.table, *law, prediction, slopes, target)
     return prediction, target, slopes
 

@@ -1,4 +1,4 @@
-"""Estimates of the light of clipped pixels: they hold a training, and say how sure its light is."""
+"""Estimates of the light of clipped pixels: the loss pulls light towards them, and they say how sure it is."""
 
 from collections.abc import Sequence
 
@@ -58,11 +58,11 @@ def light_estimates(
             result.append(ClippedLight(nothing, nothing[..., 3:]))
             continue
         exposure = response.decode(torch.from_numpy(view.image).to(device)).float() / response.white
-        evidence = view.light_above_white
-        evidence = None if evidence is None else torch.from_numpy(evidence).to(device).float()
+        stated_light = view.light_above_white
+        stated_light = None if stated_light is None else torch.from_numpy(stated_light).to(device).float()
         deviation = view.light_above_white_deviation
-        known = combined_estimates(exposure, mask.to(device), seeing, evidence, deviation)
-        result.append(ClippedLight(_by_solid_angle(known.held.cpu(), view.camera), known.certainty.cpu()))
+        known = combined_estimates(exposure, mask.to(device), seeing, stated_light, deviation)
+        result.append(ClippedLight(_by_solid_angle(known.log_light.cpu(), view.camera), known.certainty.cpu()))
     return result
 
 

@@ -22,7 +22,7 @@ TOLERANCE = 1e-4  # Of values of the harmonics' constant part that are compared 
 
 
 @torch.no_grad()
-def brighten_clipped(field: RadianceField, views: Sequence[View], held: Sequence[Tensor]) -> int:
+def brighten_clipped(field: RadianceField, views: Sequence[View], estimates: Sequence[Tensor]) -> int:
     """Brighten the Gaussians of a field at iteration 0 that are white, to the light that photos expect there.
 
     Photos agree by the weights of their estimates, as in the loss. A channel that is not white stays as it is.
@@ -30,7 +30,7 @@ def brighten_clipped(field: RadianceField, views: Sequence[View], held: Sequence
     Args:
         field: Its constant colors are those of photos.
         views: Training views, in the field's normalized coordinates.
-        held: [h, w, 6] of each view, as ClippedLight has it.
+        estimates: ClippedLight.log_light [h, w, 6] of each view.
 
     Returns:
         The number of Gaussians that are brighter now.
@@ -41,12 +41,12 @@ def brighten_clipped(field: RadianceField, views: Sequence[View], held: Sequence
     is_white = values >= white - TOLERANCE
     chosen = is_white.any(1).nonzero()[:, 0]
     points, sums, weights = gaussians.means[chosen], 0.0, torch.full((len(chosen), 3), 1e-12).to(values)
-    for view, estimates in every_nth(list(zip(views, held, strict=True)), MOST_VIEWS):
-        if len(chosen) and bool(estimates.any()):
+    for view, estimate in every_nth(list(zip(views, estimates, strict=True)), MOST_VIEWS):
+        if len(chosen) and bool(estimate.any()):
             places = _places(view.camera, points)
             inside = ((places >= 0) & (places < 1)).all(1)
             x, y = torch.where(inside[:, None], places, 0).T
-            known = _cells(estimates.to(values), x, y)
+            known = _cells(estimate.to(values), x, y)
             weight = known[:, 3:].square() * inside[:, None]
             sums = sums + weight * (known[:, :3] + math.log(field.base_time / view.exposure_time))
             weights += weight
@@ -55,19 +55,19 @@ def brighten_clipped(field: RadianceField, views: Sequence[View], held: Sequence
     return int((excess > 0).any(1).sum())
 
 
-def expected_excess(held: Tensor, pixels: Tensor, size: tuple[int, int], times: float = 1.0) -> Tensor:
+def expected_excess(estimate: Tensor, pixels: Tensor, size: tuple[int, int], times: float = 1.0) -> Tensor:
     """Return [N, 3] the logarithm, at least 0, of the expected light over white at a photo's pixels.
 
     It is 0 where nothing is known. Does not wait for the device.
 
     Args:
-        held: [h, w, 6] of the photo, as ClippedLight has it.
+        estimate: ClippedLight.log_light [h, w, 6] of the photo.
         pixels: [N, 2] int64 column and row; others than the photo has count as the nearest.
         size: Width and height of the photo.
         times: The exposure time whose white is meant, over that of the photo.
     """
     x, y = ((pixels[:, axis] + 0.5) / size[axis] for axis in (0, 1))
-    light, root = _cells(held, x, y).float().split(3, dim=1)
+    light, root = _cells(estimate, x, y).float().split(3, dim=1)
     return torch.where(root > 0, (light + math.log(times)).clamp_min(0), 0)
 
 

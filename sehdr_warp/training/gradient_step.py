@@ -16,7 +16,7 @@ from ..rasterizer import HarmonicsGradients, Rendering
 from ..rasterizer.training_step import differentiate
 from ..runs.config import Config
 from ..scene import Scene
-from .losses import compares_exposures, data_loss, extra_images, largest_hdr_truth, with_opacity_penalty
+from .losses import compares_exposures, data_loss, extra_images, largest_hdr_truth
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
 from .step_graphs import GraphCapacity
@@ -131,7 +131,7 @@ class GradientStep:
             camera,
             view.exposure_time,
             degree=options.degree,
-            also=extra_images(self._loss, target.exposure_truth is not None),
+            extra_images=extra_images(self._loss, target.exposure_truth is not None),
             max_intersections=max_intersections,
             encode=self.needs_encoded,
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
@@ -143,7 +143,7 @@ class GradientStep:
         rendering = replace(render.rendering, **dict.fromkeys(dropped))
         if needs_means2d_grad:
             rendering.means2d.retain_grad()
-        loss = with_opacity_penalty(data_loss(field, render, target, self._loss, self._largest_truth), render)
+        loss = data_loss(field, render, target, self._loss, self._largest_truth)
         image = render.encoded if self.needs_encoded else render.photo_exposure
         assert image is not None
         del render, target, view

@@ -42,11 +42,6 @@ def base_time(scene: Scene) -> float:
     return float(np.median([view.exposure_time for view in scene.train_views]))
 
 
-def scene_extent(scene: Scene) -> float:
-    """Return the radius of the training cameras around their mean, plus a tenth (3DGS); scene units, positive."""
-    return normalization_of(scene).unit
-
-
 def response_for_training(scene: Scene, config: Config) -> Response:
     """Return the response that the config names.
 
@@ -92,14 +87,14 @@ def make_field(
     check_views(scene)
     time = time or base_time(scene)
     normalization = normalization_of(scene)
-    scene = normalization.scene(scene)
-    scene = replace(scene, views=perspective_views(scene.train_views))
+    normalized = normalization.scene(scene)
+    normalized = replace(normalized, views=perspective_views(normalized.train_views))
     rng = np.random.default_rng(config.seed)
     if config.model.init_file:
-        gaussians = start_gaussians(scene, config, response, rng, normalization, time)
+        gaussians = start_gaussians(normalized, config, response, rng, normalization, time)
         return assemble_field(gaussians, config, response, time, normalization).to(device)
-    matcher = matcher or partial(make_matcher, scene, response, device)
-    points, colors = start_points(scene, config, matcher, rng)
+    matcher = matcher or partial(make_matcher, normalized, response, device)
+    points, colors = start_points(normalized, config, matcher, rng)
     most = config.densification.cap_max
     if len(points) > most:
         subset = np.sort(rng.choice(len(points), most, replace=False))

@@ -139,7 +139,8 @@ def ldr_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor:
     """
     image = compared_image(render, target)
     codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
-    clipped = clipped_weights(config, target) if target.scale.mu and config.clipping else ClippedWeights()
+    smooths_clipped = scale.compares_exposures and config.clipping
+    clipped = clipped_weights(config, target) if smooths_clipped else ClippedWeights()
     if target.mask is None and weight:
         # The common case: the terms below in one launch, and with one gradient.
         return photo_loss(
@@ -161,7 +162,7 @@ def ldr_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor:
 
 def compared_image(render: TrainRender, target: Target) -> Tensor:
     """Return the image that is compared with the photo: exposures if the target has them, else encoded values."""
-    image = render.photo_exposure if target.scale.mu else render.encoded
+    image = render.photo_exposure if target.scale.compares_exposures else render.encoded
     assert image is not None
     return image
 
@@ -232,7 +233,7 @@ def extra_images(config: LossConfig, has_truth: bool) -> frozenset[str]:
 def data_loss(
     field: RadianceField, render: TrainRender, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
-    """Return L_LDR + beta L_linear (SeHDR, equation 20) + the HDR loss + the anchor, each if it has a weight."""
+    """Return L_LDR + beta L_linear (SeHDR, equation 20) + HDR loss + anchor + opacity, each if it has a weight."""
     loss = ldr_loss(render, target, config) if config.ldr_weight > 0 else 0.0
     if config.ldr_weight not in (0, 1):
         loss = config.ldr_weight * loss
@@ -244,11 +245,6 @@ def data_loss(
     if config.anchor_weight > 0 and isinstance(field.response, ToneMapper):
         loss = loss + config.anchor_weight * anchor_loss(field.response)
     assert isinstance(loss, Tensor), "a config without any loss is refused"
-    return loss
-
-
-def with_opacity_penalty(loss: Tensor, render: TrainRender) -> Tensor:
-    """Return the loss plus the opacity penalty, if the view was rendered with an opacity weight."""
     return loss if render.opacity_penalty is None else loss + render.opacity_penalty
 
 

@@ -27,15 +27,14 @@ WINDOWS = 5  # Windows before the end at which the average begins; older samples
 SH_INTERVAL_FROM = 4000  # Steps of the shortest training to which SH_UPDATE_INTERVAL applies; shorter ones lose quality
 
 
-def make_optimizer(field: RadianceField, config: Config, extent: float, batch: int = 1) -> Adam:
+def make_optimizer(field: RadianceField, config: Config, batch: int = 1) -> Adam:
     """Create an optimizer with a named group for each parameter of the Gaussians, the fusion and a learned response.
 
-    On a GPU, counters and learning rates are tensors on the device, so that steps can be captured as CUDA graphs. The
-    learning rate of the means is in units of the scene's `extent`; a step has `batch` photos.
+    On a GPU, counters and learning rates are tensors on the device, so that steps can be captured as CUDA graphs. A
+    step has `batch` photos.
     """
     device = field.gaussians.means.device
     rates = {name: getattr(config.optimizer, name) for name in PARAMETER_NAMES}
-    rates["means"] *= extent
     groups = [{"name": name, "params": [getattr(field.gaussians, name)], "lr": rate} for name, rate in rates.items()]
     if field.fusion is not None:
         groups.append({"name": "fusion", "params": list(field.fusion.parameters()), "lr": config.optimizer.fusion})
@@ -49,11 +48,11 @@ def make_optimizer(field: RadianceField, config: Config, extent: float, batch: i
     return Adam(groups, betas=(BETAS[0] ** batch, BETAS[1] ** batch), sh_update_interval=interval)
 
 
-def means_rate(config: Config, extent: float, iteration: int, batch: int = 1) -> float:
-    """Return the learning rate of the means: exponential from `means` to `means_final`, times extent."""
+def means_rate(config: Config, iteration: int, batch: int = 1) -> float:
+    """Return the learning rate of the means: exponential from `means` to `means_final`, normalized units."""
     rates = config.optimizer
     part = min(iteration / config.schedule.iterations, 1.0)
-    return math.sqrt(batch) * extent * rates.means * (rates.means_final / rates.means) ** part
+    return math.sqrt(batch) * rates.means * (rates.means_final / rates.means) ** part
 
 
 def set_means_rate(optimizer: Adam, rate: float) -> None:

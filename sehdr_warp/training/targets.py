@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..model.camera_tensors import CameraTensors
-from ..rasterizer.code_residual import CodeScale, code_tensor
+from ..rasterizer.code_residual import code_tensor
 from ..response import Response
 from ..scene import View
 from .losses import Target, code_scale, select_view
@@ -98,48 +98,39 @@ class ViewStack:
         return TrainingView(camera, time, replace(self.targets, **parts))
 
 
-def photo_source(
-    views: Sequence[View],
-    base_time: float,
-    device,
-    *,
-    truth: bool,
-    clipping: bool = True,
-    compare_by: Response | None = None,
-    estimates: list[Tensor] | None = None,
-) -> "PhotoSource":
-    """Return training views as a sequence that uploads each on access.
-
-    Args:
-        views: The training views.
-        base_time: Exposure time dt_1 of the field, seconds.
-        device: Torch device.
-        truth: Also upload HDR truth.
-        clipping: Treat clipped codes as intervals.
-        compare_by: Response by which exposures are compared, None to compare encoded values.
-        estimates: For each view estimates of the light of clipped pixels, as in Target.
-    """
-    deep = any(view.codes.dtype == np.uint16 for view in views)
-    scale = code_scale(65535 if deep else 255, compare_by, device, clipping=clipping)
-    return PhotoSource(views, base_time, device, truth, deep, scale, estimates)
-
-
 class PhotoSource(Sequence[TrainingView]):
-    """Training views whose photos stay in memory or in a file until they are accessed."""
+    """Training views whose photos stay in memory or in a file until they are accessed; each access uploads one.
+
+    Attributes:
+        scale: Values and intervals that the codes stand for.
+    """
 
     def __init__(
         self,
         views: Sequence[View],
         base_time: float,
         device,
+        *,
         truth: bool,
-        deep: bool,
-        scale: CodeScale,
+        clipping: bool = True,
+        compare_by: Response | None = None,
         estimates: list[Tensor] | None = None,
     ):
-        """Wrap views; `deep` says that codes have 16 bits, `truth` that HDR truth is uploaded."""
+        """Wrap views.
+
+        Args:
+            views: The training views.
+            base_time: Exposure time dt_1 of the field, seconds.
+            device: Torch device.
+            truth: Also upload HDR truth.
+            clipping: Treat clipped codes as intervals.
+            compare_by: Response by which exposures are compared, None to compare encoded values.
+            estimates: For each view estimates of the light of clipped pixels, as in Target.
+        """
         self.views, self.base_time, self.device = views, base_time, device
-        self.truth, self._deep, self.scale, self.estimates = truth, deep, scale, estimates
+        self.truth, self.estimates = truth, estimates
+        self._deep = any(view.codes.dtype == np.uint16 for view in views)
+        self.scale = code_scale(65535 if self._deep else 255, compare_by, device, clipping=clipping)
 
     def __len__(self) -> int:
         """Return the number of views."""

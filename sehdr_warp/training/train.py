@@ -129,7 +129,8 @@ def _new_trainer(
 ) -> Trainer:
     """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder."""
     watch = Stopwatch()
-    config, plan = apply_plan(normalization_of(scene).scene(scene), config, device)
+    normalization = normalization_of(scene)
+    config, plan = apply_plan(normalization.scene(scene), config, device)
     check_scene_truth(scene, config.loss)
     response = response_for_training(scene, config)
     with watch:
@@ -139,9 +140,9 @@ def _new_trainer(
     output = RunOutput(folder, config, tensorboard=tensorboard, is_block=shared is not None)
     trainer = Trainer(prepared.scene, config, field, matcher=prepared.matcher, ranks=ranks, output=output)
     with watch:
-        held = trainer.views.held_estimates
-        if held is not None and not config.model.init_file:
-            brighten_clipped(field, normalization_of(scene).scene(prepared.scene).train_views, held)
+        estimates = trainer.views.loss_estimates
+        if estimates is not None and not config.model.init_file:
+            brighten_clipped(field, normalization.scene(prepared.scene).train_views, estimates)
     trainer.seconds = watch.seconds
     if plan is not None and prepared.decision is not None:
         plan = plan.with_decision(prepared.decision)

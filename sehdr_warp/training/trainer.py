@@ -26,7 +26,7 @@ from ..runs.run import Run, as_rec709
 from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
 from .gradient_step import Gradients, GradientStep, StepOptions, StepResult
-from .initialization import make_matcher, scene_extent, sizes_of
+from .initialization import make_matcher, sizes_of
 from .machine import interruptible, torch_settings
 from .matching import Matcher, seed_gaussians
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
@@ -105,11 +105,10 @@ class Trainer:
 
         normalized = field.normalization.scene(scene)
         views = normalized.train_views
-        self.extent = scene_extent(normalized)
-        self.optimizer = make_optimizer(field, config, self.extent, self.batch)
+        self.optimizer = make_optimizer(field, config, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in views)
         positions = torch.tensor([view.camera.position.tolist() for view in views], device=self.device)
-        self.strategy = make_strategy(config, self.extent, pixels, positions)
+        self.strategy = make_strategy(config, pixels, positions)
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.order = PhotoOrder(len(views), config.seed, self.rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
@@ -204,9 +203,9 @@ class Trainer:
         # The last step may have more photos than iterations are left.
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
-        views, gaussians = self.views.at(self.iteration), self.field.gaussians
+        views, gaussians = self.views.source(self.iteration), self.field.gaussians
         index = self._view_index = self.order.next()
-        means_lr = means_rate(self.config, self.extent, self.iteration, self.batch)
+        means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
         if self.reserves_rows and not self._reserved_rows:
             self._reserve_rows()
@@ -277,7 +276,7 @@ class Trainer:
     def _propose_gaussians(self, number: Tensor, bound: int) -> Proposals:
         """Propose new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
         random_seed = self.config.seed * SEED_STRIDE + self.iteration
-        view, result = self.views.at(self.iteration)[self._view_index], self._result
+        view, result = self.views.source(self.iteration)[self._view_index], self._result
         assert result is not None
         with self.graphs.on_capture_stream():
             image = result.image
@@ -348,7 +347,7 @@ class Trainer:
     @torch.no_grad()
     def psnr(self) -> float:
         """Render the last step's view and return its PSNR against the photo inside the mask, dB."""
-        view = self.views.at(self.iteration)[self._view_index]
+        view = self.views.source(self.iteration)[self._view_index]
         with self.graphs.on_capture_stream():
             photo = self.field.render_train_view(view.camera, view.exposure_time, degree=self.degree).encoded
         assert photo is not None

@@ -15,7 +15,7 @@ from ..runs.light_estimates import ClippedLight, light_estimates
 from ..scene import Scene, View
 from .losses import INTERVALS_FROM, compares_exposures
 from .photo_stream import PhotoStream, make_view_source
-from .targets import TrainingView, ViewStack, photo_source
+from .targets import PhotoSource, TrainingView, ViewStack
 
 
 def has_wide_views(scene: Scene, config: Config) -> bool:
@@ -91,13 +91,13 @@ class TrainingViews:
         return light_estimates(self._views, field.response, self._config.loss, field.gaussians.means.device)
 
     @property
-    def held_estimates(self) -> list[Tensor] | None:
-        """The estimates [h, w, 6] that the loss holds clipped light at; None if it compares no exposures."""
+    def loss_estimates(self) -> list[Tensor] | None:
+        """The estimates [h, w, 6] that the loss pulls clipped light towards; None if it compares no exposures."""
         estimates = self.estimates if compares_exposures(self._config.loss, self._field) else None
-        return None if estimates is None else [estimate.held for estimate in estimates]
+        return None if estimates is None else [estimate.log_light for estimate in estimates]
 
-    def at(self, iteration: int) -> ViewStack | PhotoStream | Sequence[TrainingView]:
-        """Return the views for the step of an iteration."""
+    def source(self, iteration: int) -> ViewStack | PhotoStream | Sequence[TrainingView]:
+        """Return the views that the step of an iteration selects from; uploads them at the first call."""
         if self._source is None:
             self._source = self._upload()
         if not self._widened and iteration > INTERVALS_FROM * self._config.schedule.iterations:
@@ -110,13 +110,13 @@ class TrainingViews:
         loss, field = self._config.loss, self._field
         device = field.gaussians.means.device
         response = field.response if compares_exposures(loss, field) else None
-        source = photo_source(
+        source = PhotoSource(
             self._views,
             field.base_time,
             device,
             clipping=loss.clipping,
             compare_by=response,
-            estimates=self.held_estimates,
+            estimates=self.loss_estimates,
             truth=loss.uses_hdr,
         )
         self.scale = source.scale

@@ -90,7 +90,7 @@ def test_brackets_share_one_rasterisation(tone_map, channels):
 
     field = wall(0.2, tone_map=tone_map, fusion=fusion_of())
     field.rasterizer = counted
-    photo = photograph(field, also=frozenset({"base", "exposure"}))
+    photo = photograph(field, extra_images=frozenset({"base", "exposure"}))
     assert calls == [channels]
     assert photo.encoded.shape == photo.exposure.shape == photo.base.shape == (24, 32, 3)
 
@@ -100,7 +100,7 @@ def test_fused_radiance_is_neefs():
     field = wall(0.2, fusion=fusion)
     with torch.no_grad():
         expected = fusion(torch.full((1, 3), math.log(0.2)))[0]
-    photo = photograph(field, also=frozenset({"base", "exposure"}))
+    photo = photograph(field, extra_images=frozenset({"base", "exposure"}))
     coverage = float(photo.rendering.alpha.detach()[12, 16])
     torch.testing.assert_close(photo.exposure.detach()[12, 16], expected * TIME * coverage, rtol=1e-4, atol=0)
     torch.testing.assert_close(photo.base.detach()[12, 16], torch.full((3,), 0.2 * coverage), rtol=1e-4, atol=0)

@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.prior import LightPrior, coarse_size, combined_estimates, load_prior
-from sehdr_warp.prior.estimate import HELD_DEVIATION, WEIGHTS, LightEstimate
+from sehdr_warp.prior.estimate import ESTIMATE_DEVIATION, WEIGHTS, LightEstimate
 from sehdr_warp.prior.network import LightNetwork
 
 
@@ -44,12 +44,12 @@ def test_any_size_is_estimated(size):
 def test_estimates_are_there_where_the_photo_clips_alone():
     exposure, clipped = photo()
     known = combined_estimates(exposure, clipped, small_prior())
-    assert torch.equal(known.certainty > 0, clipped) and torch.equal(known.held[..., 3:] > 0, clipped)
+    assert torch.equal(known.certainty > 0, clipped) and torch.equal(known.log_light[..., 3:] > 0, clipped)
     estimate = small_prior().estimate(exposure, clipped)
     inside = clipped[..., 0]
     deviation = math.log(2) * estimate.deviation[inside]
     expected = math.log(2) * estimate.mean[inside] + deviation.square() / 2  # Of a log-normal value
-    assert torch.allclose(known.held[..., :3][inside].float(), expected, rtol=2e-3)
+    assert torch.allclose(known.log_light[..., :3][inside].float(), expected, rtol=2e-3)
     assert torch.allclose(1 / known.certainty[inside].float(), math.log(2) * estimate.deviation[inside], rtol=2e-3)
 
 
@@ -57,13 +57,15 @@ def test_what_a_file_states_counts_by_its_precision():
     exposure, clipped = photo()
     limits = torch.where(clipped, 8.0, 0.0)
     alone = combined_estimates(exposure, clipped, None, limits, 0.25)
-    assert torch.allclose(alone.held[6, 12].float(), torch.tensor(3 * [math.log(8)] + 3 * [4.0]), rtol=1e-3)
+    assert torch.allclose(alone.log_light[6, 12].float(), torch.tensor(3 * [math.log(8)] + 3 * [4.0]), rtol=1e-3)
     assert torch.allclose(alone.certainty[6, 12].float(), torch.tensor(4.0), rtol=1e-3)
     sure, unsure = (
-        combined_estimates(exposure, clipped, small_prior(), limits, d).held[6, 12, 0] for d in (0.01, 100.0)
+        combined_estimates(exposure, clipped, small_prior(), limits, d).log_light[6, 12, 0] for d in (0.01, 100.0)
     )
     assert sure == pytest.approx(math.log(8), abs=1e-2)
-    assert unsure == pytest.approx(float(combined_estimates(exposure, clipped, small_prior()).held[6, 12, 0]), rel=1e-2)
+    assert unsure == pytest.approx(
+        float(combined_estimates(exposure, clipped, small_prior()).log_light[6, 12, 0]), rel=1e-2
+    )
 
 
 class FixedPrior:
@@ -82,7 +84,7 @@ def test_photos_that_hold_a_light_agree_on_the_mean_of_their_expected_light():
     stops = 4 + 2 * torch.randn(100, 100, 3, generator=torch.Generator().manual_seed(0)).clamp(-2, 2)
     clipped = torch.ones(100, 100, 3, dtype=torch.bool)
     known = combined_estimates(clipped.float(), clipped, FixedPrior(stops.clamp_min(0)))
-    light, weight = known.held[..., :3].double(), known.held[..., 3:].double().square()
+    light, weight = known.log_light[..., :3].double(), known.log_light[..., 3:].double().square()
     agreed = float((weight * light).sum() / weight.sum()) / math.log(2)
     assert agreed == pytest.approx(math.log2(torch.exp2(stops.clamp_min(0)).mean()), abs=0.25)
     # Weights by deviations would lose two stops of it.
@@ -93,9 +95,11 @@ def test_photos_that_hold_a_light_agree_on_the_mean_of_their_expected_light():
 def test_what_a_file_states_holds_by_its_deviation_beside_the_prior():
     exposure, clipped = photo()
     limits = torch.where(clipped, 8.0, 0.0)
-    alone, both = (combined_estimates(exposure, clipped, p, limits, 0.05).held[6, 12] for p in (None, small_prior()))
+    alone, both = (
+        combined_estimates(exposure, clipped, p, limits, 0.05).log_light[6, 12] for p in (None, small_prior())
+    )
     assert alone[3] == pytest.approx(20, rel=1e-2) and both[0] == pytest.approx(math.log(8), abs=0.02)
-    weight = 20**2 + math.sqrt(8) / (HELD_DEVIATION * math.log(2)) ** 2
+    weight = 20**2 + math.sqrt(8) / (ESTIMATE_DEVIATION * math.log(2)) ** 2
     assert both[3] == pytest.approx(math.sqrt(weight), rel=1e-2)
 
 
@@ -103,7 +107,7 @@ def test_nothing_known_is_precision_zero():
     exposure, clipped = photo()
     for limits in (None, torch.zeros(20, 30, 3)):
         known = combined_estimates(exposure, clipped, None, limits, 0.3)
-        assert (known.held == 0).all() and (known.certainty == 0).all()
+        assert (known.log_light == 0).all() and (known.certainty == 0).all()
 
 
 def test_weights_come_back_as_they_were_written(tmp_path):
@@ -132,7 +136,7 @@ def test_weights_that_cannot_be_used_are_one_line(tmp_path):
 def test_estimates_do_not_depend_on_the_number_type_of_the_mask():
     exposure, clipped = photo()
     one = combined_estimates(exposure, clipped, small_prior(), torch.from_numpy(np.zeros((20, 30, 3), np.float16)), 0.2)
-    assert torch.equal(one.held, combined_estimates(exposure, clipped, small_prior()).held)
+    assert torch.equal(one.log_light, combined_estimates(exposure, clipped, small_prior()).log_light)
 
 
 def lit(surround, radius, noise=0.05):

@@ -12,7 +12,7 @@ from sehdr_warp.rasterizer.code_residual import code_tensor
 
 from .scenes import relative_error
 
-WHITE, WEIGHTS = 1.3, ClippedWeights(smoothness=0.7, hold=0.4)
+WHITE, WEIGHTS = 1.3, ClippedWeights(smoothness=0.7, estimate=0.4)
 
 
 @pytest.fixture(params=["values", "patches"])
@@ -60,7 +60,7 @@ def reference(light, codes, mask=None, means_of=None, estimates=None):
             # Light below white counts as white and is held all the same.
             above = light[y, x, channel] / WHITE
             value = value if above > 1 else above - above.detach()
-            total = total + WEIGHTS.hold / 2 * (estimate[channel + 3] * (value - estimate[channel])) ** 2
+            total = total + WEIGHTS.estimate / 2 * (estimate[channel + 3] * (value - estimate[channel])) ** 2
     return total / light.numel()
 
 

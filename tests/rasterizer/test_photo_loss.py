@@ -13,7 +13,7 @@ from sehdr_warp.rasterizer.ssim import image_distance
 
 from .scenes import relative_error
 
-CLIPPED = ClippedWeights(smoothness=0.7, hold=0.3)
+CLIPPED = ClippedWeights(smoothness=0.7, estimate=0.3)
 WHITE, MU, WEIGHTS = 1.3, 300.0, {"distance_weight": 0.8, "dissimilarity_weight": 0.2}
 
 

@@ -11,7 +11,7 @@ from sehdr_warp.runs.config import LossConfig
 from sehdr_warp.runs.light_estimates import light_estimates
 from sehdr_warp.scene import Camera, View
 from sehdr_warp.scene.wide_camera import solid_angles
-from sehdr_warp.training.targets import photo_source
+from sehdr_warp.training.targets import PhotoSource
 
 SRGB = response_by_name("srgb")
 CPU = torch.device("cpu")
@@ -28,8 +28,8 @@ def view(code, stated=None, deviation=0.0):
 def test_gain_maps_count_without_the_prior():
     views = [view(255, stated=4.0, deviation=0.5), view(100)]
     first, second = light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)
-    assert first.held[0, 0].tolist() == pytest.approx([np.log(4)] * 3 + [2.0] * 3, rel=1e-3)
-    assert (second.held == 0).all() and second.held.shape == first.held.shape
+    assert first.log_light[0, 0].tolist() == pytest.approx([np.log(4)] * 3 + [2.0] * 3, rel=1e-3)
+    assert (second.log_light == 0).all() and second.log_light.shape == first.log_light.shape
 
 
 @pytest.mark.parametrize(
@@ -46,15 +46,17 @@ def test_nothing_is_estimated_where_nothing_clips_or_exposures_are_not_compared(
 
 def test_targets_carry_the_estimates():
     views = [replace(view(255, stated=4.0, deviation=0.5), name=name) for name in "ab"]
-    estimates = [known.held for known in light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)]
-    source = photo_source(views, 1.0, CPU, truth=False, compare_by=SRGB, estimates=estimates)
+    estimates = [known.log_light for known in light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)]
+    source = PhotoSource(views, 1.0, CPU, truth=False, compare_by=SRGB, estimates=estimates)
     assert torch.equal(source[1].target.estimates, estimates[1])
 
 
 def test_the_prior_estimates_photos_that_clip_alone():
     first, second = light_estimates([view(255), view(100)], SRGB, LossConfig(), CPU)
-    assert (first.held[..., 3:] > 0).all() and (first.held[..., :3] >= 0).all() and (first.certainty > 0).all()
-    assert (second.held == 0).all() and (second.certainty == 0).all()
+    assert (
+        (first.log_light[..., 3:] > 0).all() and (first.log_light[..., :3] >= 0).all() and (first.certainty > 0).all()
+    )
+    assert (second.log_light == 0).all() and (second.certainty == 0).all()
 
 
 def test_panoramas_are_seen_by_perspective_faces():
@@ -68,7 +70,7 @@ def test_panoramas_are_seen_by_perspective_faces():
     assert first.certainty.shape == second.certainty.shape and first.certainty.shape[0] > 200
     known = first.certainty[..., 0] > 0
     assert 0 < known.float().mean() < 0.01 and known[known.shape[0] // 2, known.shape[1] // 2]
-    assert (second.held == 0).all()
+    assert (second.log_light == 0).all()
 
 
 def test_estimates_of_a_panorama_weigh_by_solid_angle_in_a_training():
@@ -81,7 +83,7 @@ def test_estimates_of_a_panorama_weigh_by_solid_angle_in_a_training():
     photo = replace(view(0), codes=codes, camera=camera, light_above_white=above, light_above_white_deviation=0.5)
     (known,) = light_estimates([photo], SRGB, LossConfig(light_prior=False), CPU)
     assert known.certainty.unique().tolist() == [2.0]
-    weights = (known.held[..., 3:].float() ** 2 / 4)[:, 0, 0]
+    weights = (known.log_light[..., 3:].float() ** 2 / 4)[:, 0, 0]
     expected = solid_angles(camera)[:, 0] / solid_angles(camera).mean()
     assert weights.tolist() == pytest.approx(expected.reshape(len(weights), -1).mean(1).tolist(), rel=5e-3)
     assert weights.mean() == pytest.approx(1, rel=5e-3) and weights[0] < 0.2 * weights[len(weights) // 2]

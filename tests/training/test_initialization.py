@@ -1,4 +1,4 @@
-"""Where a training starts: extents, focus, drawn points, colors, and the choice of a response."""
+"""Where a training starts: focus, drawn points, colors, and the choice of a response."""
 
 import dataclasses
 
@@ -18,7 +18,6 @@ from sehdr_warp.training.initialization import (
     make_field,
     random_points,
     response_for_training,
-    scene_extent,
 )
 
 from ..splats.test_splat_files import gaussians
@@ -27,17 +26,9 @@ from .toy import orbit_camera, toy_scene
 RADIUS = np.hypot(4.0, 0.8)
 
 
-def test_extent_and_focus_of_an_orbit(scene):
-    centre = np.mean([view.camera.position for view in scene.train_views], axis=0)
-    farthest = max(np.linalg.norm(view.camera.position - centre) for view in scene.train_views)
-    assert scene_extent(scene) == pytest.approx(1.1 * farthest)
+def test_focus_of_an_orbit_and_of_cameras_at_one_place(scene):
     assert focus_distance(scene.train_views) == pytest.approx(RADIUS, rel=1e-3)
-
-
-def test_cameras_at_one_place_have_an_extent(scene):
     still = tuple(dataclasses.replace(view, camera=scene.views[0].camera) for view in scene.views)
-    assert scene_extent(dataclasses.replace(scene, views=still)) > 0
-    assert scene_extent(dataclasses.replace(scene, views=still, points=np.zeros((0, 3)))) == 1.0
     assert focus_distance(still) > 0
 
 

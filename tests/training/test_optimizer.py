@@ -18,7 +18,7 @@ from .toy import QUICK, load_unscaled, toy_field
 @pytest.mark.parametrize("bad", [False, True])
 def test_a_guarded_step_is_made_or_left_out_whole(device, incomplete, bad):
     field = toy_field().to(device)
-    optimizer = make_optimizer(field, load_config("default"), 1.0)
+    optimizer = make_optimizer(field, load_config("default"))
     means = field.gaussians.means
     before = means.detach().clone()
     loss = (means * (nan if bad else 1.0)).sum()
@@ -35,7 +35,7 @@ def test_a_guarded_step_is_made_or_left_out_whole(device, incomplete, bad):
 @pytest.mark.parametrize(("iterations", "batch", "interval"), [(4000, 1, 2), (3999, 1, 1), (8000, 2, 2), (7999, 2, 1)])
 def test_harmonics_step_in_turn_where_there_are_steps_enough(iterations, batch, interval):
     config = load_config("default", {"schedule.iterations": iterations})
-    assert make_optimizer(toy_field(), config, 1.0, batch).sh_update_interval == interval
+    assert make_optimizer(toy_field(), config, batch).sh_update_interval == interval
 
 
 AVERAGED = QUICK | {"schedule.iterations": 40, "schedule.ema_window": 4500, "densification.refine_stop_iter": 20}

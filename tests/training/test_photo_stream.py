@@ -11,7 +11,7 @@ from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene.photo_file import PhotoKeeper
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.photo_stream import PhotoStream
-from sehdr_warp.training.targets import photo_source
+from sehdr_warp.training.targets import PhotoSource
 from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
@@ -24,7 +24,7 @@ def test_what_is_brought_is_the_view(device, truth):
     views = list(toy_scene().train_views)
     views[1] = dataclasses.replace(views[1], mask=np.tri(32, dtype=np.float32), exposure_time=0.5)
     views[2] = dataclasses.replace(views[2], codes=views[2].codes.astype(np.uint16) * 200)
-    source = photo_source(views, EXPOSURE_TIME, device, truth=truth)
+    source = PhotoSource(views, EXPOSURE_TIME, device, truth=truth)
     stream, order = PhotoStream(source), [0, 1, 2, 2, 5, 3, 4, 0, 1, 5, 2, 0]
     assert len(stream) == len(source) == len(views)
     for index, following in zip(order, [*order[1:], None], strict=True):
@@ -43,7 +43,7 @@ def test_what_is_brought_is_the_view(device, truth):
 def test_photos_of_several_sizes_have_no_common_place(device):
     views = toy_scene().train_views + toy_scene(size=16).train_views
     with pytest.raises(ValueError, match="photos differ in size"):
-        PhotoStream(photo_source(views, EXPOSURE_TIME, device, truth=False))
+        PhotoStream(PhotoSource(views, EXPOSURE_TIME, device, truth=False))
 
 
 def test_a_training_on_a_file_is_the_same_bits(scene, trained, tmp_path):
@@ -65,7 +65,7 @@ def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
         for _ in range(60):
             trainer.step()
         assert (
-            isinstance(trainer.views.at(60), PhotoStream) == (photos == "memory")
+            isinstance(trainer.views.source(60), PhotoStream) == (photos == "memory")
             and trainer.graphs.captured is not None
         )
         states.append(state_of(trainer).tensors)

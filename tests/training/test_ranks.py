@@ -122,7 +122,7 @@ def test_a_signal_saves_and_ends_all(command, tmp_path):
 
 def test_rates_and_decays_follow_the_batch():
     config, field = VARIANTS["adc"], toy_field()
-    one, four = (make_optimizer(field, config, 2.0, batch) for batch in (1, 4))
+    one, four = (make_optimizer(field, config, batch) for batch in (1, 4))
     for a, b in zip(one.param_groups, four.param_groups, strict=True):
         assert b["lr"] == pytest.approx(2 * a["lr"]) and b["betas"] == pytest.approx([beta**4 for beta in a["betas"]])
     field.gaussians.means.grad = torch.ones_like(field.gaussians.means)
@@ -135,7 +135,7 @@ def test_rates_and_decays_follow_the_batch():
 
 def test_gradients_go_through_one_buffer():
     field = toy_field()
-    optimizer = make_optimizer(field, VARIANTS["adc"], 1.0)
+    optimizer = make_optimizer(field, VARIANTS["adc"])
     flat, gradients = FlatGradients(optimizer, 0, 1, defer_sh=False), {}
     for name in ("means", "opacity_logits"):
         parameter = getattr(field.gaussians, name)
@@ -153,7 +153,7 @@ def test_gradients_go_through_one_buffer():
 
 def test_harmonics_go_as_their_factors():
     field, count = toy_field(), 3
-    optimizer, means = make_optimizer(field, VARIANTS["adc"], 1.0), field.gaussians.means
+    optimizer, means = make_optimizer(field, VARIANTS["adc"]), field.gaussians.means
     ranks = [FlatGradients(optimizer, place, count, defer_sh=True) for place in range(count)]
     factors = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
     for flat, harmonics in zip(ranks, factors, strict=True):
@@ -168,7 +168,7 @@ def test_harmonics_go_as_their_factors():
 
 @pytest.mark.parametrize("photos", [1, 2, 3, 8])
 def test_each_change_happens_once_whatever_the_stride(photos):
-    strategy = make_strategy(VARIANTS["default"], 1.0, 1000)
+    strategy = make_strategy(VARIANTS["default"], 1000)
     due = [n for n in range(photos, 91, photos) if strategy.is_due(n, photos)]
     assert [n // 25 for n in due] == [1, 2, 3] and (strategy.schedule.start, strategy.schedule.stop) == (20, 80)
 

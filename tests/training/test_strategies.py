@@ -14,8 +14,6 @@ from sehdr_warp.training.strategies import AdcStrategy, Proposals, make_strategy
 from sehdr_warp.training.strategies.adc import rotate, sample_half
 from sehdr_warp.training.strategies.mcmc import sample_rows
 
-EXTENT = 2.0
-
 
 def cloud(count=6):
     generator = torch.Generator().manual_seed(5)
@@ -44,7 +42,7 @@ def rendering_with(gradient, visible):
 def adc_strategy(**options):
     values = {"densification.strategy": "adc"}
     values |= {f"densification.{name}": value for name, value in options.items()}
-    return AdcStrategy.from_config(load_config("default", values), EXTENT)
+    return AdcStrategy.from_config(load_config("default", values))
 
 
 def observe(strategy, gradients):
@@ -143,7 +141,7 @@ def test_faint_and_oversized_are_pruned():
     assert gaussians.count == 4, "only the faint one before the first reset"
     observe(strategy, [0.0] * 4)
     strategy.refine(3100, gaussians, optimizer, torch.Generator())
-    assert gaussians.count == 3, "0.3 is more than a tenth of the extent 2.0"
+    assert gaussians.count == 3, "0.3 is more than a tenth of the cameras' radius"
 
 
 def test_opacity_reset():
@@ -167,7 +165,7 @@ def test_nothing_changes_outside_the_schedule(iteration):
 def mcmc_strategy(places=None, *, cap_max=None, **options):
     values = {"densification.strategy": "mcmc"} | {f"mcmc.{name}": value for name, value in options.items()}
     values |= {} if cap_max is None else {"densification.cap_max": cap_max}
-    return make_strategy(load_config("default", values), EXTENT, 10**6, places)
+    return make_strategy(load_config("default", values), 10**6, places)
 
 
 def test_relocation_sums_are_equation_9():
@@ -325,7 +323,7 @@ def test_relocation_grows_to_the_budget(rooms):
 
 @pytest.mark.parametrize("iterations", [300, 1500, 30_000])
 def test_a_training_of_any_length_reaches_its_budget(iterations):
-    strategy = make_strategy(load_config("default", {"schedule.iterations": iterations}), EXTENT, 10**6)
+    strategy = make_strategy(load_config("default", {"schedule.iterations": iterations}), 10**6)
     assert strategy.cap_max == 120_000
     count = 5000
     for iteration in range(1, iterations + 1):

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from sehdr_warp.response import response_by_name
-from sehdr_warp.training.targets import ViewStack, photo_source
+from sehdr_warp.training.targets import PhotoSource, ViewStack
 
 from .toy import EXPOSURE_TIME, toy_scene
 
 
 def views_of(views, device, **options):
-    return list(photo_source(views, EXPOSURE_TIME, device, truth=True, **options))
+    return list(PhotoSource(views, EXPOSURE_TIME, device, truth=True, **options))
 
 
 def test_a_stacked_view_is_the_view(device):

@@ -23,14 +23,11 @@ __all__ = [
 ]
 
 
-def make_strategy(
-    config: Config, extent: float, pixels: int, camera_positions: Tensor | None = None
-) -> AdcStrategy | McmcStrategy:
+def make_strategy(config: Config, pixels: int, camera_positions: Tensor | None = None) -> AdcStrategy | McmcStrategy:
     """Create the strategy that config.densification.strategy names.
 
-    The scene has `extent`, in units of the Gaussians' coordinates, and its training photos have `pixels` in all and
-    camera_positions [V, 3].
+    The training photos have `pixels` in all and camera_positions [V, 3], in the Gaussians' coordinates.
     """
     if config.densification.strategy == "adc":
-        return AdcStrategy.from_config(config, extent)
+        return AdcStrategy.from_config(config)
     return McmcStrategy.from_config(config, pixels, camera_positions)

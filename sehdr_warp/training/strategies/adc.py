@@ -25,28 +25,25 @@ class AdcStrategy(Strategy):
     removed. Opacities are reset now and then, so that only what is needed becomes opaque again.
 
     Attributes:
-        options: Thresholds.
-        extent: Extent of the scene that thresholds of size refer to.
+        options: Thresholds; those of size are in normalized units.
         reset_every: Iterations between resets.
         gradient_sum: Sum of the gradients of the projected means, [rows], in normalised screen units.
         visible_count: Number of photos in that sum, [rows].
     """
 
     options: AdcConfig = field(default_factory=AdcConfig)
-    extent: float = 1.0
     reset_every: int = 3000
     gradient_sum: Tensor | None = None
     visible_count: Tensor | None = None
 
     @staticmethod
-    def from_config(config: Config, extent: float) -> "AdcStrategy":
-        """Create the strategy of a config for a scene of an extent."""
+    def from_config(config: Config) -> "AdcStrategy":
+        """Create the strategy of a config."""
         return AdcStrategy(
             schedule=Schedule.from_config(config),
             cap_max=config.densification.cap_max,
             prune_opacity=config.densification.prune_opacity,
             options=config.adc,
-            extent=extent,
             reset_every=config.scaled(config.adc.reset_every),
         )
 
@@ -115,7 +112,7 @@ class AdcStrategy(Strategy):
         if int(selected.sum()) > room:
             first = gradient.topk(max(room, 0)).indices
             selected = torch.zeros_like(selected).index_fill_(0, first, True) & selected
-        small = gaussians.log_scales.amax(1) <= math.log(self.options.grow_scale3d * self.extent)
+        small = gaussians.log_scales.amax(1) <= math.log(self.options.grow_scale3d)
         return selected & small, selected & ~small
 
     @staticmethod
@@ -157,7 +154,7 @@ class AdcStrategy(Strategy):
         """Return a mask of rows that are neither transparent nor, if that counts, oversized."""
         good = torch.sigmoid(rows["opacity_logits"]) >= self.prune_opacity
         if oversized:
-            good &= rows["log_scales"].amax(1) <= math.log(self.options.prune_scale3d * self.extent)
+            good &= rows["log_scales"].amax(1) <= math.log(self.options.prune_scale3d)
         return good
 
     def reset_opacities(self, gaussians: Gaussians, optimizer: Optimizer | None) -> None:
