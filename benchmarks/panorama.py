@@ -26,7 +26,7 @@ from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.scene.hdr_files import read_hdr
 from sehdr_warp.synth.expose import ladder_of
-from sehdr_warp.training.plan import WIDEST
+from sehdr_warp.training.plan import PRUNE_NEAR_ANGLE
 from sehdr_warp.training.train import train
 
 from .results import finish, new_result
@@ -76,7 +76,7 @@ def main(
     result = new_result("panorama", torch.device(device), settings)
     result["command"] = "python -m benchmarks.panorama --work panorama_work --json docs/reports/results/panorama.json"
     # As the plan of photos has it where cameras look all around; on truth there is no plan.
-    config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": WIDEST})
+    config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": PRUNE_NEAR_ANGLE})
     is_trained = (work / "run" / "summary.json").is_file()
     run = load_run(work / "run", device=device) if is_trained else train(scene, work / "run", config, device=device)
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))

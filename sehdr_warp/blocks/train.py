@@ -106,7 +106,7 @@ def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
         if not (resume or overwrite):
             raise InputError(out, "exists and is not empty", "choose another, or use --resume or --overwrite")
         return resume
-    RunWriter(out).can_resume(resume=False, overwrite=overwrite)
+    RunWriter(out).prepare(resume=False, overwrite=overwrite)
     return False
 
 

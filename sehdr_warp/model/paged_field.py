@@ -18,7 +18,7 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..scene import Camera
 from .gaussians import PARAMETER_NAMES, Gaussians
-from .radiance_field import RadianceField, RenderedView, Surroundings
+from .radiance_field import DirectionalRender, RadianceField, RenderedView
 
 CELL = 1 << 16  # Gaussians of a cell
 DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its cell, standard deviations
@@ -106,7 +106,7 @@ class PagedField(RadianceField):
 
     def render_directions(
         self, position: np.ndarray, directions: Tensor, *, without: Sequence[Tensor] = (), **options: Any
-    ) -> Surroundings:
+    ) -> DirectionalRender:
         """Render along directions, as RadianceField.render_directions."""
         if any(len(index) for index in without):
             raise SehdrError("lights of a scene that does not fit into the GPU cannot be left out; use --device cpu")

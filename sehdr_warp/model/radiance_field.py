@@ -63,7 +63,7 @@ class RenderedView:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class DirectionalRender:
     """A rendered environment: a trained scene along given directions from one point, composited over black.
 
     Attributes:
@@ -182,9 +182,8 @@ class RadianceField(nn.Module):
         color_sets = {"fused": fused}
         if self.tone_map == "gaussian":
             needs_exposure = "exposure" in extra_images or ("base" in extra_images and self.fusion is None)
-            color_sets = {"encoded": self.response.encode_extended(fused * ratio)} | (
-                color_sets if needs_exposure else {}
-            )
+            encoded = {"encoded": self.response.encode_extended(fused * ratio)}
+            color_sets = encoded | color_sets if needs_exposure else encoded
         if "base" in extra_images and self.fusion is not None:
             color_sets["base"] = base
         features = (
@@ -244,7 +243,7 @@ class RadianceField(nn.Module):
         beyond: float = 0.0,
         without: Sequence[Tensor] = (),
         shares: Tensor | None = None,
-    ) -> Surroundings:
+    ) -> DirectionalRender:
         """Render along unit directions from a position.
 
         Args:
@@ -288,7 +287,8 @@ class RadianceField(nn.Module):
         colors = self.response.decode(colors.clamp(0, 1)) if encoded else colors
         distance, *confidence = (_unpremultiply(image[..., i], alpha) for i in range(3, image.shape[2]))
         confidence = confidence[0].clamp(0, 1) if confidence else None
-        return Surroundings(colors / self.base_time, alpha, distance * self.normalization.unit, confidence, clipped)
+        distance = distance * self.normalization.unit
+        return DirectionalRender(colors / self.base_time, alpha, distance, confidence, clipped)
 
     @torch.no_grad()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:

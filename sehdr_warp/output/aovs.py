@@ -17,7 +17,7 @@ from .exr import Part, as_data
 from .images import as_array
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ViewData:
         depth: [H, W] in the file's units, along the camera's axis; 0 where nothing is.
     """
 
-    run: "LoadedScene"
+    run: "RenderableScene"
     camera: Camera
     camera_in_file: Camera
     alpha: np.ndarray
@@ -80,7 +80,7 @@ def _clipped(view: ViewData) -> Channels:
     return {"clipped": _require_values(view.run, view.run.render_clipped(view.camera))}
 
 
-def _require_values(run: "LoadedScene", values) -> np.ndarray:
+def _require_values(run: "RenderableScene", values) -> np.ndarray:
     if values is None:
         raise SehdrError(f"{run.path}: its confidence was not measured; `sehdr-warp report` does, from the photos")
     return as_array(values)

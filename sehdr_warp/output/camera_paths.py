@@ -11,7 +11,7 @@ from sehdr_warp.scene import Camera
 from sehdr_warp.scene.gravity import looks_down, up_direction
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 Item = TypeVar("Item")
 
@@ -34,7 +34,7 @@ def evenly(items: Sequence[Item], count: int) -> list[Item]:
     return [items[i] for i in sorted({round(i) for i in np.linspace(0, len(items) - 1, count)})]
 
 
-def training_cameras(run: "LoadedScene") -> list[Camera]:
+def training_cameras(run: "RenderableScene") -> list[Camera]:
     """Return the training cameras of a scene."""
     return [entry.camera for entry in run.cameras if entry.split == "train"]
 

@@ -13,7 +13,7 @@ from .images import as_array
 from .light_pictures import photo_for_display, photo_light
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 _GREY = 0.3  # Display light at which what photos clip is shown
 
@@ -51,7 +51,7 @@ def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: 
     return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), -8, -1))
 
 
-def compare(run: "LoadedScene", view: View, views: Sequence[View]) -> Comparison:
+def compare(run: "RenderableScene", view: View, views: Sequence[View]) -> Comparison:
     """Render a view of a run and compare it with its photo; `views` are all views of the scene."""
     confidence, hdr, new = run.render_confidence(view.camera), as_array(run.render(view.camera).hdr), None
     others = [other.camera for other in views if other.name != view.name]

@@ -18,7 +18,7 @@ from .splat_edits import Box, Sphere
 from .world_transform import WorldTransform
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 MOST_VIEWS, _VIEW_SIZE = 40, 400  # Training views that are fused, and their longest side in pixels
@@ -39,7 +39,7 @@ class DepthView:
 
 
 def depth_views(
-    run: "LoadedScene", camera: Camera, transform: WorldTransform, size: int = _VIEW_SIZE
+    run: "RenderableScene", camera: Camera, transform: WorldTransform, size: int = _VIEW_SIZE
 ) -> list[DepthView]:
     """Render a camera's depth, at most `size` pixels long: one view of a pinhole, the faces of a wide camera.
 
@@ -55,7 +55,7 @@ def depth_views(
     ]
 
 
-def _depth_view(run: "LoadedScene", camera: Camera, transform: WorldTransform) -> DepthView:
+def _depth_view(run: "RenderableScene", camera: Camera, transform: WorldTransform) -> DepthView:
     rendered = run.render(camera)
     depth = np.where(as_array(rendered.alpha) > _LEAST_ALPHA, as_array(rendered.depth), 0) * transform.scale
     flat = np.ones(depth.shape, bool)

@@ -18,7 +18,7 @@ from .html import EMPTY, join, markup
 from .images import as_array, quantize
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 LINE, COLORS = "var(--line)", ("var(--accent)", "var(--cool)")  # Of style.css
 _MAP_VIEWS, _MAP_SIZE, _SAMPLES = 12, 640, 200
@@ -57,7 +57,7 @@ def training_svg(metrics: Sequence[Mapping]) -> Markup:
     return _svg(860, 280, "Held-out PSNR against training time", elements)
 
 
-def camera_map(run: "LoadedScene", tone_map: Any, names: Sequence[str] = ()) -> Markup:
+def camera_map(run: "RenderableScene", tone_map: Any, names: Sequence[str] = ()) -> Markup:
     """Draw the scene from above as its training photos show it, with training and held-out cameras, some with `names`.
 
     Returns SVG, empty if there are no cameras; `tone_map` converts radiance [N, 3] to sRGB.
@@ -112,7 +112,7 @@ def camera_map(run: "LoadedScene", tone_map: Any, names: Sequence[str] = ()) -> 
     return markup('<div class="map">{}</div>', _svg(round(width), round(height), "Cameras from above", elements))
 
 
-def _visible_points(cameras: Sequence[Camera], run: "LoadedScene", up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _visible_points(cameras: Sequence[Camera], run: "RenderableScene", up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points of the scene [N, 3] and their radiance, from small renders of some cameras.
 
     What lies higher than the cameras, such as a ceiling, is left out.

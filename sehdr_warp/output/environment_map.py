@@ -24,7 +24,7 @@ from .render_views import provenance
 from .world_transform import AXES, WorldTransform, describe, world_transform
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 LAYOUTS = ("latlong", "cube")
@@ -54,7 +54,7 @@ _FACES = np.array(
 
 
 def write_environment_map(
-    run: "LoadedScene",
+    run: "RenderableScene",
     path: Path | str,
     *,
     at: str | tuple[float, float, float] = "center",
@@ -189,7 +189,13 @@ class RenderedMap:
 
 
 def render_map(
-    run: "LoadedScene", position: np.ndarray, size: int, layout: str, to_scene: np.ndarray, focal: float, **options: Any
+    run: "RenderableScene",
+    position: np.ndarray,
+    size: int,
+    layout: str,
+    to_scene: np.ndarray,
+    focal: float,
+    **options: Any,
 ) -> RenderedMap:
     """Render an environment map in pixels as fine as the photos' and average them to the map's.
 
@@ -368,7 +374,7 @@ def subject_of_walk(photos: list[Camera]) -> np.ndarray | None:
 
 
 def _judge(
-    run: "LoadedScene", position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray
+    run: "RenderableScene", position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray
 ) -> None:
     """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is."""
     share = weight[alpha > COVERED].sum() / weight.sum()

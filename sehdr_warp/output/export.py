@@ -33,7 +33,7 @@ from .splat_edits import SplatEdits, most_visible, without_strays
 from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 KINDS = ("ldr", "hdr")
@@ -43,7 +43,7 @@ _WORDS = ((42.0, "no visible loss"), (36.0, "close copy"), (30.0, "small differe
 
 
 def export(
-    run: "LoadedScene",
+    run: "RenderableScene",
     path: Path | str,
     *,
     kind: str | None = None,
@@ -131,7 +131,7 @@ def export(
     return path
 
 
-def _gaussians_in_colors(run: "LoadedScene", color_model: str, time: float) -> GaussianArrays:
+def _gaussians_in_colors(run: "RenderableScene", color_model: str, time: float) -> GaussianArrays:
     """Return the Gaussians of a run in its own coordinates and in the colors of a file.
 
     Display colors are those of a photo of `time` seconds.
@@ -168,7 +168,7 @@ def loss_in_words(decibels: float) -> str:
     return "visible loss"
 
 
-def _log_loss(path: Path, run: "LoadedScene", gaussians: GaussianArrays, kind: str, time: float) -> None:
+def _log_loss(path: Path, run: "RenderableScene", gaussians: GaussianArrays, kind: str, time: float) -> None:
     """Measure and log how well Gaussians in the scene's own coordinates show the scene."""
     views = _cameras_to_compare(run)
     where = f"{len(views)} view{'s' * (len(views) != 1)}"
@@ -189,7 +189,12 @@ def _log_loss(path: Path, run: "LoadedScene", gaussians: GaussianArrays, kind: s
 
 
 def _log_file_loss(
-    path: Path, run: "LoadedScene", reference: GaussianArrays | None, to_file: WorldTransform, kind: str, time: float
+    path: Path,
+    run: "RenderableScene",
+    reference: GaussianArrays | None,
+    to_file: WorldTransform,
+    kind: str,
+    time: float,
 ) -> None:
     """Measure and log what a compressed file loses, read back, beside the scene or the edited Gaussians."""
     views = _cameras_to_compare(run)
@@ -207,13 +212,13 @@ def _log_file_loss(
     log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, beside, loss_in_words(decibels), size)
 
 
-def _cameras_to_compare(run: "LoadedScene") -> Sequence[Camera]:
+def _cameras_to_compare(run: "RenderableScene") -> Sequence[Camera]:
     held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
     views = held_out or [entry.camera for entry in run.cameras]
     return every_nth(views, _MAX_COMPARED)
 
 
-def _photo_renderer(run: "LoadedScene", time: float) -> Callable:
+def _photo_renderer(run: "RenderableScene", time: float) -> Callable:
     """Return a function that renders simulated photos, or light for a scene in a sensor's colors."""
     return _display_renderer(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
@@ -224,7 +229,7 @@ def _gaussians_renderer(gaussians: GaussianArrays, time: float) -> Callable:
     return lambda camera: field.render_ldr(camera, time)
 
 
-def _display_renderer(run: "LoadedScene", time: float) -> Callable:
+def _display_renderer(run: "RenderableScene", time: float) -> Callable:
     """Return a function that renders radiance at an exposure time, encoded by sRGB."""
     from ..response import response_by_name
 
@@ -232,7 +237,7 @@ def _display_renderer(run: "LoadedScene", time: float) -> Callable:
     return lambda camera: encode(run.render(camera).hdr * time)
 
 
-def _write_cameras(path: Path, run: "LoadedScene", transform: WorldTransform, overwrite: bool) -> None:
+def _write_cameras(path: Path, run: "RenderableScene", transform: WorldTransform, overwrite: bool) -> None:
     described = []
     for index, entry in enumerate(run.cameras):
         camera = transform.camera(entry.camera)

@@ -26,7 +26,7 @@ from .render_views import shared_tone_map
 from .tonemap import encode_srgb
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ TRANSFERS |= dict.fromkeys(LOG_CURVES, Transfer("prores_ks", "yuv444p10le", {"pr
 
 
 def write_film(
-    run: "LoadedScene",
+    run: "RenderableScene",
     out: Path | str,
     cameras: Sequence[Camera],
     *,

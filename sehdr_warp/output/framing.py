@@ -15,7 +15,7 @@ from .images import as_array
 from .world_transform import scene_up
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 FILM_SIZES = ((640, 360), (1280, 720), (1920, 1080))
@@ -42,7 +42,7 @@ def film_size(photos: Sequence[Camera]) -> tuple[int, int]:
     return next((size for size in FILM_SIZES if size[1] >= short), FILM_SIZES[-1])
 
 
-def subject_radius(run: "LoadedScene", photos: Sequence[Camera], focus: np.ndarray) -> float | None:
+def subject_radius(run: "RenderableScene", photos: Sequence[Camera], focus: np.ndarray) -> float | None:
     """Return the radius around the focus that holds most of what the photos look at; None if nothing is there."""
     distances = []
     reach = _REACH * float(np.median([np.linalg.norm(camera.position - focus) for camera in photos]))
@@ -66,7 +66,7 @@ def film_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:
     return replace(camera, width=width, height=height, fx=camera.fx * scale, fy=camera.fy * scale, cx=cx, cy=cy)
 
 
-def default_path(run: "LoadedScene", count: int, up: str | Sequence[float] | None = None) -> list[Camera]:
+def default_path(run: "RenderableScene", count: int, up: str | Sequence[float] | None = None) -> list[Camera]:
     """Return the path of `--cameras orbit`: around what the photos look at, or along them if they walk ahead.
 
     Args:
@@ -85,7 +85,7 @@ def default_path(run: "LoadedScene", count: int, up: str | Sequence[float] | Non
     return frame_subject(run, [film_camera(camera, photos) for camera in path], photos)
 
 
-def opening_view(run: "LoadedScene") -> Camera | None:
+def opening_view(run: "RenderableScene") -> Camera | None:
     """Return the camera that pages and the viewer open with; None without pinhole cameras.
 
     It stands where a photo was taken, in 16:9 and level, and looks at the middle of what the photos look at, with a
@@ -136,7 +136,7 @@ def _opening_of(
     return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
 
 
-def _share_shown(run: "LoadedScene", camera: Camera, witnesses: Sequence[Camera]) -> float:
+def _share_shown(run: "RenderableScene", camera: Camera, witnesses: Sequence[Camera]) -> float:
     """Return the share of a picture whose surface several other cameras have in their pictures."""
     points = _surface(run, camera)
     if not len(points):
@@ -147,7 +147,7 @@ def _share_shown(run: "LoadedScene", camera: Camera, witnesses: Sequence[Camera]
     return float((counts >= min(_SEVERAL, len(witnesses))).sum() / (camera.width * camera.height))
 
 
-def frame_subject(run: "LoadedScene", path: Sequence[Camera], photos: Sequence[Camera]) -> list[Camera]:
+def frame_subject(run: "RenderableScene", path: Sequence[Camera], photos: Sequence[Camera]) -> list[Camera]:
     """Return a path around the photos' focus whose pictures hold the whole subject and are not blocked.
 
     The lens opens until the sphere of subject_radius fits, to at most 75 degrees: up to twice the picture if photos
@@ -186,7 +186,7 @@ def _far_enough(path: Sequence[Camera], focus: np.ndarray, least: float) -> list
 
 
 def _in_front_of_obstacles(
-    run: "LoadedScene", path: Sequence[Camera], focus: np.ndarray, radius: float
+    run: "RenderableScene", path: Sequence[Camera], focus: np.ndarray, radius: float
 ) -> list[Camera]:
     """Return the cameras, moved towards the focus if what is near fills the middle of their pictures."""
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
@@ -216,7 +216,7 @@ def _in_front_of_obstacles(
     return [replace(camera, world_to_camera=np.linalg.inv(pose)) for camera, pose in zip(path, poses, strict=True)]
 
 
-def _focus_distance(run: "LoadedScene", cameras: Sequence[Camera]) -> float:
+def _focus_distance(run: "RenderableScene", cameras: Sequence[Camera]) -> float:
     """Return the median depth in a small render of the middle camera; 1 if it is empty."""
     if not cameras:
         return 1.0
@@ -225,7 +225,7 @@ def _focus_distance(run: "LoadedScene", cameras: Sequence[Camera]) -> float:
     return float(np.median(depth)) if depth.size else 1.0
 
 
-def _surface(run: "LoadedScene", camera: Camera) -> np.ndarray:
+def _surface(run: "RenderableScene", camera: Camera) -> np.ndarray:
     """Return points [N, 3] of the surface that a camera shows."""
     rendered = run.render(camera)
     depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)

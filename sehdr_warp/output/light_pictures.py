@@ -21,7 +21,7 @@ from .images import as_array, quantize
 from .tonemap import encode_srgb
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 MIDDLE_GREY = 0.18
 SPLIT = markup('<div class="split" style="left: 50%"></div>')
@@ -38,7 +38,7 @@ def display_gain(response: Any) -> float:
     return MIDDLE_GREY / grey if grey > 0 else 1.0
 
 
-def exposure_of_white(run: "LoadedScene", white: float | None) -> float:
+def exposure_of_white(run: "RenderableScene", white: float | None) -> float:
     """Return the seconds to multiply radiance by so that a file shows the photos' white as `white`; 1 for None.
 
     Raises:
@@ -59,7 +59,7 @@ def curve_table(response: Any) -> str:
     return base64.b64encode(np.asarray(values).astype("<f2").tobytes()).decode()
 
 
-def photo_light(run: "LoadedScene", view: View) -> np.ndarray:
+def photo_light(run: "RenderableScene", view: View) -> np.ndarray:
     """Return [H, W, 3] linear Rec.709 radiance that a photo alone gives: the run's response inverted."""
     light = np.asarray(run.response.decode(view.image), np.float32) / view.exposure_time
     if run.color_matrix is None:
@@ -67,14 +67,14 @@ def photo_light(run: "LoadedScene", view: View) -> np.ndarray:
     return as_array(rec709_of(torch.from_numpy(light), run.color_matrix, run.base_time))
 
 
-def photo_for_display(run: "LoadedScene", view: View) -> np.ndarray:
+def photo_for_display(run: "RenderableScene", view: View) -> np.ndarray:
     """Return [H, W, 3] in [0, 1] as a photo is looked at: encoded values, or the light of a RAW photo as sRGB."""
     if run.color_matrix is None:
         return view.image
     return encode_srgb(np.clip(photo_light(run, view) * view.exposure_time, 0, 1))
 
 
-def simulated_photo(run: "LoadedScene", exposure: np.ndarray) -> np.ndarray:
+def simulated_photo(run: "RenderableScene", exposure: np.ndarray) -> np.ndarray:
     """Return [H, W, 3] in [0, 1]: Rec.709 exposures as a photo of the run would show them (see photo_for_display)."""
     if run.color_matrix is None:
         return np.clip(run.response.encode(exposure), 0, 1)

@@ -17,7 +17,7 @@ from .images import as_array
 from .tonemap import LUMINANCE
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 UNIT_FILE = "light_unit.json"
@@ -45,7 +45,7 @@ class LightUnit:
         return f"a radiance of 1 is {self.luminance:.4g} cd/m^2 ({self.reading} at {x:g},{y:g} of {self.view})"
 
 
-def read_light_unit(run: "LoadedScene") -> LightUnit | None:
+def read_light_unit(run: "RenderableScene") -> LightUnit | None:
     """Return the unit that is kept with a run; None if there is none, for a file of Gaussians, or during a training.
 
     Raises:
@@ -64,14 +64,14 @@ def read_light_unit(run: "LoadedScene") -> LightUnit | None:
     return unit
 
 
-def luminance_of_one(run: "LoadedScene") -> float | None:
+def luminance_of_one(run: "RenderableScene") -> float | None:
     """Return cd/m^2 of a radiance of 1; None if it is not known."""
     unit = read_light_unit(run)
     return None if unit is None else unit.luminance
 
 
 def meter(
-    run: "LoadedScene",
+    run: "RenderableScene",
     view: str,
     pixel: tuple[float, float],
     *,

@@ -35,7 +35,7 @@ from .tonemap import encode_srgb
 from .world_transform import WorldTransform, describe, world_transform
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 SUFFIXES = (".obj", ".usda", ".usdc")
@@ -92,7 +92,7 @@ class ProxyMesh:
 
 
 def write_proxy_mesh(
-    run: "LoadedScene",
+    run: "RenderableScene",
     path: Path | str,
     *,
     resolution: int = 160,
@@ -155,7 +155,7 @@ def check_mesh(path: Path | str, resolution: int, crop: str | None, overwrite: b
 
 
 def proxy_mesh(
-    run: "LoadedScene", transform: WorldTransform, *, resolution: int = 160, region: Box | Sphere | None = None
+    run: "RenderableScene", transform: WorldTransform, *, resolution: int = 160, region: Box | Sphere | None = None
 ) -> ProxyMesh:
     """Return the mesh of a run in the coordinates that a transform leads to; arguments as in write_proxy_mesh."""
     cameras = training_cameras(run)
@@ -247,7 +247,7 @@ def mesh_depth(mesh: ProxyMesh, camera: Camera) -> np.ndarray:
     return np.where(np.isfinite(depth), depth, 0).reshape(camera.height, camera.width)
 
 
-def _log_agreement(mesh: ProxyMesh, run: "LoadedScene", transform: WorldTransform) -> None:
+def _log_agreement(mesh: ProxyMesh, run: "RenderableScene", transform: WorldTransform) -> None:
     """Compare the depth of mesh and scene in a few held-out views, and log it."""
     held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
     cameras = evenly(held_out or [entry.camera for entry in run.cameras], _CHECKED)
@@ -280,7 +280,7 @@ def _ground_line(ground: Ground, transform: WorldTransform) -> str:
     return f"{line}; --up={up} levels it, here and for render, export and envmap"
 
 
-def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "LoadedScene") -> None:
+def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "RenderableScene") -> None:
     """Write an OBJ file with vertex colors, in sRGB with the exposure of the photos."""
     colors = encode_srgb(np.clip(mesh.radiance * run.base_time, 0, 1))
     with path.open("w", encoding="utf-8") as file:
@@ -293,7 +293,7 @@ def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "Loa
             file.write("f {} {} {} {}\n".format(*(len(mesh.vertices) + 1 + np.arange(4))))
 
 
-def _write_usd(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "LoadedScene") -> None:
+def _write_usd(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "RenderableScene") -> None:
     """Write an OpenUSD layer; radiance is the displayColor of the mesh."""
     Usd, UsdGeom, Sdf, Vt, Gf = (pxr(name) for name in ("Usd", "UsdGeom", "Sdf", "Vt", "Gf"))
     stage = Usd.Stage.CreateNew(str(path))

@@ -34,7 +34,7 @@ from .tonemap import ToneMap, fit_tone_map
 from .world_transform import WorldTransform, describe, world_transform
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 SPLITS = ("train", "test", "all")
@@ -45,7 +45,7 @@ _LEAST_ALPHA = 0.01  # Mean coverage below which a picture counts as empty: stra
 
 
 def render_views(
-    run: "LoadedScene",
+    run: "RenderableScene",
     out: Path | str,
     *,
     cameras: str | Path = "test",
@@ -190,7 +190,7 @@ def _camera_files(views: Sequence[tuple[str, Camera]], transform: WorldTransform
     return files
 
 
-def shared_tone_map(run: "LoadedScene", cameras: Sequence[Camera]) -> ToneMap:
+def shared_tone_map(run: "RenderableScene", cameras: Sequence[Camera]) -> ToneMap:
     """Return one tone map for all pictures of some cameras, fitted to a few small renders."""
     return fit_tone_map([as_array(run.render(camera.within(_FIT_SIZE)).hdr) for camera in evenly(cameras, _FIT_VIEWS)])
 
@@ -258,7 +258,7 @@ def select_cameras(
             others = choices.replace(f"{text}, ", "")
             raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
     elif text in PATHS:
-        path = default_path(run, count, up) if text == "orbit" else _through_photos(run, count)
+        path = default_path(run, count, up) if text == "orbit" else _interpolated_path(run, count)
         digits = max(3, len(str(count - 1)))
         return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
     else:
@@ -275,13 +275,13 @@ def select_cameras(
     return list(zip(safe_names([name for name, _ in views]), [camera for _, camera in views], strict=True))
 
 
-def _through_photos(run: "LoadedScene", count: int) -> list[Camera]:
+def _interpolated_path(run: "RenderableScene", count: int) -> list[Camera]:
     """Return a path through the training cameras."""
     photos = training_cameras(run)
     return [film_camera(camera, photos) for camera in interpolate(photos, count)]
 
 
-def _from_file(run: "LoadedScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
+def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
     """Return the cameras of a file in the scene's own coordinates."""
     views = load_cameras(path)
     if path.suffix.lower() not in EXCHANGE_SUFFIXES:
@@ -295,7 +295,7 @@ def _from_file(run: "LoadedScene", path: Path, transform: WorldTransform | None)
     return [(name, back.camera(camera)) for name, camera in views]
 
 
-def provenance(run: "LoadedScene") -> dict[str, str]:
+def provenance(run: "RenderableScene") -> dict[str, str]:
     """Return where a picture came from, as text by key."""
     unit = read_light_unit(run)
     values = {"scene": run.scene_name, "iterations": run.iterations, "units": str(unit or "relative radiance")}

@@ -25,14 +25,14 @@ from .splat_edits import SplatEdits, most_visible, without_strays
 from .world_transform import world_transform
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 _HALF = float(np.finfo(np.float16).max)
 
 
 def write_scene_page(
-    run: "LoadedScene", path: Path | str, *, edits: SplatEdits | None = None, overwrite: bool = False
+    run: "RenderableScene", path: Path | str, *, edits: SplatEdits | None = None, overwrite: bool = False
 ) -> Path:
     """Write a run as one HTML file that any browser with WebGL2 shows; return the path.
 

@@ -16,7 +16,7 @@ from ..splats import GaussianArrays
 from .camera_paths import common_focus, training_cameras
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 LEAST_OPACITY = 1 / 255
@@ -112,7 +112,7 @@ class SplatEdits:
         regions = self.crop or self.cut or self.mask_views is not None
         return bool(regions or self.min_views or self.min_opacity > LEAST_OPACITY)
 
-    def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: "LoadedScene") -> np.ndarray:
+    def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: "RenderableScene") -> np.ndarray:
         """Return [N], which Gaussians stay.
 
         Args:
@@ -149,7 +149,7 @@ class SplatEdits:
         return mask
 
 
-def most_visible(mask: np.ndarray, count: int, run: "LoadedScene") -> np.ndarray:
+def most_visible(mask: np.ndarray, count: int, run: "RenderableScene") -> np.ndarray:
     """Return [N], which of the Gaussians that stay are the `count` that contribute most to the training views.
 
     Raises:

@@ -24,7 +24,7 @@ from ..splats import STREAMED_SOG
 from .camera_paths import common_focus, middle_index, training_cameras
 
 if TYPE_CHECKING:
-    from ..runs.run import LoadedScene
+    from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 AXES = ("upright", "scene")
@@ -100,7 +100,11 @@ class WorldTransform:
 
 
 def world_transform(
-    run: "LoadedScene", axes: str = "upright", *, up: str | Sequence[float] | None = None, scale: float | None = None
+    run: "RenderableScene",
+    axes: str = "upright",
+    *,
+    up: str | Sequence[float] | None = None,
+    scale: float | None = None,
 ) -> WorldTransform:
     """Return the transform from a scene's own coordinates to those of its files.
 
@@ -154,7 +158,7 @@ def world_transform(
     return WorldTransform(rotation, -factor * (rotation @ origin), factor)
 
 
-def scene_up(run: "LoadedScene", up: str | Sequence[float] | None = None) -> np.ndarray:
+def scene_up(run: "RenderableScene", up: str | Sequence[float] | None = None) -> np.ndarray:
     """Return the up direction [3] in the scene's own coordinates, as world_transform takes it; says nothing."""
     direction = _known_up(run, up, read_orientation(run))
     if direction is None and run.world_matrix is None and (cameras := training_cameras(run)):
@@ -162,7 +166,9 @@ def scene_up(run: "LoadedScene", up: str | Sequence[float] | None = None) -> np.
     return world_transform(run).rotation[1] if direction is None else direction
 
 
-def _known_up(run: "LoadedScene", up: str | Sequence[float] | None, orientation: "Orientation") -> np.ndarray | None:
+def _known_up(
+    run: "RenderableScene", up: str | Sequence[float] | None, orientation: "Orientation"
+) -> np.ndarray | None:
     """Return the up direction that is stated, kept with a run or was found at its training; None if there is none."""
     if up is not None:
         return read_direction(up)
@@ -212,7 +218,7 @@ class Orientation(NamedTuple):
     scale: float | None = None
 
 
-def read_orientation(run: "LoadedScene") -> Orientation:
+def read_orientation(run: "RenderableScene") -> Orientation:
     """Return the up direction and the scale that are kept with a run.
 
     Raises:
@@ -230,7 +236,7 @@ def read_orientation(run: "LoadedScene") -> Orientation:
     return Orientation(up, scale)
 
 
-def write_orientation(run: "LoadedScene", *, up: Sequence[float] | None = None, scale: float | None = None) -> Path:
+def write_orientation(run: "RenderableScene", *, up: Sequence[float] | None = None, scale: float | None = None) -> Path:
     """Keep an up direction [3], scene coordinates, and a scale, meters per unit, with a run; return the file.
 
     None leaves what is kept.

@@ -18,7 +18,7 @@ from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.lights import Light, find_lights
 from ..model.paged_field import PagedField
-from ..model.radiance_field import RadianceField, RenderedView, Surroundings
+from ..model.radiance_field import DirectionalRender, RadianceField, RenderedView
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure_compensation import ExposureCompensation
@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 MEMORY_SHARE = 0.8  # Largest part of a GPU's free memory that the Gaussians of a picture take
 
 
-class LoadedScene:
+class RenderableScene:
     """A scene to render: a Run, or Splats from a file of Gaussians.
 
     Radiance is linear Rec.709; simulated photos have the colors of the photos.
@@ -104,7 +104,7 @@ class LoadedScene:
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float, **more: Any
-    ) -> Surroundings:
+    ) -> DirectionalRender:
         """Render along unit directions [H, W, 3] from a position [3]; see RadianceField.render_directions."""
         rays = torch.tensor(directions, dtype=torch.float32, device=self.device)
         options = {"focal_length": focal_length, "pixel_angle": pixel_angle, "degree": self.degree, **more}
@@ -133,7 +133,7 @@ class LoadedScene:
         return None if share is None else self.field.render_mean(camera, share)
 
 
-class Splats(LoadedScene):
+class Splats(RenderableScene):
     """A file of Gaussians as a scene to render, re-expose and export. Its response is sRGB.
 
     Attributes:
@@ -182,7 +182,7 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
     return Splats(path, model, cameras, gaussians.world_matrix)
 
 
-class Run(LoadedScene):
+class Run(RenderableScene):
     """A trained scene.
 
     Attributes:

@@ -48,7 +48,7 @@ class RunWriter(RunFolder):
     """
 
     def __init__(self, path: Path | str):
-        """Name the files of a run; lock() and begin() create them."""
+        """Name the files of a run; prepare(), lock() and begin() create them."""
         super().__init__(path)
         self._lock = FileLock(self.path / _LOCK, thread_local=False)
         self._lock_identity: tuple[int, int] | None = None
@@ -81,8 +81,8 @@ class RunWriter(RunFolder):
                     (self.path / _LOCK).unlink()
                     self.path.rmdir()
 
-    def can_resume(self, *, resume: bool, overwrite: bool) -> bool:
-        """Return whether there is a run to continue, after finishing what a killed training had begun.
+    def prepare(self, *, resume: bool, overwrite: bool) -> bool:
+        """Finish what a killed training had begun here; return whether there is a run to continue.
 
         Raises InputError if the folder holds something other than a run, if neither resume nor overwrite was asked
         for, or if another training is at work in it.
@@ -98,7 +98,7 @@ class RunWriter(RunFolder):
             raise InputError(self.path, "exists and is not empty", "choose another, or use --resume or --overwrite")
         if any((self.path / name).is_dir() for name in (NEW, READY)):
             with self._locked():
-                self._settle()
+                self._finish_replacement()
         if resume:
             self.require()
         else:
@@ -139,7 +139,7 @@ class RunWriter(RunFolder):
             require_text(name)
         require_readable(data)
         self.lock()
-        self.can_resume(resume=False, overwrite=overwrite)  # Reading the photos took time.
+        self.prepare(resume=False, overwrite=overwrite)  # Reading the photos took time.
         info = {"scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
         info["normalization"] = field.normalization.to_dict()
@@ -173,13 +173,13 @@ class RunWriter(RunFolder):
             write_json(new.info, info)
             write_json(new.config, config.model_dump())
             new.write_checkpoint(*state, keep=1)
-        self._settle()
+        self._finish_replacement()
         self._hashes, self.checkpoint_hash = new._hashes, new.checkpoint_hash
 
-    def _settle(self) -> None:
+    def _finish_replacement(self) -> None:
         """Replace the run by a new one that is complete. Each step can be repeated after a kill."""
         new, ready = self.path / NEW, self.path / READY
-        self._hold()
+        self._check_lock()
         for folder in (new, ready):
             _refuse_foreign(folder)
         with writing(self.path):
@@ -196,7 +196,7 @@ class RunWriter(RunFolder):
                     os.replace(part, self.path / part.relative_to(ready))
                 shutil.rmtree(ready)
 
-    def _hold(self) -> None:
+    def _check_lock(self) -> None:
         """Raise SehdrError if the lock file was removed or replaced: another training may be at work here by now."""
         if self._lock.is_locked and _identity(self.path / _LOCK) != self._lock_identity:
             raise SehdrError(
@@ -209,23 +209,23 @@ class RunWriter(RunFolder):
 
     def extend(self, iterations: int) -> None:
         """Set more iterations for a training that goes on; its config and checkpoints stay as they are."""
-        self._hold()
+        self._check_lock()
         write_json(self.extension, {"iterations": iterations}, internal=True)
 
     def write_summary(self, values: dict) -> None:
         """Write times, memory and counts of the training; see SummaryValues."""
-        self._hold()
+        self._check_lock()
         write_json(self.summary, values, internal=True)
 
     def append_metrics(self, line: dict) -> None:
         """Add the figures of an evaluation; see MetricsValues."""
-        self._hold()
+        self._check_lock()
         with writing(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
     def rewind_metrics(self, iteration: int) -> None:
         """Remove the evaluations after an iteration, because a resumed training makes them again."""
-        self._hold()
+        self._check_lock()
         lines = [line for line in self.read_metrics() if line["iteration"] <= iteration]
         with atomic_path(self.metrics, internal=True) as beside:
             beside.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
@@ -238,7 +238,7 @@ class RunWriter(RunFolder):
         """
         from safetensors.torch import save
 
-        self._hold()
+        self._check_lock()
         final = self.checkpoints / f"iteration_{values['iteration']:08d}"
         try:
             self.checkpoint_hash = read_checkpoint(final).values["sha256"]

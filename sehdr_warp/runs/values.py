@@ -128,7 +128,6 @@ class SummaryValues(Values):
     device: Text = ""
     peak_memory_bytes: Count | None = None
     peak_gpu_memory_bytes: Count | None = None
-    plan: dict[str, Text] | None = None
     unexplained: UnexplainedValues | None = None
     brightness_offsets: dict[str, _Decibels] | None = None
 

@@ -165,7 +165,7 @@ def _train(args: Train, ranks=None) -> None:
     if out is not None:
         # What can be refused is refused before the photos are read, which may take minutes.
         folder = RunWriter(out)
-        if folder.can_resume(resume=output.resume, overwrite=output.overwrite):
+        if folder.prepare(resume=output.resume, overwrite=output.overwrite):
             resumed = folder
         elif output.resume:
             log.info("%s holds no run yet: a training begins there", out)

@@ -26,7 +26,7 @@ from ..scene.exposure_compensation import (
 from ..scene.normalization import normalization_of
 from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
-from .plan import Decision
+from .plan import COMPENSATION, Decision
 
 RESIZED_AT_ONCE = 8  # Photos that are resized in parallel
 POINTS, ROUGH_POINTS = 1500, 500  # Pixels to match for the fit, and for a rough one
@@ -207,7 +207,7 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     def no_drift(matcher: Matcher) -> Compensation:
         least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
         reason = "do not contradict the stated times" if times_stated else f"differ by less than {least}"
-        return Compensation(None, matcher, Decision("exposure-compensation", {}, "none", f"matched points {reason}"))
+        return Compensation(None, matcher, Decision({}, "none", f"matched points {reason}", COMPENSATION))
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=tuple(prefetch_map(at_matching_size, views, RESIZED_AT_ONCE)))
@@ -315,6 +315,4 @@ def _decision(compensation: ExposureCompensation, parts: Parts, times_stated: bo
         figures.append(f"{compensation.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
     choice = f"taken out of the photos{over if times_stated else ''}"
-    return Decision(
-        "exposure-compensation", {}, choice, f"matched points differ by {', '.join(figures)}", always_log=True
-    )
+    return Decision({}, choice, f"matched points differ by {', '.join(figures)}", COMPENSATION, always_log=True)

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from operator import attrgetter
-from typing import NamedTuple
 
 import torch
 
@@ -29,30 +28,19 @@ scene fits what moved between the photos and what their poses do not explain."""
 FEWEST_ITERATIONS = 4000
 CPU_SECONDS = 60.0  # Duration of a training on a CPU, if CPU_FEWEST iterations take no longer
 CPU_FEWEST = 1000
-WIDEST = 0.12  # mcmc.prune_near_angle if cameras look all around
-CPU_BUDGET = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
+PRUNE_NEAR_ANGLE = 0.12  # mcmc.prune_near_angle if cameras look all around
+CPU_CAP_DENSITY = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
 RATES_FOR = 30_000  # Length of the trainings that 3DGS's learning rates are for
 RATE_POWER, MAX_RATE_SCALE = 0.22, 2.5  # Rates of shorter trainings grow with this power, up to this factor
 SCALED_RATE_PHOTOS = 40  # Largest number of photos for that: scenes with 10 to 21 photos gain, with 52 and 84 lose
 SCALED_RATES = "means", "means_final", "log_scales", "opacity_logits", "harmonics_rest"
-REACH = 2.0**16  # Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white
+MAX_EXPOSURE_RATIO = (
+    2.0**16
+)  # Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white
+COMPENSATION = "exposure-compensation"  # Name of the decision that compensation.py adds
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
 DRIFT = 3.0  # Stops of brightness between photos that suggest an exposure that changed without being stated
-
-
-class Choice(NamedTuple):
-    """Result of a rule.
-
-    Attributes:
-        fields: Fields of the config, with their values.
-        summary: The choice in words.
-        reason: The figures it rests on.
-    """
-
-    fields: dict[str, object]
-    summary: str
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -60,17 +48,17 @@ class Decision:
     """A decision of the plan.
 
     Attributes:
-        name: Name of the rule.
-        fields: Fields of the config that change, with their values.
+        fields: Fields of the config that change, with their values; of a rule, those that it asks for.
         choice: The choice in words.
         reason: The figures it rests on.
+        name: Name of the rule; make_plan() fills it.
         always_log: Whether it is logged although it changes no field.
     """
 
-    name: str
     fields: dict[str, object]
     choice: str
     reason: str
+    name: str = ""
     always_log: bool = False
 
 
@@ -96,7 +84,7 @@ class Plan:
 
     def to_dict(self) -> dict:
         """Return plain values for plan.json and --json."""
-        decisions = [asdict(decision) for decision in self.decisions]
+        decisions = [{"name": decision.name, **asdict(decision)} for decision in self.decisions]
         return {"decisions": decisions, "kept": self.user_fields, "facts": asdict(self.facts)}
 
     def table(self) -> str:
@@ -114,7 +102,7 @@ class Plan:
         lines = [
             f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.always_log
         ]
-        compensated = any(row.name == "exposure-compensation" and row.always_log for row in self.decisions)
+        compensated = any(row.name == COMPENSATION and row.always_log for row in self.decisions)
         if self.facts.drift >= DRIFT and not compensated:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             lines.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
@@ -146,14 +134,14 @@ def make_plan(scene: Scene, config: Config, device: str | torch.device | None = 
     check_fields(scene, config)
     planned, decisions, overridden = config, [], {}
     for name, rule in RULES.items():
-        choice = rule(facts, planned, device)
-        overridden |= {path: attrgetter(path)(planned) for path in choice.fields if path in config.plan.keep}
+        decision = rule(facts, planned, device)
+        overridden |= {path: attrgetter(path)(planned) for path in decision.fields if path in config.plan.keep}
         changes = {
             path: new
-            for path, new in choice.fields.items()
+            for path, new in decision.fields.items()
             if path not in overridden and new != attrgetter(path)(planned)
         }
-        decisions.append(Decision(name, changes, choice.summary, choice.reason))
+        decisions.append(replace(decision, fields=changes, name=name))
         planned = override_config(planned, changes, f"{scene.name}: plan of {name}")
     planned = override_config(planned, {"plan.enabled": False}, scene.name)
     return Plan(planned, facts, tuple(decisions), overridden)
@@ -216,9 +204,10 @@ def check_fields(scene: Scene, config: Config) -> None:
             problem = f"{timed[0]} is a time and the photos state none"
             refuse("fusion.exposures", problem, "write multiples of their exposure (1/8x) or stops from it (-3ev)")
         for time in exposure_times(base, config.fusion.exposures):
-            if not 1 / REACH <= time / base <= REACH:
+            if not 1 / MAX_EXPOSURE_RATIO <= time / base <= MAX_EXPOSURE_RATIO:
                 problem = f"{time:.3g} s is {time / base:.3g} times the photos' {base:.3g} s"
-                refuse("fusion.exposures", problem, f"stay within 1/{REACH:.0f} and {REACH:.0f} times")
+                most = f"{MAX_EXPOSURE_RATIO:.0f}"
+                refuse("fusion.exposures", problem, f"stay within 1/{most} and {most} times")
     if {"loss.hdr_truth", "loss.linear_weight", "loss.hdr_weight"} & set(user_fields):
         largest_hdr_truth(scene, config.loss)
     if "densification.cap_max" in user_fields and config.densification.cap_max < points:
@@ -226,58 +215,58 @@ def check_fields(scene: Scene, config: Config) -> None:
         refuse("densification.cap_max", f"the scene starts from {points} points", remedy)
 
 
-def _response(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+def _response(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     name = config.response.name
     if facts.light_known:
-        return Choice({}, "no search", "the photos hold light itself")
+        return Decision({}, "no search", "the photos hold light itself")
     if name != "auto":
-        return Choice({}, "no search", "learned with the scene" if name == "learned" else f"response.name is {name}")
+        return Decision({}, "no search", "learned with the scene" if name == "learned" else f"response.name is {name}")
     origin = "files of a camera" if facts.from_camera else "files of unknown origin"
-    return Choice({}, "search", f"response.name is auto, {origin}: chosen from {facts.photos} photos")
+    return Decision({}, "search", f"response.name is auto, {origin}: chosen from {facts.photos} photos")
 
 
-def _light(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+def _light(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     if not (facts.unclipped and facts.truths == facts.photos and config.loss.ldr_weight):
         unneeded: dict[str, object] = (
             {} if facts.clipped else dict.fromkeys(("loss.clipped_smoothness", "loss.clipped_estimate"), 0.0)
         )
-        return Choice(
+        return Decision(
             unneeded,
             "from the photos",
             f"{facts.clipped:.1%} of the pixels are clipped",
         )
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
     reason = f"{facts.truths} float pictures hold all light: behind a photo's curve the brightest would hardly count"
-    return Choice(fields, "in the mu-law", reason)
+    return Decision(fields, "in the mu-law", reason)
 
 
-def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     darker, brighter = (2 if facts.clipped < 0.001 else 4), (2 if facts.black < 0.001 else 4)
     reason = (
         f"{facts.clipped:.1%} of the pixels clip, {facts.black:.1%} are black: look at -{darker} to +{brighter} EV "
         f"(render --evs=-{darker},0,{brighter}); brackets are computed at export, from one render"
     )
     if not config.fusion.enabled:
-        return Choice({}, "plain scaling", reason)
+        return Decision({}, "plain scaling", reason)
     unfused: dict[str, object] = {"fusion.enabled": False}
     unfused |= {} if config.loss.hdr_truth and facts.truths else {"loss.linear_weight": 0.0}
     reason = f"{len(config.fusion.exposures)} brackets of one base hold no light of their own; {reason}"
-    return Choice(unfused, "plain scaling", reason)
+    return Decision(unfused, "plain scaling", reason)
 
 
-def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     truths = f"{facts.truths} of {facts.photos} photos have HDR truth"
     if config.loss.linear_weight == 0:
-        return Choice({}, "none", f"loss.linear_weight = 0; {truths}")
+        return Decision({}, "none", f"loss.linear_weight = 0; {truths}")
     if config.loss.hdr_truth and facts.truths:
-        return Choice({}, "against truth", truths)
-    return Choice({"loss.linear_weight": 0.0}, "none", f"{truths}: against its own brackets a base learns nothing")
+        return Decision({}, "against truth", truths)
+    return Decision({"loss.linear_weight": 0.0}, "none", f"{truths}: against its own brackets a base learns nothing")
 
 
-def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     fields: dict[str, object] = {}
     if _is_short_of_time(facts, config, device) and "mcmc.cap_density" not in config.plan.keep:
-        fields = {"mcmc.cap_density": CPU_BUDGET}
+        fields = {"mcmc.cap_density": CPU_CAP_DENSITY}
         config = override_config(config, fields, "plan")
     options = config.densification
     most, density = mcmc_cap(config, facts.pixels), config.mcmc.cap_density
@@ -288,25 +277,25 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> C
         start = max(facts.points, start_count(config, facts.pixels))
         choice = f"mcmc, growing to at most {most} Gaussians" if start < most else "mcmc without growth"
         if facts.around:
-            fields["mcmc.prune_near_angle"] = WIDEST
+            fields["mcmc.prune_near_angle"] = PRUNE_NEAR_ANGLE
             reason += "; the cameras look all around from within, where wide Gaussians would veil them"
-        return Choice(fields, choice, f"{reason}; {start} to start with")
+        return Decision(fields, choice, f"{reason}; {start} to start with")
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.cap_max, max(most, 2 * facts.points))
     reason += f"; {facts.points} points to start from"
-    return Choice({"densification.cap_max": most}, f"{most} Gaussians", reason)
+    return Decision({"densification.cap_max": most}, f"{most} Gaussians", reason)
 
 
 def _is_short_of_time(facts: SceneFacts, config: Config, device: torch.device) -> bool:
     """Return whether a CPU lacks time for FEWEST_ITERATIONS of mcmc, unless the user set as many."""
     options, steps = config.densification, config.schedule.iterations
-    if device.type != "cpu" or options.strategy != "mcmc" or config.mcmc.cap_density <= CPU_BUDGET:
+    if device.type != "cpu" or options.strategy != "mcmc" or config.mcmc.cap_density <= CPU_CAP_DENSITY:
         return False
     set_by_user = "schedule.iterations" in config.plan.keep and steps >= FEWEST_ITERATIONS
     return not set_by_user and FEWEST_ITERATIONS * cpu_step_seconds(facts, config) > CPU_SECONDS
 
 
-def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     preset = config.schedule.iterations
     number = min(preset, math.ceil(max(FEWEST_ITERATIONS, STEPS_PER_PHOTO * facts.photos) / 100) * 100)
     bounds = f"at least {FEWEST_ITERATIONS}, at most {preset}" if preset > FEWEST_ITERATIONS else f"at most {preset}"
@@ -321,32 +310,32 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Choi
             reason = f"about {took} on a CPU with {thread_count()} threads; --iterations for more"
             if seconds > 2 * CPU_SECONDS:  # Of the fewest steps, then.
                 reason += ", --max-size for smaller photos and less time"
-    return Choice({"schedule.iterations": number}, f"{number}", reason)
+    return Decision({"schedule.iterations": number}, f"{number}", reason)
 
 
-def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     # Adam moves a parameter by its rate at most: of fewer steps each is to go farther.
     steps = config.schedule.iterations
     if facts.photos > SCALED_RATE_PHOTOS:
-        return Choice({}, "as they are", f"more than {SCALED_RATE_PHOTOS} photos")
+        return Decision({}, "as they are", f"more than {SCALED_RATE_PHOTOS} photos")
     scale = round(min(MAX_RATE_SCALE, max(1.0, (RATES_FOR / steps) ** RATE_POWER)), 2)
     usual = OptimizerConfig()
     as_usual = [name for name in SCALED_RATES if getattr(config.optimizer, name) == getattr(usual, name)]
     if scale == 1 or not as_usual:
-        return Choice({}, "as they are", f"{steps} steps")
+        return Decision({}, "as they are", f"{steps} steps")
     fields: dict[str, object] = {f"optimizer.{name}": float(f"{getattr(usual, name) * scale:.3g}") for name in as_usual}
-    return Choice(
+    return Decision(
         fields, f"{scale:g} times", f"learning rates are tuned for {RATES_FOR} steps; this training has {steps}"
     )
 
 
-def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Choice:
+def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     unsure = facts.clipped + facts.black
     reason = f"{unsure:.1%} of the pixels are clipped or black, and a point is visible in {facts.visibility:.1f} photos"
-    return Choice({}, "low in places" if unsure >= 0.001 or facts.visibility < 4 else "high throughout", reason)
+    return Decision({}, "low in places" if unsure >= 0.001 or facts.visibility < 4 else "high throughout", reason)
 
 
-RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Choice]] = {
+RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Decision]] = {
     "response": _response,
     "light": _light,
     "brackets": _brackets,

@@ -140,11 +140,9 @@ class RunOutput:
 
     def _write_summary(self, trainer: Trainer) -> None:
         """Write summary.json: times, memory and counts."""
-        decisions = self.folder.read_decisions()
         summary = {
             "iteration": trainer.iteration,
             "finished": trainer.iteration >= trainer.total,
-            "plan": {decision["name"]: decision["choice"] for decision in decisions} or None,
             "train_seconds": round(trainer.seconds, 3),
             "gaussians": trainer.field.gaussians.count,
             "skipped_steps": trainer.skipped_steps,

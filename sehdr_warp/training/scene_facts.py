@@ -43,7 +43,7 @@ class SceneFacts:
         drift: Approximate stops between the darkest and the brightest photo's median if no exposure times are known;
             else 0.
         view_alignment: Length of the mean viewing direction: 1 if all cameras look the same way.
-        ahead: Fraction of the cameras that look towards the middle of all.
+        inward_fraction: Fraction of the cameras that look towards the middle of all.
         light_known: Whether the photos hold light itself: RAW, linear, float.
         unclipped: Whether they are float pictures without clipping.
         plateau: Code of 255, below 255, at which the photos clip, as after an edit; 0 if they do not.
@@ -61,7 +61,7 @@ class SceneFacts:
     contrast: float
     drift: float
     view_alignment: float = 1.0
-    ahead: float = 1.0
+    inward_fraction: float = 1.0
     light_known: bool = False
     unclipped: bool = False
     plateau: int = 0
@@ -69,7 +69,7 @@ class SceneFacts:
     @property
     def around(self) -> bool:
         """True if cameras look all around from within, as in a room, and not at an object from its sides."""
-        return self.view_alignment < MAX_ALIGNMENT and self.ahead < MOST_AHEAD
+        return self.view_alignment < MAX_ALIGNMENT and self.inward_fraction < MOST_AHEAD
 
 
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
@@ -86,7 +86,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     read_views = every_nth(views, MOST_VIEWS)
     figures = np.array([_codes(view) for view in read_views])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
-    view_alignment, ahead = _viewing_directions(np.stack([view.camera.world_to_camera for view in views]))
+    view_alignment, inward_fraction = _viewing_directions(np.stack([view.camera.world_to_camera for view in views]))
     return SceneFacts(
         photos=len(photos),
         pixels=sum(view.camera.width * view.camera.height for view in photos),
@@ -100,7 +100,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         contrast=float(np.sqrt(max(square - mean**2, 0.0))),
         drift=0.0 if scene.exposure_times_known else float(np.ptp(figures[:, -1])),
         view_alignment=view_alignment,
-        ahead=ahead,
+        inward_fraction=inward_fraction,
         light_known=scene.light_known,
         unclipped=scene.light_known and all(view.source and kind_of(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
@@ -133,7 +133,7 @@ def _plateau(views: Sequence[View]) -> int:
 
 
 def _viewing_directions(poses: np.ndarray) -> tuple[float, float]:
-    """Return SceneFacts.view_alignment and .ahead of cameras [V, 4, 4]."""
+    """Return SceneFacts.view_alignment and .inward_fraction of cameras [V, 4, 4]."""
     forward = poses[:, 2, :3]
     positions = -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
     inwards = np.einsum("vi,vi->v", positions.mean(axis=0) - positions, forward)

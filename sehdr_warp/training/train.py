@@ -92,7 +92,7 @@ def create_trainer(
     if tensorboard:
         summary_writer()
     with oom_context(device, lambda: sizes_of(scene), TRAINING_REMEDY):
-        resumes = folder.can_resume(resume=resume, overwrite=overwrite)
+        resumes = folder.prepare(resume=resume, overwrite=overwrite)
         try:
             if resumes:
                 trainer = _resumed_trainer(

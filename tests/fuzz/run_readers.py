@@ -37,7 +37,7 @@ def make_config(folder: Path) -> None:
 PLAN = {"decisions": [{"name": "brackets", "choice": "plain scaling", "reason": "8 bits", "fields": {"seed": 3}}]}
 REGION = {"photo": "r_0", "pixels": 9, "column": 3.0, "row": 4.0, "stops": 1.5, "box": [1, 2, 3, 4]}
 SUMMARY = {"iteration": 10, "train_seconds": 2.0, "finished": True, "gaussians": 4, "device": "cpu (1 threads)"}
-SUMMARY |= {"plan": {"brackets": "plain"}, "unexplained": {"regions": 1, "photos": 1, "worst": [REGION]}}
+SUMMARY |= {"unexplained": {"regions": 1, "photos": 1, "worst": [REGION]}}
 
 
 def make_run(folder: Path) -> None:

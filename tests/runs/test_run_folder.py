@@ -55,7 +55,7 @@ def test_a_link_is_refused_even_to_a_sound_file(run, name):
         read_all(run)
     for how in ({"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}):
         with pytest.raises(InputError, match="is a link"):
-            RunWriter(run).can_resume(**how)
+            RunWriter(run).prepare(**how)
     assert files_in(run.parent) == before
 
 
@@ -71,7 +71,7 @@ def test_links_in_place_of_an_interrupted_write_move_nothing(run, name, place):
     before = files_in(run.parent)
     for act in (
         lambda: read_all(run),
-        lambda: RunWriter(run).can_resume(resume=True, overwrite=False),
+        lambda: RunWriter(run).prepare(resume=True, overwrite=False),
         lambda: RunWriter(run).lock(),
     ):
         with pytest.raises(InputError, match="is a link"):
@@ -89,7 +89,7 @@ def test_only_a_training_finishes_an_interrupted_write(run):
     shutil.move(other, run / ".new")
     before = files_in(run)
     assert read_all(run)[1] == SUMMARY and files_in(run) == before
-    assert RunWriter(run).can_resume(resume=True, overwrite=False)
+    assert RunWriter(run).prepare(resume=True, overwrite=False)
     assert not (run / ".new").exists() and RunFolder(run).read_summary() == {}
     load_run(run)
 
@@ -107,15 +107,15 @@ def test_another_programs_folder_of_that_name_is_left_alone(tmp_path):
     before = files_in(tmp_path)
     for how in ({"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}):
         with pytest.raises(InputError, match=r"thesis\.txt: is in the place of a new run"):
-            RunWriter(tmp_path).can_resume(**how)
+            RunWriter(tmp_path).prepare(**how)
     assert {name: text for name, text in files_in(tmp_path).items() if name != ".lock"} == before
 
 
 REGIONS = {"regions": 1, "photos": 1, "worst": [REGION]}
 WRONG_SUMMARIES = [
     {"device": [1]}, {"device": 5}, {"device": None}, {"device": "x" * 5000}, {"iteration": "1"}, {"iteration": -1},
-    {"iteration": 1.5}, {"train_seconds": "soon"}, {"train_seconds": -1.0}, {"gaussians": True}, {"plan": [1]},
-    {"plan": {"a": 1}}, {"unexplained": 5}, {"unexplained": []}, {"unexplained": {}},
+    {"iteration": 1.5}, {"train_seconds": "soon"}, {"train_seconds": -1.0}, {"gaussians": True},
+    {"unexplained": 5}, {"unexplained": []}, {"unexplained": {}},
     {"unexplained": REGIONS | {"regions": "<script>"}}, {"unexplained": REGIONS | {"photos": "<b>"}},
     {"unexplained": REGIONS | {"worst": 5}}, {"unexplained": REGIONS | {"worst": [None]}},
     {"unexplained": REGIONS | {"worst": [{}]}}, {"unexplained": REGIONS | {"worst": [REGION] * 10_001}},
@@ -211,7 +211,7 @@ def test_a_lock_that_was_removed_stops_the_writer(run):
 
 def test_resume_begins_where_nothing_was_begun(tmp_path):
     for folder in (tmp_path, tmp_path / "missing"):
-        assert not RunWriter(folder).can_resume(resume=True, overwrite=False)
+        assert not RunWriter(folder).prepare(resume=True, overwrite=False)
 
 
 def test_confidence_is_the_same_file_each_time(run):

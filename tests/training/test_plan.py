@@ -12,7 +12,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Camera, codes_of, look_at
-from sehdr_warp.training.plan import RULES, WIDEST, Decision, apply_plan, cpu_step_seconds, make_plan
+from sehdr_warp.training.plan import PRUNE_NEAR_ANGLE, RULES, Decision, apply_plan, cpu_step_seconds, make_plan
 from sehdr_warp.training.scene_facts import measure_scene
 from sehdr_warp.training.train import train
 
@@ -69,7 +69,7 @@ def test_wide_gaussians_move_where_cameras_look_all_around(scene, turned, aside,
         )
     plan = make_plan(replace(scene, views=views, points=scene.points * 0), config_of())
     assert plan.facts.around == around
-    assert plan.config.mcmc.prune_near_angle == (WIDEST if around else 0)
+    assert plan.config.mcmc.prune_near_angle == (PRUNE_NEAR_ANGLE if around else 0)
     assert ("all around" in plan.table()) == around
 
 
@@ -111,8 +111,8 @@ def test_clipped_light_is_left_out_where_none_is(facts, clipped):
 @pytest.mark.parametrize("points,choice", [(0, "at most 9406"), (3000, "at most 9406"), (10_000, "without growth")])
 def test_a_plan_says_whether_relocation_has_room(facts, points, choice):
     """120 times the square root of 6144 pixels; a scene starts with 20 times as many, if it has no more."""
-    _, chosen, reason = RULES["densification"](replace(facts, pixels=6144, points=points), config_of(), GPU)
-    assert choice in chosen and f"{max(points, 1568)} to start with" in reason
+    decision = RULES["densification"](replace(facts, pixels=6144, points=points), config_of(), GPU)
+    assert choice in decision.choice and f"{max(points, 1568)} to start with" in decision.reason
 
 
 def test_photos_that_clip_below_white_get_a_line(scene):
@@ -132,7 +132,7 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     for known, line_count in ((False, 1), (True, 0)):
         plan = make_plan(replace(drifting, exposure_times_known=known), config_of())
         with_gains = plan.with_decision(
-            Decision("exposure-compensation", {}, "taken out of the photos", "", always_log=True)
+            Decision({}, "taken out of the photos", "", "exposure-compensation", always_log=True)
         )
         for case, count in ((plan, line_count), (with_gains, 0)):
             lines = [line for line in case.lines() if "no exposure times" in line and "exposures.json" in line]
@@ -161,9 +161,9 @@ def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
     config, rule = config_of(), RULES["iterations"]
     small, large = (replace(facts, photos=200, pixels=200 * side * side) for side in (32, 2000))
     some, few, all_of_them = rule(small, config, CPU), rule(large, config, CPU), rule(small, config, GPU)
-    assert all_of_them[0] == {"schedule.iterations": 15_000} and few[0] == {"schedule.iterations": 1000}
-    assert "--max-size" in few[2] and "58 min on a CPU" in few[2]
-    assert 1000 < some[0]["schedule.iterations"] <= 15_000
+    assert all_of_them.fields == {"schedule.iterations": 15_000} and few.fields == {"schedule.iterations": 1000}
+    assert "--max-size" in few.reason and "58 min on a CPU" in few.reason
+    assert 1000 < some.fields["schedule.iterations"] <= 15_000
     assert cpu_step_seconds(large, config) > 50 * cpu_step_seconds(small, config)
 
 
@@ -171,10 +171,10 @@ def test_a_cpu_short_of_time_gets_half_the_gaussians_unless_steps_are_asked_for(
     monkeypatch.setattr("sehdr_warp.training.plan.thread_count", lambda: 2)
     large, rule = replace(facts, photos=18, pixels=18 * 200 * 200), RULES["densification"]
     named = config_of(schedule__iterations=4000, plan__keep=["schedule.iterations"])
-    assert rule(large, config_of(), CPU)[0] == {"mcmc.cap_density": 60.0}
-    assert "at most 50911" in rule(large, config_of(), CPU)[1]
+    assert rule(large, config_of(), CPU).fields == {"mcmc.cap_density": 60.0}
+    assert "at most 50911" in rule(large, config_of(), CPU).choice
     for case, config, device in ((facts, config_of(), CPU), (large, config_of(), GPU), (large, named, CPU)):
-        assert rule(case, config, device)[0] == {}
+        assert rule(case, config, device).fields == {}
 
 
 def test_brackets_of_one_base_become_a_scaling(scene):
@@ -260,11 +260,12 @@ def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):
     run = train(scene, tmp_path / "run", config, device="cpu")
     assert [decision["name"] for decision in run.folder.read_decisions()] == [*RULES, "exposure-compensation"]
     assert run.config == make_plan(scene, config).config
-    assert run.summary()["plan"]["brackets"] == "plain scaling"
+    choices = {decision["name"]: decision["choice"] for decision in run.decisions()}
+    assert choices["brackets"] == "plain scaling"
     # Asking again for the same plan resumes; without one the old plan goes with the old run.
     assert train(scene, tmp_path / "run", config, device="cpu", resume=True).iterations == 12
     unplanned = load_config("default", {"response.name": "srgb", "schedule.iterations": 2, "plan.enabled": False})
-    assert train(scene, tmp_path / "run", unplanned, device="cpu", overwrite=True).summary()["plan"] is None
+    train(scene, tmp_path / "run", unplanned, device="cpu", overwrite=True)
     assert not RunFolder(tmp_path / "run").plan.exists()
 
 

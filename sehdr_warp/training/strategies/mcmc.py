@@ -25,11 +25,11 @@ class RelocationSlots:
     """Rows to fill in a refinement: those of the dead Gaussians, then the new ones.
 
     Attributes:
-        numbers: [N] int32, position of each row in that order; negative for rows that stay.
+        of_row: [N] int32, slot of each row in that order; negative for rows that stay.
         changed: [N] bool, rows whose optimizer state is to be cleared, see moments_to_clear().
     """
 
-    numbers: Tensor
+    of_row: Tensor
     changed: Tensor
 
 
@@ -85,10 +85,10 @@ class McmcStrategy(Strategy):
         added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
         dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
-        numbers, dead_count = number_places(dead, added)
+        slot_of_row, dead_count = number_places(dead, added)
         gaussians.resize(count + added, optimizer)
-        slots = RelocationSlots(numbers, torch.zeros_like(numbers, dtype=torch.bool))
-        seeded = self.place_proposals(gaussians, slots, dead_count, added, count, propose)
+        slots = RelocationSlots(slot_of_row, torch.zeros_like(slot_of_row, dtype=torch.bool))
+        seeded = self.fill_proposals(gaussians, slots, dead_count, added, count, propose)
         self.relocate(gaussians, slots, opacities.masked_fill(dead, 0), seeded, dead_count, generator)
         if added > 0:
             self.sample_add(gaussians, slots, torch.maximum(dead_count, seeded), dead_count + added, added, generator)
@@ -117,7 +117,7 @@ class McmcStrategy(Strategy):
             growth = max(growth, min((self.cap_max / count) ** (1 / remaining) - 1, MAX_GROWTH))
         return max(count, min(self.cap_max, math.ceil((1 + growth) * count)))
 
-    def place_proposals(
+    def fill_proposals(
         self,
         gaussians: Gaussians,
         slots: RelocationSlots,
@@ -126,7 +126,7 @@ class McmcStrategy(Strategy):
         count: int,
         propose: Propose | None,
     ) -> Tensor:
-        """Fill the first places with seeded Gaussians; return their number, int64 []."""
+        """Fill the first slots with seeded Gaussians; return their number, int64 []."""
         fraction, none = self.options.seed_fraction, torch.zeros_like(dead_count)
         if propose is None or not fraction:
             return none
@@ -137,7 +137,7 @@ class McmcStrategy(Strategy):
         rows, seeded = propose(number, bound)
         values = list(gaussians.tensors().values())
         rows = [rows[name] for name in PARAMETER_NAMES]
-        copy_rows(values, rows, slots.numbers, none, seeded, changed=slots.changed)
+        copy_rows(values, rows, slots.of_row, none, seeded, changed=slots.changed)
         return seeded
 
     def relocate(
@@ -149,7 +149,7 @@ class McmcStrategy(Strategy):
         last: Tensor,
         generator: torch.Generator,
     ) -> None:
-        """Fill the places [first, last) of dead Gaussians with living ones, sampled by weights [N]."""
+        """Fill the slots [first, last) of dead Gaussians with living ones, sampled by weights [N]."""
         self._fill(gaussians, slots, weights, first, last, len(weights), generator)
 
     def sample_add(
@@ -161,8 +161,8 @@ class McmcStrategy(Strategy):
         bound: int,
         generator: torch.Generator,
     ) -> None:
-        """Fill the places [first, last) of new Gaussians, at most `bound`, with others sampled by opacity."""
-        weights = gaussians.opacities().masked_fill_(slots.numbers >= first, 0)
+        """Fill the slots [first, last) of new Gaussians, at most `bound`, with others sampled by opacity."""
+        weights = gaussians.opacities().masked_fill_(slots.of_row >= first, 0)
         self._fill(gaussians, slots, weights, first, last, bound, generator)
 
     def _fill(
@@ -175,7 +175,7 @@ class McmcStrategy(Strategy):
         bound: int,
         generator: torch.Generator,
     ) -> None:
-        """Copy Gaussians sampled by weights to the places [first, last), at most `bound`.
+        """Copy Gaussians sampled by weights to the slots [first, last), at most `bound`.
 
         The copies and their source share opacity and size so that the image stays (3DGS-MCMC, equation 9).
         """
@@ -188,7 +188,7 @@ class McmcStrategy(Strategy):
         share_opacities(logits, log_scales, copies, least=self.prune_opacity)
         values = list(gaussians.tensors().values())
         # As in the authors' code, relocated Gaussians keep their Adam state, and only their sources lose it.
-        copy_rows(values, values, slots.numbers, first, last, samples=sampled)
+        copy_rows(values, values, slots.of_row, first, last, samples=sampled)
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
