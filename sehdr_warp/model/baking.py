@@ -19,7 +19,7 @@ from ..progress import stage, track_progress
 from ..response import response_by_name
 from ..scene import Camera
 from ..scene.normalization import Normalization
-from ..splats.arrays import HARMONIC_0, GaussianArrays, evaluate_colors, harmonic_basis
+from ..splats.arrays import HARMONIC_0, GaussianArrays, colors_of_basis, harmonic_basis
 from .adam import Adam
 from .color_models import rec709_of
 from .gaussians import Gaussians
@@ -34,7 +34,7 @@ RATES = {"harmonics_dc": 0.03, "harmonics_rest": 0.01, "opacity_logits": 0.3}
 # For a fit: more than three directions for each of the 16 coefficients of degree 3, and the sphere's whole weight
 # against 1 for all the cameras together; more cameras than these only cost time.
 _SPHERE_DIRECTIONS, _SPHERE_WEIGHT, _MAX_CAMERAS = 64, 0.05, 48
-_CHUNK = 4096
+_CHUNK = 1024
 
 Colors = Callable[[np.ndarray], np.ndarray]
 
@@ -200,8 +200,8 @@ def bake(gaussians: GaussianArrays, change: Colors, color_model: str, camera_pos
             rays = part.means[:, None].astype(np.float64) - cameras
             rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12)
             directions = np.concatenate([np.broadcast_to(sphere, (len(rays), *sphere.shape)), rays], axis=1)
-            target = change(evaluate_colors(part, directions)) - offset
             basis = harmonic_basis(directions, gaussians.degree)
+            target = change(colors_of_basis(part, basis)) - offset
             weighted = (basis * weights[:, None]).swapaxes(1, 2)
             fitted[rows] = np.linalg.solve(weighted @ basis, weighted @ target)
             progress.update(rows.stop)

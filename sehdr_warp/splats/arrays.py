@@ -184,17 +184,27 @@ def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return [..., (degree + 1)^2] float64 real spherical harmonics of unit directions [..., 3].
 
     They are orthonormal over the sphere, with the Condon-Shortley phase and in the order of 3D Gaussian Splatting: l =
-    0, 1, ..., and m = -l ... l.
+    0, 1, ..., and m = -l ... l. The degree is 0 to 3.
     """
-    from scipy.special import sph_harm_y
-
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
-    polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
-    basis = []
-    for order in range(degree + 1):
-        for m in range(-order, order + 1):
-            value = sph_harm_y(order, abs(m), polar, azimuth)
-            basis.append(value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag))
+    basis = [np.full_like(x, HARMONIC_0)]
+    if degree > 0:
+        c = math.sqrt(3 / (4 * math.pi))
+        basis += [-c * y, c * z, -c * x]
+    if degree > 1:
+        c = math.sqrt(15 / (4 * math.pi))
+        basis += [c * x * y, -c * y * z, c / math.sqrt(12) * (3 * z * z - 1), -c * x * z, c / 2 * (x * x - y * y)]
+    if degree > 2:
+        a, b, c = (math.sqrt(factor / (32 * math.pi)) for factor in (35, 21, 210))
+        basis += [
+            -a * y * (3 * x * x - y * y),
+            2 * c * x * y * z,
+            -b * y * (5 * z * z - 1),
+            math.sqrt(7 / (16 * math.pi)) * z * (5 * z * z - 3),
+            -b * x * (5 * z * z - 1),
+            c * z * (x * x - y * y),
+            -a * x * (x * x - 3 * y * y),
+        ]
     return np.stack(basis, axis=-1)
 
 
@@ -213,7 +223,12 @@ def rotate_harmonics(harmonics: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 def evaluate_colors(gaussians: GaussianArrays, directions: np.ndarray) -> np.ndarray:
     """Return [N, D, 3] colors, as the color model defines them, for directions [D, 3] or [N, D, 3]."""
-    value = harmonic_basis(directions, gaussians.degree) @ gaussians.harmonics.astype(np.float64)
+    return colors_of_basis(gaussians, harmonic_basis(directions, gaussians.degree))
+
+
+def colors_of_basis(gaussians: GaussianArrays, basis: np.ndarray) -> np.ndarray:
+    """Return evaluate_colors() for the harmonic_basis() of the directions."""
+    value = basis @ gaussians.harmonics.astype(np.float64)
     if gaussians.color_model == "log":
         return np.exp(np.clip(value, -80, 80))
     return np.maximum(value + (0.5 if gaussians.color_model == "display" else 0.0), 0)
