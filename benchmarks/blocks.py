@@ -37,7 +37,7 @@ from sehdr_warp.process import calm_threads
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import config_from_dict, load_config, override_config
 from sehdr_warp.runs.load_arguments import LoadArguments
-from sehdr_warp.runs.open import load_photos
+from sehdr_warp.runs.open import load_saved_scene
 from sehdr_warp.runs.run import Run, load_run
 from sehdr_warp.runs.run_writer import RunWriter
 from sehdr_warp.scene import Camera, View
@@ -156,7 +156,7 @@ def run_study(study: Study) -> None:
     merge_blocks(study.out / "at_once", plan)
     run = load_run(study.out / "at_once", device=study.device)
     held_out = [entry.name for entry in run.cameras if entry.split == "test"]
-    views = load_photos({**data, "views": held_out}, response="srgb").views
+    views = load_saved_scene({**data, "views": held_out}, response="srgb").views
     figures = {"gaussians": run.gaussian_count, "seconds": max(end for _, end in spans.values())}
     peak = max(row["peak_memory_bytes"] or 0 for row in study.rows)
     errors = measure_seams(run, views, plan.division)
@@ -196,7 +196,7 @@ def _config(study: Study) -> Config:
 
 def _warm_up(study: Study, plan: BlockPlan, data: LoadArguments, config: Config) -> None:
     """Compile kernels before anything is timed."""
-    scene = load_photos({**data, "views": list(plan.blocks[0].views)[:12]}, response="srgb")
+    scene = load_saved_scene({**data, "views": list(plan.blocks[0].views)[:12]}, response="srgb")
     short = override_config(config, {"schedule.iterations": WARM_UP})
     create_trainer(scene, study.out / "warm", short, device=study.device, overwrite=True).train()
     if study.device.type == "cuda":
@@ -221,7 +221,7 @@ def _one_visible(device: torch.device) -> Iterator[None]:
 def _train_whole(data: LoadArguments, config: Mapping[str, Any], out: Path, device: str) -> None:
     """Train the whole survey, in a process of its own; its log has the time of steps."""
     logging.basicConfig(filename=out.with_suffix(".log"), level=logging.INFO, format="%(asctime)s %(message)s")
-    scene = load_photos(data, response="srgb")
+    scene = load_saved_scene(data, response="srgb")
     trainer = create_trainer(scene, out, config_from_dict(dict(config), "config"), device=device, overwrite=True)
     before = trainer.seconds
     for progress in trainer:

@@ -22,7 +22,7 @@ from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_from_dict, field_and_problem, override_config
 from ..runs.load_arguments import LoadArguments
-from ..runs.open import load_photos
+from ..runs.open import load_saved_scene
 from ..runs.values import DataValues, GainValues, NormalizationValues
 from ..scene import Scene, View
 from ..scene.exposure_compensation import ExposureCompensation
@@ -223,7 +223,7 @@ def make_block_plan(
     """
     _check(config, data)
     size = min(data.get("max_size") or LARGEST_SIDE, LARGEST_SIDE)
-    scene = load_photos(data | {"max_size": size}, response=config.response.name, **selection)
+    scene = load_saved_scene(data | {"max_size": size}, response=config.response.name, **selection)
     check_views(scene)
     response = response_for_training(scene, config)
     times = {view.name: view.exposure_time for view in scene.views}

@@ -9,7 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..errors import InputError, UsageError
-from ..runs.open import enclosing_run_response, load_run_photos_with_confidence, open_run
+from ..runs.open import enclosing_run_response, load_run_scene_with_confidence, open_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ def _evaluate_run(options: Evaluate) -> dict[str, Any]:
     from .evaluate import evaluate
 
     run = open_run(options.run, options.scene.device)
-    scene = load_run_photos_with_confidence(run, options.scene.data)
+    scene = load_run_scene_with_confidence(run, options.scene.data)
     return evaluate(run, scene, lpips_weights=options.result.lpips)
 
 

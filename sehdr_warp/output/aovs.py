@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError, did_you_mean
-from sehdr_warp.scene import Camera
-from sehdr_warp.scene.wide_camera import pixel_directions
-
+from ..errors import SehdrError, did_you_mean
+from ..scene import Camera
+from ..scene.wide_camera import pixel_directions
 from .exr import Part, as_data
 from .images import as_array
 

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Camera
-
+from ..errors import SehdrError
 from ..files import atomic_folder, atomic_path, write_json
 from ..model.exposure import Exposure, Items, read_exposures
+from ..scene import Camera
 from .colorspace import color_space, from_rec709
 from .exr import Part, check_finite, exr_header, rgb_channels, stored_pixel_type, write_exr, write_multipart_exr
 from .images import exposure_exif, quantize, safe_names, write_picture
@@ -113,8 +112,7 @@ def write_brackets(
     """
     brackets = Brackets(
         exposures=bracket_exposures(base_time, evs=evs, exposures=exposures),
-        base_time=base_time,
-        colorspace=colorspace,
+        header=PictureHeader(base_time, colorspace),
         pixel=pixel,
         multipart=multipart,
         ldr=ldr,
@@ -129,38 +127,58 @@ def write_brackets(
 
 
 @dataclass(frozen=True)
+class PictureHeader:
+    """EXR attributes that all pictures of a render share.
+
+    Attributes:
+        base_time: Seconds at 0 EV.
+        colorspace: Primaries of the EXR files.
+        captured: Local time.
+        provenance: Text by key.
+        luminance_of_one: cd/m^2 of a radiance of 1; None if it is not known.
+    """
+
+    base_time: float
+    colorspace: str = "rec709"
+    captured: datetime | None = None
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    luminance_of_one: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raise SehdrError for an unknown color space."""
+        color_space(self.colorspace)
+
+    def of(self, view: str, exposure_time: float, camera: Camera | None, **facts: str) -> dict[str, Any]:
+        """Return the EXR attributes of a picture."""
+        facts = {**self.provenance, **facts, "view": view, "baseExposureTime": repr(self.base_time)}
+        luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
+        return exr_header(self.colorspace, exposure_time, camera, self.captured, facts, luminance)
+
+
+@dataclass(frozen=True)
 class Brackets:
     """Options of exposure brackets, checked when they are set.
 
     Attributes:
         exposures: Ascending, as from bracket_exposures.
-        base_time: Seconds at 0 EV.
-        colorspace: Primaries of the EXR files.
+        header: EXR attributes of the pictures.
         pixel: "half" (float if half would overflow) or "float".
         multipart: One EXR file with all exposures of a view.
         ldr: One of LDR_FORMATS to add simulated photos through response.encode, or None.
         response: Camera response for ldr.
-        captured: Local time.
-        provenance: Text by key, for the EXR attributes.
         group_by: "view" or "exposure": what one folder holds. Folders by exposure hold image sequences.
-        luminance_of_one: cd/m^2 of a radiance of 1; None if it is not known.
     """
 
     exposures: tuple[Exposure, ...]
-    base_time: float
-    colorspace: str = "rec709"
+    header: PictureHeader
     pixel: str = "half"
     multipart: bool = False
     ldr: str | None = None
     response: Any = None
-    captured: datetime | None = None
-    provenance: Mapping[str, str] | None = None
     group_by: str = "view"
-    luminance_of_one: float | None = None
 
     def __post_init__(self):
         """Raise SehdrError for options that contradict each other."""
-        color_space(self.colorspace)
         stored_pixel_type((), self.pixel)
         if self.group_by not in ("view", "exposure"):
             raise SehdrError(f"group_by {self.group_by!r} is not one of view, exposure")
@@ -170,12 +188,6 @@ class Brackets:
             raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
         if self.ldr is not None and self.response is None:
             raise SehdrError("LDR brackets need a camera response; pass response, or leave out ldr")
-
-    def header(self, view: str, exposure_time: float, camera: Camera | None, **facts: str) -> dict[str, Any]:
-        """Return the EXR attributes of a picture."""
-        facts = {**(self.provenance or {}), **facts, "view": view, "baseExposureTime": repr(self.base_time)}
-        luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
-        return exr_header(self.colorspace, exposure_time, camera, self.captured, facts, luminance)
 
     @contextmanager
     def open(self, out: Path, overwrite: bool = False) -> Iterator["BracketWriter"]:
@@ -196,12 +208,12 @@ class Brackets:
                 "format": MANIFEST_FORMAT,
                 "software": "sehdr-warp",
                 "units": "relative scene-linear radiance times exposure_time (seconds)",
-                "color_space": self.colorspace,
-                "base_exposure_time": self.base_time,
+                "color_space": self.header.colorspace,
+                "base_exposure_time": self.header.base_time,
                 "multipart": self.multipart,
                 "response": getattr(self.response, "name", None),
                 "ldr": self.ldr,
-                "provenance": dict(self.provenance or {}),
+                "provenance": dict(self.header.provenance),
                 "views": writer.views,
             }
             write_json(manifest, described)
@@ -237,7 +249,7 @@ class BracketWriter:
         if radiance.shape[2:] != (3,):
             raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
         check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
-        linear = from_rec709(radiance, options.colorspace)
+        linear = from_rec709(radiance, options.header.colorspace)
         pixels = [linear * exposure.time for exposure in options.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
         pixel = stored_pixel_type(pixels, options.pixel)
@@ -245,10 +257,8 @@ class BracketWriter:
             log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)
         parts, entries = [], []
         for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
-            label, header = (
-                f"b{index}_{exposure.label}",
-                options.header(name, exposure.time, camera, ev=repr(exposure.ev)),
-            )
+            label = f"b{index}_{exposure.label}"
+            header = options.header.of(name, exposure.time, camera, ev=repr(exposure.ev))
             parts.append(Part(rgb_channels(image), header, label))
             place = f"{name}/{name}_{label}" if options.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if options.multipart else f"{place}.exr"
@@ -259,7 +269,7 @@ class BracketWriter:
                 write_exr(self.folder / file, parts[-1].channels, pixel=pixel, header=header)
             if options.ldr:
                 photo = f"{place}.{'jpg' if options.ldr == 'jpeg' else 'png'}"
-                exif = exposure_exif(exposure.time, bias=exposure.ev, captured=options.captured)
+                exif = exposure_exif(exposure.time, bias=exposure.ev, captured=options.header.captured)
                 codes = quantize(options.response.encode(radiance * exposure.time), 16 if options.ldr == "png16" else 8)
                 write_picture(self.photos / photo, codes, exif=exif)
                 entry["ldr_file"] = f"brackets_ldr/{photo}"

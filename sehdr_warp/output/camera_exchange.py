@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sehdr_warp.scene import Camera
-from sehdr_warp.scene.exchange_cameras import CHAN_ROTATION, USD_SIZE, USD_WORLD_MATRIX
-
+from ..scene import Camera
+from ..scene.exchange_cameras import CHAN_ROTATION, USD_SIZE, USD_WORLD_MATRIX
 from .world_transform import WorldTransform
 
 _APERTURE = 36.0  # Of a full-frame camera, mm: USD's lens lengths are relative to it

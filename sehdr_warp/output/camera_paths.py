@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Camera
-from sehdr_warp.scene.gravity import looks_down, up_direction
+from ..errors import SehdrError
+from ..scene import Camera
+from ..scene.gravity import looks_down, up_direction
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
+from ..errors import SehdrError
 
 # ITU-R BT.709-6: what is written unless asked otherwise needs no colour-science, which takes seconds to load.
 _REC709 = (0.640, 0.330, 0.300, 0.600, 0.150, 0.060, 0.3127, 0.3290)

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from ..arguments import parse_numbers, require_positive
 from ..errors import InputError, UsageError
 from ..files import check_absent
-from ..runs.open import load_run_photos_with_confidence, open_run, open_scene
+from ..runs.open import load_run_scene_with_confidence, open_run, open_scene
 from .options import WorldOptions, changed_flags
 
 log = logging.getLogger(__name__)
@@ -312,6 +312,6 @@ def run_report(args: Report) -> None:
 
     check_absent(args.out / "report.html", args.overwrite)
     run = open_run(args.run, args.device)
-    scene = load_run_photos_with_confidence(run, args.data)
+    scene = load_run_scene_with_confidence(run, args.data)
     for path in write_report(run, scene, args.out, overwrite=args.overwrite, evaluation=evaluate(run, scene)):
         print(path)

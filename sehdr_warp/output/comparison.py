@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sehdr_warp.scene import View
-
+from ..scene import View
 from .camera_paths import interpolate
 from .images import as_array
 from .light_pictures import photo_for_display, photo_light

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Camera
-from sehdr_warp.scene.wide_camera import face_cameras, face_size
-
+from ..errors import SehdrError
 from ..progress import track_progress
+from ..scene import Camera
+from ..scene.wide_camera import face_cameras, face_size
 from .images import as_array
 from .splat_edits import Box, Sphere
 from .world_transform import WorldTransform

@@ -10,8 +10,7 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
-from sehdr_warp.scene import Camera
-
+from ..scene import Camera
 from .camera_paths import evenly
 from .charts import PANELS, training_points
 from .html import EMPTY, join, markup

@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Camera
-
+from ..errors import SehdrError
 from ..files import check_absent
+from ..scene import Camera
 from .camera_paths import common_focus, training_cameras
 from .colorspace import color_space, from_rec709
 from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr, write_radiance
 from .images import as_array
-from .light_pictures import exposure_of_white
 from .light_shares import light_shares
 from .light_unit import EFFICACY, luminance_of_one
 from .render_views import provenance
+from .tonemap import exposure_of_white
 from .world_transform import AXES, WorldTransform, describe, world_transform
 
 if TYPE_CHECKING:

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.scene import Camera
-from sehdr_warp.scene.exposure import shutter
-
+from ..errors import InputError, SehdrError
 from ..files import atomic_path, check_absent
 from ..model.baking import agreement, field_of, gaussians_of, refine
 from ..runs.run import Splats
+from ..scene import Camera
+from ..scene.exposure import shutter
 from ..splats import (
     STREAMED_SOG,
     GaussianArrays,

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from sehdr_warp import __version__
-from sehdr_warp.errors import NOT_FINITE_REMEDY, InputError, SehdrError
-from sehdr_warp.scene import Camera
-
+from .. import __version__
+from ..errors import NOT_FINITE_REMEDY, InputError, SehdrError
 from ..files import atomic_path
+from ..scene import Camera
 from .colorspace import chromaticities, color_space
 from .images import EXIF_TIME
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sehdr_warp.scene import Camera
-
+from ..scene import Camera
 from .camera_paths import common_focus, evenly, look_at_pose, orbit, surround, training_cameras, walk, walk_path
 from .images import as_array
 from .world_transform import scene_up

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import math
 import zlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -12,10 +11,8 @@ import torch
 from markupsafe import Markup
 from PIL import Image
 
-from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import View
-
 from ..model.color_models import rec709_of
+from ..scene import View
 from .html import EMPTY, data_block, join, markup
 from .images import as_array, quantize
 from .tonemap import encode_srgb
@@ -23,31 +20,9 @@ from .tonemap import encode_srgb
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
 
-MIDDLE_GREY = 0.18
 SPLIT = markup('<div class="split" style="left: 50%"></div>')
 """The handle between two pictures."""
 CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
-
-
-def display_gain(response: Any) -> float:
-    """Return the factor from exposures of a response to display light that shows a photo's middle grey as middle grey.
-
-    It is 1 for an sRGB or linear camera.
-    """
-    grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
-    return MIDDLE_GREY / grey if grey > 0 else 1.0
-
-
-def exposure_of_white(run: "RenderableScene", white: float | None) -> float:
-    """Return the seconds to multiply radiance by so that a file shows the photos' white as `white`; 1 for None.
-
-    Raises:
-        SehdrError: For a white outside 0.001 to 10000.
-    """
-    exposure = 1.0 if white is None else white * run.base_time * display_gain(run.response)
-    if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
-        raise SehdrError(f"white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
-    return exposure
 
 
 def curve_table(response: Any) -> str:

@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sehdr_warp.errors import InputError, SehdrError, did_you_mean
-
+from ..errors import InputError, SehdrError, did_you_mean
 from ..files import read_json, write_json
 from .images import as_array
 from .tonemap import LUMINANCE

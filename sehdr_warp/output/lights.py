@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from sehdr_warp.errors import SehdrError
-
+from ..errors import SehdrError
 from ..files import atomic_path, check_absent
 from .camera_paths import training_cameras
 from .environment_map import COVERED, envmap, inpainted, latlong, map_center, render_map, solid_angles

@@ -6,7 +6,8 @@ import numpy as np
 
 from .html import duration, markup, page_file, whole_page
 from .images import as_array
-from .light_pictures import dial, display_gain
+from .light_pictures import dial
+from .tonemap import display_gain
 
 if TYPE_CHECKING:
     from ..runs.run import Run

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.files import read_bytes, read_text
-
+from ..errors import InputError, SehdrError
+from ..files import read_bytes, read_text
 from .colorspace import from_rec709
 
 _ROLE = "aces_interchange"

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.scene import Camera
-
+from ..errors import InputError, SehdrError
 from ..files import atomic_path, check_absent
 from ..progress import track_progress
+from ..scene import Camera
 from ..splats.usd import pxr
 from .camera_paths import evenly, training_cameras
 from .depth_fusion import (

@@ -11,26 +11,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sehdr_warp.errors import InputError, SehdrError, did_you_mean
-from sehdr_warp.scene import Camera, load_cameras
-from sehdr_warp.scene.exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
-from sehdr_warp.scene.images import MAX_PIXELS
-
+from ..errors import InputError, SehdrError, did_you_mean
 from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
 from ..progress import track_progress
+from ..scene import Camera, load_cameras
+from ..scene.exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
+from ..scene.images import MAX_PIXELS
 from .aovs import ViewData, data_parts, read_aovs
-from .brackets import Brackets, bracket_exposures
+from .brackets import Brackets, PictureHeader, bracket_exposures
 from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .camera_paths import evenly, interpolate, training_cameras
 from .colorspace import from_rec709
-from .exr import Part, rgb_channels, write_multipart_exr
+from .exr import Part, rgb_channels, stored_pixel_type, write_multipart_exr
 from .framing import default_path, film_camera
 from .images import as_array, quantize, safe_names, write_picture
-from .light_pictures import exposure_of_white
 from .light_unit import luminance_of_one, read_light_unit
 from .ocio import ocio_view
-from .tonemap import ToneMap, fit_tone_map
+from .tonemap import ToneMap, exposure_of_white, fit_tone_map
 from .world_transform import WorldTransform, describe, world_transform
 
 if TYPE_CHECKING:
@@ -109,23 +107,24 @@ def render_views(
     bracketed = evs is not None or exposures is not None
     if (multipart or ldr_brackets or group_by != "view") and not bracketed:
         raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
-    brackets = Brackets(
-        exposures=bracket_exposures(run.base_time, evs=evs, exposures=exposures) if bracketed else (),
-        base_time=run.base_time,
-        colorspace=colorspace,
-        pixel=pixel,
-        multipart=multipart,
-        ldr=ldr_brackets,
-        response=run.response,
-        captured=datetime.now().replace(microsecond=0),
-        provenance=provenance(run),
-        group_by=group_by,
-        luminance_of_one=luminance_of_one(run),
-    )
+    captured = datetime.now().replace(microsecond=0)
+    header = PictureHeader(run.base_time, colorspace, captured, provenance(run), luminance_of_one(run))
+    stored_pixel_type((), pixel)
+    brackets = None
+    if bracketed:
+        brackets = Brackets(
+            exposures=bracket_exposures(run.base_time, evs=evs, exposures=exposures),
+            header=header,
+            pixel=pixel,
+            multipart=multipart,
+            ldr=ldr_brackets,
+            response=run.response,
+            group_by=group_by,
+        )
     exposure = exposure_of_white(run, reference_white)
     if (ocio is None) != (view is None):
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
-    look = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
+    display_transform = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
     aovs = read_aovs(aovs) if aovs else ()
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
@@ -139,8 +138,8 @@ def render_views(
             stack.enter_context(atomic_path(out / name, overwrite)).write_text(text, encoding="utf-8")
         hdr_folder = stack.enter_context(atomic_folder(out / "hdr", overwrite))
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
-        bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if bracketed else None
-        tone_map = look or shared_tone_map(run, [camera for _, camera in views])
+        bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if brackets else None
+        tone_map = display_transform or shared_tone_map(run, [camera for _, camera in views])
         for index, (name, view_camera) in track_progress("rendering views", views, log):
             rendered, confidence = run.render(view_camera), run.render_confidence(view_camera)
             hdr = as_array(rendered.hdr)
@@ -148,13 +147,13 @@ def render_views(
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
             camera_in_file = transform.camera(view_camera)
             depth = as_array(rendered.depth) * np.float32(transform.scale)
-            header = brackets.header(name, exposure, camera_in_file, worldMatrix=describe(transform))
+            attributes = header.of(name, exposure, camera_in_file, worldMatrix=describe(transform))
             channels = rgb_channels(from_rec709(hdr, colorspace) * exposure)
             channels |= {"A": as_array(rendered.alpha), "Z": depth}
             if confidence is not None:
                 channels["confidence"] = as_array(confidence)
-            parts = [Part(channels, header, "rgba" if aovs else "")]
-            parts += data_parts(aovs, ViewData(run, view_camera, camera_in_file, channels["A"], depth), header)
+            parts = [Part(channels, attributes, "rgba" if aovs else "")]
+            parts += data_parts(aovs, ViewData(run, view_camera, camera_in_file, channels["A"], depth), attributes)
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
             write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Scene, View
-from sehdr_warp.scene.exposure import shutter
-
+from ..errors import SehdrError
 from ..files import atomic_path, check_absent
 from ..progress import track_progress
+from ..scene import Scene, View
+from ..scene.exposure import shutter
 from .camera_paths import evenly
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare, darker_stops

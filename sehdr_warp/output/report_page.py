@@ -7,20 +7,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from sehdr_warp import __version__
-from sehdr_warp.scene import Scene
-from sehdr_warp.scene.camera import limited_size
-from sehdr_warp.scene.exposure import shutter
-from sehdr_warp.scene.lens import area_average
-
+from .. import __version__
 from ..model.lights import Light
+from ..scene import Scene
+from ..scene.camera import limited_size
+from ..scene.exposure import shutter
+from ..scene.lens import area_average
 from .comparison import Comparison, darker_stops
 from .diagrams import camera_map, training_svg
 from .html import EMPTY, duration, join, markup, page_file, whole_page
 from .light_pictures import (
     SPLIT,
     dial,
-    display_gain,
     img,
     jpeg,
     jpeg_source,
@@ -29,7 +27,7 @@ from .light_pictures import (
     simulated_photo,
 )
 from .light_unit import luminance_of_one, read_light_unit
-from .tonemap import expose, fit_tone_map
+from .tonemap import display_gain, expose, fit_tone_map
 from .ultra_hdr import MOST_STOPS, ultra_hdr
 from .world_transform import WorldTransform, world_transform
 

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sehdr_warp.errors import InputError
-
+from ..errors import InputError
 from ..files import atomic_path, check_absent
 from ..model.baking import gaussians_of
 from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras, training_cameras
 from .framing import opening_view
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
-from .light_pictures import curve_table, display_gain
+from .light_pictures import curve_table
 from .splat_edits import SplatEdits, most_visible, without_strays
+from .tonemap import display_gain
 from .world_transform import world_transform
 
 if TYPE_CHECKING:

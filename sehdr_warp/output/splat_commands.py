@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import UsageError
-from ..runs.open import load_run_photos, open_run, open_scene
+from ..runs.open import load_run_scene, open_run, open_scene
 from .options import WorldOptions, changed_flags
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def _with_masks(edits: "SplatEdits", options: EditOptions, run: "Run | Splats") 
         return edits
     if not isinstance(run, Run):
         raise UsageError("--mask-only: needs a run and its photos; a file of Gaussians has none")
-    return replace(edits, mask_views=load_run_photos(run, options.data).views)
+    return replace(edits, mask_views=load_run_scene(run, options.data).views)
 
 
 def run_mesh(args: Mesh) -> None:

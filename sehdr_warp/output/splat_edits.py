@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene import Camera, View
-
+from ..errors import SehdrError
 from ..model.visibility import contributions, count_views, mask_shares
+from ..scene import Camera, View
 from ..scene.wide_camera import painted_mask
 from ..splats import GaussianArrays
 from .camera_paths import common_focus, training_cameras

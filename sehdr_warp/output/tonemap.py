@@ -5,13 +5,21 @@ white point found from the scene (Reinhard 2003). Scaling by luminance alone wou
 display's gamut, and mapping each channel alone would bleach them; the two are mixed by the display luminance.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import SehdrError
+
+if TYPE_CHECKING:
+    from ..runs.run import RenderableScene
+
 # ITU-R BT.709 luminance weights.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+MIDDLE_GREY = 0.18
 # Below this part of the brightest per cent, a pixel says nothing about the scene's key.
 _FLOOR = 1e-6
 # Reinhard 2003 uses the extremes; percentiles keep a lamp's filament from deciding the picture.
@@ -75,3 +83,24 @@ def encode_srgb(linear: np.ndarray) -> np.ndarray:
     """Encode display-linear values, limited to [0, 1], by IEC 61966-2-1; float32."""
     linear = np.clip(np.asarray(linear, np.float32), 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - np.float32(0.055))
+
+
+def display_gain(response: Any) -> float:
+    """Return the factor from exposures of a response to display light that shows a photo's middle grey as middle grey.
+
+    It is 1 for an sRGB or linear camera.
+    """
+    grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
+    return MIDDLE_GREY / grey if grey > 0 else 1.0
+
+
+def exposure_of_white(run: "RenderableScene", white: float | None) -> float:
+    """Return the seconds to multiply radiance by so that a file shows the photos' white as `white`; 1 for None.
+
+    Raises:
+        SehdrError: For a white outside 0.001 to 10000.
+    """
+    exposure = 1.0 if white is None else white * run.base_time * display_gain(run.response)
+    if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
+        raise SehdrError(f"white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
+    return exposure

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.scene import Camera
-from sehdr_warp.scene.gravity import is_pitch_known, typical_roll, up_direction
-
+from ..errors import InputError, SehdrError
 from ..files import read_json, write_json
+from ..scene import Camera
+from ..scene.gravity import is_pitch_known, typical_roll, up_direction
 from ..splats import STREAMED_SOG
 from .camera_paths import common_focus, middle_index, training_cameras
 

@@ -14,7 +14,7 @@ from ..errors import SehdrError
 
 REFERENCE_ITERATIONS = 30_000  # Length of a training, as in 3DGS, that iteration numbers of a config refer to
 
-Part = Annotated[float, Field(ge=0.0, le=1.0)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, le=100.0)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Iteration = Annotated[int, Field(ge=1, le=10**12)]
@@ -95,7 +95,7 @@ class LossConfig(_Table):
 
     form: Literal["sum", "blend"] = "sum"
     """sum: L1 + w (1 - SSIM), SeHDR; blend: (1 - w) L1 + w (1 - SSIM), 3DGS"""
-    ssim_weight: Part = 0.2
+    ssim_weight: Fraction = 0.2
     """w in the formulas of form"""
     ldr_weight: Weight = 1.0
     """weight of the photos; 0 disables"""
@@ -152,9 +152,9 @@ class McmcConfig(_Table):
     cap_density: Annotated[float, Field(ge=0.0, le=1e6)] = 120.0
     """largest number of Gaussians, as a multiple of the square root of the training photos' pixels; ignored if the
     training starts with more; 0 disables this cap"""
-    growth_rate: Part = 0.05
+    growth_rate: Fraction = 0.05
     """fraction of new Gaussians per change; more in a training too short to reach the cap at this rate"""
-    seed_fraction: Part = 0.2
+    seed_fraction: Fraction = 0.2
     """fraction of the relocated and new Gaussians that is placed where a photo is reproduced worst, at depths on which
     photos agree; 0 disables"""
     noise_lr: Annotated[float, Field(ge=0.0, le=1e12)] = 5e5

@@ -73,7 +73,7 @@ def open_scene(path: Path, device: str | None) -> Run | Splats:
     return open_run(path, device)
 
 
-def load_photos(data: LoadArguments, **options: Any) -> Scene:
+def load_saved_scene(data: LoadArguments, **options: Any) -> Scene:
     """Load the scene that saved arguments describe, and log its notes.
 
     Args:
@@ -91,7 +91,7 @@ def load_photos(data: LoadArguments, **options: Any) -> Scene:
     return scene
 
 
-def load_run_photos(run: Run, data: str | None) -> Scene:
+def load_run_scene(run: Run, data: str | None) -> Scene:
     """Load the photos of a run in the same way as for its training.
 
     Args:
@@ -109,14 +109,14 @@ def load_run_photos(run: Run, data: str | None) -> Scene:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).exists():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    return load_photos(run.data | {"path": place}, response=response_for_loading(run.config, run.response))
+    return load_saved_scene(run.data | {"path": place}, response=response_for_loading(run.config, run.response))
 
 
-def load_run_photos_with_confidence(run: Run, data: str | None) -> Scene:
-    """Load the photos of a run as load_run_photos does, and measure the run's confidence if it has none."""
+def load_run_scene_with_confidence(run: Run, data: str | None) -> Scene:
+    """Load the photos of a run as load_run_scene does, and measure the run's confidence if it has none."""
     from .run import ensure_confidence
 
-    scene = load_run_photos(run, data)
+    scene = load_run_scene(run, data)
     ensure_confidence(run, scene)
     return scene
 

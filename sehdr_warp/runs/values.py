@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from ..errors import InputError
 from ..files import UnreadableError, read_json, read_text
-from ..scene.exposure import LONGEST, SHORTEST
+from ..scene.exif import LONGEST, SHORTEST
 from ..scene.gravity import LEAST_UNIT, MOST_UNIT
 from .config_files import field_and_problem
 

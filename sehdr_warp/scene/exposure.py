@@ -10,21 +10,10 @@ from pathlib import Path, PurePosixPath
 from ..errors import InputError
 from ..files import read_bytes
 from .dataparser import ImageRecord
-from .exif import LONGEST, SHORTEST, ExifExposure, are_camera_jpegs, exif_exposure, exif_lens, parse_number
+from .exif import LONGEST, SHORTEST, ExifExposure, exif_exposure, parse_number
 from .images import PHOTO_SUFFIXES
 from .names import Listing, bases_of, folded
 
-__all__ = [
-    "LONGEST",
-    "SHORTEST",
-    "are_camera_jpegs",
-    "choose_exposure",
-    "exif_exposure",
-    "exif_lens",
-    "parse_seconds",
-    "shutter",
-    "with_exposure_times",
-]
 EXPOSURES = "exposures.json"
 _MOST_NAMED = 3
 

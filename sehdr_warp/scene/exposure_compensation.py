@@ -9,7 +9,7 @@ import numpy as np
 
 from ..parallel import prefetch_map
 from ..response import Response
-from .exposure import exif_lens
+from .exif import exif_lens
 from .photo_file import PhotoKeeper
 from .types import Scene, View, codes_of, encoded_values
 

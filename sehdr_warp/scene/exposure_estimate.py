@@ -7,7 +7,8 @@ import numpy as np
 
 from ..response import Response
 from ..subsets import every_nth
-from .exposure import LONGEST, SHORTEST, shutter
+from .exif import LONGEST, SHORTEST
+from .exposure import shutter
 from .exposure_compensation import initial_gains, point_light
 from .types import Scene, View
 

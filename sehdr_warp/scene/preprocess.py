@@ -2,7 +2,6 @@
 
 import logging
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -78,7 +77,8 @@ def preprocess(
             views.append(keeper.store(view))
     damaged = left_out(problems, len(names))
     training = [view for view in views if view.split == "train"] or views
-    deque(require_content(((view.codes, view.mask) for view in training), dataset.folder), maxlen=0)
+    for _ in checked_content(((view.codes, view.mask) for view in training), dataset.folder):
+        pass
     masks = mask_note(list(preprocessor.mask_shares.values()), len(preprocessor.labeled_masks))
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
@@ -86,7 +86,7 @@ def preprocess(
     return Scene(dataset.name, dataset.format, tuple(views), points, colors, times_known, notes, response=response)
 
 
-def require_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> Iterator[np.ndarray]:
+def checked_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> Iterator[np.ndarray]:
     """Yield the codes of photos, then refuse sets with less than one sample in a thousand between black and white.
 
     Args:

@@ -11,11 +11,11 @@ import numpy as np
 from ..errors import InputError
 from ..subsets import every_nth
 from .dataparser import DataparserOutputs
-from .exposure import are_camera_jpegs
+from .exif import are_camera_jpegs
 from .gain_map import MOST_STOPS_IN_CODES, has_gain_map, read_gain_map
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix
-from .preprocess import read_codes, require_content
+from .preprocess import checked_content, read_codes
 from .types import View
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def _select_for_dataset(dataset: DataparserOutputs, method: str, candidates: Seq
             yield photo
             del photo
 
-    photos = require_content(codes(), dataset.folder)
+    photos = checked_content(codes(), dataset.folder)
     files = [None if record.derived else record.image for record in records]
     return select_for_codes(photos, files, method, candidates)
 

@@ -144,12 +144,11 @@ def _placement(folder: Path) -> tuple[float, tuple[int, ...]]:
 def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Path], None]) -> Path:
     """Return the cached folder of a result, as cached_folder() does; solve(work, result) writes it.
 
-    `work` is a temporary folder beside the result, with an empty folder "model".
+    `work` is a temporary folder beside the result.
     """
 
     def fill(result: Path) -> None:
         with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=result.parent) as work:
-            (Path(work) / "model").mkdir()
             solve(Path(work), result)
 
     return cached_folder(cache, f"sfm-{key}", fill)

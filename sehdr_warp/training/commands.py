@@ -20,7 +20,7 @@ from ..errors import InputError, SehdrError, UsageError
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.load_arguments import LOAD_OPTIONS, LoadArguments
-from ..runs.open import load_photos, pick_device
+from ..runs.open import load_saved_scene, pick_device
 
 log = logging.getLogger(__name__)
 
@@ -181,7 +181,7 @@ def _train(args: Train, ranks=None) -> None:
             from .following import PhotoRequest
 
             ranks.request_photos(PhotoRequest(data, {"response": options.name, **selection}))
-        scene = load_photos(data, response=options.name, **selection)
+        scene = load_saved_scene(data, response=options.name, **selection)
         if out is None:
             from ..blocks import estimate
             from .plan import make_plan

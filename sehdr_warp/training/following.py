@@ -13,7 +13,7 @@ from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
 from ..runs.load_arguments import LoadArguments
-from ..runs.open import load_photos
+from ..runs.open import load_saved_scene
 from ..runs.run import exposure_compensation, field_from_checkpoint
 from ..runs.run_folder import describe_scene, scene_difference
 from ..scene import Scene, View
@@ -100,7 +100,7 @@ def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
     if reads:
         request: PhotoRequest = ranks.requested_photos()
         data = request.data if path is None else request.data | {"path": path}
-        scene = load_photos(data, **request.options)
+        scene = load_saved_scene(data, **request.options)
     shared: SharedTraining = ranks.broadcast_object()
     config = shared.config
     tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in shared.layout.items()}

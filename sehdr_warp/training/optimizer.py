@@ -239,10 +239,10 @@ class MovingAverage:
                 values.copy_(self.means[name])
             self.means = {}
 
-    def state(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return the averages for a checkpoint."""
         return self.means
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from the averages of state()."""
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from the averages of state_dict()."""
         self.means = state

@@ -159,15 +159,15 @@ class Ranks:
         Returns:
             What refine() returned on rank 0.
         """
-        self.reduce_to_leader(list(strategy.state(gaussians.count).values()))
+        self.reduce_to_leader(list(strategy.state_dict(gaussians.count).values()))
         changed = self.leads and refine()
-        values = [changed, gaussians.count, bool(strategy.state(gaussians.count))]
+        values = [changed, gaussians.count, bool(strategy.state_dict(gaussians.count))]
         values = torch.tensor(values, dtype=torch.int64, device=self.device)
         self.broadcast([values])
         changed, count, has_statistics = values.tolist()
         gaussians.resize(count, optimizer)
         if not has_statistics:
-            strategy.load_state({})
+            strategy.load_state_dict({})
         self.broadcast([*gaussians.tensors().values(), *optimizer.moments(gaussians.parameters())])
         return bool(changed)
 

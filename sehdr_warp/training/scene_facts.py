@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..scene import Scene, View, encoded_values
-from ..scene.exposure import are_camera_jpegs
+from ..scene.exif import are_camera_jpegs
 from ..scene.linear_photos import kind_of
 from ..scene.wide_camera import perspective_views
 from ..subsets import every_nth

@@ -323,7 +323,7 @@ class Trainer:
     def gather(self) -> None:
         """Gather statistics on rank 0 for a checkpoint; raise SehdrError if the ranks' Gaussians differ."""
         if self.ranks is not None:
-            self.ranks.reduce_to_leader(list(self.strategy.state(self.field.gaussians.count).values()))
+            self.ranks.reduce_to_leader(list(self.strategy.state_dict(self.field.gaussians.count).values()))
             self.ranks.check_equal(self.field.gaussians.tensors(), self.iteration)
 
     def timed(self, function: Callable[[], T]) -> T:

@@ -37,8 +37,8 @@ def state_of(trainer: Trainer) -> TrainingState:
         "fusion": {} if field.fusion is None else field.fusion.state_dict(),
         "response": field.response.state_dict() if isinstance(field.response, torch.nn.Module) else {},
         "optimizer": optimizer_tensors(trainer.optimizer, trainer.batch),
-        "densification": trainer.strategy.state(field.gaussians.count),
-        "average": trainer.average.state(),
+        "densification": trainer.strategy.state_dict(field.gaussians.count),
+        "average": trainer.average.state_dict(),
     }
     order, remaining = trainer.order.state()
     parts["generators"] = {"order": order, "device": trainer.generator.get_state()}
@@ -52,8 +52,8 @@ def load_state(trainer: Trainer, state: TrainingState) -> None:
     tensors, values, device = state.tensors, state.values, trainer.device
     load_optimizer_tensors(trainer.optimizer, under(tensors, "optimizer."), trainer.batch)
     statistics = {name: value.to(device) for name, value in under(tensors, "densification.").items()}
-    trainer.strategy.load_state(statistics)
-    trainer.average.load_state({name: value.to(device) for name, value in under(tensors, "average.").items()})
+    trainer.strategy.load_state_dict(statistics)
+    trainer.average.load_state_dict({name: value.to(device) for name, value in under(tensors, "average.").items()})
     if trainer.ranks is not None and not trainer.ranks.leads:  # The sum over the ranks counts them once.
         for total in statistics.values():
             total.zero_()

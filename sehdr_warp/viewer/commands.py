@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from ..runs.open import load_run_photos, open_scene
+from ..runs.open import load_run_scene, open_scene
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ def run_view(args: View) -> None:
     def photos(index: int) -> dict:
         if not isinstance(watch.scenes[index].run, Run):
             raise InputError(args.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
-        return {view.name: view for view in load_run_photos(watch.scenes[index].run, args.data).views}
+        return {view.name: view for view in load_run_scene(watch.scenes[index].run, args.data).views}
 
     return_memory()
     watch.start()

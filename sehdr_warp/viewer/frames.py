@@ -8,15 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sehdr_warp.scene import Camera
-
 from ..model.lights import Light
 from ..output.camera_paths import facts_of_cameras
 from ..output.framing import opening_view
-from ..output.light_pictures import curve_table, display_gain
+from ..output.light_pictures import curve_table
 from ..output.light_unit import luminance_of_one
 from ..output.splat_edits import SplatEdits
+from ..output.tonemap import display_gain
 from ..output.world_transform import world_transform
+from ..scene import Camera
 from .edits import EditedOpacities, LightGains
 from .scene_lock import SceneLock
 

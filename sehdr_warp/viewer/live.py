@@ -10,10 +10,9 @@ from typing import Any
 
 import torch
 
-from sehdr_warp.scene import Camera
-
 from ..errors import SehdrError
 from ..progress import format_seconds
+from ..scene import Camera
 from .frames import ViewerScene
 from .server import Server, Viewer
 

@@ -9,7 +9,7 @@ from PIL import Image
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
 from sehdr_warp.scene import Camera, Scene, View, look_at
 from sehdr_warp.scene.color_encoding import stated_encoding
-from sehdr_warp.scene.exposure import exif_exposure
+from sehdr_warp.scene.exif import exif_exposure
 from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
 from sehdr_warp.scene.gravity import find_up
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr

@@ -15,8 +15,9 @@ from sehdr_warp.output import film
 from sehdr_warp.output.colorspace import color_space
 from sehdr_warp.output.commands import FilmOptions, Render, ViewFileOptions, _ramp, run_render
 from sehdr_warp.output.film import encode, write_film
-from sehdr_warp.output.light_pictures import display_gain
+from sehdr_warp.output.render_views import shared_tone_map
 from sehdr_warp.output.splat_commands import Convert, Export, run_convert, run_export
+from sehdr_warp.output.tonemap import display_gain
 from sehdr_warp.own_files import LIST
 
 from .helpers import AnalyticRun
@@ -49,15 +50,14 @@ def smooth_run():
 )
 def test_a_film_holds_the_light_and_says_how(tmp_path, transfer, codec, tags):
     run, cameras = smooth_run()
-    decoded, context = frames(
-        write_film(run, tmp_path / "f.mov", cameras, transfer=transfer, exposed=True, fps=24000 / 1001)
-    )
+    decoded, context = frames(write_film(run, tmp_path / "f.mov", cameras, transfer=transfer, fps=24000 / 1001))
     assert decoded.shape == (5, 64, 96, 3) and context.name == codec
     assert (context.color_primaries, context.color_trc, context.colorspace) == tags
-    gain = run.base_time * display_gain(run.response)
+    gain, tone_map = run.base_time * display_gain(run.response), shared_tone_map(run, cameras)
     for picture, camera in zip(decoded, cameras, strict=True):
-        light = run.render(camera.resized(96, 64)).hdr * gain
-        assert np.abs(picture - encode(light, transfer)).mean() < 0.02
+        light = run.render(camera.resized(96, 64)).hdr
+        expected = tone_map(light) if transfer == "sdr" else encode(light * gain, transfer)
+        assert np.abs(picture - expected).mean() < 0.02
     if transfer == "hdr10":  # Clipped where SDR clips it is not: codes of white, and of the light above.
         assert encode(np.ones(3), "hdr10") == pytest.approx(0.581, abs=2e-3) and decoded.max() > 0.65
 
@@ -199,7 +199,7 @@ from tests.output.helpers import AnalyticRun
 from sehdr_warp.output.film import write_film
 run = AnalyticRun()
 cameras = [entry.camera.resized(34, 24) for entry in run.cameras] * 3
-write_film(run, {str(tmp_path / "f.mp4")!r}, cameras, transfer="hlg", exposed=True)
+write_film(run, {str(tmp_path / "f.mp4")!r}, cameras, transfer="hlg")
 """
     environment = {**os.environ, "LD_PRELOAD": checker, "MALLOC_CHECK_": "3", "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=False)

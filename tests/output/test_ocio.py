@@ -9,9 +9,9 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.colorspace import SPACES, from_rec709
-from sehdr_warp.output.light_pictures import display_gain
 from sehdr_warp.output.ocio import ocio_view
 from sehdr_warp.output.render_views import render_views
+from sehdr_warp.output.tonemap import display_gain
 from tests.ocio_config import ocio_config
 
 from .helpers import AnalyticRun

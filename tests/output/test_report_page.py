@@ -21,10 +21,11 @@ from PIL import Image
 
 from sehdr_warp import output
 from sehdr_warp.output.comparison import Comparison, darker_stops
-from sehdr_warp.output.light_pictures import dial, display_gain, jpeg, packed_light
+from sehdr_warp.output.light_pictures import dial, jpeg, packed_light
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report import write_report
 from sehdr_warp.output.report_page import smaller
+from sehdr_warp.output.tonemap import display_gain
 from sehdr_warp.output.world_transform import world_transform
 
 from ..viewer.browser import browser

@@ -14,10 +14,10 @@ def test_photos_of_a_folder_and_of_a_video_are_loaded_again(monkeypatch, tmp_pat
     place = tmp_path / name
     run = SimpleNamespace(data={"path": str(place)}, path=tmp_path / "run", config=Config(), response=None)
     with pytest.raises(InputError, match="no longer there|no longer here"):
-        opening.load_run_photos(run, None)
+        opening.load_run_scene(run, None)
     if name == "clip.mp4":
         place.write_bytes(b"")
     else:
         place.mkdir()
-    monkeypatch.setattr(opening, "load_photos", lambda data, **_: data["path"])
-    assert opening.load_run_photos(run, None) == str(place)
+    monkeypatch.setattr(opening, "load_saved_scene", lambda data, **_: data["path"])
+    assert opening.load_run_scene(run, None) == str(place)

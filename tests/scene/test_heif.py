@@ -9,7 +9,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene import heif
-from sehdr_warp.scene.exposure import exif_exposure
+from sehdr_warp.scene.exif import exif_exposure
 from sehdr_warp.scene.images import image_sizes, read_ldr
 from tests.make_scenes import load, write_blender
 

@@ -206,7 +206,7 @@ def test_limited_size():
 
 def test_photos_made_by_a_camera(tmp_path):
     """JPEGs that state an exposure; neither other JPEGs nor other files, nor a minority of them."""
-    from sehdr_warp.scene.exposure import are_camera_jpegs
+    from sehdr_warp.scene.exif import are_camera_jpegs
 
     tags = Image.Exif()
     tags.get_ifd(0x8769)[0x829D] = 8.0

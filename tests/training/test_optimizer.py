@@ -62,9 +62,9 @@ def test_the_mean_is_as_old_as_its_span(average):
         moving_average.update(iteration, 1, gaussians)
         if iteration < iterations:
             assert (gaussians.value == iteration).all()
-            assert bool(moving_average.state()) == (average > 0 and iteration >= begin)
+            assert bool(moving_average.state_dict()) == (average > 0 and iteration >= begin)
     age = iterations - float(gaussians.value[0])
-    assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not moving_average.state()
+    assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not moving_average.state_dict()
 
 
 def test_means_begin_when_the_count_stays():

@@ -61,7 +61,7 @@ def test_statistics_are_means_over_the_photos_that_show_it():
         rendering_with(gradient * float("nan"), torch.tensor([True, True])), 200, 100, torch.tensor(0.0)
     )
     strategy.accumulate(rendering_with(gradient, torch.tensor([True, False])), 200, 100, torch.tensor(1.0))
-    assert strategy.gradient_sum.tolist() == [600.0, 200.0] and strategy.visible_count.tolist() == [2.0, 1.0]
+    assert strategy.gradient_sum.tolist() == [600.0, 200.0] and strategy.photo_count.tolist() == [2.0, 1.0]
 
 
 def test_small_are_cloned_and_large_are_split():
@@ -102,13 +102,13 @@ def test_split_points_are_drawn_from_the_parent():
 def test_statistics_stay_where_recorded_steps_add_to_them():
     strategy, gaussians = adc_strategy(), cloud(4)
     observe(strategy, [1e-6] * 4)
-    held = strategy.gradient_sum, strategy.visible_count
+    held = strategy.gradient_sum, strategy.photo_count
     for iteration in (600, 14_900):  # The last change too: steps after it still add.
         strategy.refine(iteration, gaussians, adam(gaussians), torch.Generator().manual_seed(0))
         strategy.prepare(4, "cpu")
-        assert strategy.gradient_sum is held[0] and strategy.visible_count is held[1] and not torch.cat(held).any()
+        assert strategy.gradient_sum is held[0] and strategy.photo_count is held[1] and not torch.cat(held).any()
     strategy.prepare(6, "cpu")
-    assert strategy.visible_count.shape == (6,) and strategy.state(5)["seen"].shape == (5,)
+    assert strategy.photo_count.shape == (6,) and strategy.state_dict(5)["seen"].shape == (5,)
 
 
 def test_rotation_is_the_quaternions():

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.output.light_pictures import display_gain
 from sehdr_warp.output.notebook import run_html
-from sehdr_warp.output.tonemap import encode_srgb
+from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.scene import Camera
 
 from ..output.helpers import AnalyticRun, read_exr

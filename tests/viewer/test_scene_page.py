@@ -7,10 +7,9 @@ import pytest
 
 from sehdr_warp.errors import InputError, UsageError
 from sehdr_warp.output.images import as_array
-from sehdr_warp.output.light_pictures import display_gain
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.splat_commands import Export, run_export
-from sehdr_warp.output.tonemap import encode_srgb
+from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.scene import Camera
 from sehdr_warp.training.train import train
 

@@ -28,13 +28,13 @@ class AdcStrategy(Strategy):
         options: Thresholds; those of size are in normalized units.
         reset_every: Iterations between resets.
         gradient_sum: Sum of the gradients of the projected means, [rows], in normalised screen units.
-        visible_count: Number of photos in that sum, [rows].
+        photo_count: Number of photos in that sum, [rows].
     """
 
     options: AdcConfig = field(default_factory=AdcConfig)
     reset_every: int = 3000
     gradient_sum: Tensor | None = None
-    visible_count: Tensor | None = None
+    photo_count: Tensor | None = None
 
     @staticmethod
     def from_config(config: Config) -> "AdcStrategy":
@@ -55,16 +55,14 @@ class AdcStrategy(Strategy):
         """Allocate statistics; those of rows that exist already are copied."""
         if self.gradient_sum is None or len(self.gradient_sum) != rows:
             self.gradient_sum = _resized(self.gradient_sum, rows, device)
-            self.visible_count = _resized(self.visible_count, rows, device)
+            self.photo_count = _resized(self.photo_count, rows, device)
 
     @torch.no_grad()
     def accumulate(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
         """Add the norms of the gradients of the projected means, for the Gaussians that the photo shows."""
         gradients = rendering.means2d.grad
-        assert gradients is not None and self.gradient_sum is not None and self.visible_count is not None
-        add_gradient_statistics(
-            gradients, rendering.radii, usable, width, height, self.gradient_sum, self.visible_count
-        )
+        assert gradients is not None and self.gradient_sum is not None and self.photo_count is not None
+        add_gradient_statistics(gradients, rendering.radii, usable, width, height, self.gradient_sum, self.photo_count)
 
     @torch.no_grad()
     def refine(
@@ -78,7 +76,7 @@ class AdcStrategy(Strategy):
     ) -> bool:
         """Duplicate, split and remove Gaussians, and reset opacities, if this iteration is due."""
         changed = False
-        total, count = self.gradient_sum, self.visible_count
+        total, count = self.gradient_sum, self.photo_count
         if self.schedule.is_due(iteration, step_batch) and total is not None and count is not None:
             changed = True
             small, large = self._select(gaussians, (total / count.clamp_min(1))[: gaussians.count])
@@ -163,14 +161,14 @@ class AdcStrategy(Strategy):
         logits = gaussians.opacity_logits.clamp_max(math.log(opacity / (1 - opacity)))
         gaussians.overwrite({"opacity_logits": logits}, optimizer=optimizer)
 
-    def state(self, count: int) -> dict[str, Tensor]:
+    def state_dict(self, count: int) -> dict[str, Tensor]:
         """Return the gradient statistics of `count` Gaussians."""
-        statistics = {"gradient_sum": self.gradient_sum, "seen": self.visible_count}
+        statistics = {"gradient_sum": self.gradient_sum, "seen": self.photo_count}
         return {name: values[:count] for name, values in statistics.items() if values is not None}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue with the statistics of state()."""
-        self.gradient_sum, self.visible_count = state.get("gradient_sum"), state.get("seen")
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue with the statistics of state_dict()."""
+        self.gradient_sum, self.photo_count = state.get("gradient_sum"), state.get("seen")
 
 
 def sample_half(gaussians: Gaussians, parents: Tensor, generator: torch.Generator) -> dict[str, Tensor]:

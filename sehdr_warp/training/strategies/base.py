@@ -134,9 +134,9 @@ class Strategy:
             return count
         return max(count, min(self.cap_max, math.ceil(RESERVE_FACTOR * count)))
 
-    def state(self, count: int) -> dict[str, Tensor]:
+    def state_dict(self, count: int) -> dict[str, Tensor]:
         """Return the statistics of `count` Gaussians for a checkpoint."""
         return {}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue with the statistics of state()."""
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue with the statistics of state_dict()."""
