@@ -21,6 +21,7 @@ _DEEPEST = 3  # Levels of folders below a set in which a model is looked for
 _MOST_PLACES = 1000  # Folders of a level that are looked at
 _NO_MODELS = {"distorted", "images", "input"}  # `distorted` is of photos before COLMAP undistorted them
 _REMEDY = "export the model again with COLMAP"
+_KINDS = ((".bin", ".bin"), (".txt", ".txt"), (".bin", ".txt"), (".txt", ".bin"))  # Of cameras and images
 
 
 @dataclass(frozen=True)
@@ -128,15 +129,16 @@ def read_model(folder: Path) -> SparseModel:
     Raises:
         InputError: if a file is missing, empty, damaged or truncated, or holds impossible values.
     """
-    binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    camera_path, image_path = (folder / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images"))
+    camera_path, image_path = _model_files(folder)
     cameras: dict[int, Lens] = {}
-    for number, *lens in _cameras_binary(camera_path) if binary else _records(camera_path, "a camera", _camera):
+    in_binary = _cameras_binary(camera_path) if camera_path.suffix == ".bin" else None
+    for number, *lens in in_binary or _records(camera_path, "a camera", _camera):
         if number in cameras:
             raise InputError(camera_path, f"camera {number} is listed twice", _REMEDY)
         cameras[number] = Lens(*lens, source=camera_path)
     images: dict[str, ModelImage] = {}
-    for pose, number, name in _images_binary(image_path) if binary else _image_records(image_path):
+    in_binary = _images_binary(image_path) if image_path.suffix == ".bin" else None
+    for pose, number, name in in_binary or _image_records(image_path):
         if not name or len(os.fsencode(name)) > MAX_NAME_BYTES:
             problem = f"image name {name[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes"
             raise InputError(image_path, problem, "rename the image")
@@ -146,6 +148,22 @@ def read_model(folder: Path) -> SparseModel:
             raise InputError(image_path, f"image {name!r:.90} has camera {number}, which is not listed", _REMEDY)
         images[name] = ModelImage(name, cameras[number], pose_from_quaternion(pose[:4], pose[4:], image_path, name))
     return SparseModel(tuple(images.values()), read_points(folder))
+
+
+def _model_files(folder: Path) -> tuple[Path, Path]:
+    """Return the files of a model's cameras and images: both binary if possible, else both text, else what is there.
+
+    Raises:
+        InputError: if one of them is missing.
+    """
+    kinds = [(folder / f"cameras{one}", folder / f"images{two}") for one, two in _KINDS]
+    for pair in kinds:
+        if all(path.is_file() for path in pair):
+            return pair
+    names = sorted(path.name for path in {path for pair in kinds for path in pair} if path.is_file())
+    missing = "images" if any(name.startswith("cameras") for name in names) else "cameras"
+    problem = f"has {', '.join(names) or 'no model'}, but no {missing}.bin or {missing}.txt"
+    raise InputError(folder, problem, "copy the whole model")
 
 
 def read_points(folder: Path) -> PointCloud:

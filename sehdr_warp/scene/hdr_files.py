@@ -7,14 +7,14 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..errors import InputError
 from ..files import read_bytes
 from ..quiet import silent_output
-from .images import DAMAGED, MAX_PIXELS, check_size, require_file
+from .images import DAMAGED, MAX_PIXELS, check_size, kind_by_content, remedy_for_kind, require_file
 from .primaries import REC709, encoding_of_interop_id, matrix_to_rec709
 
 # OpenEXR allocates all pixels before it reads one. Its ZIP of a single color holds 500 pixels in a byte.
@@ -28,6 +28,25 @@ _RADIANCE = (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.333, 0.333)
 """Radiance's default primaries. Files that state them were mostly written by tools that mean Rec.709."""
 
 
+class Light(NamedTuple):
+    """A scene-linear picture.
+
+    Attributes:
+        pixels: [H, W, 3] float32 linear Rec.709, as read_hdr() returns them: over black, if alpha covers a part.
+        coverage: [H, W] float32 in [0, 1], 0 where nothing was rendered or photographed; None if all is covered.
+    """
+
+    pixels: np.ndarray
+    coverage: np.ndarray | None
+
+    @property
+    def uncovered(self) -> np.ndarray:
+        """[H, W, 3] light of what covers a pixel, whatever part of it that is."""
+        if self.coverage is None:
+            return self.pixels
+        return self.pixels / np.where(self.coverage > 0, self.coverage, np.float32(1))[:, :, None]
+
+
 def hdr_size(path: Path) -> tuple[int, int]:
     """Return (width, height) from the header alone.
 
@@ -37,6 +56,7 @@ def hdr_size(path: Path) -> tuple[int, int]:
     if path.suffix.lower() != ".hdr":
         return _exr_window(path, MAX_PIXELS)[1]
     require_file(path)
+    _require_magic(path, b"#?R", "a Radiance picture")
     with path.open("rb") as file:
         size = _radiance_header(file.read(_MAX_HEADER_BYTES), path)[:2]
     check_size(path, *size)
@@ -76,12 +96,19 @@ def read_hdr(path: Path) -> np.ndarray:
         InputError: if the file is missing, damaged or too large, states impossible colors, or a value is NaN or
             infinite (with its place).
     """
+    return read_light(path).pixels
+
+
+def read_light(path: Path) -> Light:
+    """Read scene-linear radiance as read_hdr(), and its coverage; raises as read_hdr()."""
+    coverage = None
     if path.suffix.lower() == ".hdr":
         hdr_size(path)
         pixels, primaries = _read_radiance(path)
     else:
         channels, header = read_exr_channels(path)
         pixels, primaries = _exr_colors(channels, header, path)
+        coverage = _coverage(channels, header, path)
     bad = ~np.isfinite(pixels)
     if bad.any():
         row, column, channel = (int(i) for i in np.argwhere(bad)[0])
@@ -92,7 +119,22 @@ def read_hdr(path: Path) -> np.ndarray:
         matrix = matrix_to_rec709(primaries)
     except ValueError as error:
         raise InputError(path, str(error), "correct the attribute, or remove it for Rec.709") from None
-    return pixels if np.array_equal(matrix, np.eye(3)) else (pixels @ matrix.T).astype(np.float32)
+    pixels = pixels if np.array_equal(matrix, np.eye(3)) else (pixels @ matrix.T).astype(np.float32)
+    return Light(pixels, coverage)
+
+
+def _coverage(channels: Mapping[str, np.ndarray], header: Mapping[str, Any], path: Path) -> np.ndarray | None:
+    """Return [H, W] float32 in [0, 1]: alpha, 0 outside of the data window; None if all is covered, or nothing."""
+    names = channels if {"Y", "RY", "BY"} <= set(channels) else _picture_layer(channels, path)
+    shape = next(iter(channels.values())).shape
+    alpha = np.clip(np.nan_to_num(names["A"]), 0, 1) if "A" in names else np.ones(shape, np.float32)
+    origin = header["displayWindow"][0]
+    low, high = (corner - origin for corner in header["dataWindow"])
+    inside = np.zeros(shape, bool)
+    inside[max(low[1], 0) : max(high[1] + 1, 0), max(low[0], 0) : max(high[0] + 1, 0)] = True
+    alpha = np.where(inside, alpha, 0).astype(np.float32)
+    # Some programs write an alpha of 0 everywhere.
+    return None if alpha.min() >= 1 or alpha.max() <= 0 else alpha
 
 
 def _exr_colors(
@@ -227,11 +269,21 @@ def _exr_file(path: Path, **options) -> Iterator:
     import OpenEXR
 
     require_file(path)
+    _require_magic(path, b"v/1\x01", "OpenEXR")
     try:
         with silent_output(), OpenEXR.File(str(path), **options) as file:
             yield file
     except (RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None
+
+
+def _require_magic(path: Path, magic: bytes, kind: str) -> None:
+    """Raise InputError with what a file is if it does not begin as its name says; unknown content is left to others."""
+    with path.open("rb") as file:
+        if file.read(len(magic)) == magic:
+            return
+    if content := kind_by_content(path):
+        raise InputError(path, f"is {content}, not {kind}", remedy_for_kind(content))
 
 
 def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -137,10 +137,9 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
             image = Image.open(path, formats=("HEIF",) if heif else _FORMATS)
             several = getattr(image, "is_animated", False) and image.format != "MPO" and not has_thumbnails(image)
         except PILLOW_ERRORS as error:
-            if kind := _kind_by_content(path):
-                raise InputError(
-                    path, f"is {kind}, which is not read as a photo", _REMEDIES.get(kind, _EXPORT)
-                ) from None
+            if kind := kind_by_content(path):
+                problem = f"is {kind}, which is not read as a photo"
+                raise InputError(path, problem, remedy_for_kind(kind)) from None
             kinds = f", which is one of {', '.join(_FORMATS)}" * (not heif)
             detail = kinds if "cannot identify" in str(error) else f" ({error})"
             raise InputError(path, f"is not a readable {'HEIC photo' if heif else 'image'}{detail}", DAMAGED) from None
@@ -159,7 +158,7 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
     return image
 
 
-def _kind_by_content(path: Path) -> str | None:
+def kind_by_content(path: Path) -> str | None:
     """Return in words what a file is that Pillow does not read, None if it is not known."""
     with path.open("rb") as file:
         head = file.read(1 << 16)
@@ -172,6 +171,11 @@ def _kind_by_content(path: Path) -> str | None:
     with suppress(*PILLOW_ERRORS):
         return describe_tiff(path)
     return None
+
+
+def remedy_for_kind(kind: str) -> str:
+    """Return what to do with a file that is not read under its name, by what kind_by_content() says of it."""
+    return _REMEDIES.get(kind, _EXPORT)
 
 
 def exif_of(image: Image.Image) -> Image.Exif:

@@ -18,7 +18,7 @@ from .color_encoding import DEVIATION, ColorEncoding
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .float_table import FloatTable
 from .gain_map import has_gain_map, light_of, read_gain_map, with_light_above_white
-from .hdr_files import hdr_size, read_hdr
+from .hdr_files import hdr_size, read_hdr, read_light
 from .images import EncodedImage
 from .lens import Lens, Undistortion, area_average
 from .linear_photos import float_codes, kind_of, linear_codes
@@ -80,6 +80,10 @@ def preprocess(
     for _ in checked_content(((view.codes, view.mask) for view in training), dataset.folder):
         pass
     masks = mask_note(list(preprocessor.mask_shares.values()), len(preprocessor.labeled_masks))
+    if preprocessor.transparent:
+        meaning = "are left out" if dataset.alpha == "mask" else "count as black light"
+        count = f"{len(preprocessor.transparent)} of {len(names)} photos"
+        masks.append(f"transparency: {count} have transparent pixels, which {meaning}")
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
     times_known = dataset.times_known
@@ -136,14 +140,17 @@ class _StoredPhoto(NamedTuple):
     encoding: ColorEncoding
 
 
-def _read_stored(record: ImageRecord, *, oriented: bool) -> _StoredPhoto:
+def _read_stored(record: ImageRecord, *, oriented: bool, masked: bool = False) -> _StoredPhoto:
+    """Read a photo; `masked` leaves float pictures without the black that their transparent parts lie over."""
     srgb, kind = ColorEncoding("sRGB"), kind_of(record.image)
     if record.derived:
         codes = codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8)
         return _StoredPhoto(EncodedImage(codes, None), srgb)
     if kind == "float":
-        codes = float_codes(read_hdr(record.image) * record.light_scale, record.seconds)
-        return _StoredPhoto(EncodedImage(codes, None), srgb)
+        light = read_light(record.image)
+        pixels = light.uncovered if masked else light.pixels
+        codes = float_codes(pixels * record.light_scale, record.seconds)
+        return _StoredPhoto(EncodedImage(codes, light.coverage if masked else None), srgb)
     photo, encoding = read_photo(record.image, oriented=oriented), record.encoding or srgb
     if record.gain_map or (kind == "encoded" and not record.linear and has_gain_map(record.image)):
         gain_map = read_gain_map(record.image, oriented=oriented)
@@ -166,6 +173,7 @@ class _Preprocessor:
         self._last: tuple[Lens, Undistortion] | None = None
         self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
         self.labeled_masks: set[Path] = set()
+        self.transparent: set[str] = set()  # Views whose photos have transparent pixels
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
 
     def view_or_error(self, record: ImageRecord, name: str) -> View | InputError:
@@ -210,7 +218,9 @@ class _Preprocessor:
             mask = _weighted(None if stored is None else warped(stored), camera)
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
-        photo, encoding = _read_stored(record, oriented=oriented)
+        photo, encoding = _read_stored(record, oriented=oriented, masked=self.alpha == "mask")
+        if photo.alpha is not None:
+            self.transparent.add(name)
         alpha, resized = photo.alpha, (camera.width, camera.height) != (lens.width, lens.height)
         averaged = undistortion is not None or resized or (alpha is not None and self.alpha != "mask")
         to_shared = getattr(self.response, "to_shared", None)  # Of a response whose channels differ

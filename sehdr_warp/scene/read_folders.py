@@ -78,9 +78,8 @@ def _folder_of(names: Sequence[str], folder: Path) -> Path | None:
 def read_colmap(folder: Path) -> DataparserOutputs:
     """Parse a COLMAP set: one record for each image of the model, in the natural order of the names."""
     model, source = _model(folder)
-    beside = (place for place in source.parents if place.is_relative_to(folder))  # dense/images is beside dense/sparse
-    images = image_folder(folder) or next(filter(None, map(image_folder, beside)), None)
-    images = images or _folder_of([image.name for image in model.images[:_LOOKED_FOR]], folder)
+    names = [image.name for image in model.images[:_LOOKED_FOR]]
+    images = _images_of_model(source, names, folder) or _folder_of(names, folder)
     if images is None and source == folder:
         raise InputError(folder, "is a COLMAP model without photos", "give the folder that holds it and images/")
     if images is None:
@@ -105,6 +104,17 @@ def read_colmap(folder: Path) -> DataparserOutputs:
     if absent:
         notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
     return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))
+
+
+def _images_of_model(source: Path, names: Sequence[str], folder: Path) -> Path | None:
+    """Return the folder of images nearest above a model that holds one of the names, else the nearest, else None.
+
+    Photos and undistorted copies may lie in one set: `images` belongs to `sparse`, `dense/images` to `dense/sparse`.
+    """
+    above = [place for place in source.parents if place.is_relative_to(folder)]
+    places = [place for place in map(image_folder, dict.fromkeys((*above, folder))) if place is not None]
+    holds = (place for place in places if any(find_image(place, name, source) for name in names))
+    return next(holds, next(iter(places), None))
 
 
 def is_hdr_gs(folder: Path) -> bool:

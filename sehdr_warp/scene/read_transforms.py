@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePath, PureWindowsPath
@@ -21,6 +22,8 @@ from .photos import left_out, photo_sizes
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
+_FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "FISHEYE")
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 
 
 def read_transforms(folder: Path) -> DataparserOutputs:
@@ -186,7 +189,7 @@ def _frame_record(
     if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
         hdr, image = image, photo
     lens = frame_lens(values, frame, image, path)
-    mask, time = frame.get("mask_path"), frame.get("exposure_time")
+    mask, time = frame.get("mask_path"), frame.get("exposure_time", values.get("exposure_time"))
     mask = None if mask is None else contained(folder, mask, path)
     time = None if time is None else parse_seconds(time, path, name)
     return ImageRecord(image.stem, image, lens, np.eye(4), exposure_time=time, split=split, mask=mask, hdr=hdr)
@@ -236,7 +239,8 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         return float(value)
 
     def focal(key: str, angle_key: str, length: float) -> Any:
-        angle = number(angle_key, 0.0)
+        # instant-ngp's x_fov and y_fov are in degrees.
+        angle = number(angle_key) or math.radians(number(f"{angle_key[-1]}_fov", 0.0))
         return number(key, 0.5 * length / math.tan(0.5 * angle) if 1e-9 < angle < math.pi else None)
 
     width, height = number("w"), number("h")
@@ -251,23 +255,36 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
     center = number("cx", width / 2), number("cy", height / 2)
     pinhole: tuple[Any, ...] = fy if fx is None else fx, fx if fy is None else fy, *center
-    k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model, bent = str(fields.get("camera_model") or "OPENCV").upper(), (k1, k2, p1, p2)
-    if model == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True:
-        model, bent = "OPENCV_FISHEYE", (k1, k2, k3, k4)
-    elif model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL"):
-        raise InputError(
-            path,
-            f"camera_model {fields['camera_model']!r:.40} is not supported",
-            "use OPENCV, OPENCV_FISHEYE, PINHOLE or EQUIRECTANGULAR",
-        )
-    elif k4:
-        raise InputError(path, f"k4 = {k4} of a perspective camera is not supported", "undistort the images first")
-    elif k3:
-        model, bent = "FULL_OPENCV", (*bent, k3, 0.0, 0.0, 0.0)
-    else:
-        model = "OPENCV"
+    model, bent = _distortion(fields, number, path)
     return Lens(model, int(width), int(height), (*pinhole, *bent), path)
+
+
+def _distortion(fields: dict, number: Callable[..., Any], path: Path) -> tuple[str, tuple[float, ...]]:
+    """Return the lens model of a frame and its parameters behind focal lengths and center.
+
+    Args:
+        fields: of the frame and the file.
+        number: returns the number of a field, or its second argument if there is none.
+        path: the file.
+
+    Raises:
+        InputError: for a model that is not supported, or parameters whose meaning the model does not say.
+    """
+    k1, k2, k3, k4, k5, k6, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))
+    model = str(fields.get("camera_model") or "OPENCV").upper()
+    if model in _FISHEYE or fields.get("is_fisheye") is True:
+        return "OPENCV_FISHEYE", (k1, k2, k3, k4)
+    if model not in _PERSPECTIVE:
+        problem = f"camera_model {fields['camera_model']!r:.40} is not supported"
+        raise InputError(path, problem, "use OPENCV, OPENCV_FISHEYE, PINHOLE or EQUIRECTANGULAR")
+    if model != "FULL_OPENCV" and (k4 or k5 or k6):
+        # nerfstudio counts k4 as one more term of the polynomial, OpenCV and COLMAP as the first of a quotient.
+        name, value = next(pair for pair in (("k4", k4), ("k5", k5), ("k6", k6)) if pair[1])
+        problem = f"{name} = {value} of camera_model {model} has no one meaning"
+        raise InputError(path, problem, "state camera_model FULL_OPENCV for OpenCV's, or undistort the images first")
+    if k3 or k4 or k5 or k6:
+        return "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, k5, k6)
+    return "OPENCV", (k1, k2, p1, p2)
 
 
 def _points(folder: Path, path: Path, values: dict) -> PointCloud:

@@ -9,7 +9,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -55,8 +55,14 @@ _LUMA = {
     6: (0.299, 0.114),
     7: (0.212, 0.087),
     9: (0.2627, 0.0593),
-    10: (0.2627, 0.0593),
 }
+# Matrix coefficients that are no luma and color differences of encoded values; FFmpeg does not convert them either.
+_OTHER_MATRICES = {8: "YCgCo", 10: "constant-luminance BT.2020", 11: "Y'D'zD'x", 12: "YCbCr of its own primaries",
+                   13: "constant-luminance YCbCr of its own primaries", 14: "ICtCp", 15: "IPT-C2", 16: "YCgCo-Re",
+                   17: "YCgCo-Ro"}  # fmt: skip
+_DOLBY_VISION = ("dvh1", "dvhe", "dva1", "dvav", "dav1")
+"""Codec tags of Dolby Vision. Without a stated curve the stream is profile 5, whose colors only Dolby's decoder knows;
+phones write profile 8, which is HLG."""
 _RGB_MATRIX = 0
 _FULL_RANGE = 2
 # What makers call their log curves in a clip's metadata: colour-science's curve, and the primaries that belong to it.
@@ -158,9 +164,10 @@ def open_clip(path: Path) -> Clip:
         check_size(path, width, height)
         if min(width, height) < _SMALLEST:
             raise InputError(path, f"its frames have {width} x {height} pixels", f"give {_SMALLEST} and more a side")
-        size = (height, width) if _rotation(frame) % 180 else (width, height)
+        size = (height, width) if _orientation(frame).turns % 2 else (width, height)
         seconds = float(container.duration or 0) / 1e6
-        return Clip(path, size, seconds, _color(container, stream, frame), bool(frame.interlaced_frame), aspect != 1)
+        color = _color(container, stream, frame, path)
+        return Clip(path, size, seconds, color, bool(frame.interlaced_frame), aspect != 1)
 
 
 def first_frame_size(path: Path) -> dict[str, np.ndarray]:
@@ -242,7 +249,8 @@ def codes(frame: Any, color: VideoColor) -> np.ndarray:
         red, blue = y + 2 * (1 - kr) * uv[..., 1], y + 2 * (1 - kb) * uv[..., 0]
         rgb = np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], axis=2)
     levels, kind = (255, np.uint8) if color.bits == 8 else (65535, np.uint16)
-    upright = np.rot90(rgb, _rotation(frame) // 90)
+    orientation = _orientation(frame)
+    upright = np.rot90(rgb[:, ::-1] if orientation.mirrored else rgb, orientation.turns)
     return np.ascontiguousarray(np.rint(np.clip(upright, 0, 1) * levels).astype(kind))
 
 
@@ -308,9 +316,27 @@ def _chroma_places(frame: Any, layout: str) -> tuple[float, float]:
     return first, second
 
 
-def _rotation(frame: Any) -> int:
-    """Return degrees that a frame is to be turned counterclockwise to be upright."""
-    return round(getattr(frame, "rotation", 0) or 0) % 360
+class _Orientation(NamedTuple):
+    """Way of a stored frame to an upright one.
+
+    Attributes:
+        turns: quarter turns counterclockwise.
+        mirrored: whether it is mirrored left to right before that, as by front cameras.
+    """
+
+    turns: int
+    mirrored: bool
+
+
+def _orientation(frame: Any) -> _Orientation:
+    """Return what the display matrix of a frame asks for: x' = a x + c y, y' = b x + d y, with y down."""
+    stored = frame.side_data.get("DISPLAYMATRIX")
+    if stored is None or len(data := bytes(stored)) < 20:
+        return _Orientation(0, mirrored=False)
+    a, b, _, c, d = np.frombuffer(data[:20], np.int32) / 65536
+    mirrored = bool(a * d - b * c < 0)
+    a, b = (-a, -b) if mirrored else (a, b)
+    return _Orientation(round(-np.degrees(np.arctan2(b, a)) / 90) % 4, mirrored)
 
 
 def _require_library(path: Path) -> None:
@@ -345,13 +371,23 @@ def _stream(container: Any, path: Path) -> Any:
     return max([best, *container.streams.video], key=lambda stream: stream.width * stream.height)
 
 
-def _color(container: Any, stream: Any, frame: Any) -> VideoColor:
-    """Return the colors that stream, frame and metadata state."""
+def _color(container: Any, stream: Any, frame: Any, path: Path) -> VideoColor:
+    """Return the colors that stream, frame and metadata state.
+
+    Raises:
+        InputError: if its samples are of another kind than luma and color differences, or RGB.
+    """
     context = stream.codec_context
     transfer, primaries, matrix = (
         int(getattr(context, name, _UNSPECIFIED) or _UNSPECIFIED)
         for name in ("color_trc", "color_primaries", "colorspace")
     )
+    if matrix in _OTHER_MATRICES and not frame.format.is_rgb:
+        problem = f"its frames are stored as {_OTHER_MATRICES[matrix]}, which is not read"
+        raise InputError(path, problem, "convert the clip to YCbCr of BT.2020 or BT.709")
+    if transfer == _UNSPECIFIED and context.codec_tag in _DOLBY_VISION:
+        problem = "is Dolby Vision of profile 5, whose colors only Dolby's decoder knows"
+        raise InputError(path, problem, "convert it to HLG or PQ, or film in HLG")
     bits = max((component.bits for component in frame.format.components), default=8)
     bits = min(max(bits, 8), 16)
     full = int(context.color_range or 0) == _FULL_RANGE or frame.format.name.startswith("yuvj")

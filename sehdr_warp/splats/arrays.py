@@ -145,6 +145,16 @@ class GaussianArrays:
 _ARRAYS = tuple(field.name for field in fields(GaussianArrays))[:5]
 
 
+def warn_of_compensation(path: Path, compensated: bool, statement: str) -> None:
+    """Warn of Gaussians that were trained with opacity compensation, as a file states it."""
+    if compensated:
+        log.warning(
+            "%s: was trained with opacity compensation (%s): renderers without it, such as this one and most viewers, "
+            "show its small Gaussians too bright; PLY, SPZ and SOG keep the mark, other formats cannot",
+            *(path, statement),
+        )
+
+
 def concatenated(parts: Sequence[GaussianArrays]) -> GaussianArrays:
     """Return several sets of Gaussians in one space, of one color model and exposure, as one of the largest degree."""
     degree = max(part.degree for part in parts)

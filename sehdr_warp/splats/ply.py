@@ -17,11 +17,12 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import atomic_path, plain_size
-from .arrays import LONGEST_TIME, SHORTEST_TIME, GaussianArrays, degree_of, read_matrix
+from .arrays import LONGEST_TIME, SHORTEST_TIME, GaussianArrays, degree_of, read_matrix, warn_of_compensation
 from .compressed_ply import unpack_ply
 
 log = logging.getLogger(__name__)
 _MIP = "SplatRenderMode: mip"
+_FLAT = np.log(1e-6)  # Third log size of 2D Gaussian Splatting's files, which have two; as SuperSplat reads them
 _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
 _GROUPS = ("x y z", "scale_0 scale_1 scale_2", "rot_0 rot_1 rot_2 rot_3", "opacity", "f_dc_0 f_dc_1 f_dc_2")
@@ -70,8 +71,11 @@ def read_ply(path: Path) -> GaussianArrays:
         if "packed_position" in names:
             facts = _facts(read.comments, path)
             arguments: dict[str, Any] = {**unpack_ply(read, path), "color_model": "display"}
-            return GaussianArrays(**arguments, base_time=facts.base_time, world_matrix=facts.world_matrix)
-        missing = [name for group in _GROUPS for name in group.split() if name not in names]
+            shared = {"base_time": facts.base_time, "world_matrix": facts.world_matrix}
+            return GaussianArrays(**arguments, **shared, compensated=facts.compensated)
+        flat = "scale_2" not in names and {"scale_0", "scale_1", "rot_3"} <= names
+        present = names | {"scale_2"} if flat else names
+        missing = [name for group in _GROUPS for name in group.split() if name not in present]
         if missing:
             raise InputError(path, _without(missing, names), "export 3D Gaussians as an uncompressed PLY")
         whole = [p.name for p in vertex.properties if p.name in " ".join(_GROUPS).split() and p.val_dtype[0] != "f"]
@@ -81,10 +85,15 @@ def read_ply(path: Path) -> GaussianArrays:
         degree_of(1 + len(rest) / 3, path)
         filtered = ["filter_3D"] if "filter_3D" in names else []
         groups = (*(group.split() for group in _GROUPS), rest, filtered)
-        columns = [_columns([np.asarray(vertex[name], np.float32) for name in group]) for group in groups]
+        columns = [_columns([_column(vertex, name) for name in group if name in names]) for group in groups]
+        if flat:
+            thin = np.full((len(columns[0]), 1), _FLAT, np.float32)
+            columns[1] = np.concatenate([columns[1], thin], axis=1)
     except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise InputError(path, f"cannot be read as PLY ({error!s:.120})", _DAMAGED) from None
     means, log_scales, quaternions, opacity, constant, higher, smoothing = columns
+    if flat:
+        log.info("%s: its Gaussians have two sizes (2D Gaussian Splatting), and are read as flat ones", path)
     if smoothing.size:
         log_scales, opacity = _smoothed(log_scales, opacity, smoothing)
         log.info("%s: its 3D smoothing filter (filter_3D) is fused into sizes and opacities", path)
@@ -127,6 +136,10 @@ def _smoothed(log_scales: np.ndarray, logits: np.ndarray, smoothing: np.ndarray)
     with np.errstate(divide="ignore"):
         opacities = ratio / (1 + np.exp(-logits.astype(np.float64)))
         return (0.5 * np.log(wide)).astype(np.float32), np.log(opacities / (1 - opacities)).astype(np.float32)
+
+
+def _column(vertex: Any, name: str) -> np.ndarray:
+    return np.asarray(vertex[name], np.float32)
 
 
 def _columns(columns: list[np.ndarray]) -> np.ndarray:
@@ -190,10 +203,5 @@ def _facts(comments: list[str], path: Path) -> _Facts:
             path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a time of {SHORTEST_TIME} to {LONGEST_TIME} s"
         )
     compensated = any(re.fullmatch(r"SplatRenderMode:\s*mip", line.strip(), re.IGNORECASE) for line in comments)
-    if compensated:
-        log.warning(
-            "%s: was trained with opacity compensation (%s): renderers without it, such as this one and most viewers, "
-            "show its small Gaussians too bright; PLY keeps the mark, other formats cannot",
-            *(path, _MIP),
-        )
+    warn_of_compensation(path, compensated, _MIP)
     return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path), compensated)

@@ -20,7 +20,7 @@ from PIL import Image
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import GaussianArrays, read_matrix
+from .arrays import GaussianArrays, read_matrix, warn_of_compensation
 from .packing import CODES, codebook, from_smallest_three, logits, morton_order, palette, smallest_three
 
 _LARGEST_PALETTE, _PER_ENTRY, _ACROSS = 1 << 14, 2, 64  # Entries; Gaussians for each; entries side by side
@@ -65,7 +65,7 @@ def sog_files(gaussians: GaussianArrays) -> Iterator[tuple[str, str | bytes]]:
         "version": 2,
         "asset": {"generator": f"sehdr-warp {__version__}"},
         "count": count,
-        "antialias": False,
+        "antialias": gaussians.compensated,
         "means": {
             "mins": low.tolist(),
             "maxs": high.tolist(),
@@ -111,7 +111,12 @@ def read_sog(path: Path) -> GaussianArrays:
     with refusing_damage(path), zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
             raise InputError(path, "unpacks to more than 1 GiB", _DAMAGED)
-        return gaussians_of_files(archive.read, path)
+        # Some tools pack the folder, not the files in it.
+        above = next((name[: -len("meta.json")] for name in archive.namelist() if name.endswith("/meta.json")), "")
+        above = "" if "meta.json" in archive.namelist() else above
+        gaussians = gaussians_of_files(lambda name: archive.read(above + name), path)
+    warn_of_compensation(path, gaussians.compensated, "its meta.json says antialias")
+    return gaussians
 
 
 @contextmanager
@@ -175,6 +180,7 @@ def _gaussians(read: Callable[[str], bytes], meta: dict[str, Any], path: Path) -
         color_model="display",
         base_time=float(facts.get("base_exposure_time", 1.0)),
         world_matrix=read_matrix(facts.get("world_matrix"), path),
+        compensated=meta.get("antialias") is True,
     )
 
 

@@ -13,11 +13,12 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import MAX_DEGREE, GaussianArrays
+from .arrays import MAX_DEGREE, GaussianArrays, warn_of_compensation
 from .packing import from_smallest_three, logits, morton_order, smallest_three
 
 _MAGIC, _VERSION = 0x5053474E, 3
 _HEADER = struct.Struct("<IIIBBBB")
+_ANTIALIASED = 1  # Flag of opacity compensation
 _COLOR_SCALE = 0.15  # Of the constant harmonic before it becomes a byte
 _MOST = 50_000_000  # Gaussians of a file that is read
 _LARGEST = 2.0**23  # Of a coordinate: 24 bits with a sign
@@ -44,7 +45,9 @@ def write_spz(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         size = np.minimum(np.abs(column) * 511 + 0.5, 511).astype(np.uint32)
         packed = (packed << 10) | ((column < 0).astype(np.uint32) << 9) | size
     parts = [
-        _HEADER.pack(_MAGIC, _VERSION, gaussians.count, gaussians.degree, fraction, 0, 0),
+        _HEADER.pack(
+            _MAGIC, _VERSION, gaussians.count, gaussians.degree, fraction, _ANTIALIASED * gaussians.compensated, 0
+        ),
         positions.tobytes(),
         np.rint(gaussians.opacities * 255).astype(np.uint8).tobytes(),
         np.clip(colors, 0, 255).astype(np.uint8).tobytes(),
@@ -62,12 +65,14 @@ def read_spz(path: Path) -> GaussianArrays:
     unpack = None if data[:4] == struct.pack("<I", _MAGIC) else zlib.decompressobj(wbits=31)
     try:
         header = data[: _HEADER.size] if unpack is None else unpack.decompress(data, _HEADER.size)
-        magic, version, count, degree, fraction, _, _ = _HEADER.unpack(header)
+        magic, version, count, degree, fraction, flags, _ = _HEADER.unpack(header)
     except (zlib.error, struct.error) as error:
         raise InputError(path, f"is damaged SPZ ({error!s:.80})", _DAMAGED) from None
     if magic == _MAGIC and version not in (2, 3):
         raise InputError(path, f"is SPZ of version {version}", "save it as version 2 or 3, or as PLY")
-    if magic != _MAGIC or degree > MAX_DEGREE or not 0 < count <= _MOST or fraction > 24:
+    if magic == _MAGIC and degree > MAX_DEGREE:
+        raise InputError(path, f"has harmonics of degree {degree}", f"export it with degree 0 to {MAX_DEGREE}")
+    if magic != _MAGIC or not 0 < count <= _MOST or fraction > 24:
         raise InputError(path, "is not SPZ, or damaged", _DAMAGED)
     coefficients, turn = (degree + 1) ** 2 - 1, 3 if version == 2 else 4
     row = 9 + 1 + 3 + 3 + turn + 3 * coefficients
@@ -96,7 +101,9 @@ def read_spz(path: Path) -> GaussianArrays:
         harmonics=harmonics,
         color_model="display",
         base_time=1.0,
+        compensated=bool(flags & _ANTIALIASED),
     )
+    warn_of_compensation(path, gaussians.compensated, "its header says antialiased")
     turned = gaussians.transformed(np.linalg.inv(_TO_FILE))
     return GaussianArrays(**{**vars(turned), "world_matrix": None})
 

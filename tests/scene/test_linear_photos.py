@@ -21,6 +21,7 @@ from sehdr_warp.scene.sfm import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
 from sehdr_warp.training.plan import make_plan
 
+from ..make_scenes import write_colmap
 from ..output.helpers import camera
 from ..splats.test_splat_files import gaussians
 from .raw_files import TO_CAMERA, write_dng
@@ -69,6 +70,32 @@ def test_float_pictures_are_photos_whose_light_is_known(tmp_path, suffix, tolera
         load_scene(tmp_path, response="srgb")
     config = make_plan(scene, load_config("default", {}), "cpu").config
     assert (config.loss.hdr_weight, config.loss.ldr_weight, config.loss.form) == (1, 0, "blend")
+
+
+def _write_cut_out(path, light, alpha):
+    import OpenEXR
+
+    pixels = np.dstack([light * alpha[..., None], alpha]).astype(np.float32)
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, {"RGBA": pixels}).write(str(path))
+
+
+def test_transparency_of_openexr_counts_as_that_of_other_photos(tmp_path):
+    """Alpha is a mask in photographed sets, and black light in rendered ones, whose colors it has dimmed already."""
+    alpha = np.ones((24, 32), np.float32)
+    alpha[:6], alpha[6:12] = 0, 0.5
+    scene = load_scene(posed(tmp_path, lambda path, i: _write_cut_out(path, picture(i), alpha), ".exr"))
+    assert "transparency" not in str(scene.notes) and scene.views[0].mask is None
+    np.testing.assert_allclose(light_of(scene.views[0], scene), picture() * alpha[..., None], rtol=2e-3, atol=1e-3)
+    pytest.importorskip("pycolmap")
+    write_colmap(tmp_path / "set", size=(32, 24), params=(40.0, 40.0, 16.0, 12.0))
+    for i in range(6):
+        (tmp_path / "set" / "images" / f"{i:03d}.png").unlink()
+        _write_cut_out(tmp_path / "set" / "images" / f"{i:03d}.exr", picture(i), alpha)
+    scene = load_scene(tmp_path / "set")
+    np.testing.assert_array_equal(scene.views[0].mask, alpha)
+    np.testing.assert_allclose(light_of(scene.views[0], scene)[6:], picture()[6:], rtol=2e-3, atol=1e-3)
+    assert "transparency: 6 of 6 photos have transparent pixels, which are left out" in scene.notes
 
 
 def test_linear_16_bit_photos(tmp_path):

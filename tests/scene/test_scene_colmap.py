@@ -196,6 +196,32 @@ def test_mask_and_alpha_keep_pixels_out(tmp_path):
     assert scene.views[1].mask[:12].max() == 0 and scene.views[1].mask[12:].min() == 1
     np.testing.assert_array_equal(scene.views[1].image, pattern(64, 48, 1).astype(np.float32) / np.float32(255))
     assert scene.views[2].mask is None
+    assert "transparency: 1 of 6 photos have transparent pixels, which are left out" in scene.notes
+
+
+def test_files_of_a_model_of_two_kinds(tmp_path):
+    write_colmap(tmp_path, binary=True)
+    write_colmap(tmp_path / "text", binary=False)
+    model = tmp_path / "sparse" / "0"
+    (model / "images.bin").unlink()
+    with pytest.raises(InputError, match=r"0: has cameras.bin, but no images.bin or images.txt; copy the whole model"):
+        load(tmp_path)
+    (tmp_path / "text" / "sparse" / "0" / "images.txt").rename(model / "images.txt")
+    assert len(load(tmp_path, holdout=0).views) == 6
+
+
+def test_photos_beside_undistorted_copies(tmp_path):
+    """COLMAP's dense/ holds a model with its own images, gaussian-splatting issue 964 asks for them."""
+    write_colmap(tmp_path)
+    (tmp_path / "dense").mkdir()
+    (tmp_path / "sparse" / "0").rename(tmp_path / "dense" / "sparse")
+    (tmp_path / "images").rename(tmp_path / "dense" / "images")
+    (tmp_path / "sparse").rmdir()
+    (tmp_path / "images").mkdir()
+    for i in range(6):
+        Image.fromarray(pattern(70, 52, i)).save(tmp_path / "images" / f"{i:03d}.png")
+    view = load(tmp_path, holdout=0).views[0]
+    assert view.source == tmp_path / "dense" / "images" / "000.png" and view.camera.width == 64
 
 
 def test_link_out_of_the_folder_is_refused(tmp_path):

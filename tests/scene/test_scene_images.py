@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.output.exr import write_radiance
 from sehdr_warp.scene.camera import limited_size
-from sehdr_warp.scene.hdr_files import hdr_size, read_hdr
+from sehdr_warp.scene.hdr_files import hdr_size, read_hdr, read_light
 from sehdr_warp.scene.images import exif_of, has_16_bits, image_sizes, open_image, read_ldr
 from sehdr_warp.scene.lens import area_average
 from sehdr_warp.scene.masks import read_mask
@@ -110,6 +111,19 @@ def test_exr_data_window_inside_the_display_window(tmp_path):
         assert file.header()["dataWindow"][0].tolist() == [2, 1]
     read = read_hdr(tmp_path / "a.exr")
     assert read.shape == (8, 10, 3) and read[1:4, 2:6].min() == 1 and read.sum() == 36
+    coverage = read_light(tmp_path / "a.exr").coverage
+    np.testing.assert_array_equal(coverage, read[..., 0])
+
+
+@pytest.mark.parametrize("name, other", [("a.hdr", "OpenEXR, not a Radiance picture; name it .exr"),
+                                         ("a.exr", "a Radiance picture, not OpenEXR; name it .hdr")])  # fmt: skip
+def test_light_under_the_other_suffix_is_named(tmp_path, name, other):
+    write_radiance(tmp_path / "b.hdr", np.ones((4, 8, 3)))
+    _exr(tmp_path / "b.exr", np.ones((4, 8, 3), np.float32), {})
+    (tmp_path / {"a.hdr": "b.exr", "a.exr": "b.hdr"}[name]).rename(tmp_path / name)
+    for read in (read_hdr, hdr_size):
+        with pytest.raises(InputError, match=f"is {other}"):
+            read(tmp_path / name)
 
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"

@@ -9,6 +9,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_cameras
 from sehdr_warp.scene.dataparser import reinhard_gamma
+from sehdr_warp.scene.read_transforms import read_transforms
 from tests.make_scenes import (
     arc_poses,
     load,
@@ -43,6 +44,8 @@ def test_transparent_pixels_show_black_light(tmp_path):
     write_blender(tmp_path, rgba=True, camera_angle_x=0.7)
     view = load(tmp_path, cache=tmp_path / "cache").views[0]
     assert view.image[:, :20].max() == 0 and view.mask is None
+    note = "transparency: 6 of 6 photos have transparent pixels, which count as black light"
+    assert note in load(tmp_path, cache=tmp_path / "cache").notes
     np.testing.assert_allclose(view.image[:, 20:], pattern(40, 30, 0)[:, 20:] / 255, atol=1e-6)
 
 
@@ -69,6 +72,56 @@ def test_frame_values_win_over_the_files(tmp_path):
     assert (first.exposure_time, second.exposure_time) == (0.25, 0.5) and scene.exposure_times_known
     assert scene.test_views == (second,) and any("exposures differ" in note for note in scene.notes)
     np.testing.assert_array_equal(second.mask, np.eye(30, 40))
+
+
+@pytest.mark.parametrize(
+    "fields, model, bent",
+    [
+        (
+            {
+                "camera_model": "FULL_OPENCV",
+                "k1": 0.1,
+                "k2": 0.2,
+                "k3": 0.3,
+                "k4": 0.4,
+                "k5": 0.5,
+                "k6": 0.6,
+                "p1": 1e-3,
+            },
+            "FULL_OPENCV",
+            (0.1, 0.2, 1e-3, 0, 0.3, 0.4, 0.5, 0.6),
+        ),
+        ({"k1": 0.1, "k3": 0.3}, "FULL_OPENCV", (0.1, 0, 0, 0, 0.3, 0, 0, 0)),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.4)),
+        ({"camera_model": "SIMPLE_RADIAL_FISHEYE", "k1": 0.1}, "OPENCV_FISHEYE", (0.1, 0, 0, 0)),
+        ({"is_fisheye": True, "k1": 0.1, "k2": 0.2}, "OPENCV_FISHEYE", (0.1, 0.2, 0, 0)),
+    ],
+)
+def test_distortion_by_camera_model(tmp_path, fields, model, bent):
+    """nerfstudio issues 3355 and 3611, instant-ngp pull request 1147: k4 to k6 differ between programs."""
+    write_blender(tmp_path, fl_x=50.0, **fields)
+    lens = read_transforms(tmp_path).records[0].lens
+    assert lens.model == model and lens.params[4:] == pytest.approx(bent)
+
+
+@pytest.mark.parametrize("name", ["k4", "k5", "k6"])
+def test_distortion_whose_meaning_is_open_is_refused(tmp_path, name):
+    write_blender(tmp_path, **{"k1": 0.1, name: 0.2})
+    with pytest.raises(InputError, match=f"{name} = 0.2 of camera_model OPENCV has no one meaning; state camera_model"):
+        load(tmp_path)
+
+
+def test_intrinsics_of_frames_alone_and_in_degrees(tmp_path):
+    """LichtFeld-Studio pull request 1608, nerfstudio issue 737."""
+    write_blender(tmp_path, exposure_time=0.25)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    del values["camera_angle_x"]
+    for frame in values["frames"]:
+        frame |= {"x_fov": np.degrees(0.8), "w": 40, "h": 30, "cx": 19.0}
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    view = load(tmp_path).views[0]
+    assert view.camera.fx == view.camera.fy == pytest.approx(20 / np.tan(0.4)) and view.camera.cx == 19
+    assert view.exposure_time == 0.25
 
 
 def test_nerfstudio_points_move_with_the_poses(tmp_path):

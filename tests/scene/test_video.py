@@ -102,6 +102,51 @@ def test_frames_are_upright(tmp_path):
     assert np.abs(frame_pixels / 65535 - expected).mean() < 0.01
 
 
+@pytest.mark.parametrize(
+    "matrix, turn",
+    [
+        ((-1, 0, 0, 1), lambda a: a[:, ::-1]),
+        ((0, 1, 1, 0), lambda a: a.swapaxes(0, 1)),
+        ((0, 0, 0, 0), lambda a: a),
+    ],
+)
+def test_mirrored_frames_are_mirrored_back(tmp_path, matrix, turn):
+    """A front camera's display matrix mirrors, and a scene of mirrored frames would be a mirrored scene."""
+    file = tmp_path / "a.mp4"
+    write_clip(file, still(), rotation=180)
+    data = bytearray(file.read_bytes())
+    start = data.index(struct.pack(">9i", -1 << 16, 0, 0, 0, -1 << 16, 0, 0, 0, 1 << 30))
+    a, b, c, d = (value << 16 for value in matrix)
+    data[start : start + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    file.write_bytes(data)
+    clip = open_clip(file)
+    frame_pixels = codes(next(decode(clip))[1], clip.color) / 65535
+    assert frame_pixels.shape[1::-1] == clip.size
+    assert np.abs(frame_pixels - turn(still()[0])).mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    "matrix, name", [(8, "YCgCo"), (10, "constant-luminance BT.2020"), (14, "ICtCp"), (15, "IPT-C2")]
+)
+def test_samples_that_are_no_luma_are_named(tmp_path, matrix, name):
+    """PyAV issue 2149: such frames would come out in other colors, or not at all."""
+    write_clip(tmp_path / "a.mp4", still(), tags=(16, 9, matrix))
+    with pytest.raises(InputError, match=f"its frames are stored as {name}, which is not read; convert the clip"):
+        open_clip(tmp_path / "a.mp4")
+
+
+def test_dolby_vision_without_another_layer_is_named(tmp_path):
+    write_clip(tmp_path / "a.mp4", still(), tags=(2, 2, 2))
+    data = (tmp_path / "a.mp4").read_bytes()
+    (tmp_path / "a.mp4").write_bytes(data.replace(b"hev1", b"dvhe"))
+    with pytest.raises(InputError, match="is Dolby Vision of profile 5, whose colors only Dolby's decoder knows"):
+        open_clip(tmp_path / "a.mp4")
+    write_clip(tmp_path / "b.mp4", still(), tags=(18, 9, 9))
+    data = (tmp_path / "b.mp4").read_bytes()
+    (tmp_path / "b.mp4").write_bytes(data.replace(b"hev1", b"dvhe"))
+    assert open_clip(tmp_path / "b.mp4").color.curve == "HLG"
+
+
 def test_the_sharpest_frame_of_each_interval_of_movement(tmp_path):
     blur = {i for i in range(60) if i % 3}
     write_clip(tmp_path / "a.mp4", pan(60, blur=blur), codec="libx264", pixels="yuv420p")

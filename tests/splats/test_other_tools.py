@@ -1,9 +1,12 @@
 """Splat files as other tools write them: smoothing filters, marks, comments, nodes of glTF, times of OpenUSD."""
 
+import gzip
 import json
 import logging
 import re
 import struct
+import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,6 +62,51 @@ def test_the_mark_of_opacity_compensation_is_kept_and_warned_of(tmp_path, caplog
     assert not other.compensated and not caplog.records
     write_gaussians(tmp_path / "d.ply", other)
     assert b"SplatRenderMode" not in (tmp_path / "d.ply").read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply"])
+def test_the_mark_of_opacity_compensation_in_compressed_files(tmp_path, caplog, suffix):
+    """Brush issue 466: SPZ has a flag of it, SOG a field of meta.json; both were passed over."""
+    path = tmp_path / f"a{suffix}"
+    write_gaussians(path, arrays())
+    assert not read_gaussians(path).compensated and not caplog.records
+    write_gaussians(path, replace(arrays(), compensated=True), overwrite=True)
+    assert read_gaussians(path).compensated and "trained with opacity compensation" in caplog.text
+
+
+def test_gaussians_of_two_sizes_are_flat(tmp_path, caplog):
+    """SuperSplat issue 975: 2D Gaussian Splatting writes scale_0 and scale_1 alone."""
+    write_ply(tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    table = np.frombuffer(body, "<f4").reshape(3, -1)
+    place = DEGREE_0_NAMES.index("scale_2")
+    flat = head.replace(b"property float scale_2\n", b"") + b"end_header\n" + np.delete(table, place, axis=1).tobytes()
+    (tmp_path / "a.ply").write_bytes(flat)
+    with caplog.at_level(logging.INFO):
+        read = read_gaussians(tmp_path / "a.ply")
+    np.testing.assert_allclose(np.exp(read.log_scales), [[0.002, 0.02, 1e-6]] * 3, rtol=1e-5)
+    assert "have two sizes (2D Gaussian Splatting)" in caplog.text
+
+
+def test_sog_in_pieces_and_in_a_folder(tmp_path):
+    write_gaussians(tmp_path / "a.sog", arrays(300))
+    with zipfile.ZipFile(tmp_path / "a.sog") as packed, zipfile.ZipFile(tmp_path / "b.sog", "w") as other:
+        for name in packed.namelist():
+            other.writestr(f"scene/{name}", packed.read(name))
+        packed.extractall(tmp_path / "pieces")
+    np.testing.assert_array_equal(read_gaussians(tmp_path / "b.sog").means, read_gaussians(tmp_path / "a.sog").means)
+    with pytest.raises(InputError, match=r"is SOG in pieces; zip it and the pictures beside it as scene\.sog"):
+        read_gaussians(tmp_path / "pieces" / "meta.json")
+
+
+def test_harmonics_beyond_degree_3_are_named(tmp_path):
+    write_gaussians(tmp_path / "a.spz", arrays())
+    data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    data[12] = 4
+    (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
+    with pytest.raises(InputError, match="has harmonics of degree 4; export it with degree 0 to 3"):
+        read_gaussians(tmp_path / "a.spz")
 
 
 def test_comments_in_any_encoding(tmp_path):
