@@ -55,7 +55,7 @@ class FilmOptions:
     """Options of the film that render writes with --video."""
 
     fps: float = 24.0
-    """Frames a second."""
+    """Frames a second, also of the camera files of a path."""
     transfer: Literal["sdr", "hlg", "hdr10", "logc3", "slog3", "acescct"] = "sdr"
     """Purpose of the film: any display (H.264), HDR displays (hlg, hdr10: HEVC, 10 bits), or grading (ProRes 4444 in a
     camera's logarithm, .mov)."""
@@ -249,14 +249,17 @@ def run_environment_map(args: EnvironmentMap) -> None:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
-    from .render_views import PATHS, check_cameras, framed, read_size, render_views, select_cameras
+    from .render_views import PATHS, SPLITS, check_cameras, framed, read_size, render_views, select_cameras
     from .world_transform import world_transform
 
     if args.out is None and args.video is None:
         raise UsageError(
             "render needs --out, a folder for the pictures, or --video, a film; see sehdr-warp render --help"
         )
-    if args.video is None and (flags := changed_flags(args.film)):
+    flags = changed_flags(args.film)
+    if args.out is not None and args.cameras not in SPLITS:
+        flags = [flag for flag in flags if flag != "--fps"]
+    if args.video is None and flags:
         raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
     if args.out is None and (flags := changed_flags(args.pictures)):
         raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
@@ -264,6 +267,7 @@ def run_render(args: Render) -> None:
     if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
     files, ramp, summary = [], _ramp(args.film.ev_ramp), ""
+    fps = require_positive("--fps", args.film.fps)
     if args.video is not None:
         from .film import film_format, film_library
 
@@ -275,7 +279,7 @@ def run_render(args: Render) -> None:
     path = {"cameras": args.cameras, "camera": args.camera, "count": usual if args.count is None else args.count}
     if args.out is not None:
         options = path | vars(args.world) | vars(args.pictures)
-        files = render_views(run, args.out, size=args.size, overwrite=args.overwrite, **options)
+        files = render_views(run, args.out, size=args.size, overwrite=args.overwrite, fps=fps, **options)
         summary = f"{args.out}: {len(files)} files"
     if args.video is not None:
         from .film import write_film
@@ -284,11 +288,11 @@ def run_render(args: Render) -> None:
         cameras = [camera for _, camera in select_cameras(run, **path, transform=transform, up=args.world.up)]
         if args.size is not None:
             cameras = [framed(camera, *read_size(args.size)) for camera in cameras]
-        film = {"fps": require_positive("--fps", args.film.fps), "transfer": args.film.transfer, "ev_ramp": ramp}
+        film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}
         files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
         if len(cameras) == 1:
             log.warning("%s: '%s' is one camera, so one frame; --cameras orbit is a path", args.video, args.cameras)
-        seconds = len(cameras) / args.film.fps
+        seconds = len(cameras) / fps
         summary = summary or f"{args.video}: {len(cameras)} frame{'s' * (len(cameras) > 1)}, {seconds:.3g} s"
     print(json.dumps({"files": [str(path) for path in files]}) if args.json else summary)
 

@@ -65,6 +65,7 @@ def render_views(
     axes: str = "upright",
     up: str | Sequence[float] | None = None,
     scale: float | None = None,
+    fps: float = 24.0,
 ) -> list[Path]:
     """Render views of a run into files and return their paths. All files appear when the last view is complete.
 
@@ -98,6 +99,7 @@ def render_views(
             scene's own coordinates.
         up: As in world_transform.
         scale: As in world_transform.
+        fps: Frames a second of a path, which its camera files state.
 
     Raises:
         SehdrError: For unusable options or an empty set of cameras.
@@ -131,7 +133,7 @@ def render_views(
     if size is not None:
         width, height = read_size(size)
         views = [(name, framed(camera, width, height)) for name, camera in views]
-    camera_files = _camera_files(views, transform, moving=str(cameras) not in SPLITS)
+    camera_files = _camera_files(views, transform, fps, moving=str(cameras) not in SPLITS)
     empty = []
     with ExitStack() as stack:
         for name, text in camera_files.items():
@@ -171,21 +173,24 @@ def render_views(
     return [*files, *(out / name for name in camera_files)]
 
 
-def _camera_files(views: Sequence[tuple[str, Camera]], transform: WorldTransform, *, moving: bool) -> dict[str, str]:
+def _camera_files(
+    views: Sequence[tuple[str, Camera]], transform: WorldTransform, fps: float, *, moving: bool
+) -> dict[str, str]:
     """Return the names and texts of the files that hold the cameras of a render.
 
     Args:
         views: Names and cameras in the scene's own coordinates.
         transform: To the coordinates of files.
+        fps: Frames a second of a camera that moves.
         moving: Whether the cameras may be frames of one that moves; photos are not, whatever their names.
     """
     cameras = [(name, transform.camera(camera)) for name, camera in views]
     path = camera_path(cameras) if moving else None
-    files = {"cameras.usda": usd_cameras(cameras, transform, path=path)}
+    files = {"cameras.usda": usd_cameras(cameras, transform, path=path, fps=fps)}
     if path is not None:
         files["cameras.chan"] = chan_cameras(path)
         # In the set's own coordinates, which nerfstudio's dataparser_transforms.json starts from.
-        files["camera_path.json"] = nerfstudio_path(path._replace(cameras=[camera for _, camera in views]))
+        files["camera_path.json"] = nerfstudio_path(path._replace(cameras=[camera for _, camera in views]), fps)
     return files
 
 

@@ -111,7 +111,9 @@ def test_refusals(tmp_path, monkeypatch):
     with pytest.raises(SehdrError, match="cannot be written as a film .* choose .mov"):
         write_film(run, tmp_path / "film.mp4", cameras, transfer="logc3")
     assert [file.name for file in tmp_path.iterdir()] == ["mine.mp4"]
-    for args in (Render(run=tmp_path), Render(run=tmp_path, out=tmp_path, film=FilmOptions(ev_ramp="1:2"))):
+    options = {"run": tmp_path, "out": tmp_path}
+    still, ramp = Render(**options, film=FilmOptions(fps=25)), Render(**options, film=FilmOptions(ev_ramp="1:2"))
+    for args in (Render(run=tmp_path), still, ramp):
         with pytest.raises(UsageError, match="--video"):
             run_render(args)
 

@@ -226,11 +226,13 @@ def test_a_path_is_one_moving_camera(tmp_path):
     from pxr import Usd, UsdGeom
 
     run = AnalyticRun()
-    render_views(run, tmp_path, cameras="orbit", count=5, size="32x18")
+    render_views(run, tmp_path, cameras="orbit", count=5, size="32x18", fps=25)
     stage = Usd.Stage.Open(str(tmp_path / "cameras.usda"))
     prims = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
     assert [prim.GetName() for prim in prims] == ["orbit"]
-    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 4, 24)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 4, 25)
+    path = json.loads((tmp_path / "camera_path.json").read_text())
+    assert stage.GetFramesPerSecond() == path["fps"] == 25 and path["seconds"] == pytest.approx(5 / 25)
     expected = select_cameras(run, "orbit", count=5)
     for name in ("cameras.usda", "cameras.chan", "camera_path.json"):
         read = select_cameras(run, tmp_path / name)

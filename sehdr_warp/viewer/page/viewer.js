@@ -213,7 +213,7 @@ function frusta() {
   });
 }
 
-const figure = x => x === 0 ? "0" : Math.abs(x) < 1e-3 || x >= 1e5 ? x.toExponential(1) : x.toPrecision(3);
+const figure = x => x === 0 ? "0" : Math.abs(x) < 1e-3 || x >= 1e5 ? x.toExponential(1) : Math.abs(x) >= 1e3 ? counts(Number(x.toPrecision(3))) : x.toPrecision(3);
 function probe() {
   const at = state.pointer, side = at && $("left").value.startsWith("run") && at[0] < state.split ? "other" : "scene";
   const value = at && light.value(side, ...at), rows = [];
@@ -458,7 +458,8 @@ function listLights(told) {
     const sure = lamp.deviation === null ? "" : ` \u00b1 ${lamp.deviation.toFixed(1)} stops`, button = make("button", {textContent: name, title: "fly there"});
     const range = make("input", {type: "range", min: -6, max: 6, step: 0.1, value: lamp.stops, ariaLabel: `gain of light ${i + 1}, stops`});
     const stops = make("output", {textContent: stopsText(lamp.stops)});
-    row.append(button, stops, make("span", {className: "quiet", textContent: `${value(lamp.radiance)}, certain ${value(lamp.certain)}${sure}`}), make("span"), range);
+    const words = `${value(lamp.radiance)}${sure}, at least ${value(lamp.certain)}`, title = "radiance, the deviation of its estimate, and what the photos prove";
+    row.append(button, stops, make("span", {className: "quiet", textContent: words, title}), range);
     button.addEventListener("click", () => flyTo(lamp));
     range.addEventListener("input", () => { stops.textContent = stopsText(Number(range.value)); });
     range.addEventListener("change", () => gain(i, Number(range.value)));
@@ -466,10 +467,10 @@ function listLights(told) {
   }));
   $("lightNote").textContent = told && !told.lights.length ? "the photos clip no light" : "";
 }
-// From the side of the photos, near enough to see the light large.
+// From the side of the photos: five times its size away from a large light, at three tenths of the distance from a small one.
 function flyTo(lamp) {
   const places = facts.views.map(view => centerOf(view.camera)), middle = places[0] ? [0, 1, 2].map(i => places.reduce((sum, p) => sum + p[i], 0) / places.length) : camera.position;
-  const away = add(middle, lamp.position, -1), distance = Math.hypot(...away), near = Math.min(0.9 * distance, 5 * lamp.size);
+  const away = add(middle, lamp.position, -1), distance = Math.hypot(...away), near = Math.min(0.9 * distance, Math.max(5 * lamp.size, 0.3 * distance));
   camera.face(add(lamp.position, away, near / (distance || 1)), lamp.position);
   moved();
 }
