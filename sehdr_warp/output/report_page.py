@@ -65,8 +65,7 @@ def report_page(
     gain = display_gain(run.response)
     times = {view.name: view.exposure_time for view in scene.views}
     sections = [
-        _header(run, scene),
-        _opening(brightest, times[brightest.name], gain),
+        _header(run, scene, _opening(brightest, times[brightest.name], gain)),
         _pictures(run, comparisons, times, held_out),
         _brackets(brightest, times[brightest.name], gain),
         _lights(lights, luminance_of_one(run), world_transform(run)) if lights else EMPTY,
@@ -106,7 +105,8 @@ def _wide(body: Markup) -> Markup:
     return markup('<div class="wide">{}</div>', body) if body else EMPTY
 
 
-def _header(run: "Run", scene: Scene) -> Markup:
+def _header(run: "Run", scene: Scene, opening: Markup) -> Markup:
+    """Return title, opening picture and figures of the training."""
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     times = sorted({view.exposure_time for view in scene.train_views or scene.views})
@@ -130,9 +130,10 @@ def _header(run: "Run", scene: Scene) -> Markup:
     device = summary.get("device")
     return markup(
         '<header>\n<p class="quiet">sehdr-warp report</p>\n<h1>{}</h1>\n<p class="quiet">{}</p>\n'
-        '<ul class="facts">{}</ul>{}\n</header>',
+        '</header>\n{}\n<ul class="facts">{}</ul>{}',
         scene.name,
         f"Trained on {device}." if device else "The training has not ended.",
+        opening,
         items,
         markup("<ul>{}</ul>", notes) if notes else EMPTY,
     )
