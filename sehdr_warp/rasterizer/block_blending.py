@@ -19,12 +19,20 @@ def blend_on_cuda(
     transmittance: Tensor,
     alpha_threshold: float,
     deterministic: bool,
+    *,
+    keeps_rows: bool = False,
 ) -> "BlockBackward":
-    """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also in Warp's CPU block emulation)."""
+    """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also in Warp's CPU block emulation).
+
+    keeps_rows: let the backward pass read the padded features of this call, as on_fixed_memory() needs.
+    """
     rows = pad_features(features) if packed.padded is None else packed.padded
     last_contributor = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
     # Padded features take more memory; few Gaussians keep them, so that they need not be padded again.
-    saved, packed = rows if len(features) <= MAX_SINGLE_SORT else features, packed._replace(padded=None)
+    saved, packed = (
+        rows if keeps_rows or len(features) <= MAX_SINGLE_SORT else features,
+        packed._replace(padded=None),
+    )
     return BlockBackward(
         saved, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
     )
@@ -72,7 +80,10 @@ class BlockBackward:
         return emit_order.sum_by_gaussian(grad_intersections)
 
     def on_fixed_memory(self) -> "FixedBackward":
-        """Return the backward pass for less host time; for use while all tensors stay where they are."""
+        """Return the backward pass for less host time; for use while all tensors stay where they are.
+
+        features are padded, or the backward pass would read what they were at this call.
+        """
         assert not self.deterministic, "sums in a fixed order are several launches"
         grad_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
         grad_transmittance, gathered = torch.empty_like(self.transmittance), self._zeros()

@@ -89,7 +89,8 @@ class CapturedRender:
             return build_tile_lists(packed, offsets, depths, extents, width, height, limit, keep_emit_order=False)
 
         def blend(splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> BlockBackward:
-            return blend_on_cuda(splats.features, lists, packed, image, transmittance, threshold, False)
+            features = splats.features
+            return blend_on_cuda(features, lists, packed, image, transmittance, threshold, False, keeps_rows=True)
 
         def middle(splats: RasterInputs, packed: PackedSplats) -> TileLists:
             return list_tiles(splats, packed, count(splats, packed))

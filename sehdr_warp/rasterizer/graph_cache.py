@@ -33,8 +33,9 @@ LOG = logging.getLogger(__name__)
 WARMUP_CALLS = 4  # Launched calls of a size before one is captured: a capture takes the time of some twenty of them.
 MAX_SIZES = 3  # Sizes of calls with CUDA graphs, the most recent ones.
 MAX_GRAPHS = 4  # CUDA graphs of a size: each holds a render until its backward pass.
+MAX_LARGE_GRAPHS = 1  # The same with more than MAX_SINGLE_SORT Gaussians, whose memory is hundreds of megabytes.
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
-MAX_GAUSSIANS = 1 << 21  # Without a backward pass; with one the host is the bottleneck only up to MAX_SINGLE_SORT.
+MAX_GAUSSIANS = 1 << 21
 
 
 class _Signature(NamedTuple):
@@ -77,10 +78,10 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     if options.max_intersections is not None or options.deterministic:
         return None
     signature = _signature(tensors, options)
-    small = 0 < len(first) <= (MAX_SINGLE_SORT if signature.differentiable else MAX_GAUSSIANS)
-    if not small or options.width * options.height > MAX_PIXELS or is_capturing(first.device):
+    fits = 0 < len(first) <= MAX_GAUSSIANS and options.width * options.height <= MAX_PIXELS
+    if not fits or is_capturing(first.device):
         return None
-    return _pool_of(signature)
+    return _pool_of(signature, MAX_GRAPHS if len(first) <= MAX_SINGLE_SORT else MAX_LARGE_GRAPHS)
 
 
 def on_gpu(tensor: Tensor) -> bool:
@@ -149,6 +150,7 @@ class GraphPool:
 
     Attributes:
         differentiable: whether the calls need backward passes.
+        max_graphs: how many there may be.
         launched: calls that were launched.
         captured: CUDA graphs that were captured since the memory last grew.
         intersections: the least number that the next CUDA graph allocates memory for.
@@ -156,6 +158,7 @@ class GraphPool:
     """
 
     differentiable: bool = False
+    max_graphs: int = MAX_GRAPHS
     launched: int = 0
     captured: int = 0
     intersections: int = 0
@@ -167,14 +170,14 @@ class GraphPool:
             with suppress(IndexError):
                 return self.idle.pop()
         self.launched += 1
-        if self.launched <= WARMUP_CALLS or self.captured >= MAX_GRAPHS:
+        if self.launched <= WARMUP_CALLS or self.captured >= self.max_graphs:
             return None
         self.captured += 1
         try:
             return capture(self.intersections)
         except RuntimeError:
             LOG.debug("a render could not be captured and is launched", exc_info=True)
-            self.captured = MAX_GRAPHS
+            self.captured = self.max_graphs
             return None
 
     def replay(
@@ -247,9 +250,9 @@ def clear_graphs() -> None:
 atexit.register(clear_graphs)  # CUDA graphs must be freed before CUDA is.
 
 
-def _pool_of(signature: _Signature) -> GraphPool:
+def _pool_of(signature: _Signature, max_graphs: int) -> GraphPool:
     with _lock:
-        pool = _pools.setdefault(signature, GraphPool(signature.differentiable))
+        pool = _pools.setdefault(signature, GraphPool(signature.differentiable, max_graphs))
         _pools.move_to_end(signature)
         while len(_pools) > MAX_SIZES:
             _pools.popitem(last=False)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import captured_render, graph_cache, rasterize, tile_lists
+from sehdr_warp.rasterizer import block_blending, captured_render, graph_cache, rasterize, tile_lists
 from sehdr_warp.rasterizer.render_options import RenderOptions
 
 from .emulated_graphs import emulate
@@ -57,8 +57,13 @@ def assert_alike(ours, truth):
         assert relative_error(mine, true) < 5e-5  # Without a GPU, two ways of blending.
 
 
+@pytest.mark.parametrize("many", [False, True])
 @pytest.mark.parametrize("options", [{}, {"by_alpha": False}, {"depth": True, "antialiased": True}])
-def test_replays_follow_their_arguments_and_their_need_of_room(options):
+def test_replays_follow_their_arguments_and_their_need_of_room(options, many, monkeypatch):
+    if many:  # As with more Gaussians than one sort takes.
+        for module in (tile_lists, block_blending, captured_render, graph_cache):
+            monkeypatch.setattr(module, "MAX_SINGLE_SORT", 0)
+        monkeypatch.setattr(captured_render, "MAX_COPIED_GAUSSIANS", 0)
     for count, channels in ((80, 3), (40, 9), (80, 3)):
         scene = scene_of(count, channels)
         for growth in (0.0, 0.4, 1.5):
@@ -68,8 +73,10 @@ def test_replays_follow_their_arguments_and_their_need_of_room(options):
                 ours = values_and_gradients(rasterize, scene, **options)
                 with torch.no_grad():
                     scene.tensors[0] += 0.01
+                    scene.tensors[4] *= 0.9
             with torch.no_grad():
                 scene.tensors[0] -= 0.01
+                scene.tensors[4] /= 0.9
             assert_alike(ours, values_and_gradients(launched, scene, **options))
     assert recordings()
 
@@ -107,6 +114,17 @@ def test_without_gradients_pictures_stay_too(one_sort, most_copied, channels, mo
         truth = launched(*scene.arguments).image
     assert recordings() == 1 and not images[-1].requires_grad
     assert_alike([image / k for k, image in enumerate(images, 1)], [truth] * 8)
+
+
+def test_of_many_gaussians_one_render_is_held(monkeypatch):
+    monkeypatch.setattr(graph_cache, "MAX_SINGLE_SORT", 0)
+    scene = scene_of()
+    images = [rasterize(*scene.arguments).image for _ in range(CALLS)]
+    assert recordings() == 1
+    cotangent, truth = random_like(images[0], 1), launched(*scene.arguments).image
+    expected = torch.autograd.grad(truth, scene.tensors[:5], cotangent)
+    for image in images[-3:]:
+        assert_alike(torch.autograd.grad(image, scene.tensors[:5], cotangent), expected)
 
 
 def test_gradients_add_up_over_calls_and_cameras():
