@@ -20,6 +20,7 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec, overload
 import torch
 from torch import Tensor
 
+from .checks import DEVICES
 from .gradients import kernel_layout
 from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch
@@ -209,3 +210,5 @@ def _check_tensors(body: Callable[..., Any], tensors: Sequence[Any]) -> None:
             raise ValueError(
                 f"{name}(): argument {place} is on {value.device}, but argument 0 is on {tensors[0].device}"
             )
+    if tensors[0].device.type not in DEVICES:
+        raise ValueError(f"{name}(): argument 0 is on {tensors[0].device}, expected the CPU or a CUDA device")

@@ -56,6 +56,8 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
 def integer(name: str, value: Any, least: int, most: int) -> int:
     """Return the value as an int; raise TypeError for another kind of number, ValueError for one out of range."""
     try:
+        if isinstance(value, bool):
+            raise TypeError
         number = operator.index(value)
     except TypeError:
         raise TypeError(f"{name} is {value!r:.60}, expected a whole number") from None

@@ -120,6 +120,11 @@ def test_changes_in_place_before_the_backward_pass_raise_torchs_error(device, ch
             ValueError,
             "argument 1 is on cpu, but argument 0 is on meta",
         ),
+        (
+            (torch.zeros(4, 3, device="meta"), torch.zeros(1, device="meta")),
+            ValueError,
+            "argument 0 is on meta, expected the CPU or a CUDA device",
+        ),
         ((torch.zeros(4, 3), torch.zeros(1, 1)), TypeError, "gain takes a tensor with 1 dimensions"),
         ((torch.zeros(4, 3, dtype=torch.float64), torch.zeros(1)), TypeError, "float64"),
     ],

@@ -59,6 +59,7 @@ def arguments(**changes):
         ),
         ("width", lambda _: 1 << 21, ValueError, "width 2097152 is not in 1..1048576"),
         ("width", lambda _: 70.0, TypeError, "width is 70.0, expected a whole number"),
+        ("width", lambda _: True, TypeError, "width is True, expected a whole number"),
         ("height", lambda _: 0, ValueError, "height 0 is not in 1.."),
         ("max_intersections", lambda _: 2**31, ValueError, "max_intersections 2147483648 is not in 1.."),
         ("near_plane", lambda _: 0.0, ValueError, "near_plane 0.0 is not"),

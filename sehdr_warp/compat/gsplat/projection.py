@@ -73,7 +73,7 @@ def project_gaussians(
         intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
         near = max(culling.near_plane, 1e-30)
         options = RenderOptions(width, height, near, eps2d, ALPHA_THRESHOLD, antialiased)
-        log_scales = scales.abs().clamp_min(SMALLEST_SIZE).log()
+        log_scales = scales.abs().clamp_min(SMALLEST_SIZE).log().contiguous()
         shapes = means.contiguous(), log_scales, quats.contiguous()
         projected = project_to_camera(*shapes, opacities, viewmat, intrinsics, options, differentiate_compensation=True)
     else:

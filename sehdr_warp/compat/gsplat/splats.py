@@ -1,6 +1,7 @@
 """The 2D Gaussians of all views of a call, and the dictionary that rasterization() returns of them."""
 
 import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
@@ -68,6 +69,24 @@ class Meta(dict[str, Any]):
             value()
             value = super().__getitem__(key)
         return value
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over keys. With a method of its own, dict(meta) and {**meta} read values as meta[key] does."""
+        return super().__iter__()
+
+    def copy(self) -> dict[str, Any]:
+        """Return a plain dictionary of all values."""
+        return dict(self.items())
+
+    def __or__(self, other: Any) -> dict[str, Any]:
+        """Return a plain dictionary of all values and another's."""
+        return self.copy() | other
+
+    def pop(self, key: str, *default: Any) -> Any:
+        """Remove a key and return its value, or the default without it."""
+        if key in self:
+            self[key]
+        return super().pop(key, *default)
 
     def get(self, key: str, default: Any = None) -> Any:
         """Return the value of a key, or the default without it."""

@@ -277,6 +277,36 @@ def test_intersections_are_made_when_they_are_read(device):
     assert pickle.loads(pickle.dumps({k: v for k, v in info.items() if k != "means2d"}))["width"] == WIDTH
 
 
+@pytest.mark.parametrize(
+    "read",
+    [dict, lambda info: {**info}, lambda info: info.copy(), lambda info: info | {}, lambda info: {} | info],
+    ids=["dict", "unpacked", "copy", "or", "or of another"],
+)
+def test_copies_of_meta_hold_values(read):
+    leaves, place = scene()
+    _, _, info = rasterization(*leaves, *place)
+    copied = read(info)
+    assert list(copied) == list(info)
+    assert not any(callable(dict.get(copied, key)) for key in copied)
+    assert torch.equal(info.pop("isect_ids"), copied["isect_ids"]) and "isect_ids" not in info
+    with pytest.raises(KeyError):
+        info.pop("isect_ids")
+
+
+@pytest.mark.parametrize("options", [{}, {"camera_model": "ortho"}, {"sh_degree": 1}])
+def test_inputs_that_are_not_contiguous_give_the_same(options, device):
+    leaves, place = scene(device, coefficients=4 if "sh_degree" in options else 0)
+    truth, _, _ = rasterization(*leaves, *place, **options)
+    expected = gradients(truth, leaves)
+    strided = [torch.stack([leaf.detach()] * 2, dim=-1)[..., 0].requires_grad_() for leaf in leaves]
+    transposed = [tensor.mT.contiguous().mT for tensor in place[:2]]
+    assert not any(tensor.is_contiguous() for tensor in (*strided, *transposed))
+    colors, _, _ = rasterization(*strided, *transposed, *place[2:], **options)
+    assert torch.equal(colors, truth)
+    for mine, its in zip(gradients(colors, strided), expected, strict=True):
+        torch.testing.assert_close(mine, its)
+
+
 def test_no_gaussians_and_cameras_that_are_singular_show_the_background(device):
     leaves, place = scene(device)
     background = torch.tensor([[0.2, 0.4, 0.8]] * 2, device=device)
