@@ -4,7 +4,8 @@ python -m tests.compat.gsplat.simple_trainer EXAMPLES STRATEGY STEPS [--device c
 
 EXAMPLES is the folder `examples` of a checkout of gsplat. Its file is read as it is; only the name of its device is
 another on the CPU. What it imports beside gsplat (a viewer, TensorBoard, metrics, the reader of COLMAP sets) is small
-here. The output has a line of JSON for each seed: PSNR of the held-out views, and how many Gaussians there are.
+here. The output has a line of JSON for each seed: PSNR of the held-out views and, as psnr_train, of the other views,
+and how many Gaussians there are.
 """
 
 import argparse
@@ -247,7 +248,10 @@ def train(names: dict[str, Any], strategy: Any, steps: int, more: dict[str, floa
         runner.train()
         seconds = time.perf_counter() - began
         result = json.loads(Path(runner.stats_dir, f"val_step{steps - 1:04d}.json").read_text())
-    return result | {"seconds": seconds}
+        runner.valset = runner.trainset
+        runner.eval(steps - 1, stage="train")
+        trained = json.loads(Path(runner.stats_dir, f"train_step{steps - 1:04d}.json").read_text())
+    return result | {"psnr_train": trained["psnr"], "seconds": seconds}
 
 
 if __name__ == "__main__":
