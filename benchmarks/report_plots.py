@@ -11,12 +11,13 @@ from matplotlib.ticker import NullLocator
 
 from sehdr_warp.output.charts import COLORS, RULE
 
+from .report_tables import median_of_runs
 from .results import groups
 
 
 def plot_kernels(result: dict, path: Path) -> None:
     """Median times over channels: a panel for each size, a line for each implementation, forward and backward."""
-    rows, panels = [row for row in result["rows"] if row["pass"] != "forward"], []
+    rows, panels = [row for row in median_of_runs(result["rows"]) if row["pass"] != "forward"], []
     for (count, width, height), here in groups(rows, "gaussians", "width", "height").items():
         lines = {
             name: sorted((row["channels"], row["median_ms"]) for row in mine)

@@ -26,9 +26,19 @@ def pivot(rows: Sequence[Mapping], places: dict[str, str], over: str, value: str
     return markdown_table(pivoted, places | dict.fromkeys((row[over] for row in rows), form))
 
 
+def median_of_runs(rows: Sequence[Mapping]) -> list[dict[str, Any]]:
+    """Join the rows of several runs of `kernels`: each time is the median of the runs."""
+    keys = "gaussians", "width", "height", "channels", "pass", "implementation"
+    joined = []
+    for key, runs in groups(rows, *keys).items():
+        times = [name for name in ("median_ms", "host_ms", "device_ms") if name in runs[0]]
+        joined.append(dict(zip(keys, key, strict=True)) | {name: median(run[name] for run in runs) for name in times})
+    return joined
+
+
 def _kernel_tables(result: dict) -> Iterable[str]:
     places = {"Gaussians=gaussians": ",d", "width": "d", "height": "d", "C=channels": "d"}
-    for (passing,), rows in groups(result["rows"], "pass").items():
+    for (passing,), rows in groups(median_of_runs(result["rows"]), "pass").items():
         yield f"## {passing.capitalize()}, median ms"
         yield pivot(rows, places, "implementation", "median_ms", ".3f")
         for key, what in (("host_ms", "of the host alone"), ("device_ms", "of the GPU's kernels alone")):
