@@ -223,7 +223,7 @@ def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list
     if not folder.is_dir():
         return notes
     # nerfstudio writes masks_2, masks_4, ... beside masks.
-    looks = r"(?!masks_\d+$).*(mask|segment)" if places else r".*(mask|segment)"
+    looks = r"(?!masks_\d+$).*(mask|segment|matte|alpha)" if places else r".*(mask|segment|matte|alpha)"
     for place in sorted(folder.iterdir()):
         if place in places or place in used or not re.match(looks, place.name, re.IGNORECASE):
             continue

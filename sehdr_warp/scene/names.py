@@ -85,7 +85,7 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         source: the data file.
 
     Raises:
-        InputError: if the name leads out of the folder.
+        InputError: if the name leads out of the folder by `..` or a link.
     """
     names = dict.fromkeys((name, name.replace("\\", "/")))
     with suppress(UnicodeError):
@@ -95,6 +95,8 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         names |= {os.fsdecode(name.encode("latin-1")): None}
     if inner := _inside(folder, name, source):
         names = {inner: None}
+    elif PureWindowsPath(name).anchor and "\0" not in name:
+        return None
     places = [contained(folder, each, source) for each in names]
     image = next((place for place in places if os.path.isfile(place)), None)
     image = image or next((photo for place in places if (photo := sibling(place, PHOTO_SUFFIXES))), None)

@@ -16,6 +16,7 @@ from .heif import avif_bits
 from .images import EncodedImage, image_sizes, open_image, read_ldr, require_file
 from .lens import Lens
 from .linear_photos import kind_of, raw_sizes, read_raw, tone_mapped
+from .masks import MASK_FOLDERS
 
 FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_NAMED = 3
@@ -97,9 +98,14 @@ def left_out(problems: Sequence[InputError], count: int) -> list[str]:
     rest = count - len(problems)
     if 2 * len(problems) > count or rest < min(FEWEST_PHOTOS, count):
         raise problems[0]
-    reasons = "; ".join(f"{Path(error.path).name}: {error.problem}" for error in problems[:_MOST_NAMED])
+    reasons = "; ".join(f"{_short_name(Path(error.path))}: {error.problem}" for error in problems[:_MOST_NAMED])
     more = " ..." if len(problems) > _MOST_NAMED else ""
     return [f"{len(problems)} of {count} photos cannot be used and were left out ({reasons}{more})"]
+
+
+def _short_name(path: Path) -> str:
+    """Return a file's name, with its folder for a mask, which may have the name of its photo."""
+    return path.name if path.parent.name.lower() not in MASK_FOLDERS else f"{path.parent.name}/{path.name}"
 
 
 def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRecord], list[str]]:

@@ -54,12 +54,12 @@ def read_transforms(folder: Path) -> DataparserOutputs:
                 absent.append(name)
                 continue
             photo_names.append((name, image))
-            record = _frame_record(folder, path, values, frame, name, image, split or splits.get(name))
+            record = _frame_record(folder, path, values, frame, name, image, split or splits.get(_plain(name)))
             records.append(replace(record, world_to_camera=pose))
         if not len(cloud[0]):
             cloud = _points(folder, path, values)
         stated_points = values.get("ply_file_path")
-        if isinstance(stated_points, str) and not contained(folder, stated_points, path).is_file():
+        if isinstance(stated_points, str) and _points_file(folder, stated_points, path) is None:
             missing.append(f"the points that {path.name} states are not here: {stated_points!r:.90}")
     notes = tuple(left_out(unusable, len(records) + len(absent) + len(unusable)))
     if not records:
@@ -138,13 +138,13 @@ def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
 
 
 def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str]:
-    """Return splits by file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
+    """Return splits by _plain() file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
     split_names = ("train", "test", "val")
-    by_name = {name: frame["split"] for name, frame in frames if frame.get("split") in split_names}
+    by_name = {_plain(name): frame["split"] for name, frame in frames if frame.get("split") in split_names}
     for split in ("train", "val", "test"):
         filenames = values.get(f"{split}_filenames")
         if isinstance(filenames, list):
-            by_name.update({name: split for name in filenames if isinstance(name, str)})
+            by_name.update({_plain(name): split for name in filenames if isinstance(name, str)})
     splits = {"train": "train", "test" if "test" in by_name.values() else "val": "test"}
     return {name: splits[split] for name, split in by_name.items() if split in splits}
 
@@ -190,9 +190,22 @@ def _frame_record(
         hdr, image = image, photo
     lens = frame_lens(values, frame, image, path)
     mask, time = frame.get("mask_path"), frame.get("exposure_time", values.get("exposure_time"))
-    mask = None if mask is None else contained(folder, mask, path)
+    mask = _mask_file(folder, mask, path) if mask else None
     time = None if time is None else parse_seconds(time, path, name)
     return ImageRecord(image.stem, image, lens, np.eye(4), exposure_time=time, split=split, mask=mask, hdr=hdr)
+
+
+def _mask_file(folder: Path, name: Any, path: Path) -> Path:
+    """Return the mask that a frame states, by the rules of photos' names; a path without a file if it is not there."""
+    if not isinstance(name, str):
+        return contained(folder, name, path)
+    return find_image(folder, name, path) or folder / PureWindowsPath(name).name
+
+
+def _points_file(folder: Path, name: str, path: Path) -> Path | None:
+    """Return the file of points that a set states, None if it is not there; names as find_image() reads them."""
+    file = find_image(folder, name, path) if name else None
+    return file if file is not None and file.suffix.lower() == ".ply" else None
 
 
 def _matrix(values) -> np.ndarray:
@@ -250,12 +263,12 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
         width, height = photo_sizes(image)[0]
     if str(fields.get("camera_model")).upper() in ("EQUIRECTANGULAR", "SPHERICAL"):
         return Lens("EQUIRECTANGULAR", int(width), int(height), (width, height), path)
+    model, bent = _distortion(fields, number, path)
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
         raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
     center = number("cx", width / 2), number("cy", height / 2)
     pinhole: tuple[Any, ...] = fy if fx is None else fx, fx if fy is None else fy, *center
-    model, bent = _distortion(fields, number, path)
     return Lens(model, int(width), int(height), (*pinhole, *bent), path)
 
 
@@ -290,7 +303,7 @@ def _distortion(fields: dict, number: Callable[..., Any], path: Path) -> tuple[s
 def _points(folder: Path, path: Path, values: dict) -> PointCloud:
     """Read ply_file_path (in the frames' coordinates), or nerfstudio's COLMAP model moved by applied_transform."""
     name = values.get("ply_file_path")
-    if isinstance(name, str) and (ply := contained(folder, name, path)).is_file():
+    if isinstance(name, str) and (ply := _points_file(folder, name, path)) is not None:
         return read_ply_points(ply)
     points, colors = _sparse_points(folder)
     if len(points) and values.get("applied_transform") is not None:

@@ -7,7 +7,7 @@ the camera, and its response is found as for photos.
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from ..errors import InputError, SehdrError
 from ..sandbox import read_sandboxed
 from .chroma import upsample_chroma
 from .images import MAX_PIXELS, check_size
+from .video_color import VideoColor, stated_color
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -32,89 +33,6 @@ _REMEDY = "copy the clip again, or convert it with FFmpeg"
 # FFmpeg's demuxers of VIDEO_SUFFIXES, by content. Others, such as playlists, would open the files that they name.
 _DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mxf"
 _OPTIONS = {"format_whitelist": _DEMUXERS, "protocol_whitelist": "file"}
-# Codes of ITU-T H.273: transfer characteristics, color primaries and matrix coefficients.
-_HLG, _PQ, _LOG100, _LOG316 = 18, 16, 9, 10
-_UNSPECIFIED = 2
-_STATED_CURVES = {_HLG: "colour:ITU-R BT.2100 HLG", _PQ: "colour:ST 2084"}
-_CURVE_NAMES = {
-    1: "Rec.709",
-    4: "gamma 2.2",
-    6: "Rec.601",
-    8: "linear",
-    13: "sRGB",
-    14: "Rec.2020",
-    15: "Rec.2020",
-    16: "PQ",
-    18: "HLG",
-}
-_PRIMARIES = {5: "ITU-R BT.470 - 625", 6: "SMPTE C", 9: "ITU-R BT.2020", 11: "DCI-P3", 12: "Display P3"}
-_LUMA = {
-    1: (0.2126, 0.0722),
-    4: (0.30, 0.11),
-    5: (0.299, 0.114),
-    6: (0.299, 0.114),
-    7: (0.212, 0.087),
-    9: (0.2627, 0.0593),
-}
-# Matrix coefficients that are no luma and color differences of encoded values; FFmpeg does not convert them either.
-_OTHER_MATRICES = {8: "YCgCo", 10: "constant-luminance BT.2020", 11: "Y'D'zD'x", 12: "YCbCr of its own primaries",
-                   13: "constant-luminance YCbCr of its own primaries", 14: "ICtCp", 15: "IPT-C2", 16: "YCgCo-Re",
-                   17: "YCgCo-Ro"}  # fmt: skip
-_DOLBY_VISION = ("dvh1", "dvhe", "dva1", "dvav", "dav1")
-"""Codec tags of Dolby Vision. Without a stated curve the stream is profile 5, whose colors only Dolby's decoder knows;
-phones write profile 8, which is HLG."""
-_RGB_MATRIX = 0
-_FULL_RANGE = 2
-# What makers call their log curves in a clip's metadata: colour-science's curve, and the primaries that belong to it.
-_LOGS = {
-    "applelog": ("Apple Log Profile", "ITU-R BT.2020"),
-    "slog3": ("S-Log3", "S-Gamut3.Cine"),
-    "slog2": ("S-Log2", "S-Gamut"),
-    "vlog": ("V-Log", "V-Gamut"),
-    "canonlog3": ("Canon Log 3", "Cinema Gamut"),
-    "canonlog2": ("Canon Log 2", "Cinema Gamut"),
-    "clog3": ("Canon Log 3", "Cinema Gamut"),
-    "clog2": ("Canon Log 2", "Cinema Gamut"),
-    "dlog": ("D-Log", "DJI D-Gamut"),
-    "nlog": ("N-Log", "N-Gamut"),
-    "flog2": ("F-Log2", "F-Gamut"),
-    "flog": ("F-Log", "F-Gamut"),
-    "llog": ("L-Log", "ITU-R BT.2020"),
-    "logc4": ("ARRI LogC4", "ARRI Wide Gamut 4"),
-    "logc3": ("ARRI LogC3", "ARRI Wide Gamut 3"),
-    "log3g10": ("Log3G10", "REDWideGamutRGB"),
-}
-
-
-@dataclass(frozen=True)
-class VideoColor:
-    """Colors that a clip states.
-
-    Attributes:
-        curve: of its codes, in words.
-        response: name of the response that the curve stands for; None for a camera's own development (SDR).
-        primaries: name of the primaries in colour-science; None for Rec.709.
-        matrix: (kr, kb) of the luma that the codes were made with; None for stored RGB.
-        full_range: whether codes use the whole range.
-        bits: of a sample.
-    """
-
-    curve: str
-    response: str | None
-    primaries: str | None
-    matrix: tuple[float, float] | None
-    full_range: bool
-    bits: int
-
-    def to_rec709(self) -> np.ndarray | None:
-        """Return [3, 3] from the clip's linear colors to linear Rec.709, or None if they are Rec.709."""
-        if self.primaries is None:
-            return None
-        import colour
-
-        spaces = colour.RGB_COLOURSPACES
-        matrix = colour.matrix_RGB_to_RGB(spaces[self.primaries], spaces["ITU-R BT.709"])
-        return np.asarray(matrix, np.float64)
 
 
 @dataclass(frozen=True)
@@ -166,7 +84,7 @@ def open_clip(path: Path) -> Clip:
             raise InputError(path, f"its frames have {width} x {height} pixels", f"give {_SMALLEST} and more a side")
         size = (height, width) if _orientation(frame).turns % 2 else (width, height)
         seconds = float(container.duration or 0) / 1e6
-        color = _color(container, stream, frame, path)
+        color = stated_color(container, stream, frame, path)
         return Clip(path, size, seconds, color, bool(frame.interlaced_frame), aspect != 1)
 
 
@@ -369,51 +287,3 @@ def _stream(container: Any, path: Path) -> Any:
     # Cameras put thumbnails and covers into streams of their own, of which the first may be one.
     best = container.streams.best("video") or container.streams.video[0]
     return max([best, *container.streams.video], key=lambda stream: stream.width * stream.height)
-
-
-def _color(container: Any, stream: Any, frame: Any, path: Path) -> VideoColor:
-    """Return the colors that stream, frame and metadata state.
-
-    Raises:
-        InputError: if its samples are of another kind than luma and color differences, or RGB.
-    """
-    context = stream.codec_context
-    transfer, primaries, matrix = (
-        int(getattr(context, name, _UNSPECIFIED) or _UNSPECIFIED)
-        for name in ("color_trc", "color_primaries", "colorspace")
-    )
-    if matrix in _OTHER_MATRICES and not frame.format.is_rgb:
-        problem = f"its frames are stored as {_OTHER_MATRICES[matrix]}, which is not read"
-        raise InputError(path, problem, "convert the clip to YCbCr of BT.2020 or BT.709")
-    if transfer == _UNSPECIFIED and context.codec_tag in _DOLBY_VISION:
-        problem = "is Dolby Vision of profile 5, whose colors only Dolby's decoder knows"
-        raise InputError(path, problem, "convert it to HLG or PQ, or film in HLG")
-    bits = max((component.bits for component in frame.format.components), default=8)
-    bits = min(max(bits, 8), 16)
-    full = int(context.color_range or 0) == _FULL_RANGE or frame.format.name.startswith("yuvj")
-    luma = None if frame.format.is_rgb else _LUMA.get(matrix, _LUMA[1 if frame.height > 576 else 5])
-    texts = [*container.metadata.items(), *stream.metadata.items()]
-    color = VideoColor("", None, _PRIMARIES.get(primaries), luma, full, bits)
-    if log := _log_curve(texts, transfer, primaries, bits):
-        return replace(color, curve=log[0], response=f"colour:{log[0]}", primaries=log[1])
-    if transfer in _STATED_CURVES:
-        # Where a clip states HLG or PQ alone, its primaries are those of BT.2100.
-        space = color.primaries or (None if primaries == 1 else "ITU-R BT.2020")
-        return replace(color, curve=_CURVE_NAMES[transfer], response=_STATED_CURVES[transfer], primaries=space)
-    if transfer == 8:
-        return replace(color, curve="linear", response="linear")
-    return replace(color, curve=_CURVE_NAMES.get(transfer, "no stated curve"))
-
-
-def _log_curve(texts: list[tuple[str, str]], transfer: int, primaries: int, bits: int) -> tuple[str, str] | None:
-    """Return colour-science's names of a log curve and its primaries if a clip states them."""
-    for _, text in texts:
-        plain = "".join(letter for letter in text.lower() if letter.isalnum())
-        for name, curve in _LOGS.items():
-            if plain == name or plain.endswith(name) or f"gamma{name}" in plain:
-                return curve
-    makers = {text.lower() for key, text in texts if key.lower().endswith("make")}
-    # iPhones leave the transfer function of Apple Log open, and state BT.2020 with 10 bits.
-    if transfer == _UNSPECIFIED and primaries == 9 and bits >= 10 and "apple" in makers:
-        return _LOGS["applelog"]
-    return None

@@ -1,5 +1,6 @@
-"""Clients of requests, and the answer to a request that is refused."""
+"""Clients of requests, the paths that they ask for, and the answer to a request that is refused."""
 
+import re
 from contextlib import AbstractContextManager
 
 from .connections import Connection, Connections
@@ -32,3 +33,9 @@ class Client:
     def asking(self) -> AbstractContextManager[None]:
         """Return a context in which the request is received; see Connection.asking."""
         return self._connection.asking()
+
+
+def own_path(path: str) -> str:
+    """Return the path of a request without its query, and without the prefix that some proxies leave there."""
+    match = re.search(r"/(photo/[^/]+|[^/]*)$", path.partition("?")[0])
+    return match[0] if match else path

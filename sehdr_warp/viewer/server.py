@@ -29,7 +29,7 @@ from ..output.images import quantize
 from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
-from .clients import Client, Refusal
+from .clients import Client, Refusal, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, orient
 from .frames import ViewerScene, camera_file, camera_of, frame_bytes
@@ -349,7 +349,7 @@ class _Handler(BaseHTTPRequestHandler):
         with connections.answering(connection):
             self._send(
                 connection,
-                *self._result_of(partial(find, self.path.partition("?")[0], Client(connections, connection))),
+                *self._result_of(partial(find, own_path(self.path), Client(connections, connection))),
             )
 
     def _result_of(self, find: Callable[[], tuple[str, bytes | memoryview]]) -> tuple[int, str, bytes | memoryview]:

@@ -265,7 +265,7 @@ def test_a_photo_whose_mask_cannot_be_used_is_left_out(tmp_path):
     (tmp_path / "masks" / "001.png").write_bytes(b"no picture")
     scene = load(tmp_path, holdout=0)
     (note,) = (note for note in scene.notes if "left out" in note)
-    assert len(scene.views) == 4 and "2 of 6 photos cannot be used and were left out (000.png: mask is 64 x 30" in note
+    assert len(scene.views) == 4 and "2 of 6 photos cannot be used and were left out (masks/000.png: mask is 64" in note
     for i in range(6):
         write_mask(tmp_path / "masks" / f"{i:03d}.png", HALF[:30])
     with pytest.raises(InputError, match="mask is 64 x 30, its image 64 x 48; make the mask at the image's size"):

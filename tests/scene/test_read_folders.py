@@ -11,7 +11,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene.parse import parse_dataset
 from sehdr_warp.scene.read_folders import find_photos
 from sehdr_warp.scene.unused_files import unused_notes
-from tests.make_scenes import load, pattern, write_blender, write_colmap
+from tests.make_scenes import load, pattern, write_blender, write_colmap, write_ply
 
 
 def photos(folder, count=4, suffix=".jpg"):
@@ -150,6 +150,36 @@ def test_masks_and_points_that_are_missing_are_named(tmp_path):
     assert len(scene.views) == 6
     assert "1 masks that frames state are not here, and their photos count whole: r_1.png" in scene.notes
     assert "the points that transforms.json states are not here: 'sparse_pc.ply'" in scene.notes
+
+
+@pytest.mark.parametrize("before", ["./m/", "m\\", "/home/other/room/m/", "C:\\room\\m\\"])
+def test_masks_and_points_under_other_spellings(tmp_path, before):
+    """instant-DexNerf issue 3 and exports of Windows: photos were found by such names, masks and points were not."""
+    write_blender(tmp_path, 6, ply_file_path=f"{before}cloud.ply")
+    (tmp_path / "m").mkdir()
+    write_ply(tmp_path / "m" / "cloud.ply", [(0, 0, 0), (1, 2, 3)])
+    file = tmp_path / "transforms.json"
+    values = json.loads(file.read_text())
+    for i, frame in enumerate(values["frames"]):
+        frame["mask_path"] = f"{before}half_{i}.png" if i else ""
+        Image.fromarray(np.eye(30, 40, dtype=np.uint8) * 255).save(tmp_path / "m" / f"half_{i}.png")
+    file.write_text(json.dumps(values))
+    scene = load(tmp_path, holdout=0)
+    assert [view.mask is None for view in scene.views] == [True] + [False] * 5
+    assert "not here" not in str(scene.notes) and len(scene.points) == 2
+
+
+def test_splits_under_other_spellings(tmp_path):
+    """nerfstudio compares its lists of names as paths: `./images/r_0` is `images/r_0`."""
+    names = [f"images/r_{i}" for i in range(6)]
+    write_blender(tmp_path, 6, train_filenames=names[:4], test_filenames=["./" + names[4], names[5].replace("/", "\\")])
+    assert [view.name for view in load(tmp_path).test_views] == ["r_4", "r_5"]
+
+
+def test_a_lens_that_is_not_supported_is_named_before_its_focal_length(tmp_path):
+    write_blender(tmp_path, 6, camera_model="VR180_L", camera_angle_x=None)
+    with pytest.raises(InputError, match="camera_model 'VR180_L' is not supported"):
+        load(tmp_path)
 
 
 def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):

@@ -150,9 +150,12 @@ def test_absolute_names_of_a_copied_set(tmp_path, before):
         frame["file_path"] = (before or f"{tmp_path}/") + (name.replace("/", "\\") if "\\" in before else name)
     (tmp_path / "transforms.json").write_text(json.dumps(values))
     assert len(load(tmp_path, holdout=0).views) == 6
-    for file in (tmp_path / "images").iterdir():
+    files = sorted((tmp_path / "images").iterdir())
+    files[0].unlink()
+    assert len(load(tmp_path, holdout=0).views) == 5, "one photo that is missing stops no set"
+    for file in files[1:]:
         file.unlink()
-    with pytest.raises(InputError, match="is absolute; use a path relative to"):
+    with pytest.raises(InputError, match="image file not found, nor any of 6 frames; copy the whole set"):
         load(tmp_path)
 
 

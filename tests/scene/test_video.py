@@ -14,7 +14,8 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, load_scene, look_at
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.names import list_images
-from sehdr_warp.scene.video import VideoColor, codes, decode, is_video, open_clip
+from sehdr_warp.scene.video import codes, decode, is_video, open_clip
+from sehdr_warp.scene.video_color import VideoColor
 from sehdr_warp.scene.video_frames import choose_frames, frames_folder, read_video
 
 from .clips import pan, write_clip

@@ -56,6 +56,15 @@ def test_queries_are_ignored_and_addresses_are_relative(serve):
     assert 'src="/' not in page and 'href="/' not in page and 'ask("/' not in script and "ask(`/" not in script
 
 
+@pytest.mark.parametrize("prefix", ["/proxy/absolute/7007", "/user/me"])
+def test_a_prefix_that_a_proxy_leaves_does_not_matter(serve, prefix):
+    """jupyter-server-proxy's /proxy/absolute/PORT/ and nginx without a trailing slash; visdom pull request 978."""
+    server = serve()
+    for path in ("/", "/viewer.js", "/scene"):
+        assert ask(server, prefix + path)[0::2] == ask(server, path)[0::2]
+    assert ask(server, f"{prefix}/nothing")[0] == 404
+
+
 def test_head_is_a_get_without_content(serve):
     status, kind, content = ask(serve(), "/", method="HEAD")
     assert (status, kind, content) == (200, "text/html", b"")
