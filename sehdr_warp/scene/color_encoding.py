@@ -309,7 +309,8 @@ def _from_gama(info: dict) -> ColorEncoding | None:
             return ColorEncoding("gAMA", problem=f"its gAMA is {gamma:g}")
         if abs(gamma * 2.2 - 1) > 0.02:
             curves = (np.linspace(0, 1, _SAMPLES) ** (1 / gamma),) * 3
-    chunks = [f"gAMA {gamma:.5g}"] * (gamma is not None) + ["cHRM"] * (matrix is not None)
+    chunks = [] if gamma is None else [f"gAMA {gamma:.5g}"]
+    chunks += [] if matrix is None else ["cHRM"]
     return _simplified(" and ".join(chunks), matrix, curves)
 
 

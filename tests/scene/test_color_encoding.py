@@ -266,6 +266,10 @@ def test_gamma_and_primaries_of_png(tmp_path):
     png16(tmp_path / "b.png", np.full((2, 2, 3), 0.5), (b"gAMA", struct.pack(">I", 45_455)))
     with open_image(tmp_path / "b.png") as image:
         assert stated_encoding(image).is_srgb
+    png16(tmp_path / "c.png", np.full((2, 2, 3), 0.5), chunks[1])
+    with open_image(tmp_path / "c.png") as image:
+        alone = stated_encoding(image)
+    assert alone.name == "cHRM" and not alone.curves and alone.to_rec709 is not None, "primaries without a gamma"
 
 
 def test_photos_of_one_name_in_several_folders_are_counted_each(tmp_path):
