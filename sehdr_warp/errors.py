@@ -17,6 +17,15 @@ _ARGUMENTS = {
     "--overwrite": "overwrite=True",
     "--max-size": "max_size",
     "--holdout": "holdout",
+    "--device cpu": 'device="cpu"',
+    "--inpaint": "inpaint=True",
+    "--evs": "evs",
+    "--axes": "axes",
+    "--up": "up",
+    "--scale": "scale",
+    "--crop": "crop",
+    "--at": "at",
+    "--beyond": "beyond",
 }
 """Python names of the flags in messages."""
 _shows_flags = False

@@ -246,4 +246,6 @@ def test_errors_name_arguments_in_python_and_flags_on_the_command_line():
     with flags_in_messages():
         assert str(error) == "runs/a: exists; use --resume, or type `sehdr-warp train --overwrite`"
     assert str(error) == python
+    no_surface = SehdrError("there is no surface to mesh; take another --crop, up and --up=0,1,0 or --device cpu")
+    assert str(no_surface).endswith('take another crop, up and up=0,1,0 or device="cpu"')
     assert str(UsageError("no flag --resume")) == "no flag --resume"

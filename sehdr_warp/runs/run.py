@@ -29,6 +29,7 @@ from .checkpoint import PICTURE, Checkpoint, under
 from .config import Config
 from .light_estimates import light_estimates
 from .load_arguments import LoadArguments
+from .open import pick_device
 from .run_folder import CameraEntry, RunFolder
 from .run_writer import write_confidence
 
@@ -165,11 +166,12 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
         device: "cpu", "cuda:0", ...
 
     Raises:
-        InputError: If the file, or the cameras.json beside it, is missing, damaged or of another kind.
+        InputError: If the file, or the cameras.json beside it, is missing, damaged or of another kind, or for a device
+            that torch cannot use.
     """
     path = Path(path)
     gaussians = read_gaussians(path)
-    model = on_device(field_of(gaussians), torch.device(device))
+    model = on_device(field_of(gaussians), pick_device(device))
     own, shared, cameras = path.with_name(f"{path.stem}.cameras.json"), path.with_name("cameras.json"), ()
     beside = next((file for file in (own, shared) if file.is_file()), None)
     if beside is not None:
@@ -292,7 +294,8 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
         device: "cpu", "cuda:0", ...
 
     Raises:
-        InputError: With file and field, if the folder is not a run, or has no usable checkpoint.
+        InputError: With file and field, if the folder is not a run, or has no usable checkpoint; for a device that
+            torch cannot use.
     """
     folder = RunFolder(path)
     folder.require()
@@ -302,7 +305,7 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
     model = field_from_checkpoint(checkpoint, config, info)
     model.confidence = folder.read_confidence(checkpoint)
-    return Run(folder, config, on_device(model.requires_grad_(False), torch.device(device)), info, checkpoint.values)
+    return Run(folder, config, on_device(model.requires_grad_(False), pick_device(device)), info, checkpoint.values)
 
 
 def on_device(model: RadianceField, device: torch.device, budget: int | None = None) -> RadianceField:
