@@ -26,8 +26,7 @@ from .read_folders import (
     read_hdr_nerf_real,
     read_llff,
 )
-from .read_opensfm import FILE as OPENSFM_FILE
-from .read_opensfm import read_opensfm
+from .read_opensfm import find_reconstruction, read_opensfm
 from .read_transforms import read_hdr_nerf, read_transforms
 from .truth_files import assign_truth
 from .unused_files import ARCHIVE_SUFFIXES, unused_notes
@@ -144,7 +143,7 @@ def _read(folder: Path) -> DataparserOutputs:
         (beside, read_colmap),
         (has("transforms.json") or has("transforms_train.json"), read_transforms),
         (model is not None and model_fits(folder, model), read_colmap),
-        (has(OPENSFM_FILE), read_opensfm),
+        (find_reconstruction(folder) is not None, read_opensfm),
         (has("poses_bounds.npy"), read_llff),
     )
     return next((reader for fits, reader in readers if fits), find_photos)(folder)

@@ -49,6 +49,7 @@ _POSE_FILES = {
     "cameras.sfm": "Meshroom", "model.nvm": "VisualSFM", "registration.csv": "RealityCapture",
     "mesh_info.json": "Polycam", "metadata.json": "Record3D", "arposes.txt": "ARKit",
 }  # fmt: skip
+_CAMERA_FILES = ("transforms.json", "reconstruction.json", "poses_bounds.npy")  # Beside a folder of photos
 _REMEDY = "copy the images that COLMAP used"
 _POSES_REMEDY = "export the poses again with LLFF's imgs2poses"
 
@@ -360,7 +361,8 @@ def _folders_with_photos(folder: Path) -> list[str]:
         folders[:] = [] if deepest else sorted(name for name in folders if not is_kept_by_system(name))
         if place.parts and list_images(folder / place, PHOTO_SUFFIXES):
             above = folder / place.parent
-            is_set = place.parent.parts and (find_model(above) is not None or (above / "transforms.json").is_file())
+            has_cameras = any((above / name).is_file() for name in _CAMERA_FILES) or find_model(above) is not None
+            is_set = place.parent.parts and has_cameras
             result[(place.parent if is_set else place).as_posix()] = None
     return list(result)
 

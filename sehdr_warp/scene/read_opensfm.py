@@ -7,14 +7,21 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..files import contained, read_text
+from ..files import read_text
 from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud
 from .lens import Lens
-from .names import natural_key
+from .names import find_image, natural_key
+from .photos import left_out
 
 FILE = "reconstruction.json"
+_PLACES = (FILE, f"opensfm/{FILE}")  # The second is OpenDroneMap's, whose images lie beside opensfm/
 _REMEDY = "export it again with OpenSfM"
 _SPHERES = ("spherical", "equirectangular")
+
+
+def find_reconstruction(folder: Path) -> Path | None:
+    """Return the file of reconstructions of a set, in the folder or its `opensfm/`, or None."""
+    return next((folder / place for place in _PLACES if (folder / place).is_file()), None)
 
 
 def read_opensfm(folder: Path) -> DataparserOutputs:
@@ -23,28 +30,36 @@ def read_opensfm(folder: Path) -> DataparserOutputs:
     Raises:
         InputError: if the file is damaged, or none of its images is there.
     """
-    path = folder / FILE
+    path = find_reconstruction(folder) or folder / FILE
+    images = next(
+        (place / "images" for place in (path.parent, folder) if (place / "images").is_dir()), folder / "images"
+    )
     try:
         models = json.loads(read_text(path))
+        if models == []:
+            raise InputError(path, "holds no reconstruction", "reconstruct again: OpenSfM placed no image")
         model = max(models, key=lambda each: len(each["shots"]))
         shots, cameras = dict(model["shots"]), dict(model["cameras"])
     except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
         raise InputError(path, f"is not a list of reconstructions ({error!r:.60})", _REMEDY) from None
     lenses = {name: _lens(values, path, name) for name, values in cameras.items()}
-    records, absent = [], []
+    records, absent, unusable = [], [], []
     for name in sorted(shots, key=natural_key):
-        image = contained(folder / "images", name, path)
-        if not image.is_file():
+        image = find_image(images, name, path)
+        if image is None:
             absent.append(name)
             continue
         camera = shots[name].get("camera") if isinstance(shots[name], dict) else None
         lens = lenses.get(camera) if isinstance(camera, str) else None
         if lens is None:
             raise InputError(path, f"shot {name!r:.90} has no camera of the file", _REMEDY)
-        records.append(ImageRecord(image.stem, image, lens, _pose(shots[name], path, name), oriented=True))
+        try:
+            records.append(ImageRecord(image.stem, image, lens, _pose(shots[name], path, name), oriented=True))
+        except InputError as error:
+            unusable.append(error)
+    notes = left_out(unusable, len(records) + len(unusable))
     if not records:
-        raise InputError(folder / "images", f"none of the {len(shots)} images of {FILE} is here", "copy the whole set")
-    notes = []
+        raise InputError(images, f"none of the {len(shots)} images of {FILE} is here", "copy the whole set")
     if absent:
         notes.append(f"{len(absent)} images of {FILE} are missing and were left out: {absent[0]!r:.90} ...")
     if len(models) > 1:

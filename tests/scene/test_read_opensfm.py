@@ -17,7 +17,7 @@ def write(folder, kind="spherical", count=4, size=None, **changes):
     width, height = size or SIZES.get(kind, (48, 36))
     camera = {"projection_type": kind, "width": width, "height": height, "focal": 0.3 if kind == "fisheye" else 0.9}
     shots = {}
-    (folder / "images").mkdir(exist_ok=True)
+    (folder / "images").mkdir(exist_ok=True, parents=True)
     for i in range(count):
         pixels = np.random.default_rng(i).integers(20, 230, (height, width, 3), np.uint8)
         Image.fromarray(pixels).save(folder / "images" / f"{i}.jpg")
@@ -59,9 +59,29 @@ def test_what_cannot_be_used_is_named(tmp_path):
     refused("projection_type 'dual', which is not supported", json.dumps(whole))
     whole[1]["cameras"]["v2"]["projection_type"] = "spherical"
     whole[1]["shots"]["1.jpg"]["rotation"] = [0, "x", 1]
-    refused("pose of '1.jpg' cannot be used", json.dumps(whole))
+    (folder / "reconstruction.json").write_text(json.dumps(whole))
+    scene = load_scene(folder, response="srgb")
+    assert len(scene.views) == 3 and "pose of '1.jpg' cannot be used" in scene.notes[0]
+    for name in ("0.jpg", "2.jpg"):
+        whole[1]["shots"][name]["rotation"] = [0, "x", 1]
+    refused("pose of '0.jpg' cannot be used", json.dumps(whole))
+    refused("holds no reconstruction; reconstruct again", "[]")
     whole[1]["shots"]["1.jpg"] = {"camera": "other", "rotation": [0, 0, 0], "translation": [0, 0, 0]}
     refused("shot '1.jpg' has no camera", json.dumps(whole))
+
+
+@pytest.mark.parametrize("images", ["images", "opensfm/images"])
+def test_projects_of_opendronemap(tmp_path, images):
+    """OpenSplat issue 126: the reconstruction lies in opensfm/, the photos beside it or in it, in other letters."""
+    write(tmp_path, "perspective")
+    (tmp_path / "opensfm").mkdir()
+    (tmp_path / "reconstruction.json").rename(tmp_path / "opensfm" / "reconstruction.json")
+    if images != "images":
+        (tmp_path / "images").rename(tmp_path / images)
+    (tmp_path / images / "1.jpg").rename(tmp_path / images / "1.JPG")
+    assert len(load_scene(tmp_path, response="srgb").views) == 4
+    with pytest.raises(InputError, match="give one of its folders with photos: set"):
+        load_scene(write(tmp_path / "above" / "set").parent, response="srgb")
 
 
 def test_colmap_panoramas(tmp_path):
