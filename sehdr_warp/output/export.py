@@ -103,6 +103,8 @@ def export(
     color_model = "display" if kind == "ldr" else radiance
     whole, parts = [], []
     for scene in (run, *merge):
+        means = scene.field.gaussians.means.detach().cpu().numpy()
+        edits.check_regions(upright.points(scene.field.normalization.scene_points(means)))  # Before minutes of fitting
         gaussians = _gaussians_in_colors(scene, color_model, time)
         whole.append(gaussians)
         mask = edits.mask(gaussians.opacities, upright.points(gaussians.means), scene)

@@ -122,11 +122,7 @@ class SplatEdits:
         Raises:
             SehdrError: If none stays, or views are to be counted and the scene has no cameras.
         """
-        steps = {"fainter than min_opacity": opacities < self.min_opacity}
-        if self.crop:
-            steps[f"outside of {self.crop}"] = ~read_region(self.crop).contains(upright_means)
-        if self.cut:
-            steps[f"inside of {self.cut}"] = read_region(self.cut).contains(upright_means)
+        steps = {"fainter than min_opacity": opacities < self.min_opacity} | self._outside(upright_means)
         if self.min_views:
             cameras = training_cameras(run)
             if not cameras:
@@ -142,10 +138,31 @@ class SplatEdits:
             if goes.any():
                 log.info("left out: %d Gaussians (%.0f %%) %s", goes.sum(), 100 * goes.mean(), reason)
         if not mask.any():
-            low, high = (np.percentile(upright_means, q, axis=0) for q in (2, 98))
-            extent = " to ".join(", ".join(f"{v:.3g}" for v in corner) for corner in (low, high))
-            raise SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in upright coordinates")
+            raise _nothing_left(upright_means)
         return mask
+
+    def check_regions(self, upright_means: np.ndarray) -> None:
+        """Raise SehdrError if crop and cut leave none of the Gaussians at upright_means [N, 3]."""
+        removed = np.zeros(len(upright_means), bool)
+        for outside in self._outside(upright_means).values():
+            removed |= outside
+        if removed.all():
+            raise _nothing_left(upright_means)
+
+    def _outside(self, upright_means: np.ndarray) -> dict[str, np.ndarray]:
+        """Return [N] which Gaussians crop and cut remove, by what the log says of them."""
+        steps = {}
+        if self.crop:
+            steps[f"outside of {self.crop}"] = ~read_region(self.crop).contains(upright_means)
+        if self.cut:
+            steps[f"inside of {self.cut}"] = read_region(self.cut).contains(upright_means)
+        return steps
+
+
+def _nothing_left(upright_means: np.ndarray) -> SehdrError:
+    low, high = (np.percentile(upright_means, q, axis=0) for q in (2, 98))
+    extent = " to ".join(", ".join(f"{v:.3g}" for v in corner) for corner in (low, high))
+    return SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in upright coordinates")
 
 
 def most_visible(mask: np.ndarray, count: int, run: "RenderableScene") -> np.ndarray:
