@@ -88,7 +88,9 @@ def main(module: str, name: str, path: str, memory: str) -> int:
         with open(1, "wb", closefd=False) as out:
             out.write(packed.getbuffer())
     except Exception as error:  # noqa: BLE001 - whatever a reader raises says that it cannot read
-        os.write(2, f"\n{type(error).__name__}: {' '.join(str(error).split())[-140:]}\n".encode(errors="replace"))
+        message = " ".join(str(error).split())[-140:]
+        kind = "" if message and type(error) is ValueError else f"{type(error).__name__}: "  # Readers' own words
+        os.write(2, f"\n{kind}{message}\n".encode(errors="replace"))
         return 1
     return 0
 

@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -15,6 +15,8 @@ from .images import PHOTO_SUFFIXES
 from .names import Listing, bases_of, folded
 
 EXPOSURES = "exposures.json"
+_LISTS = ("exposures", "exposure_times", "exposure")  # Names under which people list times in other files
+_LIST_SUFFIXES = (".csv", ".txt", ".tsv")
 _MOST_NAMED = 3
 
 
@@ -133,7 +135,7 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
     bases = bases_of(images, source)
     parents = {image.parent for image in images}
     places, listing = dict.fromkeys((source, *reversed(bases), *(image.parent for image in images))), Listing()
-    times, notes = {}, []
+    times, notes = {}, _unread_lists(places)
     for place in places:
         if not (place / EXPOSURES).is_file():
             continue
@@ -159,6 +161,14 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
             text = ", ".join(ambiguous[:_MOST_NAMED])
             notes.append(f"{EXPOSURES}: {len(ambiguous)} names fit several photos, and need their folders: {text}")
     return times, notes
+
+
+def _unread_lists(places: Iterable[Path]) -> list[str]:
+    """Return a note on each file that seems to list times and is not read, such as exposures.csv."""
+    files = (file for place in places if place.is_dir() for file in sorted(place.iterdir()) if file.suffix)
+    lists = (file.name for file in files if file.stem.lower() in _LISTS and file.name != EXPOSURES)
+    unread = (name for name in lists if name.lower() == EXPOSURES or name.lower().endswith(_LIST_SUFFIXES))
+    return [f'{name} is not read: write {EXPOSURES}, {{"file name": seconds, ...}}' for name in unread]
 
 
 def _read_times(path: Path) -> Mapping[str, float]:

@@ -36,6 +36,7 @@ def read_transforms(folder: Path) -> DataparserOutputs:
     records, absent, cloud = [], [], NO_POINTS
     photo_names: list[tuple[str, Path]] = []
     unusable: list[InputError] = []
+    untimed: list[InputError] = []
     missing: list[str] = []
     for path, split in files:
         if split == "test" and not path.is_file():
@@ -54,8 +55,14 @@ def read_transforms(folder: Path) -> DataparserOutputs:
                 absent.append(name)
                 continue
             photo_names.append((name, image))
-            record = _frame_record(folder, path, values, frame, name, image, split or splits.get(_plain(name)))
-            records.append(replace(record, world_to_camera=pose))
+            record = _frame_record(folder, path, values, frame, image, split or splits.get(_plain(name)))
+            time = frame.get("exposure_time", values.get("exposure_time"))
+            try:
+                seconds = None if time is None else parse_seconds(time, path, name)
+            except InputError as error:
+                untimed.append(error)
+                seconds = None
+            records.append(replace(record, world_to_camera=pose, exposure_time=seconds))
         if not len(cloud[0]):
             cloud = _points(folder, path, values)
         stated_points = values.get("ply_file_path")
@@ -67,6 +74,10 @@ def read_transforms(folder: Path) -> DataparserOutputs:
             folder / _plain(absent[0]), f"image file not found, nor any of {len(absent)} frames", _INCOMPLETE
         )
     notes += (*_absent_note(absent, len(records)), *renamed_note(photo_names))
+    if 2 * len(untimed) > len(records):
+        raise untimed[0]
+    if untimed:
+        notes += (f"{len(untimed)} of {len(records)} frames state no usable exposure time: {untimed[0].problem}",)
     records, repeated = distinct(records)
     notes += (*repeated, *missing)
     records, unmasked = _without_missing_masks(records)
@@ -181,18 +192,15 @@ def _frame_image(folder: Path, name: str, path: Path) -> Path | None:
     return image
 
 
-def _frame_record(
-    folder: Path, path: Path, values: dict, frame: dict, name: str, image: Path, split: str | None
-) -> ImageRecord:
-    """Return the photo of a frame without its pose."""
+def _frame_record(folder: Path, path: Path, values: dict, frame: dict, image: Path, split: str | None) -> ImageRecord:
+    """Return the photo of a frame without its pose and exposure time."""
     hdr = None
     if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
         hdr, image = image, photo
     lens = frame_lens(values, frame, image, path)
-    mask, time = frame.get("mask_path"), frame.get("exposure_time", values.get("exposure_time"))
+    mask = frame.get("mask_path")
     mask = _mask_file(folder, mask, path) if mask else None
-    time = None if time is None else parse_seconds(time, path, name)
-    return ImageRecord(image.stem, image, lens, np.eye(4), exposure_time=time, split=split, mask=mask, hdr=hdr)
+    return ImageRecord(image.stem, image, lens, np.eye(4), split=split, mask=mask, hdr=hdr)
 
 
 def _mask_file(folder: Path, name: Any, path: Path) -> Path:

@@ -93,6 +93,30 @@ def test_listed_times_of_no_photo_are_named(tmp_path):
     assert [note for note in load(tmp_path).notes if "6 of its 6 names" in note and "shot2.jpg ..." in note]
 
 
+@pytest.mark.parametrize("name", ["exposures.csv", "Exposures.json", "exposure_times.txt"])
+def test_lists_of_times_that_are_not_read_are_named(tmp_path, name):
+    write_blender(tmp_path)
+    (tmp_path / name).write_text("{}")
+    note = f'{name} is not read: write exposures.json, {{"file name": seconds, ...}}'
+    assert note in load(tmp_path).notes
+
+
+def test_one_frame_with_an_impossible_time_stops_no_set(tmp_path):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(values["frames"]):
+        frame["exposure_time"] = 0.5 if i else -1
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6 and scene.views[1].exposure_time == 0.5
+    assert "1 of 6 frames state no usable exposure time: exposure time of './images/r_0' is -1" in scene.notes
+    for frame in values["frames"]:
+        frame["exposure_time"] = -1
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match="exposure time of './images/r_0' is -1; state seconds above zero"):
+        load(tmp_path)
+
+
 @pytest.mark.parametrize(
     "name",
     ["{}.JPG", "{}.CR2", "images/{}", "C:\\scan\\images\\{}.jpg", "/home/me/scan/images/{}.jpg", "./IMAGES/{}.jpg"],
