@@ -67,7 +67,7 @@ def row(job: tuple[str, int, int, str, str], *, iterations: int, max_size: int |
     curve = response_by_name("srgb")
     truth = load_scene(f"embedded:{name}", max_size=max_size, response="srgb")
     time = exposure_ladder(truth, curve)[exposure]
-    scene = photographed(truth, curve, time, bits, kind, SensorNoise() if noise == "camera" else None)
+    scene = photograph(truth, curve, time, bits, kind, SensorNoise() if noise == "camera" else None)
     config = load_config("default", {"schedule.iterations": iterations, "response.name": "srgb"})
     with tempfile.TemporaryDirectory() as folder:
         figures = evaluate(train(scene, Path(folder) / "run", config, device=device), scene)
@@ -77,7 +77,7 @@ def row(job: tuple[str, int, int, str, str], *, iterations: int, max_size: int |
     return place | {region.replace("-", "_"): regions[region]["psnr_mu"]["gt-max"] for region in regions}
 
 
-def photographed(truth: Scene, curve: Response, time: float, bits: int, kind: str, noise: SensorNoise | None) -> Scene:
+def photograph(truth: Scene, curve: Response, time: float, bits: int, kind: str, noise: SensorNoise | None) -> Scene:
     """Return the scene in photos of `bits` bits.
 
     kind: "linear" rounds before the curve, and the photos are read as RAW files are; "curve" rounds behind it.

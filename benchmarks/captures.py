@@ -91,7 +91,7 @@ def compare(
     figures_of_run = {"iterations": run.iterations, "seconds": run.train_seconds, "gaussians": run.gaussian_count}
     scores = [(line["seconds"], line["psnr_ldr"]) for line in run.metrics()]
     figures_of_run["best"] = max(score for _, score in scores)
-    add("sehdr-warp", run.response, lambda view: photographed(run, view), **figures_of_run)
+    add("sehdr-warp", run.response, lambda view: photograph(run, view), **figures_of_run)
     shutil.rmtree(scratch)
     response, normalized = response_for_training(scene, load_config("default")), normalization_of(scene)
     for strategy in strategies:
@@ -116,7 +116,7 @@ def seconds_until(scores: Iterable[tuple[float, float]], level: float) -> float 
 
 
 @torch.no_grad()
-def photographed(run: Run, view: View) -> Tensor:
+def photograph(run: Run, view: View) -> Tensor:
     """Return [H, W, 3] encoded: the scene as the camera shows it, with the exposure and vignetting of that photo."""
     light = run.field.render(view.camera, degree=run.degree).hdr * view.exposure_time
     compensation = run.exposure_compensation

@@ -30,12 +30,12 @@ class LightMap:
     Attributes:
         position: [3] in the scene.
         radiance: [H, 2 H, 3], lat-long in the scene's axes (see output.environment_map).
-        seen: [H, 2 H] in [0, 1], the part of a pixel that photos show.
+        coverage: [H, 2 H] in [0, 1], the part of a pixel that photos show.
     """
 
     position: np.ndarray
     radiance: np.ndarray
-    seen: np.ndarray
+    coverage: np.ndarray
 
 
 def read_light_maps(folder: Path) -> list[LightMap]:
@@ -63,7 +63,7 @@ def read_light_maps(folder: Path) -> list[LightMap]:
 def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Camera], scale: float = 1.0) -> dict:
     """Return relative errors of irradiance over all directions of all places.
 
-    Light is the mean over channels, and only that which photos show: render and truth are multiplied by `seen`.
+    Light is the mean over channels, and only that which photos show: render and truth are multiplied by `coverage`.
     Surfaces that face too little of it do not count.
 
     Args:
@@ -92,7 +92,7 @@ def rendered_map(run: Any, truth: LightMap, focal: float, without: Sequence[torc
 
     focal: pixels, of the training cameras. without: groups of Gaussians that give no light.
     """
-    height, width = truth.seen.shape
+    height, width = truth.coverage.shape
     finer = int(np.clip(np.ceil(2 * np.pi * focal / width), FINER, FINEST))
     fine = finer * width
     options: dict[str, Any] = {"focal_length": focal, "pixel_angle": 2 * np.pi / fine}
@@ -107,9 +107,9 @@ def typical_focal(cameras: Sequence[Camera]) -> float:
 
 
 def _errors(run: Any, truth: LightMap, focal: float, scale: float) -> np.ndarray:
-    width = truth.seen.shape[1]
+    width = truth.coverage.shape[1]
     light = scale * rendered_map(run, truth, focal).mean(2)
-    weight = truth.seen * solid_angles(width, "latlong")
+    weight = truth.coverage * solid_angles(width, "latlong")
     facing = np.maximum(sphere_directions(NORMALS) @ latlong(width).reshape(-1, 3).T, 0)
     rendered, true, coverage = (facing @ (each * weight).ravel() for each in (light, truth.radiance.mean(2), 1.0))
     covered = coverage > LEAST_SEEN * (facing @ solid_angles(width, "latlong").ravel())

@@ -64,7 +64,7 @@ def against_float64(scene: SplatScene, most: int, name: str = OURS) -> list[dict
     """Check our kernels in float32 against float64, on a scene like this of at most `most` Gaussians."""
     small = make_splat_scene(scene.size.reduced(most), scene.channels, scene.device)
     truth = _image_and_gradients(small.to("cpu", torch.float64), rasterize_reference)
-    return _compared(name, "float64", _image_and_gradients(small), truth)
+    return _compare(name, "float64", _image_and_gradients(small), truth)
 
 
 @torch.no_grad()
@@ -77,11 +77,11 @@ def _checks(scene: SplatScene, peer: bool) -> list[dict]:
     """Check our kernels on a scene like this of at most REFERENCE_GAUSSIANS Gaussians."""
     checks = against_float64(scene, REFERENCE_GAUSSIANS)
     if scene.device.type == "cuda":
-        cpu, recorded = _image_and_gradients(scene.to("cpu")), _recorded(scene, scene.cotangent())()
+        cpu, recorded = _image_and_gradients(scene.to("cpu")), _record(scene, scene.cotangent())()
         # The last of as many calls as are launched before a picture of this size is replayed.
         repeated = [_image_and_gradients(scene) for _ in range(WARMUP_CALLS + 2)][-1]
         for name, ours in ((OURS, repeated), (RECORDED, recorded)):
-            checks += _compared(name, "the CPU's kernels", ours, cpu)
+            checks += _compare(name, "the CPU's kernels", ours, cpu)
     return [*checks, against_gsplat(scene)] if peer else checks
 
 
@@ -90,7 +90,7 @@ def _image_and_gradients(scene: SplatScene, rasterizer: Callable | None = None) 
     return [image.detach(), *torch.autograd.grad(image, scene.leaves, scene.cotangent())]
 
 
-def _compared(name: str, against: str, ours: list[torch.Tensor], truth: list[torch.Tensor]) -> list[dict]:
+def _compare(name: str, against: str, ours: list[torch.Tensor], truth: list[torch.Tensor]) -> list[dict]:
     """Compare an image and the gradients of NAMES."""
     labels, bounds = ["image", *(f"gradient of {leaf}" for leaf in NAMES)], [IMAGE_BOUND] + [GRADIENT_BOUND] * 5
     pairs = zip(labels, ours, truth, bounds, strict=True)
@@ -103,7 +103,7 @@ def _difference(value: torch.Tensor, other: torch.Tensor) -> float:
     return float((value - other).norm() / other.norm().clamp_min(1e-300))
 
 
-def _recorded(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
+def _record(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
     """Return a replay of [image], or with a cotangent of [image, gradients of the leaves]."""
     with torch.no_grad():
         max_intersections = rasterize(*scene.arguments).intersection_count * 5 // 4
@@ -143,7 +143,7 @@ def _rows(scene: SplatScene, peer: bool, repetitions: int) -> list[dict]:
     for name, backward in (("forward", False), ("forward + backward", True)):
         variants = {key: splat_variant(call, scene, backward) for key, call in renderers.items()}
         if scene.device.type == "cuda":
-            variants[RECORDED] = Variant(_recorded(scene, scene.cotangent() if backward else None))
+            variants[RECORDED] = Variant(_record(scene, scene.cotangent() if backward else None))
         timings = time_variants(variants, scene.device, repetitions=repetitions, apart=True)
         for key, timing in timings.items():
             row = place | {"channels": scene.channels, "pass": name, "implementation": key, "entries": entries}

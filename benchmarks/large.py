@@ -25,7 +25,7 @@ from sehdr_warp.scene import Scene
 from sehdr_warp.scene.normalization import normalization_of
 from sehdr_warp.training.train import create_trainer
 
-from .captures import figures, photographed
+from .captures import figures, photograph
 from .gsplat_trainer import GsplatScene, Snapshot, train_gsplat
 from .results import finish, new_result
 from .splats import Size, make_photo_scene, parse_size
@@ -76,7 +76,7 @@ def _train(scene: Scene, config: Config, device: str) -> dict:
         memory = held_memory(training.device) or 0
     row = {"method": "sehdr-warp", "gaussians": training.run.gaussian_count, "seconds": training.seconds - begun}
     row["tests"] = [[line["iteration"], line["psnr_ldr"]] for line in training.run.metrics()]
-    row |= {"memory": memory} | _means(lambda view: photographed(training.run, view), scene, device)
+    row |= {"memory": memory} | _means(lambda view: photograph(training.run, view), scene, device)
     shutil.rmtree(scratch)
     return row
 

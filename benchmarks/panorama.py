@@ -87,11 +87,11 @@ def main(
     renders = np.stack([run.render(camera).hdr.cpu().numpy() for camera in judged])
     rays = np.stack([_rays(camera) for camera in judged])
     weight, directions = solid_angles(width, "latlong"), latlong(width)
-    errors = _squared(_even(read_hdr(map_file)), _even(panorama), peak)
+    errors = _squared_distance(_even(read_hdr(map_file)), _even(panorama), peak)
     column = np.arange(width)
     edge = np.broadcast_to((column < EDGE) | (column >= width - EDGE), errors.shape)
     pole, shown_pole = (np.abs(each[..., 1]) > np.cos(POLE) for each in (directions, rays))
-    plain = _squared(renders, truth_views, peak)
+    plain = _squared_distance(renders, truth_views, peak)
     parts = {
         "12 perspective views": (plain, np.ones(plain.shape)),
         "of these, 15 degrees around the map's poles": (plain, 1.0 * shown_pole),
@@ -206,7 +206,7 @@ def _mu(image: np.ndarray, peak: float) -> np.ndarray:
     return mu_law(torch.from_numpy(np.ascontiguousarray(image)) / peak).numpy()
 
 
-def _squared(image: np.ndarray, truth: np.ndarray, peak: float) -> np.ndarray:
+def _squared_distance(image: np.ndarray, truth: np.ndarray, peak: float) -> np.ndarray:
     """[...] squared mu-law error, mean over channels."""
     return ((_mu(image, peak) - _mu(truth, peak)) ** 2).mean(axis=-1)
 

@@ -56,7 +56,7 @@ class Work:
         harmonics: numbers of a Gaussian's harmonics.
         channels: features that are blended.
         pairs: pairs of a Gaussian and a tile.
-        drawn: pairs of a Gaussian and a warp that blends it.
+        pairs: pairs of a Gaussian and a warp that blends it.
         pixels: of the image.
     """
 
@@ -64,7 +64,7 @@ class Work:
     harmonics: int
     channels: int
     pairs: int
-    drawn: int
+    warp_pairs: int
     pixels: int
 
 
@@ -89,8 +89,8 @@ BYTES: dict[str, Callable[[Work], float]] = {
 """The fewest bytes that each part must move, were nothing read twice."""
 
 INSTRUCTIONS: dict[str, Callable[[Work], float]] = {
-    "blend": lambda w: w.drawn * (28 + 1.25 * (w.channels - 3)),
-    "blend, backward": lambda w: w.drawn * (49 + 2.25 * (w.channels - 3)),
+    "blend": lambda w: w.warp_pairs * (28 + 1.25 * (w.channels - 3)),
+    "blend, backward": lambda w: w.warp_pairs * (49 + 2.25 * (w.channels - 3)),
 }
 """That warps issue, at least: what sm_90's code of three channels has for a Gaussian in a warp, and one multiply-add
 and a fourth of a load for each more; the backward pass sums once more."""

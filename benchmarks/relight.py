@@ -103,13 +103,13 @@ def balls(
         lights: shapes in the scene's coordinates, with their radiance [3].
         samples: paths of a pixel.
     """
-    visible_light = np.maximum(radiance, 0) * place.seen[..., None]
+    visible_light = np.maximum(radiance, 0) * place.coverage[..., None]
     scene: dict[str, Any] = {"type": "scene", "integrator": {"type": "path", "max_depth": DEPTH}}
     scene["map"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(visible_light, np.float32))}
     for index, (shape, light) in enumerate(lights):
         scene[f"light_{index}"] = _emitter(mi, shape, light, place.position)
-    weight = solid_angles(place.seen.shape[1], "latlong") * place.seen
-    ahead = np.einsum("hw,hwk->k", weight, latlong(place.seen.shape[1]))
+    weight = solid_angles(place.coverage.shape[1], "latlong") * place.coverage
+    ahead = np.einsum("hw,hwk->k", weight, latlong(place.coverage.shape[1]))
     ahead = np.array([*ahead[:2], 0.0]) / max(np.linalg.norm(ahead[:2]), 1e-9)
     across = np.cross(ahead, (0.0, 0.0, 1.0))
     gold = {"type": "roughconductor", "material": "Au", "alpha": 0.2}

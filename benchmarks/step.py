@@ -149,7 +149,7 @@ def _rows(scene: Scene, config: Config, device: torch.device, repetitions: int) 
             row["ours_over_this"] = rows[0]["median_ms"] / row["median_ms"]
         else:
             with torch_settings(config.deterministic):
-                row |= amortized(trainer, trainer.step)
+                row |= amortize(trainer, trainer.step)
         rows.append(row)
         del trainer
     return rows
@@ -172,7 +172,7 @@ def _plain_torch(*arguments, max_intersections=None, deterministic=False, **opti
     return rasterize_reference(*arguments, **options)
 
 
-def amortized(trainer: Trainer, step: Callable[[], object]) -> dict:
+def amortize(trainer: Trainer, step: Callable[[], object]) -> dict:
     """Return the mean step over whole densification intervals, changes of the count included."""
     trainer.iteration = thick_of_training(trainer.config) - 1
     step()  # the first change prepares what the others use

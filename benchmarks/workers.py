@@ -22,7 +22,7 @@ from sehdr_warp.training.ranks import GO, Ranks, join_ranks
 
 from .results import check, new_result
 from .splats import Size, make_photo_scene
-from .step import amortized, make_trainer, step_variant
+from .step import amortize, make_trainer, step_variant
 from .timing import time_variants, wait
 
 LOG = logging.getLogger(__name__)
@@ -116,9 +116,9 @@ def _time_steps(ranks: Ranks | None, size: Size, device: torch.device, repetitio
             step()
         wait(device)
         mean = (time.perf_counter() - started) * 1e3 / (STEPS * repetitions)
-        whole = amortized(trainer, step)["amortized_ms"]
+        whole = amortize(trainer, step)["amortize_ms"]
         trainer.gather()  # Raises an error if the Gaussians of the ranks differ.
-    return {"photo_ms": mean / photos, "amortized_ms": whole / photos, "repetitions": STEPS * repetitions}
+    return {"photo_ms": mean / photos, "amortize_ms": whole / photos, "repetitions": STEPS * repetitions}
 
 
 def _config(size: Size) -> Config:

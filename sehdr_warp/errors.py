@@ -5,7 +5,9 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 MAX_MESSAGE_PART = 400
 """Characters of a path and of a problem that a message shows; both may come from a damaged file."""
@@ -83,6 +85,17 @@ class InputError(SehdrError):
 
 def _shorten(text: str) -> str:
     return text if len(text) <= MAX_MESSAGE_PART else text[:MAX_MESSAGE_PART] + " ..."
+
+
+def require_extra(module: str, purpose: str, extra: str) -> Any:
+    """Return an optional module, such as "av"; raise SehdrError, with the extra to install, if it is missing.
+
+    `purpose` is the subject of the message, with a verb, such as "films need PyAV".
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise SehdrError(f"{purpose}; run `pip install 'sehdr-warp[{extra}]'`") from None
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:

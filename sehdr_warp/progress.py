@@ -69,9 +69,9 @@ class Stage:
     def line(self) -> str:
         """Return the state in words: `finding features in photos: 8 of 21, 0:19 left`."""
         count = f"{self.done} of {self.total}" if self.total else str(self.done)
-        left = "" if self.seconds_left is None else f", {format_seconds(self.seconds_left)} left"
+        remaining = "" if self.seconds_left is None else f", {format_seconds(self.seconds_left)} left"
         training = "" if self.training_in is None else f"; training starts in about {format_seconds(self.training_in)}"
-        return f"{self.activity}: {count}{left}{training}"
+        return f"{self.activity}: {count}{remaining}{training}"
 
     def _show(self, line: str) -> None:
         if not self._logger.isEnabledFor(logging.INFO):

@@ -85,10 +85,11 @@ class _Fusion(NeuralExposureFusion):
     forward = NeuralExposureFusion.exact
 
     def __init__(self, sigma: float):
-        super().__init__(response_by_name("srgb"), BRACKETS, 1.0, width=16, sigma=sigma)
+        super().__init__(response_by_name("srgb"), BRACKETS, 1.0, width=16)
+        torch.nn.init.constant_(self.log_sigma, math.log(sigma))
 
 
-def _fused(sigma: float, gain: float, device):
+def _fusion_results(sigma: float, gain: float, device):
     """gain: of the last layer: logits reach a tenth of it."""
     fusion = _Fusion(sigma)
     generator = torch.Generator().manual_seed(0)
@@ -96,16 +97,16 @@ def _fused(sigma: float, gain: float, device):
     last = fusion.weights[1].detach().double() * gain
     tensors = {"log_base": log_base, "log_sigma": fusion.log_sigma.detach().double(), "last": last}
 
-    def fused(log_base, log_sigma, last):
+    def fuse(log_base, log_sigma, last):
         """Evaluate the equations in the precision of the arguments."""
         parameters = {name: value.to(log_base) for name, value in fusion.named_parameters()}
         parameters |= {"log_sigma": log_sigma, "weights.1": last}
         return {"fused": torch.func.functional_call(fusion, parameters, (log_base,))}
 
     # Each logit is rounded by itself, at its own size; what differs by that much, the softmax sees as a factor.
-    yield from compare(fused, tensors, device, gradients=("last",), extra=ROUNDINGS * UNIT * gain / 10)
+    yield from compare(fuse, tensors, device, gradients=("last",), extra=ROUNDINGS * UNIT * gain / 10)
     leaves = {name: t.to(device, torch.float32).requires_grad_() for name, t in tensors.items()}
-    fused(*leaves.values())["fused"].sum().backward()
+    fuse(*leaves.values())["fused"].sum().backward()
     yield count("derivatives not finite", not_finite(*(t.grad for t in leaves.values())))
 
 
@@ -192,10 +193,10 @@ LIGHT_CASES = (
     _case("responses", "flat, steep, noisy and clipped curves", _odd_responses),
     _case("exposure-limits", "zero, denormal, huge and infinite exposures", _extremes),
     _case("log-zero", "the logarithm of zero radiance", _zero_radiance),
-    _case("sigma-small", "fusion with sigma 1e-3", partial(_fused, 1e-3, 1.0)),
-    _case("sigma-large", "fusion with sigma 1e3", partial(_fused, 1e3, 1.0)),
+    _case("sigma-small", "fusion with sigma 1e-3", partial(_fusion_results, 1e-3, 1.0)),
+    _case("sigma-large", "fusion with sigma 1e3", partial(_fusion_results, 1e3, 1.0)),
     _case("sigma-limits", "fusion with sigma towards 0 and infinity", _sigma_limits),
-    _case("logits", "softmax logits of +-1e4", partial(_fused, 1e3, 1e5),
+    _case("logits", "softmax logits of +-1e4", partial(_fusion_results, 1e3, 1e5),
          note="a logit of 1e4 is known to 1e-3 in float32, and the weights of the brackets to no better"),
     _case("photos", "photos all clipped, all black, and with one bright pixel", _photos),
     _case("clipped-light", "clipped light near white, far above, nearly equal, and one pixel at 2^100", _clipped_light),

@@ -97,32 +97,32 @@ def main(words: list[str] | None = None) -> None:
         sys.exit(130)
 
 
-def render(asked: Render) -> None:
-    recipes = recipes_named(asked.name)
-    width, _, height = asked.size.partition("x")
+def render(args: Render) -> None:
+    recipes = recipes_named(args.name)
+    width, _, height = args.size.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise SehdrError(f"--size {asked.size}: is not WIDTHxHEIGHT in pixels; write for example --size 200x200")
-    views = None if asked.views is None else parse_numbers("--views", asked.views, int)
-    settings = Settings(int(width), int(height), asked.samples, asked.seed, views, asked.denoise)
-    mi = load_mitsuba(asked.variant)
+        raise SehdrError(f"--size {args.size}: is not WIDTHxHEIGHT in pixels; write for example --size 200x200")
+    views = None if args.views is None else parse_numbers("--views", args.views, int)
+    settings = Settings(int(width), int(height), args.samples, args.seed, views, args.denoise)
+    mi = load_mitsuba(args.variant)
     LOG.info("Mitsuba %s, %s", mi.__version__, mi.variant())
     for recipe in recipes:
-        print(render_scene(mi, recipe, asked.out, settings))
+        print(render_scene(mi, recipe, args.out, settings))
 
 
-def pack(asked: Pack) -> None:
-    packing = pack_truth(**vars(asked))
+def pack(args: Pack) -> None:
+    packing = pack_truth(**vars(args))
     print(
-        f"{asked.out}: {packing['bytes'] / 1e6:.2f} MB, relative error {100 * packing['relative_error']:.2f} %, "
+        f"{args.out}: {packing['bytes'] / 1e6:.2f} MB, relative error {100 * packing['relative_error']:.2f} %, "
         f"{packing['mu_law_psnr']:.1f} dB (mu-law)"
     )
 
 
-def light(asked: Light) -> None:
-    recipes = recipes_named(asked.name)
-    mi = load_mitsuba(asked.variant)
+def light(args: Light) -> None:
+    recipes = recipes_named(args.name)
+    mi = load_mitsuba(args.variant)
     for recipe in recipes:
-        print(*render_light(mi, recipe, asked.folder / recipe.name, asked.samples), sep="\n")
+        print(*render_light(mi, recipe, args.folder / recipe.name, args.samples), sep="\n")
 
 
 if __name__ == "__main__":

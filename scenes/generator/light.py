@@ -51,7 +51,7 @@ def render_light(mi, recipe: Recipe, folder: Path, samples: int) -> list[Path]:
     unit = _unit(mi, scene, tracer, train[0], folder)
     written = []
     for number, position in enumerate(_places(recipe, train)):
-        radiance, seen = _map(mi, scene, tracer, position, train, samples * recipe.effort)
+        radiance, coverage = _map(mi, scene, tracer, position, train, samples * recipe.effort)
         _check_light(radiance, f"{recipe.name}: the map of place {number} has", "take another number of --samples")
         facts = {"scene": recipe.name, "position": json.dumps(position.tolist()), "axes": "scene"}
         header = exr_header(provenance=facts | {"samples": str(samples * recipe.effort)}) | {
@@ -59,9 +59,9 @@ def render_light(mi, recipe: Recipe, folder: Path, samples: int) -> list[Path]:
         }
         header |= {"compression": _dwab(), "dwaCompressionLevel": 45.0}
         path = folder / "light" / f"place_{number}.exr"
-        write_exr(path, rgb_channels(radiance * unit) | {"A": seen}, header=header, overwrite=True)
-        told = "%s: place %d at (%.2f, %.2f, %.2f), %.0f %% of its directions are seen, %.3g to %.4g"
-        LOG.info(told, recipe.name, number, *position, 100 * seen.mean(), radiance.min(), radiance.max())
+        write_exr(path, rgb_channels(radiance * unit) | {"A": coverage}, header=header, overwrite=True)
+        message = "%s: place %d at (%.2f, %.2f, %.2f), %.0f %% of its directions are seen, %.3g to %.4g"
+        LOG.info(message, recipe.name, number, *position, 100 * coverage.mean(), radiance.min(), radiance.max())
         written.append(path)
     return written
 
@@ -84,8 +84,10 @@ def _places(recipe: Recipe, cameras: list[Camera]) -> list[np.ndarray]:
 def _unit(mi, scene, tracer, camera: Camera, folder: Path) -> float:
     """What the set multiplied radiance by: packing takes a power of two."""
     stored = read_hdr(truth_path(folder, "train", 0))
-    shown = np.array(mi.render(scene, sensor=_sensor(mi, camera), integrator=tracer, spp=UNIT_SAMPLES, seed=1))[..., :3]
-    ratio = float(np.median(stored.mean(2)) / np.median(shown.mean(2)))
+    rendering = np.array(mi.render(scene, sensor=_sensor(mi, camera), integrator=tracer, spp=UNIT_SAMPLES, seed=1))[
+        ..., :3
+    ]
+    ratio = float(np.median(stored.mean(2)) / np.median(rendering.mean(2)))
     unit = 2.0 ** round(np.log2(ratio))
     if not abs(ratio / unit - 1) < UNIT_ERROR:
         raise InputError(folder, f"is {ratio:.3g} times as bright as its recipe", "render it again by this generator")
@@ -95,23 +97,23 @@ def _unit(mi, scene, tracer, camera: Camera, folder: Path) -> float:
 def _map(mi, scene, tracer, position: np.ndarray, cameras: list[Camera], samples: int) -> tuple[np.ndarray, np.ndarray]:
     """[H, W, 3] radiance and [H, W] what part of each pixel two cameras see."""
     width, height = COLUMNS, COLUMNS // 2
-    total, seen, done = np.zeros((height * width, 3)), np.zeros(height * width), 0
+    total, coverage, traced = np.zeros((height * width, 3)), np.zeros(height * width), 0
     largest = max(1, VARIANTS[mi.variant()] // (height * width))
-    while done < samples:
+    while traced < samples:
         # The first launch is a small one, whose rays are also asked who sees what they meet.
-        launch = min(largest, samples - done) if done else min(SEEN_SAMPLES, samples)
+        launch = min(largest, samples - traced) if traced else min(SEEN_SAMPLES, samples)
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(done, height * width * launch)
+        sampler.seed(traced, height * width * launch)
         place = mi.UInt32(np.tile(np.arange(height * width, dtype=np.uint32), launch))
         longitude = np.pi - 2 * np.pi * (mi.Float(place % width) + sampler.next_1d()) / width
         latitude = np.pi / 2 - np.pi * (mi.Float(place // width) + sampler.next_1d()) / height
         ray = mi.RayDifferential3f(mi.Point3f(*position.tolist()), _direction(mi, longitude, latitude))
-        if not done:
-            seen = np.array(_seen(mi, scene, ray, cameras), np.float64).reshape(launch, -1).mean(0)
+        if not traced:
+            coverage = np.array(_coverage(mi, scene, ray, cameras), np.float64).reshape(launch, -1).mean(0)
         light = np.array(tracer.sample(scene, sampler, ray)[0]).reshape(3, launch, -1)
         total += light.sum(1).T
-        done += launch
-    return (total / samples).reshape(height, width, 3).astype(np.float32), seen.reshape(height, width)
+        traced += launch
+    return (total / samples).reshape(height, width, 3).astype(np.float32), coverage.reshape(height, width)
 
 
 def _direction(mi, longitude, latitude):
@@ -122,14 +124,14 @@ def _direction(mi, longitude, latitude):
     return mi.Vector3f(flat * sin, up, flat * cos)
 
 
-def _seen(mi, scene, ray, cameras: list[Camera]):
+def _coverage(mi, scene, ray, cameras: list[Camera]):
     """1 for each ray whose first surface, or sky, two cameras have in view from the same side, else 0."""
     import drjit as dr
 
-    met = scene.ray_intersect(ray)
-    found = met.is_valid()
-    point = dr.select(found, met.p, ray(FAR))
-    facing = dr.dot(met.n, -ray.d)
+    surface = scene.ray_intersect(ray)
+    valid = surface.is_valid()
+    point = dr.select(valid, surface.p, ray(FAR))
+    facing = dr.dot(surface.n, -ray.d)
     count = mi.Float(0)
     for camera in cameras:
         x, y, z = (dr.dot(mi.Vector3f(*row[:3]), point) + row[3] for row in camera.world_to_camera[:3].tolist())
@@ -139,6 +141,6 @@ def _seen(mi, scene, ray, cameras: list[Camera]):
         away = point - eye
         distance = dr.norm(away)
         hidden = scene.ray_test(mi.Ray3f(mi.Ray3f(eye, away / distance), (1 - 1e-3) * distance))
-        inside &= ~hidden & (~found | (facing * dr.dot(met.n, -away) > 0))  # Not from behind.
+        inside &= ~hidden & (~valid | (facing * dr.dot(surface.n, -away) > 0))  # Not from behind.
         count += dr.select(inside, 1.0, 0.0)
     return dr.select(count >= 2, 1.0, 0.0)

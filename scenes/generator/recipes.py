@@ -89,15 +89,15 @@ def _call(stage: Stage, step: list):
     """What a method of the stage makes of its arguments, of which lists that begin with a name are such calls too."""
     method, *arguments = step
     options = arguments.pop() if isinstance(step[-1], dict) else {}
-    made = (_call(stage, each) if isinstance(each, list) and isinstance(each[0], str) else each for each in arguments)
-    return getattr(stage, method)(*made, **options)
+    values = (_call(stage, each) if isinstance(each, list) and isinstance(each[0], str) else each for each in arguments)
+    return getattr(stage, method)(*values, **options)
 
 
 def _read() -> dict[str, Recipe]:
     recipes = {}
-    for name, stated in tomllib.loads(Path(__file__).with_name("recipes.toml").read_text(encoding="utf-8")).items():
-        ((kind, places),) = stated.pop("layout").items()
-        recipes[name] = Recipe(name, layout={"grid": Grid, "arc": Arc}[kind](**places), **stated)
+    for name, fields in tomllib.loads(Path(__file__).with_name("recipes.toml").read_text(encoding="utf-8")).items():
+        ((kind, places),) = fields.pop("layout").items()
+        recipes[name] = Recipe(name, layout={"grid": Grid, "arc": Arc}[kind](**places), **fields)
     return recipes
 
 

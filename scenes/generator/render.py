@@ -69,12 +69,12 @@ def _probe(variant: str, seconds: float = 120.0) -> str | None:
     """None where a variant renders on this machine, else why it does not, in a line."""
     command = [sys.executable, "-c", _PROBE, variant]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+        process = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
         return f"no picture within {seconds:.0f} s"
-    if done.returncode == 0:
+    if process.returncode == 0:
         return None
-    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    lines = [line.strip() for line in process.stderr.splitlines() if line.strip()]
     telling = [line for line in lines if "rror" in line or "LLVM" in line or "could not" in line.lower()]
     return f"{(telling or lines or ['no message'])[-1]:.160}"
 
@@ -152,18 +152,18 @@ def render_scene(mi, recipe: Recipe, out: Path, settings: Settings) -> Path:
 def _claim(folder: Path, recipe: Recipe, settings: Settings) -> None:
     """Note the settings in a new folder; refuse one with others."""
     path = folder / "work" / "settings.json"
-    wanted = json.loads(json.dumps(asdict(settings) | {"scene": recipe.name}))
+    request = json.loads(json.dumps(asdict(settings) | {"scene": recipe.name}))
     if path.is_file():
         try:
-            found = json.loads(path.read_text())
+            record = json.loads(path.read_text())
         except (OSError, ValueError):
-            found = None
-        if found != wanted:
-            raise InputError(folder, f"was begun with other settings ({found})", "give the same, or another --out")
+            record = None
+        if record != request:
+            raise InputError(folder, f"was begun with other settings ({record})", "give the same, or another --out")
     else:
         if folder.is_dir() and any(folder.iterdir()):
             raise InputError(folder, "exists already and is no unfinished rendering", "choose another --out")
-        write_json(path, wanted)
+        write_json(path, request)
 
 
 def _aside(folder: Path, view: int) -> Path:
@@ -180,10 +180,10 @@ def _sensor(mi, camera: Camera):
     return mi.load_dict(sensor | {"near_clip": 0.01, "far_clip": 1000.0, "sampler": {"type": "independent"}})
 
 
-def _check_light(radiance: np.ndarray, found: str, remedy: str) -> None:
+def _check_light(radiance: np.ndarray, subject: str, remedy: str) -> None:
     """SehdrError where a pixel [H, W, 3] cannot be light: truth that is not finite would poison whatever it judges."""
     if not np.isfinite(radiance).all() or radiance.min() < 0:
-        raise SehdrError(f"{found} pixels that are not finite or negative; {remedy}")
+        raise SehdrError(f"{subject} pixels that are not finite or negative; {remedy}")
 
 
 def _render_view(mi, scene, recipe, camera, view: int, settings, denoiser, path: Path, aside: Path) -> str:
@@ -225,8 +225,8 @@ def _finish(mi, recipe: Recipe, folder: Path, settings: Settings, cameras: dict[
     views, figures = [], []
     for view, camera in cameras.items():
         views.append(RadianceView(f"r_{view}", camera, read_hdr(places[view]), split_of(view)))
-        with np.load(_aside(folder, view)) as found:
-            figures.append(dict(found))
+        with np.load(_aside(folder, view)) as figure:
+            figures.append(dict(figure))
     luminance = np.concatenate([(view.radiance @ [0.2126, 0.7152, 0.0722]).ravel() for view in views])
     low, high = np.maximum(np.percentile(luminance, [1, 99.9]), 1e-30)
     making = asdict(settings) | {
@@ -234,8 +234,8 @@ def _finish(mi, recipe: Recipe, folder: Path, settings: Settings, cameras: dict[
         "title": recipe.title,
         "paths_of_a_pixel": settings.samples * recipe.effort,
         "generator": f"sehdr-warp {__version__}, Mitsuba {mi.__version__}, {mi.variant()}",
-        "seconds": float(sum(found["seconds"] for found in figures)),
-        "noise_db": -10 * float(np.log10(np.mean([found["noise"] ** 2 for found in figures]) + 1e-18)),
+        "seconds": float(sum(figure["seconds"] for figure in figures)),
+        "noise_db": -10 * float(np.log10(np.mean([figure["noise"] ** 2 for figure in figures]) + 1e-18)),
         # Of luminance, between the 1st and the 99.9th percentile.
         "decades": float(np.log10(high / low)),
     }
@@ -274,23 +274,23 @@ def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, straig
     import pyoidn  # pyright: ignore[reportMissingImports]
 
     images = radiance, np.clip(albedo, 0, 1), np.clip(normal, -1, 1)
-    found = pyoidn.denoise(*(np.ascontiguousarray(image, np.float32) for image in images), hdr=True, clean_aux=True)
+    clean = pyoidn.denoise(*(np.ascontiguousarray(image, np.float32) for image in images), hdr=True, clean_aux=True)
     lit = straight.sum(-1) > 0.5 * radiance.sum(-1)
-    return np.where(lit[..., None], radiance, np.maximum(found, 0)).astype(np.float32)
+    return np.where(lit[..., None], radiance, np.maximum(clean, 0)).astype(np.float32)
 
 
 def guide_items(items: dict) -> dict:
     """A scene for albedo and normals: every surface diffuse, of its own or a varnish's albedo, or white; the sky a
     white ball beyond all things and within the cameras' far plane."""
-    white, made = two_sided(type="diffuse", reflectance=_WHITE), {}
+    white, items = two_sided(type="diffuse", reflectance=_WHITE), {}
     for name, item in items.items():
         if not isinstance(item, dict):
-            made[name] = item
+            items[name] = item
         elif item["type"] == "envmap":
-            made[name] = {"type": "sphere", "radius": 500.0, "flip_normals": True, "bsdf": white}
+            items[name] = {"type": "sphere", "radius": 500.0, "flip_normals": True, "bsdf": white}
         elif "bsdf" in item:
             layer = {} if "emitter" in item else item["bsdf"].get("layer", {})
             paint = layer.get("reflectance") or layer.get("diffuse_reflectance") or _WHITE
             plain = {key: value for key, value in item.items() if key != "emitter"}
-            made[name] = plain | {"bsdf": two_sided(type="diffuse", reflectance=paint)}
-    return made
+            items[name] = plain | {"bsdf": two_sided(type="diffuse", reflectance=paint)}
+    return items

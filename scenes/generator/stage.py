@@ -32,8 +32,8 @@ class Stage:
         self, paint: str, *args, power: float = 1.0, gain: float = 1.0, lift: float = 0.0, **options
     ) -> np.ndarray:
         """A texture's picture [H, W, 3], or gain * picture ** power + lift."""
-        made = self.paints[paint] if paint in self.paints else getattr(textures, paint)(self.rng, *args, **options)
-        return made**power * gain + lift
+        texture = self.paints[paint] if paint in self.paints else getattr(textures, paint)(self.rng, *args, **options)
+        return texture**power * gain + lift
 
     def paint(self, paint, *args, repeat=(1.0, 1.0), **options) -> dict:
         if isinstance(paint, dict):
@@ -52,7 +52,7 @@ class Stage:
     def matt(self, *paint, **options) -> Material:
         return two_sided(type="diffuse", reflectance=self.paint(*paint, **options))
 
-    def varnished(self, *paint, rough: float = 0.2, **options) -> Material:
+    def varnish(self, *paint, rough: float = 0.2, **options) -> Material:
         reflectance = self.paint(*paint, **options)
         return two_sided(type="roughplastic", diffuse_reflectance=reflectance, alpha=rough, nonlinear=False)
 
@@ -182,8 +182,8 @@ class Stage:
         """Balls at random. ranges: of x, y and radius, drawn in this order; ground: its height, or "lawn"."""
         low, high = zip(*ranges.values())
         for _ in range(count):
-            drawn = dict(zip(ranges, self.rng.uniform(low, high).tolist()))
-            x, y, radius = (drawn[name] for name in ("x", "y", "radius"))
+            sample = dict(zip(ranges, self.rng.uniform(low, high).tolist()))
+            x, y, radius = (sample[name] for name in ("x", "y", "radius"))
             height = hills(x, y - 1.5) - 0.4 * radius if ground == "lawn" else ground
             self.ball([x, y, height + radius], radius, self.matt(*paint, **options))
 
@@ -197,17 +197,17 @@ class Stage:
         """A wooden table around (x, y); returns the height of its top."""
         x, y = center
         board = self.image("wood", 4, (0.08, 0.04, 0.02), (0.34, 0.20, 0.11))
-        self.box([x, y, height - 0.025], [half[0], half[1], 0.025], self.varnished(board))
+        self.box([x, y, height - 0.025], [half[0], half[1], 0.025], self.varnish(board))
         for side in (-0.9, 0.9):
             for end in (-0.85, 0.85):
                 foot = x + side * half[0], y + end * half[1]
-                self.rod([*foot, 0], [*foot, height - 0.04], 0.03, self.varnished(board, rough=0.25))
+                self.rod([*foot, 0], [*foot, height - 0.04], 0.03, self.varnish(board, rough=0.25))
         return height
 
     def shelf(self, center, half_width: float, depth: float, levels: int) -> None:
         """A bookcase standing at (x, y), open towards -y, full of books; its depths are dark."""
         rng, (x, y), gap = self.rng, center, 0.42
-        boards = self.varnished("wood", 2, (0.05, 0.03, 0.02), (0.20, 0.12, 0.07), rough=0.3)
+        boards = self.varnish("wood", 2, (0.05, 0.03, 0.02), (0.20, 0.12, 0.07), rough=0.3)
         half = levels * gap / 2
         for level in range(levels + 1):
             self.box([x, y, 0.02 + level * gap], [half_width, depth, 0.018], boards)
@@ -221,7 +221,7 @@ class Stage:
                 if rng.random() < 0.12:
                     place += 0.06
                     continue
-                back = self.varnished("books", rough=0.3)
+                back = self.varnish("books", rough=0.3)
                 middle = [place + thick, y - 0.03 + 0.03 * rng.random(), 0.04 + level * gap + high]
                 self.box(middle, [thick, depth * 0.65, high], back)
                 place += 2 * thick + 0.003
@@ -232,7 +232,7 @@ class Stage:
         half_v, center = np.array([0, 0, half_height]), np.asarray(center, float)
         facing = np.cross(half_u, half_v)
         facing /= np.linalg.norm(facing)
-        self.panel(center + 0.02 * facing, half_u, half_v, self.varnished("painting", cells, rough=0.15))
+        self.panel(center + 0.02 * facing, half_u, half_v, self.varnish("painting", cells, rough=0.15))
         for sign in (-1, 1):
             for along, aside in ((half_u, half_v), (half_v, half_u)):
                 ends = [center + sign * aside * 1.04 + s * along * 1.04 for s in (-1, 1)]
@@ -249,7 +249,7 @@ class Stage:
     def plant(self, center, leaves: int = 11, size: float = 0.3) -> None:
         """Broad leaves from one place."""
         for k in range(leaves):
-            green = self.varnished("fabric", (0.03, 0.16, 0.03), (0.16, 0.40, 0.08), 64, rough=0.3)
+            green = self.varnish("fabric", (0.03, 0.16, 0.03), (0.16, 0.40, 0.08), 64, rough=0.3)
             length, lean = size * self.rng.uniform(0.8, 1.3), self.rng.uniform(0.3, 0.85)
             self.surface(leaf(length, 0.16 * length, lean, k * 2.399), 20, 7, center, green)
 
@@ -264,7 +264,7 @@ class Stage:
             self.box([x + side * half, y, z + half], [0.015, half, half], boards)
             self.box([x, y, z + half + side * (half - 0.015)], [half, half, 0.015], boards)
         self.box([x, y + half, z + half], [half, 0.015, half], boards)
-        self.ball([x + 0.05, y + 0.1, z + 0.03 + 0.4 * half], 0.4 * half, self.varnished("checker", 10))
+        self.ball([x + 0.05, y + 0.1, z + 0.03 + 0.4 * half], 0.4 * half, self.varnish("checker", 10))
 
     def armchair(self, center, turn: float) -> None:
         """Upholstered boxes; `turn` 0 faces -y."""

@@ -35,7 +35,7 @@ def wood(rng, planks: int = 9, dark: Color = (0.16, 0.075, 0.03), light: Color =
     grain = 0.5 + 0.5 * np.sin((x * planks * 9 + rough * 6 + tone * 30) * 2 * np.pi)
     image = mix(dark, light, 0.15 + 0.45 * tone + 0.25 * grain * fine + 0.25 * (rough - 0.5))
     image[(_off(x * planks) > 0.487) | (_off(along) > 0.4975)] *= 0.25
-    return limited(image)
+    return limit(image)
 
 
 def brick(rng, rows=18, columns=7, dark=(0.30, 0.08, 0.05), light=(0.55, 0.24, 0.15), mortar=(0.42, 0.40, 0.37)):
@@ -48,14 +48,14 @@ def brick(rng, rows=18, columns=7, dark=(0.30, 0.08, 0.05), light=(0.55, 0.24, 0
     image = mix(dark, light, 0.75 * tone + 0.5 * (rough - 0.5) + 0.1)
     joint = (_off(y * rows) > 0.455) | (_off(x) > 0.478)
     image[joint] = np.array(mortar, np.float32) * (0.75 + 0.5 * rough[joint])[:, None]
-    return limited(image)
+    return limit(image)
 
 
 def checker(rng, count: int = 8, dark: Color = (0.05, 0.06, 0.08), light: Color = (0.65, 0.62, 0.55), size: int = 512):
     """count x count worn squares."""
     y, x = _grid(size)
     square = (np.floor(y * count) + np.floor(x * count)) % 2
-    return limited(mix(dark, light, square) * (0.7 + 0.6 * noise(rng, size, size, 8, 6))[..., None])
+    return limit(mix(dark, light, square) * (0.7 + 0.6 * noise(rng, size, size, 8, 6))[..., None])
 
 
 def wallpaper(rng, ground=(0.50, 0.46, 0.36), stripe=(0.17, 0.30, 0.30), dot=(0.55, 0.16, 0.10), size: int = 512):
@@ -65,14 +65,14 @@ def wallpaper(rng, ground=(0.50, 0.46, 0.36), stripe=(0.17, 0.30, 0.30), dot=(0.
     away = np.hypot((x * 14) % 1 - 0.5, (y * 20 + 0.5 * (np.floor(x * 14) % 2)) % 1 - 0.5)
     image = mix(ground, stripe, stripes * 0.55 + 0.5 * (noise(rng, size, size, 8, 6) - 0.5))
     image[away < 0.17] = image[away < 0.17] * 0.4 + np.array(dot, np.float32) * 0.6
-    return limited(image)
+    return limit(image)
 
 
 def plaster(rng, size: int = 512):
     """Stained, cracked plaster: never an even wall."""
     stain, crack = noise(rng, size, size, 4, 8), noise(rng, size, size, 6, 6)
     shade = 1 - (0.45 * stain + 0.5 * (np.abs(crack - 0.5) < 0.012))
-    return limited(np.array((0.62, 0.60, 0.56), np.float32) * (1.2 * shade)[..., None])
+    return limit(np.array((0.62, 0.60, 0.56), np.float32) * (1.2 * shade)[..., None])
 
 
 def fabric(rng, dark: Color, light: Color, size: int = 512):
@@ -80,7 +80,7 @@ def fabric(rng, dark: Color, light: Color, size: int = 512):
     y, x = _grid(size)
     weave = np.sin(x * 2 * np.pi * 24) * np.sin(y * 2 * np.pi * 24) > 0
     squares = (np.floor(x * 6) + np.floor(y * 6)) % 2
-    return limited(mix(dark, light, 0.3 * weave + 0.5 * squares + 0.4 * noise(rng, size, size, 4, 7) - 0.1))
+    return limit(mix(dark, light, 0.3 * weave + 0.5 * squares + 0.4 * noise(rng, size, size, 4, 7) - 0.1))
 
 
 def painting(rng, cells: int = 40, size: int = 256):
@@ -92,7 +92,7 @@ def painting(rng, cells: int = 40, size: int = 256):
     image = colors[distance.argmin(-1)] * (0.8 + 0.4 * bends[1])
     nearest = np.sort(distance, axis=-1)[..., :2]
     image[nearest[..., 1] - nearest[..., 0] < size / 100] = 0.02
-    return limited(image)
+    return limit(image)
 
 
 def globe(rng, size: int = 512):
@@ -105,13 +105,13 @@ def globe(rng, size: int = 512):
     line = max(1, 3 * height // 256)
     image[np.arange(height) % (height // 12) < line] *= 0.35
     image[:, np.arange(width) % (width // 24) < line] *= 0.35
-    return limited(image)
+    return limit(image)
 
 
 def ground(rng, dark: Color = (0.05, 0.09, 0.02), light: Color = (0.30, 0.36, 0.10), size: int = 512):
     """Grass, gravel or soil: fine grain with patches."""
     grain, patch = noise(rng, size, size, 64, 4, 0.8), noise(rng, size, size, 4, 5)
-    return limited(mix(dark, light, 0.75 * grain + 0.6 * patch - 0.25))
+    return limit(mix(dark, light, 0.75 * grain + 0.6 * patch - 0.25))
 
 
 def books(rng, size: int = 64):
@@ -120,7 +120,7 @@ def books(rng, size: int = 64):
     for _ in range(3):
         start = rng.integers(4, size - 8)
         image[start : start + rng.integers(2, 7)] = rng.random(3) * 0.7 + 0.05
-    return limited(image)
+    return limit(image)
 
 
 def facade(rng, lit: float, color: Color, columns: int, rows: int, size: int = 256):
@@ -139,14 +139,14 @@ def outside(rng, size: int = 512):
     y, x = _grid(size)
     clouds = np.clip((noise(rng, size, size, 4, 7) - 0.5) * 4, 0, 1)[..., None]
     image = 2.2 * clouds + mix((0.35, 0.60, 1.25), (1.05, 1.2, 1.35), y * 1.5) * (1 - clouds)
-    horizon, left = 0.52, 0.0
-    while left < 1:
+    horizon, edge = 0.52, 0.0
+    while edge < 1:
         wide, high, color = 0.09 + 0.12 * rng.random(), 0.12 + 0.22 * rng.random(), rng.random(3) * 0.35 + 0.12
-        house = (x >= left) & (x < left + wide) & (y > horizon - high + 0.25)
+        house = (x >= edge) & (x < edge + wide) & (y > horizon - high + 0.25)
         image[house] = color
-        v, u = ((y - horizon) * 26) % 1, ((x - left) / wide * 4) % 1
+        v, u = ((y - horizon) * 26) % 1, ((x - edge) / wide * 4) % 1
         image[house & (v > 0.3) & (v < 0.75) & (u > 0.3) & (u < 0.75)] = color * 0.18
-        left += wide
+        edge += wide
     trees = y > 0.78 + 0.10 * (noise(rng, size, size, 8, 5)[0][None] - 0.5)
     image[trees] = mix((0.03, 0.10, 0.02), (0.22, 0.38, 0.08), noise(rng, size, size, 32, 5))[trees]
     return image.astype(np.float32)
@@ -175,7 +175,7 @@ def mix(first: Color, second: Color, share) -> np.ndarray:
     return np.array(first, np.float32) * (1 - share) + np.array(second, np.float32) * share
 
 
-def limited(image: np.ndarray) -> np.ndarray:
+def limit(image: np.ndarray) -> np.ndarray:
     """Reflectance within what real matter has."""
     return np.clip(image, _DARKEST, _BRIGHTEST).astype(np.float32)
 

@@ -25,8 +25,8 @@ def write_truth_tables(folder: Path, views: Sequence[RadianceView], making: dict
 
     views: in the order of their files. making: what `synth.json` says of the set.
     """
-    seen = [view.radiance for view in views if view.split == "train"] or [view.radiance for view in views]
-    times = ladder_of(folder.name, seen, reinhard_gamma)
+    radiances = [view.radiance for view in views if view.split == "train"] or [view.radiance for view in views]
+    times = ladder_of(folder.name, radiances, reinhard_gamma)
     size = {"w": views[0].camera.width, "h": views[0].camera.height}
     write_tables(folder, views, times, None, **size, photo_response=DERIVED_PHOTOS)
     write_json(folder / "synth.json", making, overwrite=True)
@@ -60,24 +60,24 @@ def pack_truth(folder: Path, out: Path, *, compression="dwab", level: float = 45
     header, squares = {"compression": getattr(OpenEXR, f"{compression.upper()}_COMPRESSION")}, []
     if compression == "dwab":
         header["dwaCompressionLevel"] = float(level)
-    with atomic_folder(out, overwrite) as made:
+    with atomic_folder(out, overwrite) as temporary:
         for source in sources:
-            truth, target = read_hdr(source) * np.float32(scale), made / source.relative_to(folder)
+            truth, target = read_hdr(source) * np.float32(scale), temporary / source.relative_to(folder)
             write_radiance(target, truth, header=header)
             squares.append(_squared_errors(read_hdr(target).astype(np.float64), truth.astype(np.float64)))
         for split, table in tables.items():
-            write_json(made / f"exposure_{split}.json", {name: time / scale for name, time in table.items()})
+            write_json(temporary / f"exposure_{split}.json", {name: time / scale for name, time in table.items()})
         for split in splits:
-            shutil.copyfile(folder / f"transforms_{split}.json", made / f"transforms_{split}.json")
+            shutil.copyfile(folder / f"transforms_{split}.json", temporary / f"transforms_{split}.json")
         relative, mu_law = np.mean(squares, 0)
         packing = {
             "compression": f"dwab {level:g}" if compression == "dwab" else compression,
             "relative_error": float(np.sqrt(relative)),
             "mu_law_psnr": -10 * float(np.log10(mu_law + 1e-15)),
-            "bytes": sum(path.stat().st_size for path in made.rglob("*") if path.is_file()),
+            "bytes": sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file()),
         }
         making = folder / "synth.json"
-        write_json(made / "synth.json", (read_json(making) if making.is_file() else {}) | {"packing": packing})
+        write_json(temporary / "synth.json", (read_json(making) if making.is_file() else {}) | {"packing": packing})
     return packing
 
 

@@ -31,7 +31,7 @@ from ..training.compensation import SharedDecisions, estimate_compensation, esti
 from ..training.initialization import base_time, check_views, match_points, response_for_training
 from ..training.matching import LARGEST_SIDE
 from ..training.plan import STEPS_PER_PHOTO
-from .division import Cell, Division, divide, largest_count, thinned, weights_of
+from .division import Cell, Division, divide, largest_count, thin_out, weights_of
 
 log = logging.getLogger(__name__)
 
@@ -331,7 +331,7 @@ def _blocks(scene: Scene, division: Division, points: np.ndarray) -> tuple[Block
     views = scene.train_views
     sizes = np.array([view.camera.width * view.camera.height for view in views], np.float64)
     names: list[list[str]] = [[views[index].name for index in own] for own in division.photos]
-    points = thinned(points, len(views))
+    points = thin_out(points, len(views))
     owner = division.block_of(points)
     for view in scene.test_views:
         weights = np.bincount(owner, weights_of(view.camera, points), len(division.cells))

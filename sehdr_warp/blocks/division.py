@@ -75,7 +75,7 @@ class Division:
             index[cell.contains(places)] = block
         return index
 
-    def enlarged(self, block: int) -> Cell:
+    def enlarge(self, block: int) -> Cell:
         """Return the core of a block with its margin."""
         cell, margin = self.cells[block], self.margins[block]
         return Cell(cell.low - margin, cell.high + margin)
@@ -110,7 +110,7 @@ class ShownPlaces:
     @staticmethod
     def of(cameras: Sequence[Camera], points: np.ndarray) -> "ShownPlaces":
         """Describe photos by some of the points [P, 3] of what they show."""
-        points = thinned(np.asarray(points, np.float64), len(cameras))
+        points = thin_out(np.asarray(points, np.float64), len(cameras))
         columns, values = [], []
         for camera in cameras:
             weights = weights_of(camera, points)
@@ -128,7 +128,7 @@ class ShownPlaces:
         return ShownPlaces(points, parts, middles)
 
 
-def thinned(points: np.ndarray, photos: int) -> np.ndarray:
+def thin_out(points: np.ndarray, photos: int) -> np.ndarray:
     """Return every nth of points [P, 3], as many as describe a number of photos."""
     most = min(max(FEWEST_PLACES, PLACES_PER_PHOTO * photos), MOST_PLACES)
     return points[:: -(-len(points) // most) or 1]

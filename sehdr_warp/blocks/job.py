@@ -108,7 +108,7 @@ def shared_scene(plan: BlockPlan, index: int, scene: Scene) -> Scene:
     counts = np.zeros(len(points), np.int64)
     for view in scene.train_views:
         counts += weights_of(view.camera, positions) > 0
-    inside = plan.division.enlarged(index).contains(positions @ plan.axes.T)
+    inside = plan.division.enlarge(index).contains(positions @ plan.axes.T)
     points = points[(counts >= FEWEST_VIEWS) | (inside & (counts > 0))]
     return replace(
         scene, views=views, points=scene.points[points], point_colors=scene.point_colors[points], chosen_by=chosen_by

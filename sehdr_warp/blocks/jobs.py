@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from ..errors import SehdrError
+from ..errors import SehdrError, require_extra
 from ..parallel import thread_count
 from ..training.launch import installed_versions
 from .block_plan import BlockPlan
@@ -106,9 +106,9 @@ def run_blocks(
     if errors:
         name, error = next(iter(errors.items()))
         others = f" and {len(errors) - 1} more blocks" if len(errors) > 1 else ""
-        done = f"{finished} of {len(plan.blocks)} blocks are finished"
+        progress = f"{finished} of {len(plan.blocks)} blocks are finished"
         remedy = f"--resume trains the others (logs in {out / FOLDER / 'logs'})"
-        raise SehdrError(f"{name}{others}: {error}; {done}; {remedy}")
+        raise SehdrError(f"{name}{others}: {error}; {progress}; {remedy}")
 
 
 def _newest_checkpoint(folder: Path) -> str:
@@ -149,11 +149,7 @@ def visible_gpus(device: torch.device, count: int) -> list[str]:
 
 def _executors(out: Path, device: torch.device, slots: int, slurm: Mapping[str, str] | None) -> list[Any]:
     """Return an executor of submitit for each job that may run at the same time."""
-    try:
-        import submitit
-    except ImportError:
-        problem = "submitit, which runs blocks as jobs, is not installed"
-        raise SehdrError(f"{problem}; run `pip install sehdr-warp[blocks]`") from None
+    submitit = require_extra("submitit", "submitit, which runs blocks as jobs, is not installed", "blocks")
     # submitit exchanges pickled values through this folder, so it is a new one that nobody can have prepared.
     logs = out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
     if slurm is not None:

@@ -65,7 +65,7 @@ def train_in_blocks(
         InputError: If the folder is in use, the set cannot be divided, or a resumed training differs.
         SehdrError: If blocks could not be trained.
     """
-    plan = _continued(out, data, config, count) if _check(out, resume=resume, overwrite=overwrite) else None
+    plan = _continue(out, data, config, count) if _check(out, resume=resume, overwrite=overwrite) else None
     if plan is None:
         options = config.response
         selection = {"method": options.method, "candidates": options.candidates, "photo_storage": photo_storage}
@@ -110,7 +110,7 @@ def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
     return False
 
 
-def _continued(out: Path, data: LoadArguments, config: Config, count: int | None) -> BlockPlan:
+def _continue(out: Path, data: LoadArguments, config: Config, count: int | None) -> BlockPlan:
     """Return the plan of a training in blocks to continue; raise InputError if something else was asked for."""
     plan = BlockPlan.read(out)
     for index in range(len(plan.blocks)):

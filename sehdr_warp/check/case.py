@@ -58,7 +58,7 @@ class Case:
     note: str = ""
 
 
-def _disturbed(values: Tensor, generator: torch.Generator) -> Tensor:
+def _disturb(values: Tensor, generator: torch.Generator) -> Tensor:
     """Return x (1 + r), whose gradient is g (1 + r'), with r uniform within ROUNDINGS units."""
 
     def factor(of: Tensor) -> Tensor:
@@ -139,7 +139,7 @@ def compare(
 
     def run(draw: int) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(draw)
-        disturb = partial(_disturbed, generator=generator) if draw else lambda x: x
+        disturb = partial(_disturb, generator=generator) if draw else lambda x: x
         return _results(lambda *t: by_stages(disturb, *map(disturb, t)), values, places)
 
     by_stages = truth or (lambda _, *t: function(*t))

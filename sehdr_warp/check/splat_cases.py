@@ -108,7 +108,7 @@ def compare_splats(splats: Splats, device: torch.device) -> list[Reading]:
     )
 
 
-def compared(make: Callable[[], Splats | Iterable[Splats]]) -> Callable[[torch.device], Iterator[Reading]]:
+def measure_of(make: Callable[[], Splats | Iterable[Splats]]) -> Callable[[torch.device], Iterator[Reading]]:
     """Return a measure that compares the splats, one or several, that a function makes."""
 
     def measure(device):
@@ -312,34 +312,34 @@ def _poisoned_others(device):
 
 
 SPLAT_CASES = (
-    Case("scale-tiny", "standard deviations from 1e-7", compared(lambda: Splats(24, scales=(1e-7, 2e-7, 5e-7)))),
+    Case("scale-tiny", "standard deviations from 1e-7", measure_of(lambda: Splats(24, scales=(1e-7, 2e-7, 5e-7)))),
     Case("scale-huge", "standard deviations from 1e4: each covers the image",
-         compared(lambda: Splats(24, scales=(1e4, 2e4, 5e4))),
+         measure_of(lambda: Splats(24, scales=(1e4, 2e4, 5e4))),
          note="a Gaussian wider than about 4e9 pixels overflows the determinant and is culled"),
-    Case("scale-mixed", "standard deviations from 1e-7 to 1e4 in one image", compared(_mixed_scales)),
-    Case("needle", "needles, 1e6 times longer than thick", compared(lambda: Splats(24, scales=(1e1, 1e-5, 1e-5))),
+    Case("scale-mixed", "standard deviations from 1e-7 to 1e4 in one image", measure_of(_mixed_scales)),
+    Case("needle", "needles, 1e6 times longer than thick", measure_of(lambda: Splats(24, scales=(1e1, 1e-5, 1e-5))),
          note="the conic's three terms cancel along a needle: error grows with the square of the distance in pixels"),
-    Case("disc", "discs, 1e6 times wider than thick", compared(lambda: Splats(24, scales=(1e1, 1e1, 1e-5)))),
+    Case("disc", "discs, 1e6 times wider than thick", measure_of(lambda: Splats(24, scales=(1e1, 1e1, 1e-5)))),
     Case("near-plane", "at, before and behind the near plane", _near_plane),
-    Case("border", "centers on and beyond the image's borders", compared(_on_borders)),
-    Case("subpixel", "a thousandth of a pixel wide", compared(lambda: Splats(24, scales=(1e-4, 2e-5, 5e-5)))),
-    Case("opacity", "opacity 0, 1/255, 0.999, 1 and next to them", compared(_near_threshold)),
+    Case("border", "centers on and beyond the image's borders", measure_of(_on_borders)),
+    Case("subpixel", "a thousandth of a pixel wide", measure_of(lambda: Splats(24, scales=(1e-4, 2e-5, 5e-5)))),
+    Case("opacity", "opacity 0, 1/255, 0.999, 1 and next to them", measure_of(_near_threshold)),
     Case("overlap-100k", "10^5 Gaussians in one tile, all counted",
-         compared(lambda: overlap(100_000, 5e-5, 1e-6)), quick=False),
+         measure_of(lambda: overlap(100_000, 5e-5, 1e-6)), quick=False),
     Case("overlap-opaque", "10^4 Gaussians in one tile, finished early",
-         compared(lambda: overlap(10_000, 0.02, ALPHA_THRESHOLD))),
+         measure_of(lambda: overlap(10_000, 0.02, ALPHA_THRESHOLD))),
     Case("equal-depths", "60 Gaussians at one depth", _equal_depths),
-    Case("radiance-dark", "radiance from 1e-12 to 1e-8", compared(lambda: Splats(50, radiance=(-12, -8)))),
-    Case("radiance-bright", "radiance from 1e5 to 1e9", compared(lambda: Splats(50, radiance=(5, 9)))),
-    Case("radiance-range", "radiance from 1e-12 to 1e9 in one image", compared(lambda: Splats(50, radiance=(-12, 9)))),
-    Case("decades", "16 decades of radiance within a pixel", compared(_light_behind)),
+    Case("radiance-dark", "radiance from 1e-12 to 1e-8", measure_of(lambda: Splats(50, radiance=(-12, -8)))),
+    Case("radiance-bright", "radiance from 1e5 to 1e9", measure_of(lambda: Splats(50, radiance=(5, 9)))),
+    Case("radiance-range", "radiance from 1e-12 to 1e9 at once", measure_of(lambda: Splats(50, radiance=(-12, 9)))),
+    Case("decades", "16 decades of radiance within a pixel", measure_of(_light_behind)),
     Case("image-sizes", "images of 1 x 1 and of odd size",
-         compared(lambda: (Splats(30, *size, label="{{}} {} x {}".format(*size)) for size in SIZES))),
+         measure_of(lambda: (Splats(30, *size, label="{{}} {} x {}".format(*size)) for size in SIZES))),
     Case("quaternions", "unnormalized, zero and huge quaternions", _quaternions),
     Case("far-1e3", "scene and camera 1e3 units from the origin", partial(_far, 1e3)),
     Case("far-1e6", "scene and camera 1e6 units from the origin", partial(_far, 1e6),
          note="float32 places are 0.06 units apart there: move the scene to the origin before training"),
-    Case("far-away", "1e6 units before the camera, and as large", compared(_far_away)),
+    Case("far-away", "1e6 units before the camera, and as large", measure_of(_far_away)),
     Case("harmonics", "spherical harmonics from 1e-6 to 1e6 units, and at the camera", _harmonics),
 )  # fmt: skip
 POISON_CASES = (

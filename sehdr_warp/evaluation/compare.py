@@ -79,10 +79,10 @@ def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
             raise SehdrError(f"{problem}; train it with some held out (--holdout 8), or further")
         config = run.config.model_dump(mode="json", exclude={"seed"})
         groups.setdefault(json.dumps([run.scene_name, run.data, config], sort_keys=True, default=str), []).append(run)
-    return [_compared(members) for members in groups.values()]
+    return [_compare_runs(members) for members in groups.values()]
 
 
-def _compared(runs: Sequence) -> ComparedRuns:
+def _compare_runs(runs: Sequence) -> ComparedRuns:
     names = {"iterations": "iterations", "gaussians": "gaussian_count", "seconds": "train_seconds"}
     last = [run.metrics()[-1] | {column: getattr(run, name) for column, name in names.items()} for run in runs]
     figures = {column: [line.get(column) for line in last] for column in COLUMNS}
@@ -94,7 +94,7 @@ def _compared(runs: Sequence) -> ComparedRuns:
 
 def comparison_table(rows: Sequence[ComparedRuns]) -> str:
     """Return means with their standard deviation over seeds, for a terminal."""
-    return "\n".join(columns(_cells(rows), left=2))
+    return "\n".join(columns(_cells(rows), texts=2))
 
 
 def comparison_latex(rows: Sequence[ComparedRuns]) -> str:
@@ -128,10 +128,10 @@ def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
     return text.getvalue()
 
 
-def columns(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
+def columns(rows: Sequence[Sequence[str]], texts: int = 1) -> list[str]:
     """Return one line for each row, with aligned cells: the first `left` flush left, the others flush right."""
     widths = [max(map(len, cells)) for cells in zip_longest(*rows, fillvalue="")]
-    sides = [str.ljust] * left + [str.rjust] * (len(widths) - left)
+    sides = [str.ljust] * texts + [str.rjust] * (len(widths) - texts)
     return ["  ".join(side(cell, width) for side, cell, width in zip(sides, row, widths)) for row in rows]
 
 

@@ -87,17 +87,17 @@ def gaussians_of(
 
 def to_normalized(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:
     """Return Gaussians of scene coordinates in normalized ones."""
-    return _transformed(gaussians, normalization.points(gaussians.means), -math.log(normalization.unit))
+    return _transform(gaussians, normalization.points(gaussians.means), -math.log(normalization.unit))
 
 
 def to_scene(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:
     """Return Gaussians of normalized coordinates in those of the scene."""
     if normalization.is_identity:
         return gaussians
-    return _transformed(gaussians, normalization.scene_points(gaussians.means), math.log(normalization.unit))
+    return _transform(gaussians, normalization.scene_points(gaussians.means), math.log(normalization.unit))
 
 
-def _transformed(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> GaussianArrays:
+def _transform(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> GaussianArrays:
     """Return Gaussians at other means [N, 3] float64, with sizes multiplied by exp(log_scale).
 
     Positions stay float64 if float32 would move them by more than a thousandth of the median size, as in UTM

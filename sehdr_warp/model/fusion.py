@@ -23,6 +23,7 @@ from .exposure import bracket_log_radiance, exposure_times
 # The table spans, for every bracket, exposures from where the encoded value is this far above black (a four-hundredth
 # of an 8-bit code) to this many octaves above white, where only the response's extension is left: a line in the log.
 DARKEST_VALUE, OCTAVES_ABOVE_WHITE = 1e-5, 6.0
+START_SIGMA = 0.2
 NODES = 1024
 
 
@@ -43,7 +44,6 @@ class NeuralExposureFusion(nn.Module):
         radiance_scale: Factor on the fused value, which is at most 1; > 0.
         seed: Seed of the MLPs' start values.
         width: Hidden units of each MLP, as in HDR-GS's tone mapper.
-        sigma: Initial standard deviation.
 
     Raises:
         SehdrError: If a time or the scale is not positive.
@@ -58,7 +58,6 @@ class NeuralExposureFusion(nn.Module):
         radiance_scale: float = 1.0,
         seed: int = 0,
         width: int = 128,
-        sigma: float = 0.2,
     ):
         """Create the fusion with seeded MLPs; arguments as in the class."""
         super().__init__()
@@ -68,7 +67,7 @@ class NeuralExposureFusion(nn.Module):
         self.times = exposure_times(base_time, [f"{float(time)!r}s" for time in times])
         (self.base_time,) = exposure_times(base_time, ("base",))
         self.radiance_scale = radiance_scale
-        self.log_sigma = nn.Parameter(torch.full((3,), math.log(sigma)))
+        self.log_sigma = nn.Parameter(torch.full((3,), math.log(START_SIGMA)))
         self.weights, self.biases = _channel_layers([2, width, 1], seed)
         brackets = [math.log(time / self.base_time) for time in self.times]
         self._low = math.log(response.decode(response.black + DARKEST_VALUE)) - max(brackets)
@@ -78,7 +77,9 @@ class NeuralExposureFusion(nn.Module):
     def forward(self, log_base: Tensor) -> Tensor:
         """Return scene-linear radiance c^h [N, 3] of log c^{l_1} [N, 3], the log radiance at the input exposure."""
         step = (self._high - self._low) / (NODES - 1)
-        table = fuse_exposures(self._encoded_at_nodes(log_base, step), *self._learned(), scale=self.radiance_scale)
+        table = fuse_exposures(
+            self._encoded_at_nodes(log_base, step), *self._learned_tensors(), scale=self.radiance_scale
+        )
         return interpolate(table, self._low, step, log_base)
 
     def exact(self, log_base: Tensor) -> Tensor:
@@ -89,13 +90,13 @@ class NeuralExposureFusion(nn.Module):
     def fusion_weights(self, log_base: Tensor) -> tuple[Tensor, Tensor]:
         """Return the weights w and the encoded brackets f(c^{l_p}), each [n, N, 3], of log c^{l_1} [N, 3]."""
         encoded = self._encode(log_base)
-        return fusion_weights(encoded, *self._learned()), encoded
+        return fusion_weights(encoded, *self._learned_tensors()), encoded
 
     def _encode(self, log_base):
         """Return the encoded brackets [n, N, 3] of log_base [N, 3]."""
         return self.response.encode_extended(bracket_log_radiance(log_base, self.times, self.base_time).exp())
 
-    def _learned(self):
+    def _learned_tensors(self):
         """Return the learnable arguments of fuse_exposures()."""
         return self.log_sigma, *(part for layer in zip(self.weights, self.biases, strict=True) for part in layer)
 

@@ -111,11 +111,11 @@ def find_lights(
     lights = []
     for group in _groups(positions, REACH * float(np.median(widths))):
         shape = _shape(positions[group], widths[group], weights[group], middle)
-        area = float(_fitted(shape, covered[:, group].sum(1, keepdims=True), cameras)[0])
+        area = float(_fit(shape, covered[:, group].sum(1, keepdims=True), cameras)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
         sides = [side * min(max(area, 1e-4), 1e4) ** 0.5 for side in shape.size]
         shape = replace(shape, size=(sides[0], sides[1]))
-        radiance = _fitted(shape, received[:, group].sum(1), cameras)
+        radiance = _fit(shape, received[:, group].sum(1), cameras)
         deviation = None
         if confidence is not None:
             stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
@@ -187,7 +187,7 @@ def _shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, middl
     return LightShape("rect", position, axes, (width, height))
 
 
-def _fitted(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+def _fit(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """Return the values [C] whose products with a shape's solid angles are what cameras receive [V, C].
 
     By least squares: the radiance of light, or the area of a solid angle as a multiple of the shape's.

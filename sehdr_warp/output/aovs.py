@@ -75,7 +75,7 @@ def _confidence(view: ViewData) -> Channels:
     return {"confidence": _require_values(view.run, view.run.render_confidence(view.camera))}
 
 
-def _clipped(view: ViewData) -> Channels:
+def _clipped_part(view: ViewData) -> Channels:
     return {"clipped": _require_values(view.run, view.run.render_clipped(view.camera))}
 
 
@@ -91,7 +91,7 @@ AOVS: Mapping[str, Callable[[ViewData], Channels]] = {
     "normals": _normals,
     "alpha": _alpha,
     "confidence": _confidence,
-    "clipped": _clipped,
+    "clipped": _clipped_part,
 }
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..errors import SehdrError
+from ..errors import SehdrError, require_extra
 from ..progress import track_progress
 from ..scene import Camera
 from ..scene.wide_camera import face_cameras, face_size
@@ -167,11 +167,7 @@ def zero_surface(distance: np.ndarray, has_depth: np.ndarray, voxel: np.ndarray)
 
 def marching_cubes_function() -> Any:
     """Return scikit-image's marching cubes; raise SehdrError if it is not installed."""
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError:
-        raise SehdrError("meshes need scikit-image; pip install 'sehdr-warp[mesh]'") from None
-    return marching_cubes
+    return require_extra("skimage.measure", "meshes need scikit-image", "mesh").marching_cubes
 
 
 def nearest_values(volume: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -116,10 +116,10 @@ def write_environment_map(
     check_absent(path, overwrite)
     cameras = {entry.name: entry.camera for entry in run.cameras}
     photos = training_cameras(run)
-    position = _point(at, cameras, photos, transform)
-    clearance = 0.0
     if isinstance(at, str) and at == "center":
         position, clearance = map_center(photos)
+    else:
+        position, clearance = _point(at, cameras, transform), 0.0
     place = transform.points(position)
     if beyond is None:
         beyond = transform.scale * clearance
@@ -136,7 +136,7 @@ def write_environment_map(
     _judge(run, position, photos, alpha, distance, weight)
     added = np.zeros_like(hdr)
     if inpaint:
-        added = (1 - alpha[..., None]) * inpainted(hdr, alpha, directions, weight)
+        added = (1 - alpha[..., None]) * inpainted_light(hdr, alpha, directions, weight)
     clipped = rendered.clipped
     shares = light_shares(hdr, added, clipped, weight, run.response.white / run.base_time)
     coverage = 100 * weight[alpha > COVERED].sum() / weight.sum()
@@ -222,34 +222,34 @@ def render_map(
         rays = (latlong if layout == "latlong" else cube)(size * finer, band) @ to_scene
         bands.append(_averaged_map(run.render_directions(position, rays, **options), finer))
 
-    def joined(name: str) -> Any:
+    def join_parts(name: str) -> Any:
         parts = [getattr(band, name) for band in bands]
         return None if parts[0] is None else np.concatenate(parts)
 
-    return RenderedMap(*(joined(field.name) for field in fields(RenderedMap)))
+    return RenderedMap(*(join_parts(field.name) for field in fields(RenderedMap)))
 
 
 def _averaged_map(rendered: Any, finer: int) -> RenderedMap:
     """Return a render along directions as pixels of `finer` x `finer` of its own."""
 
-    def averaged(values: np.ndarray) -> np.ndarray:
+    def average(values: np.ndarray) -> np.ndarray:
         height, width, *channels = values.shape
         return values.reshape(height // finer, finer, width // finer, finer, *channels).mean(axis=(1, 3))
 
-    def weighted(values: Any, weight: np.ndarray) -> np.ndarray:
+    def weighted_mean(values: Any, weight: np.ndarray) -> np.ndarray:
         """Return the mean of values with weights; the mean without where all are 0."""
-        values, total = as_array(values), averaged(weight)
-        mean = averaged(values * weight) / np.where(total > 0, total, 1)
-        return np.where(total > 0, mean, averaged(values)).astype(np.float32)
+        values, total = as_array(values), average(weight)
+        mean = average(values * weight) / np.where(total > 0, total, 1)
+        return np.where(total > 0, mean, average(values)).astype(np.float32)
 
     hdr, alpha, distance = (as_array(values) for values in (rendered.hdr, rendered.alpha, rendered.distance))
     coverage, light = alpha * (distance > 0), np.maximum(hdr.mean(2), 0)
     return RenderedMap(
-        averaged(hdr),
-        averaged(alpha),
-        weighted(distance, coverage),
-        None if rendered.confidence is None else weighted(rendered.confidence, coverage),
-        None if rendered.clipped is None else weighted(rendered.clipped, light),
+        average(hdr),
+        average(alpha),
+        weighted_mean(distance, coverage),
+        None if rendered.confidence is None else weighted_mean(rendered.confidence, coverage),
+        None if rendered.clipped is None else weighted_mean(rendered.clipped, light),
     )
 
 
@@ -288,7 +288,7 @@ def solid_angles(size: int, layout: str) -> np.ndarray:
     return np.tile(face, (6, 1))
 
 
-def inpainted(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def inpainted_light(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return [H, W, 3] of light for each direction, interpolated from the directions that photos cover.
 
     It is the geometric mean of their light weighted by the inverse fourth power of the distance on the sphere, so that
@@ -325,7 +325,12 @@ class MapCenter(NamedTuple):
 
 
 def map_center(photos: list[Camera]) -> MapCenter:
-    """Return the mean place of the training cameras, or, if they walk around something, what surrounds that."""
+    """Return the mean place of the training cameras, or, if they walk around something, what surrounds that.
+
+    Raises SehdrError without cameras.
+    """
+    if not photos:
+        raise SehdrError("the scene has no cameras, so no center; say where with --at x,y,z")
     focus = subject_of_walk(photos)
     if focus is None:
         return MapCenter(np.mean([camera.position for camera in photos], axis=0), 0.0)
@@ -333,14 +338,8 @@ def map_center(photos: list[Camera]) -> MapCenter:
     return MapCenter(focus, _CLEARANCE * nearest)
 
 
-def _point(
-    at: str | tuple[float, float, float], cameras: dict[str, Camera], photos: list[Camera], transform: WorldTransform
-) -> np.ndarray:
+def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], transform: WorldTransform) -> np.ndarray:
     """Return the point [3] that `at` names, in the scene's coordinates; its numbers are in those of the transform."""
-    if isinstance(at, str) and at == "center":
-        if not photos:
-            raise SehdrError("the scene has no cameras, so no center; say where with --at x,y,z")
-        return np.mean([camera.position for camera in photos], axis=0)
     if isinstance(at, str) and at.startswith("camera:"):
         name = at.partition(":")[2]
         if name not in cameras:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, SehdrError, require_extra
 from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
@@ -214,8 +214,4 @@ def _with_progress(cameras: Sequence[Camera], out: Path) -> Iterator[Camera]:
 
 def film_library() -> Any:
     """Return PyAV; raise SehdrError if it is not installed."""
-    try:
-        import av
-    except ImportError:
-        raise SehdrError("films need PyAV; run `pip install sehdr-warp[film]`") from None
-    return av
+    return require_extra("av", "films need PyAV", "film")

@@ -107,11 +107,11 @@ def opening_view(run: "RenderableScene") -> Camera | None:
     def score(camera: Camera) -> float:
         coverage = _share_shown(run, camera.within(_SIZE), witnesses)
         aside = float(np.linalg.norm(camera.position - middle)) / extent
-        held = 1.0
+        whole = 1.0
         if focus is not None and radius is not None:
             distance = float(np.linalg.norm(focus - camera.position))
-            held = min(1.0, camera.height / 2 / camera.fy * distance / radius)
-        return coverage - _ASIDE * aside + _TURNED * float(camera.world_to_camera[2, :3] @ common) + _WHOLE * held
+            whole = min(1.0, camera.height / 2 / camera.fy * distance / radius)
+        return coverage - _ASIDE * aside + _TURNED * float(camera.world_to_camera[2, :3] @ common) + _WHOLE * whole
 
     return max((_opening_of(camera, photos, up, focus, radius) for camera in evenly(photos, _OPENINGS)), key=score)
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 SPLIT = markup('<div class="split" style="left: 50%"></div>')
 """The handle between two pictures."""
+_DIAL_STOPS = 8.0  # Range of the dial
 CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
 
 
@@ -81,7 +82,7 @@ def packed_light(light: np.ndarray) -> str:
     return base64.b64encode(zlib.compress(half.tobytes(), 9)).decode()
 
 
-def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right: str, stops: float = 8.0) -> Markup:
+def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right: str) -> Markup:
     """Return HTML that shows pictures of one size under one exposure dial, two of them side by side.
 
     Args:
@@ -89,7 +90,6 @@ def dial(lights: Mapping[str, np.ndarray], base_time: float, gain: float, right:
         base_time: Seconds.
         gain: See display_gain.
         right: Name of the picture on the right.
-        stops: Range of the dial.
     """
     height, width = next(iter(lights.values())).shape[:2]
     blocks = join(data_block(packed_light(light), data_light=name) + "\n" for name, light in lights.items())
@@ -109,7 +109,7 @@ aria-label="exposure in stops"><output>0 EV</output></p>
         blocks=blocks,
         sides=side_choices(list(lights), next(iter(lights)), right) if pair else EMPTY,
         split=SPLIT if pair else EMPTY,
-        stops=stops,
+        stops=_DIAL_STOPS,
     )
 
 

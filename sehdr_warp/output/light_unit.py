@@ -56,7 +56,7 @@ def read_light_unit(run: "RenderableScene") -> LightUnit | None:
     values = read_json(path)
     try:
         x, y = (float(value) for value in values["pixel"])
-        unit = LightUnit(_checked(values["luminance"]), str(values["view"]), (x, y), str(values["reading"]))
+        unit = LightUnit(_check(values["luminance"]), str(values["view"]), (x, y), str(values["reading"]))
     except (SehdrError, LookupError, OverflowError, TypeError, ValueError) as error:
         remedy = "delete the file, or take the reading again with `sehdr-warp meter`"
         raise InputError(path, f"cannot be used ({error})", remedy) from None
@@ -119,12 +119,12 @@ def meter(
     clipped = run.render_clipped(camera)
     if clipped is not None and float(clipped[rows, columns].mean()) > _CLIPPED:
         log.warning("photos clip at %g,%g of %s: its light is an estimate; read a darker place", x, y, view)
-    unit = LightUnit(_checked(light / rendered), view, (float(x), float(y)), reading)
+    unit = LightUnit(_check(light / rendered), view, (float(x), float(y)), reading)
     write_json(Path(run.path) / UNIT_FILE, asdict(unit), internal=True)
     return unit
 
 
-def _checked(luminance: Any) -> float:
+def _check(luminance: Any) -> float:
     if not isinstance(luminance, int | float) or not _RANGE[0] <= luminance <= _RANGE[1]:
         raise SehdrError(f"luminance {luminance} is not between {_RANGE[0]:g} and {_RANGE[1]:g} cd/m^2")
     return float(luminance)

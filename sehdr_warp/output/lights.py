@@ -12,7 +12,7 @@ import torch
 from ..errors import SehdrError
 from ..files import atomic_path, check_absent
 from .camera_paths import training_cameras
-from .environment_map import COVERED, envmap, inpainted, latlong, map_center, render_map, solid_angles
+from .environment_map import COVERED, envmap, inpainted_light, latlong, map_center, render_map, solid_angles
 from .exr import exr_header, rgb_channels, write_exr
 from .images import as_array
 from .light_unit import luminance_of_one
@@ -108,7 +108,7 @@ def write_lights(
             "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest", run.path
         )
     unit = luminance_of_one(run)
-    rows = [_described(f"light_{index}", light, transform, unit or 1.0) for index, light in enumerate(lights)]
+    rows = [_describe(f"light_{index}", light, transform, unit or 1.0) for index, light in enumerate(lights)]
     if suffix == ".usda":
         _write_rest(run, rest, lights, transform, unseen, overwrite)
         text = usd_lights(rows, run.scene_name, rest.name, unit or 1.0)
@@ -151,7 +151,7 @@ def usd_lights(rows: Sequence[dict], scene: str, rest: str, rest_intensity: floa
     return _STAGE.format(scene=json.dumps(scene), lights="\n".join(lights))
 
 
-def _described(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:
+def _describe(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:
     """Return a light as plain values, in the coordinates and the unit of the file."""
     shape = light.shape
     return {
@@ -210,7 +210,7 @@ def _write_rest(
     # Dark lights are not the light around them.
     source = np.where(_shows_lights(run, members, position, transform.rotation, **options), 0, rest.alpha)
     if unseen == "inpaint" and (source > COVERED).any():
-        added = (1 - rest.alpha[..., None]) * inpainted(hdr, source, directions, weight)
+        added = (1 - rest.alpha[..., None]) * inpainted_light(hdr, source, directions, weight)
         dark, total = (float((light.mean(2) * weight).sum()) for light in (added, hdr + added))
         share = 100 * float((weight * (1 - rest.alpha)).sum() / weight.sum())
         text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"

@@ -3,13 +3,12 @@
 import os
 import zipfile
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, require_extra
 from ..files import read_bytes, read_text
 from .colorspace import from_rec709
 
@@ -31,10 +30,7 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
         SehdrError: Without OpenColorIO.
         InputError: For a config that cannot be read, or that lacks the role, display or view.
     """
-    try:
-        OCIO: Any = import_module("PyOpenColorIO")  # Its stubs lack what it loads from its library.
-    except ImportError:
-        raise SehdrError("--ocio needs OpenColorIO; run `pip install sehdr-warp[ocio]`") from None
+    OCIO = require_extra("PyOpenColorIO", "--ocio needs OpenColorIO", "ocio")
     # Messages quote the files, whose bytes need not be UTF-8.
     refused = (OCIO.Exception, OCIO.ExceptionMissingFile, UnicodeDecodeError)
     try:

@@ -70,7 +70,7 @@ def report_page(
         _brackets(brightest, times[brightest.name], gain),
         _lights(lights, luminance_of_one(run), world_transform(run)) if lights else EMPTY,
         _confidence(comparisons),
-        _unexplained(run, scene),
+        _unexplained_regions(run, scene),
         _plan(run.decisions()),
         _table(evaluation, held_out),
         _section(
@@ -248,7 +248,7 @@ def _confidence(comparisons: Sequence[Comparison]) -> Markup:
     return _section("Confidence", lead, _views(figures) + scale)
 
 
-def _unexplained(run: "Run", scene: Scene) -> Markup:
+def _unexplained_regions(run: "Run", scene: Scene) -> Markup:
     """Show the photos with the worst unexplained regions, each region in a box."""
     unexplained = run.summary().get("unexplained")
     if unexplained is None:

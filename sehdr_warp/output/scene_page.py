@@ -83,8 +83,8 @@ def write_scene_page(
     }
     blocks = [
         json_block("facts", facts),
-        data_block(_packed(values[:3].astype("<f4")), id="means"),
-        data_block(_packed(values[3:].astype("<f2")), id="rest"),
+        data_block(_pack(values[:3].astype("<f4")), id="means"),
+        data_block(_pack(values[3:].astype("<f2")), id="rest"),
     ]
     body = page_markup("scene.html", title=run.scene_name, data=join(blocks, "\n"))
     scripts = [
@@ -98,5 +98,5 @@ def write_scene_page(
     return path
 
 
-def _packed(values: np.ndarray) -> str:
+def _pack(values: np.ndarray) -> str:
     return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 6)).decode()

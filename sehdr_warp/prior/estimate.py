@@ -108,7 +108,7 @@ def combined_estimates(
     exposure: Tensor,
     clipped: Tensor,
     prior: Prior | None,
-    stated: Tensor | None = None,
+    stated_light: Tensor | None = None,
     stated_deviation: float = 0.0,
 ) -> ClippedLight:
     """Return what is known of a photo's clipped light, from the prior and from what its file states.
@@ -117,7 +117,7 @@ def combined_estimates(
         exposure: [H, W, 3], as of LightPrior.estimate.
         clipped: [H, W, 3] bool.
         prior: LightPrior, or another for a photo by a camera that is no pinhole; None leaves it out.
-        stated: [H, W, 3], light in multiples of white, at least 1 where it is known, as View.light_above_white has it.
+        stated_light: [H, W, 3] in multiples of white, at least 1 where it is known, as View.light_above_white has it.
         stated_deviation: standard deviation of its natural logarithm.
 
     Returns:
@@ -133,15 +133,15 @@ def combined_estimates(
         precision += deviation**-2
         # The mean of light, not of its logarithm: lamps then have their energy in the mean.
         total += precision * (estimate.mean * math.log(2) + deviation.square() / 2)
-    if stated is not None and stated_deviation > 0:
-        has_value = (clipped & (stated >= 1)).to(exposure)
+    if stated_light is not None and stated_deviation > 0:
+        has_value = (clipped & (stated_light >= 1)).to(exposure)
         share, light = (
-            _averaged(values, size) for values in (has_value, has_value * stated.to(exposure).clamp_min(1).log())
+            _average(values, size) for values in (has_value, has_value * stated_light.to(exposure).clamp_min(1).log())
         )
         stated_precision = (share > 0).to(exposure) / stated_deviation**2
         total += stated_precision * light / share.clamp_min(1e-6)
         precision += stated_precision
-    some = _averaged(clipped.to(exposure), size) > 0
+    some = _average(clipped.to(exposure), size) > 0
     mean = torch.where(some, total / precision.clamp_min(1e-12), 0)
     weight = stated_precision
     if prior is not None:
@@ -150,7 +150,7 @@ def combined_estimates(
     return ClippedLight(torch.cat([mean, roots[0]], 2).half(), roots[1].half())
 
 
-def _averaged(values: Tensor, size: tuple[int, int]) -> Tensor:
+def _average(values: Tensor, size: tuple[int, int]) -> Tensor:
     """Return [H, W, 3] averaged by area to [h, w, 3]."""
     return F.interpolate(values.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
 

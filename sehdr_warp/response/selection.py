@@ -102,7 +102,7 @@ def select_response(
 
     curves = tabulate(candidates)
     if with_family:
-        curves = curves.joined(family_curves())
+        curves = curves.join(family_curves())
     likely = likelihoods(evidence, curves)
     scores = score_candidates(candidates, evidence, curves, likely, from_camera=from_camera)
 

@@ -108,7 +108,7 @@ class CurveTables(NamedTuple):
         """Natural log exposures [K, 256] at the codes."""
         return self.logs[:, ::FINE]
 
-    def joined(self, other: "CurveTables") -> "CurveTables":
+    def join(self, other: "CurveTables") -> "CurveTables":
         """Return these curves and then those of another table."""
         return CurveTables(np.concatenate([self.logs, other.logs]), np.concatenate([self.rises, other.rises]))
 

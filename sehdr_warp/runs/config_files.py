@@ -187,7 +187,7 @@ def _read(preset: str | Path) -> tuple[dict, Path]:
         if not isinstance(base, str | None):
             raise InputError(path, f"base = {base!r} is not a name", f"use one of {preset_names()}, or a file")
         path = None if base is None else _locate(base, beside=path.parent)
-    return reduce(_merged, reversed(chain.values())), next(iter(chain))
+    return reduce(_merge, reversed(chain.values())), next(iter(chain))
 
 
 def _locate(preset: str | Path, beside: Path | None = None) -> Path:
@@ -202,7 +202,7 @@ def _locate(preset: str | Path, beside: Path | None = None) -> Path:
     raise InputError(str(preset)[:200], problem, f"use one of {', '.join(preset_names())}, or a TOML file")
 
 
-def _merged(below: dict, above: dict) -> dict:
+def _merge(below: dict, above: dict) -> dict:
     """Merge two levels of tables; values of `above` win."""
     both = {key for key in above if isinstance(above[key], dict) and isinstance(below.get(key), dict)}
     return below | above | {key: below[key] | above[key] for key in both}

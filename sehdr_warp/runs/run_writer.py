@@ -97,7 +97,7 @@ class RunWriter(RunFolder):
         if not resume and not overwrite:
             raise InputError(self.path, "exists and is not empty", "choose another, or use --resume or --overwrite")
         if any((self.path / name).is_dir() for name in (NEW, READY)):
-            with self._locked():
+            with self._lock_held():
                 self._finish_replacement()
         if resume:
             self.require()
@@ -105,11 +105,11 @@ class RunWriter(RunFolder):
             self.require("choose another folder for the run; --overwrite replaces runs alone")
         if not {"format", "base_time", "response"} <= self._read(self.info, _read_own).keys():
             raise InputError(self.info, "is not that of a run of sehdr-warp", _CHOOSE_OTHER)
-        with self._locked():  # Only to see that no other training holds it.
+        with self._lock_held():  # Only to see that no other training holds it.
             return resume
 
     @contextmanager
-    def _locked(self) -> Iterator[None]:
+    def _lock_held(self) -> Iterator[None]:
         """Hold the lock meanwhile, and release it if it was not held before."""
         had_lock = self._lock.is_locked
         self.lock()

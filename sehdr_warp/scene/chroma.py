@@ -32,14 +32,14 @@ def upsample_chroma(luma: np.ndarray, chroma: np.ndarray, offsets: Sequence[floa
     shape = luma.shape
     padding = [(0, 0 if offset is None else size % 2) for size, offset in zip(shape, offsets, strict=True)]
     luma = np.pad(luma, padding, mode="edge")
-    small = _reduced(luma, offsets)
-    center, center_small = _blurred(chroma), _blurred(small)
-    variance = np.maximum(_blurred(small * small) - center_small**2, 0) + _NOISE
-    slope = (_blurred(small[..., None] * chroma) - center_small[..., None] * center) / variance[..., None]
+    small = _reduce(luma, offsets)
+    center, center_small = _blur(chroma), _blur(small)
+    variance = np.maximum(_blur(small * small) - center_small**2, 0) + _NOISE
+    slope = (_blur(small[..., None] * chroma) - center_small[..., None] * center) / variance[..., None]
     result = np.zeros((*luma.shape, chroma.shape[2]), np.float32)
     _add_enlarged(result, slope, offsets, luma[..., None])
     _add_enlarged(result, chroma - slope * small[..., None], offsets)
-    difference = chroma - _reduced(result, offsets)
+    difference = chroma - _reduce(result, offsets)
     deviation = np.median(np.abs(difference), axis=(0, 1)) / np.float32(0.6745) * np.float32(_TRUSTED)
     difference *= np.maximum(0, 1 - (deviation / np.maximum(np.abs(difference), np.float32(1e-9))) ** 2)
     _add_enlarged(result, difference, offsets)
@@ -53,18 +53,18 @@ def _add_enlarged(
     step = 1 if offsets[0] is None else 2
     for top in range(0, len(values), _BAND_ROWS):
         start, end = max(top - _MARGIN, 0), min(top + _BAND_ROWS, len(values))
-        band = _enlarged(values[start : end + _MARGIN], offsets)[(top - start) * step : (end - start) * step]
+        band = _enlarge(values[start : end + _MARGIN], offsets)[(top - start) * step : (end - start) * step]
         rows = slice(top * step, end * step)
         result[rows] += band if factor is None else band * factor[rows]
 
 
-def _blurred(values: np.ndarray) -> np.ndarray:
+def _blur(values: np.ndarray) -> np.ndarray:
     from scipy.ndimage import gaussian_filter  # Takes a second to load
 
     return gaussian_filter(values, (_RADIUS, _RADIUS, 0)[: values.ndim], mode="nearest", truncate=3)
 
 
-def _reduced(values: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
+def _reduce(values: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
     """Return averages of [H, W, ...] where the chroma samples lie: of two samples between, of three around one."""
     for axis, offset in enumerate(offsets):
         if offset is None:
@@ -79,7 +79,7 @@ def _reduced(values: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
     return values
 
 
-def _enlarged(values: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
+def _enlarge(values: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
     """Return [h, w, C] at the size of luma, by Catmull-Rom splines (Keys 1981)."""
     for axis, offset in enumerate(offsets):
         if offset is None:

@@ -65,7 +65,7 @@ def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:
     first = first or (_model_elsewhere(folder) if anywhere else None)
     if first is None or first.name != "0":
         return first
-    models = _numbered(first.parent)
+    models = _by_number(first.parent)
     counts = {model: _image_count(model) for model in models} if len(models) > 1 else {first: 0}
     return max(counts, key=lambda model: counts[model])
 
@@ -92,7 +92,7 @@ def _model_elsewhere(folder: Path) -> Path | None:
 
 def other_models(model: Path) -> list[str]:
     """Return a note on the models that lie beside the one that is used; none if there are no others."""
-    models = _numbered(model.parent) if model.name.isdecimal() else []
+    models = _by_number(model.parent) if model.name.isdecimal() else []
     if not models and model.parent.name.lower() == "sparse":
         models = sorted(place for place in model.parent.iterdir() if place.is_dir() and _is_whole_model(place))
     if len(models) < 2:
@@ -106,7 +106,7 @@ def _is_model(place: Path) -> bool:
     return any((place / f"cameras{end}").is_file() for end in (".bin", ".txt"))
 
 
-def _numbered(parent: Path) -> list[Path]:
+def _by_number(parent: Path) -> list[Path]:
     """List the models sparse/0, sparse/1 ... in their order."""
     places = [place for place in parent.iterdir() if place.name.isdecimal() and _is_model(place)]
     return sorted(places, key=lambda place: int(place.name))
@@ -221,9 +221,11 @@ class _Bytes:
     def count(self, smallest: int) -> int:
         """Read a 64-bit count of records that take at least `smallest` bytes each."""
         (count,) = self.take("<Q")
-        left = len(self.data) - self.position
-        if count * smallest > left:
-            raise InputError(self.path, f"count {count} needs {count * smallest} bytes, but {left} are left", _REMEDY)
+        remaining = len(self.data) - self.position
+        if count * smallest > remaining:
+            raise InputError(
+                self.path, f"count {count} needs {count * smallest} bytes, but {remaining} are left", _REMEDY
+            )
         return count
 
     def skip_list(self, size: int) -> None:
@@ -271,7 +273,7 @@ def _records(path: Path, what: str, parse: Callable[[str], tuple]) -> Iterator[t
     """Parse the lines of a text file except empty ones and comments; ValueError becomes an InputError."""
     for number, line in enumerate(read_lines(path), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
-            yield _parsed(path, number, line, what, parse)
+            yield _parse(path, number, line, what, parse)
 
 
 def _image_records(path: Path) -> Iterator[tuple]:
@@ -287,7 +289,7 @@ def _image_records(path: Path) -> Iterator[tuple]:
         if not line.strip() or (after_image and _is_observations(line)):
             after_image = False
         else:
-            yield _parsed(path, number, line, "an image", _image)
+            yield _parse(path, number, line, "an image", _image)
             after_image = True
 
 
@@ -304,7 +306,7 @@ def _is_observations(line: str) -> bool:
     return True
 
 
-def _parsed(path: Path, number: int, line: str, what: str, parse: Callable[[str], tuple]) -> tuple:
+def _parse(path: Path, number: int, line: str, what: str, parse: Callable[[str], tuple]) -> tuple:
     try:
         return parse(line)
     except ValueError:

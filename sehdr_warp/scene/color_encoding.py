@@ -82,7 +82,7 @@ class ColorEncoding:
             channels are clipped.
         """
         clipped = pixels == np.iinfo(pixels.dtype).max
-        light = self._decoded(pixels) if self.table is None else self._light_by_table(pixels)
+        light = self._decode(pixels) if self.table is None else self._light_by_table(pixels)
         if above is not None:
             light, clipped = np.where(above > 0, above, light), clipped & (above == 0)
         if self.to_rec709 is not None:
@@ -91,7 +91,7 @@ class ColorEncoding:
             light = (light.reshape(-1, 3) @ matrix).reshape(light.shape)
         return light, clipped
 
-    def _decoded(self, pixels: np.ndarray) -> np.ndarray:
+    def _decode(self, pixels: np.ndarray) -> np.ndarray:
         """Return [H, W, 3] float32 light of codes by the curves, in the primaries of the codes."""
         levels = int(np.iinfo(pixels.dtype).max)
         if levels not in self._decoders:
@@ -103,9 +103,9 @@ class ColorEncoding:
 
     def _light_by_table(self, pixels: np.ndarray) -> np.ndarray:
         """Return [H, W, 3] float32 linear Rec.709 of codes by the profile's table."""
-        return self._known_colors.light(pixels) if pixels.dtype == np.uint8 else self._converted(pixels)
+        return self._known_colors.light(pixels) if pixels.dtype == np.uint8 else self._convert(pixels)
 
-    def _converted(self, pixels: np.ndarray) -> np.ndarray:
+    def _convert(self, pixels: np.ndarray) -> np.ndarray:
         assert self.table is not None
         values = pixels / np.float32(np.iinfo(pixels.dtype).max)
         return xyz_to_rec709(self.table.to_xyz(values)).astype(np.float32)
@@ -117,7 +117,7 @@ class ColorEncoding:
 
     @cached_property
     def _known_colors(self) -> KnownColors:
-        return KnownColors(self._converted)
+        return KnownColors(self._convert)
 
     def convert(self, image: EncodedImage) -> EncodedImage:
         """Return a photo as the codes of a photo in sRGB, of 16 bits if they change.
@@ -177,7 +177,7 @@ def encoding_of_profile(data: bytes, colors: str = "RGB") -> ColorEncoding:
         return _from_cicp((*profile.cicp, 1), name)
     if profile.table is not None:
         return ColorEncoding(name, table=profile.table)
-    return _simplified(name, profile.to_rec709, profile.curves)
+    return _simplify(name, profile.to_rec709, profile.curves)
 
 
 def note_of(encodings: dict[Path, ColorEncoding | None]) -> list[str]:
@@ -204,7 +204,7 @@ def _srgb_curve(count: int) -> np.ndarray:
     return srgb_to_linear(np.linspace(0, 1, count))
 
 
-def _simplified(name: str, matrix: np.ndarray | None, curves: tuple[np.ndarray, ...]) -> ColorEncoding:
+def _simplify(name: str, matrix: np.ndarray | None, curves: tuple[np.ndarray, ...]) -> ColorEncoding:
     """Return an encoding by primaries and curves, without those that are sRGB's or linear."""
     if matrix is not None and np.abs(matrix - np.eye(3)).max() < _SAME:
         matrix = None
@@ -262,7 +262,7 @@ def _from_cicp(values: tuple[int, int, int], source: str) -> ColorEncoding:
         curve = np.interp((255 * codes - 16) / 219, codes, curve)
     if transfer in _LIGHT:
         return ColorEncoding(name, matrix, (curve,) * 3, _LIGHT[transfer])
-    return _simplified(name, matrix, (curve,) * 3)
+    return _simplify(name, matrix, (curve,) * 3)
 
 
 def _h273_matrix(primaries: int) -> np.ndarray:
@@ -311,7 +311,7 @@ def _from_gama(info: dict) -> ColorEncoding | None:
             curves = (np.linspace(0, 1, _SAMPLES) ** (1 / gamma),) * 3
     chunks = [] if gamma is None else [f"gAMA {gamma:.5g}"]
     chunks += [] if matrix is None else ["cHRM"]
-    return _simplified(" and ".join(chunks), matrix, curves)
+    return _simplify(" and ".join(chunks), matrix, curves)
 
 
 def _from_tiff(image: Image.Image) -> ColorEncoding | None:
@@ -324,7 +324,7 @@ def _from_tiff(image: Image.Image) -> ColorEncoding | None:
         matrix = matrix_to_rec709((*map(float, places), *white))
     except (ValueError, TypeError, ZeroDivisionError):
         return ColorEncoding("TIFF", problem="its PrimaryChromaticities span no colors")
-    return _simplified("primaries of the TIFF", matrix, ())
+    return _simplify("primaries of the TIFF", matrix, ())
 
 
 def _from_exif(image: Image.Image) -> ColorEncoding | None:

@@ -85,7 +85,7 @@ def read_dng(path: Path) -> DngRaw | None:
         return None  # LibRaw's message says what is wrong.
     if not tables or _DNG_VERSION not in tables[0]:
         return None
-    raw = [table for table in tables if table.get(_PHOTOMETRIC) in (_CFA, _LINEAR_RAW) and not _reduced(table)]
+    raw = [table for table in tables if table.get(_PHOTOMETRIC) in (_CFA, _LINEAR_RAW) and not _reduce(table)]
     if not raw:
         return None
     try:
@@ -116,7 +116,7 @@ def _tables(file: Any) -> Iterator[Any]:
         yield table
 
 
-def _reduced(table: Any) -> bool:
+def _reduce(table: Any) -> bool:
     """Return whether a directory holds a preview, a mask or a depth map rather than the photo."""
     kind = table.get(_NEW_SUBFILE_TYPE, 0)
     return bool(kind if isinstance(kind, int) else 0)

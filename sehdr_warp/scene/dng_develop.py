@@ -67,7 +67,7 @@ def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorL
     if dng.opcodes[0]:
         sensor = apply_opcodes(dng.opcodes[0], sensor.astype(np.float32) / 65535, path, cell=cell) * 65535
     top, left, bottom, right = dng.active
-    light = _normalized(sensor[top:bottom, left:right], dng)
+    light = _normalize(sensor[top:bottom, left:right], dng)
     levels = np.ones(light.shape, np.float32)
     for channel in range(3):
         places = (..., channel) if pattern is None else (_places(light.shape, pattern, channel), 0)
@@ -76,12 +76,12 @@ def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorL
         light = apply_opcodes(dng.opcodes[1], light, path, cell=cell)
         levels = apply_opcodes(dng.opcodes[1], levels, path, cell=cell)
     if pattern is not None:
-        light, levels = (_demosaiced(each[..., 0], pattern) for each in (light, levels))
+        light, levels = (_demosaic(each[..., 0], pattern) for each in (light, levels))
     light, levels = (np.maximum(each, 0.0) for each in (light, levels))
     if dng.opcodes[2]:
         levels = apply_opcodes(dng.opcodes[2], levels, path)
         light = apply_opcodes(dng.opcodes[2], light, path)
-    light, levels = (_cropped(each, dng) for each in (light, levels))
+    light, levels = (_crop(each, dng) for each in (light, levels))
     clipped = light >= CLIPPED * levels
     if oriented:
         light, clipped = (turn_upright(each, dng.orientation) for each in (light, clipped))
@@ -95,7 +95,7 @@ def _places(shape: tuple[int, ...], pattern: np.ndarray, channel: int) -> np.nda
     return np.tile(pattern == channel, repeats)[:height, :width]
 
 
-def _normalized(sensor: np.ndarray, dng: DngRaw) -> np.ndarray:
+def _normalize(sensor: np.ndarray, dng: DngRaw) -> np.ndarray:
     """Return [H, W, samples] float32: 0 at the black level, 1 at the white level of the same pixel and channel."""
     rows, columns, _ = dng.black.shape
     light = np.empty(sensor.shape, np.float32)
@@ -108,7 +108,7 @@ def _normalized(sensor: np.ndarray, dng: DngRaw) -> np.ndarray:
     return light
 
 
-def _demosaiced(mosaic: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+def _demosaic(mosaic: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """Return [H, W, 3] float32 in the sensor's colors from a mosaic [H, W], by LibRaw."""
     import rawpy
 
@@ -168,7 +168,7 @@ def _plain_dng(mosaic: np.ndarray, pattern: np.ndarray) -> bytes:
     return b"".join((head, blobs, samples.tobytes()))
 
 
-def _cropped(image: np.ndarray, dng: DngRaw) -> np.ndarray:
+def _crop(image: np.ndarray, dng: DngRaw) -> np.ndarray:
     """Return the default crop of an image of the active area [H, W, 3], with square pixels."""
     from scipy.ndimage import map_coordinates
 

@@ -130,7 +130,7 @@ def _gain_map(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
     down = places(area.rows, image.shape[0], origin_v, spacing_v)
     right = places(area.columns, image.shape[1], origin_h, spacing_h)
 
-    def multiplied(part: np.ndarray, place: int) -> np.ndarray:
+    def multiply(part: np.ndarray, place: int) -> np.ndarray:
         grid = gains[:, :, min(place, planes - 1)]
         # Separable: columns of the grid first, so that a large photo needs no coordinates of its own.
         rows = map_coordinates(
@@ -143,13 +143,13 @@ def _gain_map(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
         after = rows[:, np.minimum(first + 1, points_h - 1)]
         return part * (rows[:, first] * (1 - share) + after * share)
 
-    area.change(image, multiplied)
+    area.change(image, multiply)
     return image
 
 
 def _fix_bad_pixels_constant(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
     constant, _ = reader.take("2I")
-    return _filled(image, np.rint(image * 65535) == constant, cell)
+    return _fill(image, np.rint(image * 65535) == constant, cell)
 
 
 def _fix_bad_pixels_list(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
@@ -160,10 +160,10 @@ def _fix_bad_pixels_list(reader: _Reader, image: np.ndarray, cell: int) -> np.nd
     bad[places[:, 0], places[:, 1]] = True
     for top, left, bottom, right in reader.array("u4", 4 * rectangles).astype(int).reshape(-1, 4):
         bad[top:bottom, left:right] = True
-    return _filled(image, bad, cell)
+    return _fill(image, bad, cell)
 
 
-def _filled(image: np.ndarray, bad: np.ndarray, cell: int) -> np.ndarray:
+def _fill(image: np.ndarray, bad: np.ndarray, cell: int) -> np.ndarray:
     """Replace bad pixels by the mean of the good ones of the same color around them."""
     rows, columns, planes = np.nonzero(bad)
     total, count = np.zeros(len(rows)), np.zeros(len(rows))
@@ -260,7 +260,7 @@ def _warp_rectilinear(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarr
         y = factor * down + k[5] * 2 * right * down + k[4] * (squared + 2 * down**2)
         return x, y
 
-    return _warped(image, polar, terms, moved)
+    return _warp(image, polar, terms, moved)
 
 
 def _warp_fisheye(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
@@ -274,10 +274,10 @@ def _warp_fisheye(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
         factor = angle * np.polynomial.polynomial.polyval(angle**2, k) / np.maximum(radius, 1e-9)
         return factor * polar.right, factor * polar.down
 
-    return _warped(image, polar, terms, moved)
+    return _warp(image, polar, terms, moved)
 
 
-def _warped(image: np.ndarray, polar: _Polar, terms: np.ndarray, moved: Callable) -> np.ndarray:
+def _warp(image: np.ndarray, polar: _Polar, terms: np.ndarray, moved: Callable) -> np.ndarray:
     """Return each plane [H, W] resampled at moved(terms of the plane), relative to the center."""
     from scipy.ndimage import map_coordinates
 

@@ -112,8 +112,8 @@ def usd_camera_arrays(path: Path) -> dict[str, Any]:
     world = np.zeros((4, 4)) if world is None else np.array(list(world), np.float64).reshape(4, 4)
     shapes = ("names", names, str, (-1,)), ("lenses", lenses, float, (-1, 7)), ("matrices", matrices, float, (-1, 4, 4))
     arrays = {name: np.array(values, kind).reshape(shape) for name, values, kind, shape in shapes}
-    stated = stage.GetPseudoRoot().HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
-    return arrays | {"world_matrix": world, "up_stated": np.array(stated)}
+    has_up_axis = stage.GetPseudoRoot().HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
+    return arrays | {"world_matrix": world, "up_stated": np.array(has_up_axis)}
 
 
 def _sample_times(stage: Any, prim: Any) -> list[Any]:

@@ -135,14 +135,14 @@ class ExposureCompensation:
             return replace(view, exposure_time=time)
         codes, table = np.empty(view.codes.shape, np.uint16), response.decode(np.arange(view.levels + 1) / view.levels)
 
-        def divided(light: np.ndarray, factor: np.ndarray) -> np.ndarray:
+        def divide(light: np.ndarray, factor: np.ndarray) -> np.ndarray:
             return codes_of(response.encode(light / np.maximum(factor / largest, 0.05)), 16)
 
         if vignetted:
             for rows in bands:
-                codes[rows] = divided(table[view.codes[rows]], self.light(view, rows))
+                codes[rows] = divide(table[view.codes[rows]], self.light(view, rows))
         else:  # Each code becomes the same code everywhere in the photo.
-            for channel, tables in enumerate(divided(np.repeat(table[:, None], 3, 1), gain).T):
+            for channel, tables in enumerate(divide(np.repeat(table[:, None], 3, 1), gain).T):
                 codes[..., channel] = tables[view.codes[..., channel]]
         codes[view.codes == view.levels] = 65535
         return replace(view, exposure_time=time, codes=codes)

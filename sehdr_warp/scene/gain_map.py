@@ -81,7 +81,7 @@ def light_of(photo: EncodedImage, gain_map: GainMap | None, scale: float = 1.0) 
         gain_map: of the photo; None for one without, whose light ends at white.
         scale: light that code 65535 stands for is white's divided by it.
     """
-    light = _decoded(photo)
+    light = _decode(photo)
     light = light if gain_map is None else gain_map.light(light) * np.float32(scale)
     codes = linear_codes(np.minimum(light, 1))
     above = None if gain_map is None else _above_white(light, codes == 65535)
@@ -90,11 +90,11 @@ def light_of(photo: EncodedImage, gain_map: GainMap | None, scale: float = 1.0) 
 
 def with_light_above_white(photo: EncodedImage, gain_map: GainMap) -> EncodedImage:
     """Return a photo with the same codes, and the light of its white pixels beside them."""
-    above = _above_white(gain_map.light(_decoded(photo)), photo.pixels == photo.levels)
+    above = _above_white(gain_map.light(_decode(photo)), photo.pixels == photo.levels)
     return replace(photo, above_white=above, above_white_deviation=DEVIATION)
 
 
-def _decoded(photo: EncodedImage) -> np.ndarray:
+def _decode(photo: EncodedImage) -> np.ndarray:
     """Return [H, W, 3] float32 light by sRGB's transfer function (that of Display P3, too), 1 at white."""
     codes = np.arange(photo.levels + 1) / photo.levels
     return srgb_to_linear(codes).astype(np.float32)[photo.pixels]

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_bytes
 from ..quiet import silent_output
-from .images import DAMAGED, MAX_PIXELS, check_size, kind_by_content, remedy_for_kind, require_file
+from .images import DAMAGED, check_size, kind_by_content, remedy_for_kind, require_file
 from .primaries import REC709, encoding_of_interop_id, matrix_to_rec709
 
 # OpenEXR allocates all pixels before it reads one. Its ZIP of a single color holds 500 pixels in a byte.
@@ -54,7 +54,7 @@ def hdr_size(path: Path) -> tuple[int, int]:
         InputError: if it cannot be read or states too many pixels.
     """
     if path.suffix.lower() != ".hdr":
-        return _exr_window(path, MAX_PIXELS)[1]
+        return _exr_window(path)[1]
     require_file(path)
     _require_magic(path, b"#?R", "a Radiance picture")
     with path.open("rb") as file:
@@ -195,7 +195,7 @@ def _from_luminance(channels: Mapping[str, np.ndarray], primaries: tuple[float, 
     return np.stack([red, green, blue], axis=2).astype(np.float32)
 
 
-def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict[str, np.ndarray], dict]:
+def read_exr_channels(path: Path) -> tuple[dict[str, np.ndarray], dict]:
     """Read the channels of an OpenEXR file over the display window, and its header: of the part that is the picture.
 
     Pixels of the display window outside the data window are 0. Subsampled channels are interpolated. Values are as
@@ -205,9 +205,9 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
         Channels [H, W] float32 by name, and the header's attributes.
 
     Raises:
-        InputError: if the file is missing, damaged, truncated or holds more than max_pixels pixels.
+        InputError: if the file is missing, damaged, truncated or holds more than MAX_PIXELS pixels.
     """
-    origin, (width, height) = _exr_window(path, max_pixels)
+    origin, (width, height) = _exr_window(path)
     with _exr_file(path, separate_channels=True) as file:
         # A file whose pixels end early has no parts instead of raising.
         if not file.parts:
@@ -225,7 +225,7 @@ def read_exr_channels(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[dict
     for name, (pixels, *sampling) in arrays.items():
         if pixels is not None and pixels.ndim == 2:
             if sampling != [1, 1]:
-                pixels = _interpolated(pixels, size[::-1], sampling[::-1])
+                pixels = _interpolate(pixels, size[::-1], sampling[::-1])
             inside = pixels[max(-top, 0) : max(height - top, 0), max(-left, 0) : max(width - left, 0)]
             channels[name] = np.zeros((height, width), np.float32)
             channels[name][max(top, 0) :, max(left, 0) :][: inside.shape[0], : inside.shape[1]] = inside
@@ -255,7 +255,7 @@ def _colored_part(file: Any) -> int:
     return next(iter(pictures or colored), 0)
 
 
-def _interpolated(pixels: np.ndarray, shape: tuple[int, ...], sampling: list[int]) -> np.ndarray:
+def _interpolate(pixels: np.ndarray, shape: tuple[int, ...], sampling: list[int]) -> np.ndarray:
     """Interpolate a subsampled channel, whose samples lie at every `sampling` rows and columns, bilinearly."""
     from scipy.ndimage import map_coordinates
 
@@ -286,7 +286,7 @@ def _require_magic(path: Path, magic: bytes, kind: str) -> None:
         raise InputError(path, f"is {content}, not {kind}", remedy_for_kind(content))
 
 
-def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int, int]]:
+def _exr_window(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the display window's origin and its (width, height)."""
     with _exr_file(path, header_only=True) as file:
         header = file.header(_colored_part(file))
@@ -294,7 +294,7 @@ def _exr_window(path: Path, max_pixels: int) -> tuple[tuple[int, int], tuple[int
     sizes = [(high[0] - low[0] + 1, high[1] - low[1] + 1) for low, high in windows]
     file_size = path.stat().st_size
     for size in sizes:
-        check_size(path, *size, max_pixels)
+        check_size(path, *size)
         if size[0] * size[1] > _MOST_PIXELS_PER_BYTE * file_size:
             raise InputError(path, f"states {size[0]} x {size[1]} pixels, but has only {file_size} bytes", DAMAGED)
     return windows[0][0], sizes[0]

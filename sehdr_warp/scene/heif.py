@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, require_extra
 
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 _DAMAGED = "copy or export the photo again"
@@ -80,10 +80,7 @@ def is_heif(path: Path) -> bool:
 
 def register_heif(path: Path) -> None:
     """Make Pillow able to open HEIF. Raises SehdrError if pillow-heif is not installed."""
-    if not heif_installed():
-        raise SehdrError(f"{path}: HEIC photos need pillow-heif; pip install 'sehdr-warp[phone]'")
-    import pillow_heif
-
+    pillow_heif = require_extra("pillow_heif", f"{path}: HEIC photos need pillow-heif", "phone")
     pillow_heif.register_heif_opener(thumbnails=False, depth_images=False)
 
 

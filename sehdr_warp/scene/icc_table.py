@@ -40,7 +40,7 @@ class IccTable:
     def to_xyz(self, codes: np.ndarray) -> np.ndarray:
         """Return CIE XYZ relative to D50 [..., 3], Y 1 at the medium's white, of codes [..., 3] in [0, 1]."""
         values = _through(self.device_curves, np.asarray(codes, np.float32))
-        values = values if self.entries is None else _interpolated(self.entries, values)
+        values = values if self.entries is None else _interpolate(self.entries, values)
         values = _through(self.middle_curves, values)
         if self.matrix is not None:
             values = values @ self.matrix[:, :3].T.astype(np.float32) + self.matrix[:, 3].astype(np.float32)
@@ -170,7 +170,7 @@ def _below(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return first, places - first
 
 
-def _interpolated(entries: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _interpolate(entries: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return entries [r, g, b, 3] at values [..., 3]: between corners of the tetrahedron that holds each value.
 
     From the cell's lowest corner the way goes along the axis of the largest part first, then of the middle one.

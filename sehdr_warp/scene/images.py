@@ -246,14 +246,14 @@ def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndar
             raise InputError(path, problem, "export it with 16 bits")
         return _split(whole_range(image, values.astype(np.uint16)))
     transparent = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-    return _split(_converted(image, "RGBA" if transparent else "RGB"))
+    return _split(_convert(image, "RGBA" if transparent else "RGB"))
 
 
 def _is_grey_alpha_of_16_bits(image: ImageFile.ImageFile) -> bool:
     return bool(image.tile) and image.tile[0].args == "LA;16B"
 
 
-def _converted(image: Image.Image, mode: str) -> np.ndarray:
+def _convert(image: Image.Image, mode: str) -> np.ndarray:
     """Convert an image to [H, W, C] uint8 in bands, because Pillow copies what it converts."""
     width, height = image.size
     codes = np.empty((height, width, len(mode)), np.uint8)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, require_extra
 from ..quiet import silent_stderr
 from ..subsets import every_nth
 from .dataparser import reinhard_gamma
@@ -71,29 +71,26 @@ def tone_mapped(path: Path) -> np.ndarray:
 def raw_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return (width, height) of the developed photo as the sensor lies, and turned upright."""
     dng = read_dng(path)
-    with _opened(path) as raw:
+    with _open(path) as raw:
         size, turned = (raw.sizes.width, raw.sizes.height), (raw.sizes.height, raw.sizes.width)
         sizes = (size, turned if raw.sizes.flip in (5, 6) else size) if dng is None else dng.sizes
     check_size(path, *sizes[0])
     return sizes
 
 
-def raw_codes(path: Path, *, oriented: bool) -> np.ndarray:
-    """Return [H, W, 3] uint16 sRGB codes of a RAW file in the sensor's colors, 1 at each channel's white level."""
-    return read_raw(path, oriented=oriented).pixels
-
-
 def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
-    """Return the codes of a RAW file, as raw_codes() does, and the light above white that a DNG's gain map states.
+    """Return the codes of a RAW file, and the light above white that a DNG's gain map states.
+
+    The codes are [H, W, 3] uint16 by sRGB's curve in the sensor's colors, 1 at each channel's white level.
 
     Raises:
         InputError: if the file is missing or damaged, or holds what LibRaw does not decode.
     """
     raw_sizes(path)
     dng = read_dng(path)
-    with _opened(path) as raw:
+    with _open(path) as raw:
         if dng is None:
-            linear = _developed(raw, oriented)
+            linear = _develop(raw, oriented)
             return EncodedImage(linear_codes(linear), None)
         sensor = develop_dng(path, dng, raw, oriented=oriented)
     codes = linear_codes(np.where(sensor.clipped, 1, sensor.light))
@@ -102,7 +99,7 @@ def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
     return EncodedImage(codes, None, above, _NOISE)
 
 
-def _developed(raw: Any, oriented: bool) -> np.ndarray:
+def _develop(raw: Any, oriented: bool) -> np.ndarray:
     """Return [H, W, 3] float32 light of an opened RAW file, 1 where a channel clips."""
     import rawpy
 
@@ -130,7 +127,7 @@ def linear_codes(linear: np.ndarray) -> np.ndarray:
 
 def raw_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
     """Exposure time in seconds, ISO speed and f-number that a RAW file states, None where it does not."""
-    with _opened(path) as raw:
+    with _open(path) as raw:
         metadata = raw.other
         return tuple(v if v > 0 else None for v in (metadata.shutter_speed, metadata.iso_speed, metadata.aperture))  # type: ignore[return-value]
 
@@ -142,7 +139,7 @@ def color_matrix(photos: Sequence[Path]) -> np.ndarray:
     """
     first = None
     for photo in photos:
-        with _opened(photo) as raw:
+        with _open(photo) as raw:
             matrix, xyz_matrix = np.array(raw.color_matrix)[:, :3], np.array(raw.rgb_xyz_matrix)[:3]
             if not matrix.any() and xyz_matrix.any():
                 to_camera = xyz_matrix @ _XYZ_FROM_REC709
@@ -159,12 +156,9 @@ def color_matrix(photos: Sequence[Path]) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open(path: Path) -> Iterator[Any]:
     require_file(path)
-    try:
-        import rawpy
-    except ImportError:
-        raise SehdrError(f"{path}: RAW files need rawpy; pip install 'sehdr-warp[raw]'") from None
+    rawpy = require_extra("rawpy", f"{path}: RAW files need rawpy", "raw")
     try:
         # LibRaw prints of damage, too.
         with silent_stderr(), rawpy.imread(str(path)) as raw:

@@ -60,8 +60,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         keys = _photo_keys(record, bases, shared)
         near = beside[record.image.parent]
         tables = [*((masks, keys) for masks in index), (near, [record.image.name, record.image.stem])]
-        found = (masks.get(folded(key)) for masks, names in tables for key in names)
-        mask = record.mask or next((file for file in found if file is not None), None)
+        candidates = (masks.get(folded(key)) for masks, names in tables for key in names)
+        mask = record.mask or next((file for file in candidates if file is not None), None)
         if mask is not None and record.mask is None:
             mask = contained(folder, mask.relative_to(folder).as_posix(), folder)
         if mask is None and common is not None and _has_shape(common, record):

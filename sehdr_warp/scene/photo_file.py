@@ -211,8 +211,8 @@ def available_memory() -> int:
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         limits.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
-    if (left := memory_left()) is not None:
-        limits.append(left)
+    if (limit := memory_left()) is not None:
+        limits.append(limit)
     return min(limits)
 
 
@@ -220,7 +220,6 @@ def _folder() -> Path:
     folder = cache_folder()
     if folder is None or not usable(folder):
         return Path(tempfile.gettempdir())
-    folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 

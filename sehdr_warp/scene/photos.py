@@ -45,7 +45,7 @@ def usable_photos(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], st
     usable, problems = [], []
     for record in selected:
         try:
-            usable.append(_checked(record))
+            usable.append(_check_size(record))
         except InputError as error:
             problems.append(error)
     notes += left_out(problems, len(selected))
@@ -120,7 +120,7 @@ def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRe
     return kind, [record for record in records if kind_of(record.image) == kind], notes
 
 
-def _checked(record: ImageRecord) -> ImageRecord:
+def _check_size(record: ImageRecord) -> ImageRecord:
     """Return the photo with what its file states of its colors. Raises InputError if it cannot be used."""
     if kind_of(record.image) == "encoded":
         with open_image(record.image) as image:

@@ -119,12 +119,9 @@ def checked_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], fold
         raise InputError(folder, f"the training photos are {state}", remedy)
 
 
-def read_codes(record: ImageRecord, *, oriented: bool = False) -> EncodedImage:
-    """Read a photo's codes, or compute them from HDR truth or light, before anything is undistorted or resized.
-
-    `oriented` turns the pixels as the EXIF orientation says.
-    """
-    stored = _read_stored(record, oriented=oriented)
+def read_codes(record: ImageRecord) -> EncodedImage:
+    """Read a photo's codes, or compute them from HDR truth or light, before anything is undistorted or resized."""
+    stored = _read_stored(record, oriented=False)
     return stored.encoding.convert(stored.photo)
 
 
@@ -205,8 +202,8 @@ class _Preprocessor:
         def warped(image: np.ndarray, values: Callable[[slice], np.ndarray | None] | None = None) -> np.ndarray:
             """Undistort and average [H, W] or [H, W, C] from the photo's size to the camera's; see area_average."""
             if not undistortion:
-                return _shrunk(image, camera, values)
-            return _shrunk(undistortion.apply(_shrunk(image, working, values)), camera)
+                return _shrink(image, camera, values)
+            return _shrink(undistortion.apply(_shrink(image, working, values)), camera)
 
         hdr = None if record.hdr is None else warped(_read_truth(record.hdr, lens, camera, undistortion is not None))
         if hdr is not None and record.hdr == record.image:
@@ -215,7 +212,7 @@ class _Preprocessor:
         stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented, self.labeled_masks)
         self.mask_shares[name] = None if stored is None else float(stored.mean())
         if record.derived and hdr is not None:  # Compute HDR-NeRF's photo from the truth at the final size.
-            mask = _weighted(None if stored is None else warped(stored), camera)
+            mask = _by_solid_angle(None if stored is None else warped(stored), camera)
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
         photo, encoding = _read_stored(record, oriented=oriented, masked=self.alpha == "mask")
@@ -227,15 +224,15 @@ class _Preprocessor:
         if to_shared is not None or not averaged:
             photo, encoding = encoding.convert(photo), ColorEncoding("sRGB")
         photo = photo if to_shared is None else replace(photo, pixels=to_shared(photo.pixels))
-        masks = [] if undistortion is None or undistortion.inside is None else [_shrunk(undistortion.inside, camera)]
+        masks = [] if undistortion is None or undistortion.inside is None else [_shrink(undistortion.inside, camera)]
         if stored is not None:
             masks.append(warped(stored))
         if alpha is not None and self.alpha == "mask":
             masks.append(warped(alpha))
             alpha = None
-        photo = self._averaged(replace(photo, alpha=alpha), encoding, warped) if averaged else photo
+        photo = self._average(replace(photo, alpha=alpha), encoding, warped) if averaged else photo
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
-        mask = _weighted(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
+        mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         return View(
             name,
             photo.pixels,
@@ -249,7 +246,7 @@ class _Preprocessor:
             light_above_white_deviation=photo.above_white_deviation,
         )
 
-    def _averaged(self, photo: EncodedImage, encoding: ColorEncoding, warped: Callable) -> EncodedImage:
+    def _average(self, photo: EncodedImage, encoding: ColorEncoding, warped: Callable) -> EncodedImage:
         """Return the codes of the mean light, and the light above white that is left in it.
 
         Colors that are not sRGB's are converted on the way, because codes of all pixels would take time and memory.
@@ -303,7 +300,7 @@ class _Preprocessor:
         return np.where(light > 1, light * float(self.response.decode(np.ones(1))[0]), decoded)
 
 
-def _weighted(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
+def _by_solid_angle(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
     """Return the mask of a view; pixels of a panorama or a wide fisheye photo count by their solid angle."""
     if camera.is_pinhole:
         return mask
@@ -311,7 +308,7 @@ def _weighted(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
     return weights if mask is None else weights * mask
 
 
-def _shrunk(
+def _shrink(
     image: np.ndarray, to: Lens | Camera, values: Callable[[slice], np.ndarray | None] | None = None
 ) -> np.ndarray:
     return area_average(image, to.width, to.height, values)
@@ -331,7 +328,7 @@ def _fitted_mask(path: Path, lens: Lens, oriented: bool, labeled: set[Path]) -> 
     mask = read_mask(path, oriented=oriented, labeled=labeled)
     height, width = mask.shape
     if width >= lens.width and height >= lens.height and _same_aspect((width, height), (lens.width, lens.height)):
-        return _shrunk(mask, lens)
+        return _shrink(mask, lens)
     if width < lens.width and height < lens.height and _same_aspect((lens.width, lens.height), (width, height)):
         resized = Image.fromarray(mask).resize((lens.width, lens.height), Image.Resampling.BILINEAR)
         return np.asarray(resized)

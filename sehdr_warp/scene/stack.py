@@ -142,7 +142,7 @@ def calibrate(
         raise InputError(folder, *error.args[0].split(": ", 1)[1].split("; ", 1)) from None
     for calibration in curves:
         _tell(calibration, files, channel)
-    response = curves[0].response if len(curves) == 1 else _joined(name, curves)
+    response = curves[0].response if len(curves) == 1 else _join(name, curves)
     if paths:
         with atomic_path(paths[1], overwrite) as picture:
             _plot(curves, times, picture)
@@ -151,7 +151,7 @@ def calibrate(
     return response
 
 
-def _joined(name: str, calibrations: Sequence["Calibration"]) -> "ChannelResponse":
+def _join(name: str, calibrations: Sequence["Calibration"]) -> "ChannelResponse":
     """Return the channels' curves as one response, in which equal middle codes are neutral (Debevec and Malik)."""
     from ..response.table import ChannelResponse
 

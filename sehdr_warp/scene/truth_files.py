@@ -50,9 +50,9 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         if _may_have_truth(record):
             keys = [_key(image.relative_to(base)) for base in bases if image.is_relative_to(base)]
             keys += [folded(image.stem)] * (stems[folded(image.stem)] <= 1)
-            found = ((place, files[place].get(key)) for key in keys for place in places)
+            candidates = ((place, files[place].get(key)) for key in keys for place in places)
             near = image.parent, beside[image.parent].get(folded(image.stem))
-            hdr = next((_inside(place, file, folder) for place, file in (*found, near) if file), None)
+            hdr = next((_inside(place, file, folder) for place, file in (*candidates, near) if file), None)
             hdr = None if hdr is not None and is_without_colors(hdr) else hdr
         result.append(replace(record, hdr=hdr))
     in_use, notes = {record.hdr for record in result}, []

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, require_extra
 from ..sandbox import read_sandboxed
 from .chroma import upsample_chroma
 from .images import MAX_PIXELS, check_size
@@ -70,7 +70,7 @@ def open_clip(path: Path) -> Clip:
         InputError: if it cannot be read, has no picture, or its frames are too large.
         SehdrError: if PyAV is not installed.
     """
-    _require_library(path)
+    require_extra("av", f"{path}: video needs PyAV", "film")
     read_sandboxed(first_frame_size, path, "video", _REMEDY)
     with _container(path) as container:
         stream = _stream(container, path)
@@ -160,7 +160,7 @@ def grey(frame: Any, width: int) -> np.ndarray:
 def codes(frame: Any, color: VideoColor) -> np.ndarray:
     """Return [H, W, 3] codes of a frame, upright: uint8 for 8 bits, else uint16."""
     if color.matrix is None:
-        rgb = _reformatted(frame, "rgb48le", color).to_ndarray() / np.float32(65535)
+        rgb = _reformat(frame, "rgb48le", color).to_ndarray() / np.float32(65535)
     else:
         kr, kb = color.matrix
         y, uv = _luma_and_chroma(frame, color)
@@ -188,7 +188,7 @@ def _luma_and_chroma(frame: Any, color: VideoColor) -> tuple[np.ndarray, np.ndar
     rows, columns = (bool(2 * small - size in (0, 1) and small < size) for size, small in sizes)  # Whether halved
     # FFmpeg interpolates chroma of other sizes, such as a quarter of the width.
     layout = {(False, True): "yuv422p16le", (True, True): "yuv420p16le"}.get((rows, columns), "yuv444p16le")
-    y, u, v = _planes(_reformatted(frame, layout, color))
+    y, u, v = _planes(_reformat(frame, layout, color))
     top, step = 2**color.bits - 1, np.float32(1 << (16 - color.bits))
     if color.full_range:
         # Below the bits of luma, FFmpeg repeats the highest ones (white is 65535) or, by layout, puts zeros.
@@ -202,7 +202,7 @@ def _luma_and_chroma(frame: Any, color: VideoColor) -> tuple[np.ndarray, np.ndar
     return y, upsample_chroma(y, uv, (down if rows else None, right if columns else None))
 
 
-def _reformatted(frame: Any, layout: str, color: VideoColor | None = None) -> Any:
+def _reformat(frame: Any, layout: str, color: VideoColor | None = None) -> Any:
     from av.video.reformatter import ColorRange, Interpolation
 
     same = ColorRange.JPEG if color is not None and color.full_range else ColorRange.MPEG
@@ -228,7 +228,7 @@ def _chroma_places(frame: Any, layout: str) -> tuple[float, float]:
         rows, columns = np.indices((plane.height, plane.line_size // 2))
         ramp = 0 * rows if axis is None else 1000 * steps[axis] * (columns if axis else rows)
         plane.update((20_000 + ramp).astype("<u2").tobytes())
-    _, right, down = _planes(_reformatted(probe, "yuv444p16le"))
+    _, right, down = _planes(_reformat(probe, "yuv444p16le"))
     offsets = (16 - (ramp[16, 16] - 20_000) / 1000 for ramp in (down, right))
     first, second = (float(np.clip(round(2 * place) / 2, 0, 1)) for place in offsets)
     return first, second
@@ -255,14 +255,6 @@ def _orientation(frame: Any) -> _Orientation:
     mirrored = bool(a * d - b * c < 0)
     a, b = (-a, -b) if mirrored else (a, b)
     return _Orientation(round(-np.degrees(np.arctan2(b, a)) / 90) % 4, mirrored)
-
-
-def _require_library(path: Path) -> None:
-    """Raise SehdrError if PyAV is not installed."""
-    try:
-        import av  # noqa: F401
-    except ImportError:
-        raise SehdrError(f"{path}: video needs PyAV; run `pip install sehdr-warp[film]`") from None
 
 
 def _container(path: Path, *, threads: bool = True) -> Any:

@@ -39,7 +39,6 @@ _OTHER_MATRICES = {8: "YCgCo", 10: "constant-luminance BT.2020", 11: "Y'D'zD'x",
 _DOLBY_VISION = ("dvh1", "dvhe", "dva1", "dvav", "dav1")
 """Codec tags of Dolby Vision. Without a stated curve the stream is profile 5, whose colors only Dolby's decoder knows;
 phones write profile 8, which is HLG."""
-_RGB_MATRIX = 0
 _FULL_RANGE = 2
 # What makers call their log curves in a clip's metadata: colour-science's curve, and the primaries that belong to it.
 _LOGS = {

@@ -30,6 +30,7 @@ _FEWEST, _MOST = 24, 240  # Frames of a clip
 _LEAST_MOVEMENT = 0.05  # In parts of the width, of a whole clip: less shows no depth
 _LEAST_STEP = 4.0  # Pixels from a reference frame to the next one, at _MOVEMENT_WIDTH
 _MOST_LOOKED_AT = 3000
+_BLOCK = 64  # Pixels of the blocks whose movement is measured
 _SHARPNESS_WIDTH, _MOVEMENT_WIDTH = 640, 192
 
 
@@ -69,7 +70,7 @@ def choose_frames(clip: Clip) -> FrameChoice:
         tiny = grey(frame, _MOVEMENT_WIDTH)
         # From a reference some pixels back: a slow camera moves by less than a pixel between frames.
         reference = tiny if reference is None else reference
-        step = shift(reference, tiny)
+        step = frame_shift(reference, tiny)
         moved.append(max(before + step, moved[-1] if moved else 0.0))
         if step * tiny.shape[1] >= _LEAST_STEP:
             reference, before = tiny, moved[-1]
@@ -95,13 +96,13 @@ def sharpness(picture: np.ndarray) -> float:
     return float(np.abs(around - 4 * inner).mean() / (inner.mean() + 1e-3))
 
 
-def shift(first: np.ndarray, second: np.ndarray, block: int = 64) -> float:
+def frame_shift(first: np.ndarray, second: np.ndarray) -> float:
     """Return how far two grey pictures [h, w] are moved, in parts of the width: the median over blocks.
 
     Phase correlation (Kuglin and Hines 1975). 0 if blocks agree on no movement.
     """
     height, width = first.shape
-    side = min(block, height, width)
+    side = min(_BLOCK, height, width)
     window = np.outer(np.hanning(side), np.hanning(side))
     lengths = []
     for top in np.linspace(0, height - side, max(1, round(height / side))).astype(int):

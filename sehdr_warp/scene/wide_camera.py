@@ -121,18 +121,16 @@ def painted_mask(view: View) -> np.ndarray | None:
     return None if mask.min() > 1 - 1e-3 else mask
 
 
-def perspective_views(views: Sequence[View], size: int | None = None) -> tuple[View, ...]:
-    """Return pinhole views for what needs them: pinholes as they are, others cut into faces of FACE_ANGLE degrees.
-
-    Args:
-        views: of any cameras.
-        size: of a face in pixels; by default that of the photo's resolution at its axis.
-    """
-    return tuple(face for view in views for face in ((view,) if view.camera.is_pinhole else faces_of(view, size)))
+def perspective_views(views: Sequence[View]) -> tuple[View, ...]:
+    """Return pinhole views for what needs them: pinholes as they are, others cut into faces of FACE_ANGLE degrees."""
+    return tuple(face for view in views for face in ((view,) if view.camera.is_pinhole else faces_of(view)))
 
 
 def faces_of(view: View, size: int | None = None) -> list[View]:
-    """Return pinhole views cut from a wide view: forward, right, back, left, up and down, where it shows enough."""
+    """Return pinhole views cut from a wide view: forward, right, back, left, up and down, where it shows enough.
+
+    `size` is that of a face in pixels; by default that of the photo's resolution at its axis.
+    """
     from scipy.ndimage import map_coordinates
 
     camera = view.camera
@@ -174,7 +172,7 @@ class Face(NamedTuple):
 
 
 def face_cameras(camera: Camera, size: int | None = None) -> list[Face]:
-    """Return the faces of a wide camera that it shows enough of; `size` as in perspective_views()."""
+    """Return the faces of a wide camera that it shows enough of; `size` as in faces_of()."""
     count = size or face_size(camera)
     focal = count / 2 / np.tan(np.radians(FACE_ANGLE / 2))
     faces = []

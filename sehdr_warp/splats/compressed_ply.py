@@ -83,7 +83,7 @@ def unpack_ply(elements: Any, path: Path) -> dict[str, np.ndarray]:
     if len(chunk.data) * _CHUNK < count:
         raise InputError(path, f"has {len(chunk.data)} chunks for {count} Gaussians", _DAMAGED)
 
-    def scaled(unit: np.ndarray, names: tuple[str, ...], prefix: tuple[str, str] = ("min", "max")) -> np.ndarray:
+    def in_chunk(unit: np.ndarray, names: tuple[str, ...], prefix: tuple[str, str] = ("min", "max")) -> np.ndarray:
         low, high = (np.stack([np.asarray(chunk[f"{end}_{name}"], np.float64) for name in names], 1) for end in prefix)
         return low[index] + unit * (high - low)[index]
 
@@ -93,7 +93,7 @@ def unpack_ply(elements: Any, path: Path) -> dict[str, np.ndarray]:
     units = [np.stack([_field(packed, shift, bits) for shift, bits in _BITS], 1) for packed in (position, scale)]
     shades = np.stack([_field(color, shift, 8) for shift in (24, 16, 8, 0)], 1)
     present = {each.name for each in chunk.properties}
-    tint = scaled(shades[:, :3], _names(2)) if "min_r" in present else shades[:, :3].astype(np.float64)
+    tint = in_chunk(shades[:, :3], _names(2)) if "min_r" in present else shades[:, :3].astype(np.float64)
     others = np.stack([_field(turns, shift, 10) for shift in (20, 10, 0)], 1) * 2 - 1
     constant = (tint - 0.5) / HARMONIC_0
     harmonics = constant[:, None]
@@ -108,8 +108,8 @@ def unpack_ply(elements: Any, path: Path) -> dict[str, np.ndarray]:
         rest = ((values - 0.5) * _REACH).reshape(count, 3, -1).swapaxes(1, 2)
         harmonics = np.concatenate([harmonics, rest], axis=1)
     return {
-        "means": scaled(units[0], _names(0)).astype(np.float32),
-        "log_scales": scaled(units[1], _names(1)).astype(np.float32),
+        "means": in_chunk(units[0], _names(0)).astype(np.float32),
+        "log_scales": in_chunk(units[1], _names(1)).astype(np.float32),
         "quaternions": from_smallest_three((turns >> 30).astype(int), others),
         "opacity_logits": logits(shades[:, 3]),
         "harmonics": harmonics.astype(np.float32),

@@ -87,7 +87,7 @@ def read_glb(path: Path) -> GaussianArrays:
             for primitive in mesh["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):
                     gaussians = _primitive(described, binary, mesh, primitive, path)
-                    parts.append(gaussians if np.allclose(matrix, np.eye(4)) else _moved(gaussians, matrix, path))
+                    parts.append(gaussians if np.allclose(matrix, np.eye(4)) else _move(gaussians, matrix, path))
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
     if not parts:
@@ -160,7 +160,7 @@ def _node_matrix(node: dict) -> np.ndarray:
     return matrix
 
 
-def _moved(gaussians: GaussianArrays, matrix: np.ndarray, path: Path) -> GaussianArrays:
+def _move(gaussians: GaussianArrays, matrix: np.ndarray, path: Path) -> GaussianArrays:
     stretch = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if not (np.isfinite(matrix).all() and stretch[2] > 0 and stretch[0] < 1.001 * stretch[2]):
         raise InputError(path, "stretches its Gaussians by a node's transform", "bake the transform into the Gaussians")

@@ -95,7 +95,7 @@ def read_ply(path: Path) -> GaussianArrays:
     if flat:
         log.info("%s: its Gaussians have two sizes (2D Gaussian Splatting), and are read as flat ones", path)
     if smoothing.size:
-        log_scales, opacity = _smoothed(log_scales, opacity, smoothing)
+        log_scales, opacity = _smooth(log_scales, opacity, smoothing)
         log.info("%s: its 3D smoothing filter (filter_3D) is fused into sizes and opacities", path)
     higher = higher.reshape(len(means), 3, len(rest) // 3).swapaxes(1, 2)
     harmonics = np.concatenate([constant[:, None], higher], axis=1)
@@ -125,7 +125,7 @@ def _read(path: Path):
     return PlyData.read(io.BytesIO(data))
 
 
-def _smoothed(log_scales: np.ndarray, logits: np.ndarray, smoothing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _smooth(log_scales: np.ndarray, logits: np.ndarray, smoothing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fuse Mip-Splatting's 3D smoothing filter (Yu et al. 2024, section 5.1) into sizes [N, 3] and opacities [N, 1].
 
     `smoothing` is the standard deviation [N, 1] of the filter in scene units.

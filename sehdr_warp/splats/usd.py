@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, SehdrError, require_extra
 from ..files import atomic_path
 from ..sandbox import read_sandboxed
 from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_matrix
@@ -23,12 +23,7 @@ _FAINTEST = 1 / 255  # Opacity below which programs draw nothing of a Gaussian
 
 def pxr(module: str) -> Any:
     """Return a module of OpenUSD; raise SehdrError if it is not installed."""
-    from importlib import import_module
-
-    try:
-        return import_module(f"pxr.{module}")
-    except ImportError:
-        raise SehdrError("OpenUSD is not installed; pip install 'sehdr-warp[usd]'") from None
+    return require_extra(f"pxr.{module}", "OpenUSD is not installed", "usd")
 
 
 def open_stage(path: Path) -> Any:

@@ -74,7 +74,7 @@ def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise |
             rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
             exposure = noisy(exposure, response.clip_exposure if response.clips else response.white, noise, rng)
         views.append(replace(view, codes=codes_of(response.encode(exposure), 8), exposure_time=float(exposure_time)))
-    fields = {"views": tuple(views), "point_colors": _recolored(scene, views), "exposure_times_known": True}
+    fields = {"views": tuple(views), "point_colors": _recolor(scene, views), "exposure_times_known": True}
     return replace(scene, **fields, response=None, chosen_by=None)
 
 
@@ -127,7 +127,7 @@ def noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.r
     return np.clip(electrons, 0.0, noise.full_well) * (saturation / noise.full_well)
 
 
-def _recolored(scene: Scene, views: Sequence[View]) -> np.ndarray:
+def _recolor(scene: Scene, views: Sequence[View]) -> np.ndarray:
     """[P, 3] float32 colors of the points in the new photos."""
     colors = scene.point_colors.astype(np.float32)
     nearest = np.full(len(colors), np.inf)

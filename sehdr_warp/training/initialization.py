@@ -146,7 +146,7 @@ def start_points(
     points, colors = scene.points, scene.point_colors
     number = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
     if number > len(points):
-        matches = _matched(matcher(), number - len(points), config.seed)
+        matches = _match_points(matcher(), number - len(points), config.seed)
         points, colors = (np.concatenate(both) for both in zip((points, colors), matches, strict=True))
         _log.info("%d points matched between the photos", len(matches[0]))
     points = within_reach(points)
@@ -189,11 +189,11 @@ def match_points(
     """
     normalization = normalization_of(scene)
     response = response or scene.response or response_by_name("srgb")
-    points, colors = _matched(make_matcher(normalization.scene(scene), response, device), count, seed)
+    points, colors = _match_points(make_matcher(normalization.scene(scene), response, device), count, seed)
     return normalization.scene_points(points), colors
 
 
-def _matched(matcher: Matcher, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _match_points(matcher: Matcher, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Match about `count` pixels; return points [N, 3] and colors [N, 3]."""
     matches = matcher.match(matcher.pixels(count, np.random.default_rng(seed)))
     return matches.points.double().cpu().numpy(), matches.colors.cpu().numpy()

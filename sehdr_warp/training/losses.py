@@ -86,19 +86,19 @@ def code_scale(
     """
     mu, white = (0.0, 1.0) if response is None else (mu_of_knee(response), response.white)
 
-    def compared(encoded: Tensor) -> Tensor:
+    def to_scale(encoded: Tensor) -> Tensor:
         return encoded if response is None else mu_law(response.decode(encoded), white, mu)
 
     values = torch.arange(largest + 1, dtype=torch.float64) / largest
-    centers, between = compared(values), compared(values[:-1] + 0.5 / largest)
+    centers, between = to_scale(values), to_scale(values[:-1] + 0.5 / largest)
     if response is not None:
         centers[1:-1] = (between[1:] + between[:-1]) / 2
     table, wide = torch.stack([centers, centers, centers], 1), None
     if clipping:
         table[0, 1], table[-1, 2] = -math.inf, math.inf
-        table[0, 2], table[-1, 1] = compared(values.new_tensor([CODE / 2, 1 - CODE / 2]))
+        table[0, 2], table[-1, 1] = to_scale(values.new_tensor([CODE / 2, 1 - CODE / 2]))
         if response is not None:
-            finest = compared((torch.arange(255) + 0.5).double() / 255).diff().min()
+            finest = to_scale((torch.arange(255) + 0.5).double() / 255).diff().min()
             ends = torch.stack([between[:-1] + finest, between[1:] - finest], 1)
             wide = table.clone()
             wide[1:-1, 1:] = torch.where(ends[:, :1] < ends[:, 1:], ends, table[1:-1, 1:])

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from ..errors import SehdrError
+from ..errors import require_extra
 from ..parallel import thread_count
 
 SWITCH_SECONDS = 2e-4  # Interval after which a waiting thread requests the interpreter's lock; Python's 5 ms are long
@@ -138,8 +138,4 @@ def interruptible() -> Iterator[threading.Event]:
 
 def summary_writer() -> type:
     """Return TensorBoard's SummaryWriter; raises SehdrError if it is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise SehdrError("TensorBoard is not installed; run `pip install sehdr-warp[tensorboard]`") from None
-    return SummaryWriter
+    return require_extra("torch.utils.tensorboard", "TensorBoard is not installed", "tensorboard").SummaryWriter

@@ -294,7 +294,7 @@ class Ranks:
 
         Rank 0 may be long between steps, but its own watch keeps reporting.
         """
-        heard, since, beat = "", time.monotonic(), 0.0
+        last_message, since, beat = "", time.monotonic(), 0.0
         while not self._over.wait(min(1.0, self._patience / 4)):
             now, deadline = time.monotonic(), self._deadline
             if now - beat > self._patience / 4:
@@ -302,9 +302,9 @@ class Ranks:
                 with suppress(RuntimeError):  # The store is gone: its rank will be missed otherwise.
                     if self.leads:
                         self.store.set("alive", str(now))
-                    elif self.store.check(["alive"]) and (message := self.store.get("alive").decode()) != heard:
-                        heard, since = message, now
-            if (deadline is not None and now > deadline) or (heard and now - since > self._patience):
+                    elif self.store.check(["alive"]) and (message := self.store.get("alive").decode()) != last_message:
+                        last_message, since = message, now
+            if (deadline is not None and now > deadline) or (last_message and now - since > self._patience):
                 if self.ends_first():
                     message = "another rank did not answer %s for %.0f s (%s): %s"
                     log.error(message, self.info, self._patience, TIMEOUT, ENDING)

@@ -12,17 +12,17 @@ from sehdr_warp.rasterizer import rasterize
 def test_what_warps_draw_is_counted(device, monkeypatch):
     scene = make_splat_scene(Size(400, 40, 24), 3, device)
     means, log_scales, quaternions, opacities, features = scene.leaves
-    camera = scene.world_to_camera, scene.intrinsics
+    pose, lens = scene.world_to_camera, scene.intrinsics
 
     def counted(opacities, grown=0.0):
         """What is counted, and the warps that have a pixel which a Gaussian colors, were it alone."""
         gaussians = means, log_scales + grown, quaternions, opacities, features
         with monkeypatch.context() as blocks:
             blocks.setattr(wp.config, "enable_cpu_blocks", device == "cpu")
-            pairs, blended = count_blended_pairs((*gaussians, *camera), 40, 24)
-        each = [rasterize(*(tensor[i : i + 1] for tensor in gaussians), *camera, 40, 24).alpha for i in range(400)]
+            pairs, blended = count_blended_pairs((*gaussians, pose, lens), 40, 24)
+        each = [rasterize(*(tensor[i : i + 1] for tensor in gaussians), pose, lens, 40, 24).alpha for i in range(400)]
         colored = torch.stack(each) >= ALPHA_THRESHOLD
-        assert pairs == rasterize(*gaussians, *camera, 40, 24).intersection_count
+        assert pairs == rasterize(*gaussians, pose, lens, 40, 24).intersection_count
         return blended, int(colored.view(400, 6, 4, 5, 8).any(4).any(2).sum())
 
     faint, alone = counted(0.05 * opacities)

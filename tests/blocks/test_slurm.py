@@ -102,7 +102,7 @@ def test_a_job_that_is_ended_goes_on_and_the_blocks_are_merged(cluster, survey, 
     sender = threading.Thread(target=send_once, args=(out, number))
     sender.start()
     words = ["--schedule.checkpoint-every", "3000", "--slurm", "partition=gpu,time=9,mem=4GB"]
-    assert call("train", survey, "--out", out, *FLAGS, *words) == 0
+    assert call("train", survey, "--out", out, *[*FLAGS, *words]) == 0
     sender.join()
     scripts = [script.read_text() for script in sorted(cluster.glob("*.sh"))]
     assert len(scripts) == (2 if number == signal.SIGUSR2 else 3), "one is requeued by SLURM, or submitted again"

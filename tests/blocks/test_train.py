@@ -203,7 +203,7 @@ def test_one_training_that_does_for_auto_takes_all_gpus(survey, tmp_path, monkey
     monkeypatch.setattr("sehdr_warp.blocks.train.train_in_blocks", lambda *_, **__: None)
     monkeypatch.setattr("sehdr_warp.training.launch.launch", lambda count, _, words: started.append((count, words)))
     words = ["train", str(survey), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu"]
-    assert call(*words, *flag) == 0
+    assert call(*[*words, *flag]) == 0
     assert started == [(2, words)]
 
 

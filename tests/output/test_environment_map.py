@@ -11,7 +11,7 @@ from sehdr_warp.model.baking import field_of
 from sehdr_warp.output import environment_map
 from sehdr_warp.output.environment_map import (
     cube,
-    inpainted,
+    inpainted_light,
     latlong,
     render_map,
     solid_angles,
@@ -223,7 +223,7 @@ def test_unseen_directions_are_inpainted_on_request(tmp_path, run, logged):
 def test_a_fill_is_the_light_of_what_is_seen():
     directions, weight = latlong(64), solid_angles(64, "latlong")
     alpha = np.where(directions[..., 2] > 0.5, 1.0, 0)
-    light = inpainted(np.where(alpha[..., None] > 0, np.array([1.0, 2, 4]), 1e5), alpha, directions, weight)
+    light = inpainted_light(np.where(alpha[..., None] > 0, np.array([1.0, 2, 4]), 1e5), alpha, directions, weight)
     np.testing.assert_allclose(light, np.broadcast_to([1.0, 2, 4], light.shape), rtol=1e-6)
 
 

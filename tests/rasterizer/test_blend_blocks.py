@@ -41,7 +41,7 @@ def leaves_and_lists(scene):
     offsets = order_intersections(splats.counts, depths, extents)
     lists = build_tile_lists(splats, offsets, depths, extents, scene.width, scene.height)
     leaves = [tensor.detach().requires_grad_() for tensor in (means2d, conics, opacities, scene.tensors[4])]
-    return leaves, [lists, splats], extents
+    return leaves, lists, splats, extents
 
 
 @pytest.mark.parametrize("dtype", BOUNDS, ids=["float64", "float32"])
@@ -49,14 +49,16 @@ def leaves_and_lists(scene):
 def test_block_kernels_match_the_reference(blocks, dtype, channels, deterministic):
     # Enough overlap that queues spill over 32 and pixels finish early; a cut tile at the right and the bottom.
     scene = random_scene(count=600, channels=channels, width=44, height=26, spread=1.6, seed=2)
-    leaves, lists_of_tiles, _ = leaves_and_lists(scene.to(dtype))
-    ranges = lists_of_tiles[0].tile_ranges
+    leaves, lists, splats, _ = leaves_and_lists(scene.to(dtype))
+    ranges = lists.tile_ranges
     assert int((ranges[:, 1] - ranges[:, 0]).max()) > 64
-    image, transmittance = blocks(lambda: blend(*leaves, *lists_of_tiles, THRESHOLD, deterministic))
+    image, transmittance = blocks(lambda: blend(*leaves, lists, splats, THRESHOLD, deterministic))
     truth = scene.to(torch.float64)
-    true_leaves, _, true_extents = leaves_and_lists(truth)
-    sizes = truth.width, truth.height, THRESHOLD
-    true_image, true_transmittance = blend_reference(*true_leaves, projected(truth)[2], true_extents, *sizes)
+    true_leaves, _, _, true_extents = leaves_and_lists(truth)
+    depths_extents = projected(truth)[2], true_extents
+    true_image, true_transmittance = blend_reference(
+        *[*true_leaves, *depths_extents], truth.width, truth.height, THRESHOLD
+    )
     assert (true_transmittance < 0.001).any()
     assert relative_error(image, true_image) < BOUNDS[dtype]
     assert relative_error(transmittance, true_transmittance) < BOUNDS[dtype]
@@ -71,8 +73,8 @@ def test_block_kernels_match_the_reference(blocks, dtype, channels, deterministi
 
 def test_a_single_pixels_gradient_may_have_any_strides(blocks):
     scene = random_scene(count=600, channels=1, width=1, height=1, spread=1.6, seed=2).to(torch.float32, "cpu")
-    leaves, lists_of_tiles, _ = leaves_and_lists(scene)
-    image = blocks(lambda: blend(*leaves, *lists_of_tiles, THRESHOLD))[0]
+    leaves, lists, splats, _ = leaves_and_lists(scene)
+    image = blocks(lambda: blend(*leaves, lists, splats, THRESHOLD))[0]
     blocks(image.sum().backward)
     assert float(leaves[3].grad.sum()) > 0
 
@@ -81,9 +83,9 @@ def test_nothing_more_by_gaussian_is_kept_for_the_backward_pass(blocks, monkeypa
     monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
     monkeypatch.setattr(block_blending, "MAX_SINGLE_SORT", 0)  # few are kept padded
     scene = random_scene(count=600, channels=3, width=44, height=26, seed=2).to(torch.float32, "cpu")
-    leaves, lists_of_tiles, _ = leaves_and_lists(scene)
+    leaves, lists, splats, _ = leaves_and_lists(scene)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
-        image = blocks(lambda: blend(*leaves, *lists_of_tiles, THRESHOLD))[0]
+        image = blocks(lambda: blend(*leaves, lists, splats, THRESHOLD))[0]
     allocated = sum(event.nbytes() for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]")
     by_pixel = 3 + 1 + 1  # image, transmittance and the last Gaussian drawn
     assert image.requires_grad and allocated == 4 * by_pixel * 44 * 26

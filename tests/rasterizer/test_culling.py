@@ -10,7 +10,7 @@ from sehdr_warp.rasterizer import rasterize, rasterize_directions, spherical_har
 from .scenes import random_like
 
 NAN, INF = math.nan, math.inf
-SIZE = 40, 30
+WIDTH, HEIGHT = 40, 30
 BAD = [(place, value) for place in range(5) for value in (NAN, INF, -INF)] + [(0, 1e30), (0, -1e30), (1, 1e30)]
 
 
@@ -64,7 +64,7 @@ def test_a_gaussian_that_is_not_finite_is_gone(place, value, dtype, device):
         pytest.skip("a size has a largest value")
 
     def draw(*tensors):
-        return rasterize(*tensors, *SIZE, antialiased=place % 2 == 0).image
+        return rasterize(*tensors, WIDTH, HEIGHT, antialiased=place % 2 == 0).image
 
     assert_gone(draw, scene(device, dtype), cameras(device, dtype), place, value)
 
@@ -90,7 +90,7 @@ def test_harmonics_of_a_gaussian_that_is_gone_leave_the_position_its_gradient(ba
     def draw(means, log_scales, quaternions, opacities, coefficients, position):
         colors = spherical_harmonics(3, coefficients, means, position)
         return rasterize(
-            means, log_scales, quaternions, opacities, colors, *cameras(device, torch.float64), *SIZE
+            means, log_scales, quaternions, opacities, colors, *cameras(device, torch.float64), WIDTH, HEIGHT
         ).image
 
     place = 0 if bad == "mean" else 4
@@ -102,14 +102,16 @@ def test_a_camera_that_is_not_finite_shows_nothing_on_a_gpu_and_is_refused_on_th
     for bad in ([pose * NAN, lens], [pose, lens * NAN], [pose * INF, lens]):
         if device == "cpu":
             with pytest.raises(ValueError, match="finite"):
-                rasterize(*gaussians, *bad, *SIZE)
+                rasterize(*[*gaussians, *bad], WIDTH, HEIGHT)
             continue
-        image, grads = gradients(lambda *t: rasterize(*t, *SIZE).image, [*gaussians, *bad])
+        image, grads = gradients(lambda *t: rasterize(*t, WIDTH, HEIGHT).image, [*gaussians, *bad])
         assert bool((image == 0).all()) and all(bool((gradient == 0).all()) for gradient in grads)
 
 
 def test_sizes_of_nearly_nothing_are_drawn_with_finite_gradients(device):
     gaussians = scene(device, torch.float32)
     gaussians[1][:] = -80.0
-    image, grads = gradients(lambda *t: rasterize(*t, *SIZE).image, [*gaussians, *cameras(device, torch.float32)])
+    image, grads = gradients(
+        lambda *t: rasterize(*t, WIDTH, HEIGHT).image, [*gaussians, *cameras(device, torch.float32)]
+    )
     assert bool((image > 0).any()) and all(bool(gradient.isfinite().all()) for gradient in grads)

@@ -9,13 +9,13 @@ import torch
 from sehdr_warp.rasterizer import custom_ops, rasterize
 
 from .scenes import random_scene
-from .test_torch_contract import SIZE, directions, splats
+from .test_torch_contract import HEIGHT, WIDTH, directions, splats
 
 STEP = """
 import time, warnings
 import torch
 from sehdr_warp.rasterizer import rasterize, rasterize_directions, spherical_harmonics, ssim, ssim_map
-from tests.rasterizer.test_torch_contract import SIZE, directions, splats
+from tests.rasterizer.test_torch_contract import HEIGHT, WIDTH, directions, splats
 
 leaves = splats(dtype=torch.float32, channels=3)
 coefficients, rays = torch.rand(6, 4, 3), directions().float()
@@ -24,7 +24,7 @@ def step(*leaves):
     total = 0.0
     for _ in range(3):
         colors = spherical_harmonics(1, coefficients, leaves[0], torch.zeros(3)) + leaves[4]
-        rendering = rasterize(*leaves[:4], colors, *leaves[5:], *SIZE, depth=True, background=torch.ones(3))
+        rendering = rasterize(*leaves[:4], colors, *leaves[5:], WIDTH, HEIGHT, depth=True, background=torch.ones(3))
         image = rendering.image * 2.0
         total = total + ssim(image, torch.full_like(image, 0.5)) + rendering.alpha.mean() + rendering.depth.mean()
         total = total + (rendering.means2d[:, 0] * rendering.visible).mean() + ssim_map(image, image.detach()).mean()
@@ -60,7 +60,7 @@ OPTIONS = 0.01, 0.3, 1e-3, False
 @pytest.mark.parametrize("options", [(False, None, False), (True, 400, True)])
 def test_torch_checks_the_node(options, device):
     tensors = [leaf.detach().requires_grad_() for leaf in splats(device, torch.float32)]
-    arguments = [*tensors, torch.ones(2, device=device)], *SIZE, *OPTIONS, *options
+    arguments = [*tensors, torch.ones(2, device=device)], WIDTH, HEIGHT, *OPTIONS, *options
     checks = "test_schema", "test_faketensor"
     torch.library.opcheck(torch.ops.sehdr_warp.rasterize.default, arguments, test_utils=checks)
     rays = directions(device).float()
@@ -72,7 +72,7 @@ def test_torch_checks_the_node(options, device):
 def test_several_cameras_and_room_have_the_shapes_that_the_compiler_expects(device):
     scene = random_scene(count=20, channels=3).to(torch.float32, device)
     cameras = [torch.stack([tensor.detach()] * 2) for tensor in scene.tensors[5:]]
-    arguments = *scene.tensors[:5], *cameras, *SIZE
+    arguments = *scene.tensors[:5], *cameras, WIDTH, HEIGHT
     truth = rasterize(*arguments, max_intersections=500, depth=True)
     rendering = custom_ops.compiled_rasterize(*arguments, max_intersections=500, depth=True)
     for name in ("image", "transmittance", "means2d", "depths", "extents", "overflow", "needed_intersections", "depth"):
@@ -82,7 +82,9 @@ def test_several_cameras_and_room_have_the_shapes_that_the_compiler_expects(devi
 
 def test_a_misfit_is_named_while_compiling():
     leaves = splats(dtype=torch.float32)
-    draw = torch.compile(lambda means: rasterize(means, *leaves[1:], *SIZE).image, backend="eager", fullgraph=True)
+    draw = torch.compile(
+        lambda means: rasterize(means, *leaves[1:], WIDTH, HEIGHT).image, backend="eager", fullgraph=True
+    )
     with pytest.raises(Exception, match=r"means has shape \[6, 2\], expected \[N, 3\]"):
         draw(leaves[0][:, :2])
 
@@ -90,7 +92,11 @@ def test_a_misfit_is_named_while_compiling():
 def test_half_precision_is_cast_under_autocast():
     leaves = splats(dtype=torch.float32)
     half = leaves[4].detach().bfloat16()
-    draw = torch.compile(lambda colors: rasterize(*leaves[:4], colors, *leaves[5:], *SIZE).image, backend="eager")
+
+    def draw_colors(colors):
+        return rasterize(*[*leaves[:4], colors, *leaves[5:]], WIDTH, HEIGHT).image
+
+    draw = torch.compile(draw_colors, backend="eager")
     with torch.autocast("cpu", dtype=torch.bfloat16):
         image = draw(half)
-    assert torch.equal(image, rasterize(*leaves[:4], half.float(), *leaves[5:], *SIZE).image)
+    assert torch.equal(image, draw_colors(half.float()))

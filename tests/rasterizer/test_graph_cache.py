@@ -108,9 +108,8 @@ def test_without_gradients_pictures_stay_too(one_sort, most_copied, channels, mo
     monkeypatch.setattr(captured_render, "MAX_COPIED_GAUSSIANS", most_copied)
     scene = scene_of(channels=channels)
     with torch.no_grad():
-        images = [
-            rasterize(*scene.arguments[:4], scene.tensors[4] * k, *scene.arguments[5:]).image for k in range(1, 9)
-        ]
+        arguments = [[*scene.arguments[:4], scene.tensors[4] * k, *scene.arguments[5:]] for k in range(1, 9)]
+        images = [rasterize(*each).image for each in arguments]
         truth = launched(*scene.arguments).image
     assert recordings() == 1 and not images[-1].requires_grad
     assert_alike([image / k for k, image in enumerate(images, 1)], [truth] * 8)
@@ -129,13 +128,13 @@ def test_of_many_gaussians_one_render_is_held(monkeypatch):
 
 def test_gradients_add_up_over_calls_and_cameras():
     scene = scene_of()
-    cameras = torch.stack([scene.tensors[5]] * 2), torch.stack([scene.tensors[6]] * 2)
+    poses, lenses = torch.stack([scene.tensors[5]] * 2), torch.stack([scene.tensors[6]] * 2)
 
     def summed(splat):
         for tensor in scene.tensors:
             tensor.grad = None
         for _ in range(CALLS):
-            image = splat(*scene.tensors[:5], *cameras, scene.width, scene.height).image
+            image = splat(*scene.tensors[:5], poses, lenses, scene.width, scene.height).image
             (image * random_like(image, 1)).sum().backward()
         return [tensor.grad.clone() for tensor in scene.tensors[:5]]
 

@@ -31,7 +31,7 @@ def clipped_photo(dtype, mu):
 
 
 def composed(image, codes, scale, index, clipped, estimates):
-    loss = image_distance(*code_residual(image, codes, scale, index), *WEIGHTS.values())
+    loss = image_distance(*code_residual(image, codes, scale, index), **WEIGHTS)
     return loss + clipped_light_energy(image, codes, WHITE, clipped, index, None, estimates) if clipped else loss
 
 

@@ -17,7 +17,7 @@ from sehdr_warp.rasterizer import differentiable, rasterize, rasterize_direction
 
 from .scenes import random_scene
 
-SIZE = 20, 14
+WIDTH, HEIGHT = SIZE = 20, 14
 
 
 @wp.kernel
@@ -68,9 +68,9 @@ def operations(device="cpu"):
     rays, look = directions(device), {"focal_length": 22.0, "alpha_threshold": 1e-9}
     return {
         # Without a threshold: at its border the picture is not continuous, and differences are no derivatives.
-        "rasterize": (lambda *t: rasterize(*t, *SIZE, alpha_threshold=1e-9).image, leaves),
-        "transmittance": (lambda *t: rasterize(*t, *SIZE, alpha_threshold=1e-9).transmittance, leaves),
-        "depth": (lambda *t: rasterize(*t, *SIZE, depth=True, alpha_threshold=1e-9).depth, leaves),
+        "rasterize": (lambda *t: rasterize(*t, WIDTH, HEIGHT, alpha_threshold=1e-9).image, leaves),
+        "transmittance": (lambda *t: rasterize(*t, WIDTH, HEIGHT, alpha_threshold=1e-9).transmittance, leaves),
+        "depth": (lambda *t: rasterize(*t, WIDTH, HEIGHT, depth=True, alpha_threshold=1e-9).depth, leaves),
         "directions": (lambda *t: rasterize_directions(*t, rays, **look)[0], [*leaves[:5], position]),
         "harmonics": (lambda *t: spherical_harmonics(3, *t), [random(5, 16, 3), random(5, 3), position]),
         "ssim": (ssim, images),
@@ -169,12 +169,12 @@ def test_autocast_casts_half_precision_and_without_it_the_argument_is_named(half
     leaves = splats(dtype=torch.float32)
     halves = [leaf.detach().to(half).requires_grad_() for leaf in leaves[:5]]
     with pytest.raises(ValueError, match=f"means is {half}, expected torch.float32"):
-        rasterize(*halves, *leaves[5:], *SIZE)
+        rasterize(*[*halves, *leaves[5:]], WIDTH, HEIGHT)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        image = rasterize(*halves, *leaves[5:], *SIZE).image
+        image = rasterize(*[*halves, *leaves[5:]], WIDTH, HEIGHT).image
         assert torch.is_autocast_enabled("cpu")
     image.sum().backward()
-    truth = rasterize(*(leaf.detach().float() for leaf in halves), *leaves[5:], *SIZE).image
+    truth = rasterize(*[*(leaf.detach().float() for leaf in halves), *leaves[5:]], WIDTH, HEIGHT).image
     assert image.dtype == torch.float32 and torch.equal(image, truth)
     assert all(leaf.grad is not None and leaf.grad.dtype == half for leaf in halves)
 
@@ -182,12 +182,12 @@ def test_autocast_casts_half_precision_and_without_it_the_argument_is_named(half
 def test_inputs_that_are_not_contiguous_or_expanded_give_the_same(device):
     leaves = [leaf.detach() for leaf in splats(device, torch.float32)]
     count = len(leaves[0])
-    truth = rasterize(*leaves[:3], leaves[3][:1].repeat(count), *leaves[4:], *SIZE)
+    truth = rasterize(*[*leaves[:3], leaves[3][:1].repeat(count), *leaves[4:]], WIDTH, HEIGHT)
     strided = [torch.stack([leaf, leaf], dim=-1)[..., 0] for leaf in leaves]
     strided[3] = leaves[3][:1].expand(count)
     assert not strided[0].is_contiguous()
     strided[0].requires_grad_()
-    rendering = rasterize(*strided, *SIZE)
+    rendering = rasterize(*strided, WIDTH, HEIGHT)
     assert torch.equal(rendering.image, truth.image)
     rendering.image.sum().backward()
     assert strided[0].grad is not None
@@ -195,7 +195,7 @@ def test_inputs_that_are_not_contiguous_or_expanded_give_the_same(device):
 
 def test_results_can_be_copied_and_operations_pickled():
     with torch.no_grad():
-        rendering = rasterize(*splats(), *SIZE)
+        rendering = rasterize(*splats(), WIDTH, HEIGHT)
     for copied in (copy.deepcopy(rendering), pickle.loads(pickle.dumps(rendering))):
         assert torch.equal(copied.image, rendering.image) and copied.intersection_count == rendering.intersection_count
     assert pickle.loads(pickle.dumps(cube)) is cube and pickle.loads(pickle.dumps(rasterize)) is rasterize
@@ -204,7 +204,7 @@ def test_results_can_be_copied_and_operations_pickled():
 def test_threads_work_at_the_same_time():
     def gradients(_):
         leaves = splats(dtype=torch.float32)
-        rasterize(*leaves, *SIZE).image.square().sum().backward()
+        rasterize(*leaves, WIDTH, HEIGHT).image.square().sum().backward()
         return [leaf.grad for leaf in leaves]
 
     truth = gradients(0)
@@ -216,14 +216,14 @@ def test_threads_work_at_the_same_time():
 
 def _picture(queue):
     with torch.no_grad():
-        queue.put(rasterize(*splats(dtype=torch.float32), *SIZE).image.numpy())
+        queue.put(rasterize(*splats(dtype=torch.float32), WIDTH, HEIGHT).image.numpy())
 
 
 @pytest.mark.skipif(not hasattr(multiprocessing, "get_context") or sys.platform == "win32", reason="no fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_other_processes_render_too(method):
-    truth = rasterize(*splats(dtype=torch.float32), *SIZE).image
+    truth = rasterize(*splats(dtype=torch.float32), WIDTH, HEIGHT).image
     if torch.cuda.is_initialized() and method == "fork":
         pytest.skip("CUDA forbids it")
     context = multiprocessing.get_context(method)
@@ -271,14 +271,16 @@ def test_no_gaussians_at_all_have_gradients(what, device):
     if what == "all":
         tensors[0] = tensors[0] - torch.tensor([0.0, 0.0, 100.0], device=device)
     leaves = [tensor.detach().requires_grad_() for tensor in (*tensors, *scene.tensors[5:])]
-    rasterize(*leaves, *SIZE, background=torch.ones(3, device=device)).image.sum().backward()
+    rasterize(*leaves, WIDTH, HEIGHT, background=torch.ones(3, device=device)).image.sum().backward()
     assert all(bool((leaf.grad == 0).all()) for leaf in leaves)
 
 
 def test_checkpointing_and_inference_mode_work():
     leaves = splats(dtype=torch.float32)
-    truth = torch.autograd.grad(rasterize(*leaves, *SIZE).image.square().sum(), leaves)
-    image = torch.utils.checkpoint.checkpoint(lambda *t: rasterize(*t, *SIZE).image, *leaves, use_reentrant=False)
+    truth = torch.autograd.grad(rasterize(*leaves, WIDTH, HEIGHT).image.square().sum(), leaves)
+    image = torch.utils.checkpoint.checkpoint(
+        lambda *t: rasterize(*t, WIDTH, HEIGHT).image, *leaves, use_reentrant=False
+    )
     assert all(map(torch.equal, torch.autograd.grad(image.square().sum(), leaves), truth))
     with torch.inference_mode():
-        assert torch.equal(rasterize(*leaves, *SIZE).image, image)
+        assert torch.equal(rasterize(*leaves, WIDTH, HEIGHT).image, image)

@@ -152,8 +152,8 @@ def test_gradient_statistics_are_lengths_on_a_screen_of_two(device, usable):
     gradient[:4] = torch.tensor([[0.0, 0.0], [1e-30, 0.0], [0.0, -1e-25], [3e-24, 4e-24]])
     radii = torch.randint(0, 3, (500,), generator=generator).float()
     sums = torch.full((500,), 0.5, device=device), torch.zeros(500, device=device)
-    inputs = gradient.to(device), radii.to(device), torch.tensor(usable, device=device)
-    add_gradient_statistics(*inputs, 200, 100, *sums)
+    applied = torch.tensor(usable, device=device)
+    add_gradient_statistics(gradient.to(device), radii.to(device), applied, 200, 100, *sums)
     length = torch.hypot(gradient[:, 0] * 100, gradient[:, 1] * 50)
     counted = (radii > 0) * usable
     torch.testing.assert_close(sums[0].cpu(), 0.5 + counted * length, rtol=1e-6, atol=0)

@@ -9,7 +9,7 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.linear_photos import color_matrix, raw_codes, raw_sizes, read_raw
+from sehdr_warp.scene.linear_photos import color_matrix, raw_sizes, read_raw
 
 from .dng_files import area, gain_map, longs, mosaic, opcodes, rationals, shorts, write_tagged_dng
 
@@ -23,7 +23,7 @@ XTRANS = np.array([[1, 2, 1, 1, 0, 1], [0, 1, 0, 2, 1, 2], [1, 2, 1, 1, 0, 1], [
 
 
 def light_of(path, oriented=False):
-    return response_by_name("srgb").decode(raw_codes(path, oriented=oriented) / 65535)
+    return response_by_name("srgb").decode(read_raw(path, oriented=oriented).pixels / 65535)
 
 
 def stored(light, black=512.0, white=15000.0):
@@ -84,7 +84,7 @@ def test_white_levels_by_channel_of_linear_raw(tmp_path):
     write_tagged_dng(tmp_path / "a.dng", values, {50717: longs(4000, 6000, 8000)})
     light = light_of(tmp_path / "a.dng")
     np.testing.assert_allclose(light[:, :60], EVEN[:, :60], rtol=2e-3)
-    assert (raw_codes(tmp_path / "a.dng", oriented=False)[:, 64:] == 65535).all()
+    assert (read_raw(tmp_path / "a.dng", oriented=False).pixels[:, 64:] == 65535).all()
 
 
 def test_black_levels_by_channel_of_a_mosaic(tmp_path):
@@ -96,7 +96,7 @@ def test_black_levels_by_channel_of_a_mosaic(tmp_path):
     np.testing.assert_allclose(light_of(tmp_path / "a.dng"), EVEN, rtol=1e-3)
     light[np.tile([[False, False], [False, True]], (HEIGHT // 2, WIDTH // 2))] = 1.0
     write_tagged_dng(tmp_path / "b.dng", stored(light, levels), tags)
-    codes = raw_codes(tmp_path / "b.dng", oriented=False)
+    codes = read_raw(tmp_path / "b.dng", oriented=False).pixels
     assert (codes[..., 2] == 65535).all() and (codes[..., :2] < 65535).all()
 
 
@@ -200,7 +200,7 @@ def test_what_cannot_be_read_is_named(tmp_path):
     def refused(match, values=None, tags=None):
         write_tagged_dng(file, stored(mosaic(EVEN)) if values is None else values, LEVELS | (tags or {}))
         with pytest.raises(InputError, match=match):
-            raw_codes(file, oriented=False)
+            read_raw(file, oriented=False)
 
     refused("compressed as JPEG XL.*convert it with Adobe DNG Converter", tags={259: shorts(52546)})
     refused("floating-point samples", values=mosaic(EVEN).astype(np.float32), tags={50714: longs(0), 50717: longs(1)})

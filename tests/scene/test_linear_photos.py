@@ -16,7 +16,7 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.dng import read_dng
-from sehdr_warp.scene.linear_photos import color_matrix, linear_codes, raw_codes, raw_exposure
+from sehdr_warp.scene.linear_photos import color_matrix, linear_codes, raw_exposure, read_raw
 from sehdr_warp.scene.sfm import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
 from sehdr_warp.training.plan import make_plan
@@ -123,7 +123,7 @@ def test_raw_files_clip_by_channel_in_the_sensors_colors(tmp_path):
     # A surface from dark to three times white: green clips first.
     light = BALANCE * np.linspace(0.02, 3, 96)[None, :, None] * np.ones((64, 1, 1))
     write_dng(tmp_path / "a.dng", light, balance=BALANCE)
-    codes = raw_codes(tmp_path / "a.dng", oriented=False)
+    codes = read_raw(tmp_path / "a.dng", oriented=False).pixels
     decoded, expected = np.zeros(codes.shape), np.clip(light, 0, 1)
     decoded = np.where(codes / 65535 <= 0.04045, codes / 65535 / 12.92, ((codes / 65535 + 0.055) / 1.055) ** 2.4)
     inside = slice(4, -4), slice(4, -4)
@@ -144,10 +144,10 @@ def test_what_piles_up_below_the_stated_white_is_clipped(tmp_path, clips):
     light = np.random.default_rng(0).uniform(0.02, 1, (128, 96, 1)) * [0.9, 1, 0.8]
     light[:, 70:] *= 3
     write_dng(tmp_path / "a.dng", light, white=clips, stated=16383)
-    clipped = raw_codes(tmp_path / "a.dng", oriented=False) == 65535
+    clipped = read_raw(tmp_path / "a.dng", oriented=False).pixels == 65535
     write_dng(tmp_path / "b.dng", light / 4, white=clips, stated=16383)
     assert clipped[:, 74:].mean() > 0.4 and clipped[:, :66].mean() < 0.02
-    assert raw_codes(tmp_path / "b.dng", oriented=False).max() < 65535
+    assert read_raw(tmp_path / "b.dng", oriented=False).pixels.max() < 65535
 
 
 @pytest.mark.parametrize("suffix, maker, white", [
@@ -160,7 +160,7 @@ def test_cameras_whose_colors_libraw_knows(tmp_path, suffix, maker, white):
     rawpy = pytest.importorskip("rawpy")
     file, light = tmp_path / f"a{suffix}", BALANCE * np.linspace(0.02, 0.9, 96)[None, :, None] * np.ones((64, 1, 1))
     write_dng(file, light, black=0, white=white, maker=maker)
-    decoded = response_by_name("srgb").decode(raw_codes(file, oriented=False) / 65535)
+    decoded = response_by_name("srgb").decode(read_raw(file, oriented=False).pixels / 65535)
     np.testing.assert_allclose(decoded[4:-4, 4:-4], light[4:-4, 4:-4], rtol=0.03)
     with rawpy.imread(str(file)) as raw:
         daylight = np.array(raw.daylight_whitebalance[:3])
@@ -212,11 +212,11 @@ def test_files_that_are_no_photos_of_a_camera(tmp_path, shared, capfd):
     (tmp_path / "c.dng").write_bytes((tmp_path / "b.dng").read_bytes()[:3000])
     for name in ("a.nef", "c.dng"):
         with pytest.raises(InputError, match="cannot be read as RAW"):
-            raw_codes(tmp_path / name, oriented=False)
+            read_raw(tmp_path / name, oriented=False)
     assert capfd.readouterr().err == ""
     folder = shared / "data" / "raw"
     with pytest.raises(InputError, match="no photo through a filter of three colors"):
-        raw_codes(folder / "Nikon_uncompressed.nef", oriented=False)
+        read_raw(folder / "Nikon_uncompressed.nef", oriented=False)
     shutil.copy(folder / "RAW_KODAK_DC50.KDC", tmp_path / "d.dng")
     with pytest.raises(InputError, match="states no color matrix"):
         color_matrix([tmp_path / "d.dng"])
@@ -234,7 +234,7 @@ def test_raw_and_its_developed_jpeg_show_the_same_light(tmp_path, shared):
         left, top, width, height = map(int, read_dng(file).crop)
         developed = raw.postprocess(**options)[top : top + height, left : left + width]
         Image.fromarray(developed).save(tmp_path / "a.jpg", quality=95, subsampling=0)
-    codes = [raw_codes(file, oriented=False) / 65535, np.asarray(Image.open(tmp_path / "a.jpg")) / 255]
+    codes = [read_raw(file, oriented=False).pixels / 65535, np.asarray(Image.open(tmp_path / "a.jpg")) / 255]
     blocks = [c[:2144, :4096].reshape(67, 32, 128, 32, 3).swapaxes(1, 2) for c in codes]
     well = (blocks[1].min((2, 3, 4)) > 0.1) & (blocks[1].max((2, 3, 4)) < 0.92)
     ours, theirs = (response_by_name("srgb").decode(block[well]).mean((1, 2)) for block in blocks)

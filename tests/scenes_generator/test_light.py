@@ -20,15 +20,15 @@ SCENES = [name for name in RECIPES if name in embedded_scenes()]
 def test_the_first_map_shows_what_the_nearest_view_does(name):
     """In unit and direction; views are filtered by a denoiser, and some cameras stand aside of the place."""
     maps = read_light_maps(embedded_folder(f"embedded:{name}"))
-    assert len(maps) == len(PLACES) and all(0.02 < each.seen.mean() < 0.98 for each in maps)
+    assert len(maps) == len(PLACES) and all(0.02 < each.coverage.mean() < 0.98 for each in maps)
     first = maps[0]
     views = load_scene(f"embedded:{name}", response="srgb").views
     view = min(views, key=lambda view: np.linalg.norm(view.camera.position - first.position))
-    camera, height = view.camera, first.seen.shape[0]
+    camera, height = view.camera, first.coverage.shape[0]
     x, y, z = np.moveaxis(latlong(2 * height) @ camera.world_to_camera[:3, :3].T, 2, 0)
     column, row = (camera.fx * x / z + camera.cx).astype(int), (camera.fy * y / z + camera.cy).astype(int)
     edge = 8
-    inside = (z > 0) & (first.seen == 1) & (column >= edge) & (row >= edge)
+    inside = (z > 0) & (first.coverage == 1) & (column >= edge) & (row >= edge)
     inside &= (column < camera.width - edge) & (row < camera.height - edge)
     blurred = uniform_filter(view.hdr.mean(2), 6)
     photo_light, mapped = (

@@ -89,7 +89,7 @@ def command(tmp_path, monkeypatch, capfd):
         flags += " --schedule.checkpoint-every 30 --model.initial-density 0 --mcmc.seed-fraction 0"
         watcher = threading.Thread(target=once_saved, args=(tmp_path / "run", disturb))
         watcher.start()
-        status = call("train", "embedded", "--out", tmp_path / "run", *flags.split(), *words)
+        status = call("train", "embedded", "--out", tmp_path / "run", *[*flags.split(), *words])
         watcher.join()
         return status, capfd.readouterr().err
 

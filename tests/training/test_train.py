@@ -283,7 +283,7 @@ def test_tensorboard_gets_the_figures_of_the_held_out_views(scene, tmp_path, mon
     short = quick(**{"schedule.iterations": 4})
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "torch.utils.tensorboard", None)
-        with pytest.raises(SehdrError, match=r"pip install sehdr-warp\[tensorboard\]"):
+        with pytest.raises(SehdrError, match=r"pip install 'sehdr-warp\[tensorboard\]'"):
             train(scene, tmp_path / "without", short, device="cpu", tensorboard=True)
     assert not (tmp_path / "without").exists()
     pytest.importorskip("tensorboard")

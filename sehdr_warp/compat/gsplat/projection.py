@@ -112,7 +112,7 @@ def _project_covariances(
     # What is culled takes part as a point in front of the camera, so that its derivatives are finite.
     centres = torch.where(inside[:, None], centres, centres.new_tensor([0.0, 0.0, 1.0]))
     covars = torch.where(inside[:, None, None], covars, torch.eye(3, dtype=covars.dtype, device=covars.device))
-    centre2d, jacobian = _linearised(centres, K, width, height, camera_model)
+    centre2d, jacobian = _linearise(centres, K, width, height, camera_model)
     spread = jacobian @ rotation
     covars2d = spread @ covars @ spread.transpose(1, 2)
     xx, xy, yy = covars2d[:, 0, 0], covars2d[:, 0, 1], covars2d[:, 1, 1]
@@ -139,9 +139,7 @@ def _project_covariances(
     )
 
 
-def _linearised(
-    centres: Tensor, K: Tensor, width: int, height: int, camera_model: CameraModel
-) -> tuple[Tensor, Tensor]:
+def _linearise(centres: Tensor, K: Tensor, width: int, height: int, camera_model: CameraModel) -> tuple[Tensor, Tensor]:
     """Return the pixels [N, 2] of places in front of the camera [N, 3] and the Jacobian there [N, 2, 3]."""
     x, y, z = centres.unbind(1)
     focal, principal = torch.stack([K[0, 0], K[1, 1]]), torch.stack([K[0, 2], K[1, 2]])

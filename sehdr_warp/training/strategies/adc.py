@@ -54,8 +54,8 @@ class AdcStrategy(Strategy):
     def prepare(self, rows: int, device: torch.device | str) -> None:
         """Allocate statistics; those of rows that exist already are copied."""
         if self.gradient_sum is None or len(self.gradient_sum) != rows:
-            self.gradient_sum = _resized(self.gradient_sum, rows, device)
-            self.photo_count = _resized(self.photo_count, rows, device)
+            self.gradient_sum = _resize(self.gradient_sum, rows, device)
+            self.photo_count = _resize(self.photo_count, rows, device)
 
     @torch.no_grad()
     def accumulate(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
@@ -188,7 +188,7 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     return vectors + scalar * cross + torch.linalg.cross(axis, cross)
 
 
-def _resized(values: Tensor | None, rows: int, device: torch.device | str) -> Tensor:
+def _resize(values: Tensor | None, rows: int, device: torch.device | str) -> Tensor:
     """Return values [rows] that begin with the given ones, and are 0 behind them."""
     result = torch.zeros(rows, device=device)
     if values is not None:

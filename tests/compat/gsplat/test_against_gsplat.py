@@ -34,11 +34,10 @@ def test_projections_are_gsplats(model, compensated):
 
 def test_intersections_are_gsplats():
     leaves, place = scene()
-    _, _, info = ours.rasterization(*leaves, *place, packed=False)
-    frame = 16, 3, 2
-    inputs = info["means2d"].detach(), info["radii"], info["depths"].detach()
-    true = reference._isect_tiles(*inputs, *frame)
-    result = ours.isect_tiles(*inputs, *frame)
+    _, _, info = ours.rasterization(*leaves, **place._asdict(), packed=False)
+    inputs = info["means2d"].detach(), info["radii"], info["depths"].detach(), 16, 3, 2
+    true = reference._isect_tiles(*inputs)
+    result = ours.isect_tiles(*inputs)
     assert (
         torch.equal(result[0], true[0].int()) and torch.equal(result[1], true[1]) and result[2].shape == true[2].shape
     )
@@ -78,7 +77,9 @@ def test_its_own_strategy_takes_what_we_render_and_does_what_ours_does(absgrad):
         state, numbers = strategy.initialize_state(scene_scale=1.0), []
         for step in range(5):
             inputs = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid()
-            colors, _, info = ours.rasterization(*inputs, params["colors"], *place, packed=False, absgrad=absgrad)
+            colors, _, info = ours.rasterization(
+                *inputs, params["colors"], **place._asdict(), packed=False, absgrad=absgrad
+            )
             strategy.step_pre_backward(params, optimizers, state, step, info)
             (colors - 0.5).square().mean().backward()
             strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
@@ -99,7 +100,7 @@ def test_images_and_gradients_are_gsplats(options, packed):
     leaves, place = scene("cuda:0", coefficients=9 if "sh_degree" in options else 0)
     results = []
     for module in (gsplat, ours):
-        colors, alphas, info = module.rasterization(*leaves, *place, packed=packed, absgrad=True, **options)
+        colors, alphas, info = module.rasterization(*leaves, **place._asdict(), packed=packed, absgrad=True, **options)
         info["means2d"].retain_grad()
         results.append((colors, alphas, gradients(colors, leaves), info["means2d"].absgrad))
     (colors, alphas, result, absolute), (mine, my_alphas, my_found, my_absolute) = results

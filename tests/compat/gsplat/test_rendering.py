@@ -1,6 +1,7 @@
 """gsplat's rasterization(), made of ours: what it takes and gives, and a training as its examples make one."""
 
 import pickle
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -10,6 +11,15 @@ from sehdr_warp.compat.gsplat import fully_fused_projection, quat_scale_to_covar
 from sehdr_warp.rasterizer import rasterize, spherical_harmonics
 
 WIDTH, HEIGHT, COUNT = 40, 30, 200
+
+
+class Place(NamedTuple):
+    """Cameras as gsplat's rasterization() names them."""
+
+    viewmats: torch.Tensor
+    Ks: torch.Tensor
+    width: int
+    height: int
 
 
 def scene(device="cpu", count=COUNT, coefficients=0):
@@ -26,7 +36,7 @@ def scene(device="cpu", count=COUNT, coefficients=0):
     poses[:, 2, 3] = torch.tensor([3.0, 4.0])
     lenses = torch.tensor([[40.0, 0, 20], [0, 42.0, 15], [0, 0, 1]]).repeat(2, 1, 1)
     leaves = [tensor.to(device).requires_grad_() for tensor in values]
-    return leaves, [poses.to(device), lenses.to(device), WIDTH, HEIGHT]
+    return leaves, Place(poses.to(device), lenses.to(device), WIDTH, HEIGHT)
 
 
 def alone(leaves, place, camera, features=None, **options):
@@ -39,7 +49,8 @@ def alone(leaves, place, camera, features=None, **options):
 def test_cameras_in_one_call_are_those_of_each_alone(device):
     leaves, place = scene(device)
     background = torch.tensor([[0.2, 0.4, 0.8], [1.0, 0.0, 0.5]], device=device)
-    colors, alphas, info = rasterization(*leaves, *place, packed=False, backgrounds=background, render_mode="RGB+ED")
+    options = {"packed": False, "backgrounds": background, "render_mode": "RGB+ED"}
+    colors, alphas, info = rasterization(*leaves, **place._asdict(), **options)
     info["means2d"].retain_grad()
     colors.square().sum().backward()
     together = [leaf.grad.clone() for leaf in leaves]
@@ -63,11 +74,11 @@ def test_cameras_in_one_call_are_those_of_each_alone(device):
 def test_harmonics_depths_and_the_far_plane(device):
     leaves, place = scene(device, coefficients=9)
     means, coefficients = leaves[0], leaves[4]
-    colors, _, info = rasterization(*leaves, *place, packed=False, sh_degree=2)
+    colors, _, info = rasterization(*leaves, **place._asdict(), packed=False, sh_degree=2)
     eye = torch.tensor([0.0, 0.0, -4.0], device=device)
     lit = (spherical_harmonics(2, coefficients, means, eye) + 0.5).clamp_min(0)
     torch.testing.assert_close(colors[1], alone(leaves, place, 1, lit).image)
-    depths, _, _ = rasterization(*leaves, *place, sh_degree=2, render_mode="D", far_plane=3.0)
+    depths, _, _ = rasterization(*leaves, **place._asdict(), sh_degree=2, render_mode="D", far_plane=3.0)
     assert depths.shape == (2, HEIGHT, WIDTH, 1)
     near = (means[:, 2] + 3.0 <= 3.0).nonzero()[:, 0]
     near_leaves = [leaf[near] for leaf in leaves]
@@ -98,7 +109,7 @@ def test_harmonics_depths_and_the_far_plane(device):
 def test_what_is_not_supported_is_named(options, message):
     leaves, place = scene(coefficients=4 if "sh_degree" in options else 0)
     with pytest.raises((ValueError, TypeError), match=message):
-        rasterization(*leaves, *place, **options)
+        rasterization(*leaves, **place._asdict(), **options)
 
 
 def test_wrong_shapes_types_and_devices_are_named():
@@ -132,7 +143,7 @@ def test_packed_results_are_the_visible_of_the_others(options, device):
         leaves[0][:20, 2] -= 100.0
     results = []
     for packed in (True, False):
-        colors, alphas, info = rasterization(*leaves, *place, packed=packed, **options)
+        colors, alphas, info = rasterization(*leaves, **place._asdict(), packed=packed, **options)
         info["means2d"].retain_grad()
         results.append((colors, alphas, info, gradients(colors, leaves)))
     (colors, alphas, info, grads), (other_colors, other_alphas, other, expected) = results
@@ -173,19 +184,27 @@ def test_absolute_gradients_are_sums_over_pixels(device):
 
 def test_batch_axes_are_scenes_of_their_own(device):
     leaves, place = scene(device)
-    pose, lens, *size = place
+    pose, lens = place[:2]
     others = [leaf.detach() * 0.9 for leaf in leaves]
     stacked = [torch.stack([leaf, other])[None] for leaf, other in zip(leaves, others, strict=True)]
     cameras = [tensor.expand(1, 2, *tensor.shape) for tensor in (pose, lens)]
     backgrounds = torch.rand(1, 2, 2, 3, generator=torch.Generator().manual_seed(5)).to(device)
     for packed in (True, False):
         colors, alphas, info = rasterization(
-            *stacked, *cameras, *size, packed=packed, backgrounds=backgrounds, render_mode="RGB+D"
+            *stacked,
+            viewmats=cameras[0],
+            Ks=cameras[1],
+            width=WIDTH,
+            height=HEIGHT,
+            packed=packed,
+            backgrounds=backgrounds,
+            render_mode="RGB+D",
         )
         assert colors.shape == (1, 2, 2, HEIGHT, WIDTH, 4) and alphas.shape == (1, 2, 2, HEIGHT, WIDTH, 1)
         assert info["n_batches"] == 2 and info["n_cameras"] == 2
         for index, inputs in enumerate((leaves, others)):
-            truth, _, _ = rasterization(*inputs, *place, backgrounds=backgrounds[0, index], render_mode="RGB+D")
+            options = {"backgrounds": backgrounds[0, index], "render_mode": "RGB+D"}
+            truth, _, _ = rasterization(*inputs, **place._asdict(), **options)
             torch.testing.assert_close(colors[0, index], truth)
         if packed:
             assert set(info["batch_ids"].tolist()) == {0, 1}
@@ -199,12 +218,12 @@ def test_batch_axes_are_scenes_of_their_own(device):
 def test_colors_of_each_camera(device):
     leaves, place = scene(device, coefficients=4)
     coefficients = torch.stack([leaves[4].detach(), -leaves[4].detach()])
-    colors, _, _ = rasterization(*leaves[:4], coefficients, *place, sh_degree=1)
-    plain, _, _ = rasterization(*leaves[:4], coefficients[:, :, 0], *place)
+    colors, _, _ = rasterization(*leaves[:4], coefficients, **place._asdict(), sh_degree=1)
+    plain, _, _ = rasterization(*leaves[:4], coefficients[:, :, 0], **place._asdict())
     for camera in range(2):
-        one, _, _ = rasterization(*leaves[:4], coefficients[camera], *place, sh_degree=1)
+        one, _, _ = rasterization(*leaves[:4], coefficients[camera], **place._asdict(), sh_degree=1)
         torch.testing.assert_close(colors[camera], one[camera])
-        one, _, _ = rasterization(*leaves[:4], coefficients[camera, :, 0], *place)
+        one, _, _ = rasterization(*leaves[:4], coefficients[camera, :, 0], **place._asdict())
         torch.testing.assert_close(plain[camera], one[camera])
 
 
@@ -213,14 +232,14 @@ def test_sizes_of_nothing_and_opacities_beyond_one_are_gsplats(device):
     with torch.no_grad():
         leaves[2][0], leaves[2][1] = 0.0, -leaves[2][1]
         leaves[3][:] = torch.linspace(0, 1.4, COUNT)
-    colors, _, info = rasterization(*leaves, *place, packed=False)
+    colors, _, info = rasterization(*leaves, **place._asdict(), packed=False)
     grads = gradients(colors, leaves)
     assert all(bool(gradient.isfinite().all()) for gradient in grads)
     assert bool((grads[2][0] == 0).all()) and bool((info["radii"][0, 1] > 0).all())
     assert bool((info["radii"][:, 0] == 0).all()), "an opacity of 0"
     with torch.no_grad():
         leaves[2][1] = -leaves[2][1]
-    torch.testing.assert_close(rasterization(*leaves, *place)[0], colors)
+    torch.testing.assert_close(rasterization(*leaves, **place._asdict())[0], colors)
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
@@ -228,11 +247,11 @@ def test_covariances_and_cameras_are_projected_alike(model, device):
     """A pinhole's kernel against torch's operations; other cameras against differences of their formulas."""
     leaves, place = scene(device, count=12)
     leaves = [leaf.detach().double().requires_grad_() for leaf in leaves]
-    cameras = [tensor.double() for tensor in place[:2]]
+    place = place._replace(viewmats=place.viewmats.double(), Ks=place.Ks.double())
     covars = quat_scale_to_covar_preci(leaves[1], leaves[2])[0]
     options = {"packed": False, "camera_model": model, "rasterize_mode": "classic"}
-    colors, _, info = rasterization(*leaves, *cameras, *place[2:], **options)
-    same, _, _ = rasterization(leaves[0], None, None, *leaves[3:], *cameras, *place[2:], covars=covars, **options)
+    colors, _, info = rasterization(*leaves, **place._asdict(), **options)
+    same, _, _ = rasterization(leaves[0], None, None, *leaves[3:], **place._asdict(), covars=covars, **options)
     torch.testing.assert_close(colors, same, rtol=1e-6, atol=1e-8)
     for one, two in zip(gradients(colors, leaves), gradients(same, leaves), strict=True):
         torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-7)
@@ -241,7 +260,7 @@ def test_covariances_and_cameras_are_projected_alike(model, device):
 
     def conics(*tensors):
         return fully_fused_projection(
-            tensors[0], None, *tensors[1:3], *cameras, *place[2:], camera_model=model, opacities=tensors[3]
+            tensors[0], None, *tensors[1:3], **place._asdict(), camera_model=model, opacities=tensors[3]
         )[1:4]
 
     assert torch.autograd.gradcheck(conics, few, eps=1e-6, atol=1e-5, rtol=1e-3)
@@ -249,19 +268,19 @@ def test_covariances_and_cameras_are_projected_alike(model, device):
 
 def test_far_planes_and_small_radii_cull(device):
     leaves, place = scene(device)
-    _, _, info = rasterization(*leaves, *place, packed=False)
+    _, _, info = rasterization(*leaves, **place._asdict(), packed=False)
     size = info["radii"].amax(-1)
     limit = float(size[size > 0].float().median())
-    _, _, clipped = rasterization(*leaves, *place, packed=False, radius_clip=limit)
+    _, _, clipped = rasterization(*leaves, **place._asdict(), packed=False, radius_clip=limit)
     assert torch.equal((clipped["radii"] > 0).all(-1), (size > limit))
     middle = float(info["depths"][0].median())
-    _, _, cut = rasterization(*leaves, *place, packed=False, far_plane=middle)
+    _, _, cut = rasterization(*leaves, **place._asdict(), packed=False, far_plane=middle)
     assert bool((cut["radii"][info["depths"] > middle] == 0).all()) and bool((cut["radii"] > 0).any())
 
 
 def test_intersections_are_made_when_they_are_read(device):
     leaves, place = scene(device)
-    _, _, info = rasterization(*leaves, *place, packed=False)
+    _, _, info = rasterization(*leaves, **place._asdict(), packed=False)
     assert {"isect_ids", "flatten_ids", "isect_offsets", "tiles_per_gauss"} <= set(info)
     counts, offsets, ids = info["tiles_per_gauss"], info["isect_offsets"], info["isect_ids"]
     assert counts.shape == (2, COUNT) and int(counts.sum()) == len(ids) == len(info["flatten_ids"])
@@ -312,10 +331,10 @@ def test_no_gaussians_and_cameras_that_are_singular_show_the_background(device):
     background = torch.tensor([[0.2, 0.4, 0.8]] * 2, device=device)
     for packed in (True, False):
         none = [leaf[:0] for leaf in leaves]
-        colors, alphas, _ = rasterization(*none, *place, packed=packed, backgrounds=background)
+        colors, alphas, _ = rasterization(*none, **place._asdict(), packed=packed, backgrounds=background)
         assert torch.equal(colors, background[:, None, None].expand_as(colors)) and bool((alphas == 0).all())
         poses = torch.zeros_like(place[0])
-        colors, _, _ = rasterization(*leaves, poses, *place[1:], packed=packed, backgrounds=background)
+        colors, _, _ = rasterization(*leaves, poses, place.Ks, WIDTH, HEIGHT, packed=packed, backgrounds=background)
         assert torch.equal(colors, background[:, None, None].expand_as(colors))
 
 
@@ -355,7 +374,7 @@ def test_antialiasing_is_differentiated_whole(device):
     """As torch's operations do it, by which covariances are projected."""
     leaves, place = scene(device)
     leaves = [leaf.detach().double().requires_grad_() for leaf in leaves]
-    place = [place[0].double(), place[1].double(), *place[2:]]
+    place = place._replace(viewmats=place.viewmats.double(), Ks=place.Ks.double())
     gradients_of = []
     for by_covariances in (False, True):
         means, quats, scales, opacities, colors = leaves
@@ -363,7 +382,7 @@ def test_antialiasing_is_differentiated_whole(device):
         shapes = (None, None) if by_covariances else (quats, scales)
         values = {"covars": covars} if by_covariances else {}
         image, _, _ = rasterization(
-            means, *shapes, opacities, colors, *place, rasterize_mode="antialiased", packed=False, **values
+            means, *shapes, opacities, colors, **place._asdict(), rasterize_mode="antialiased", packed=False, **values
         )
         gradients_of.append(torch.autograd.grad(image.square().sum(), leaves))
     for ours, true in zip(*gradients_of, strict=True):

@@ -13,7 +13,7 @@ from .test_rendering import COUNT, scene
 
 def model(device="cpu", count=COUNT):
     truth, place = scene(device, count)
-    photos = rasterization(*truth, *place)[0].detach()
+    photos = rasterization(*truth, **place._asdict())[0].detach()
     generator = torch.Generator().manual_seed(1)
     means = truth[0].detach() + 0.05 * torch.randn(count, 3, generator=generator).to(device)
     values = {
