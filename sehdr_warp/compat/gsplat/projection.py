@@ -14,6 +14,7 @@ from ...rasterizer.render_options import ALPHA_THRESHOLD, RenderOptions
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS = "pinhole", "ortho", "fisheye"
 SMALLEST_SIZE = 1e-30  # A size of 0 has no logarithm; its gradient is 0 as the covariance's is.
+LARGEST_SIZE = 1e12  # Scene units. The squares of larger ones are not finite in an image.
 
 
 def check_camera_model(camera_model: Any) -> None:
@@ -79,7 +80,7 @@ def project_gaussians(
     else:
         if covars is None:
             assert quats is not None and scales is not None
-            covars, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+            covars = _finite_covariances(quats, scales)
         assert covars is not None
         projected = _project_covariances(
             means, covars, opacities, viewmat, K, width, height, eps2d, culling.near_plane, antialiased, camera_model
@@ -90,6 +91,15 @@ def project_gaussians(
     if culling.radius_clip > 0:
         extents = extents * (extents.ceil() > culling.radius_clip).any(1, keepdim=True)
     return projected if extents is projected.extents else projected._replace(extents=extents)
+
+
+def _finite_covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    """Return covariances [N, 3, 3], NaN for Gaussians without one, whose quaternions and scales get no gradient."""
+    usable = quats.isfinite().all(1) & (scales.abs() < LARGEST_SIZE).all(1)
+    quats = torch.where(usable[:, None], quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
+    covars, _ = quat_scale_to_covar_preci(quats, torch.where(usable[:, None], scales, 1.0), compute_preci=False)
+    assert covars is not None
+    return torch.where(usable[:, None, None], covars, math.nan)
 
 
 def _project_covariances(
@@ -107,6 +117,7 @@ def _project_covariances(
 ) -> ProjectedGaussians:
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     finite = means.isfinite().all(1) & covars.isfinite().all(2).all(1) & opacities.isfinite()
+    opacities = torch.where(finite, opacities, 0.0)
     centres = torch.where(finite[:, None], means, 0.0) @ rotation.T + translation
     inside = finite & (centres[:, 2] > near_plane) & viewmat.isfinite().all() & K.isfinite().all()
     # What is culled takes part as a point in front of the camera, so that its derivatives are finite.
@@ -345,7 +356,16 @@ def isect_tiles(
     Returns:
         tiles_per_gauss [..., N] or [nnz] int32; isect_ids [M] int64, in bits from the highest: image, tile, 32 bits of
         the depth; flatten_ids [M] int32, the index in the flattened inputs.
+
+    Raises:
+        TypeError: for what is not a tensor.
+        ValueError: for shapes, dtypes or devices that do not fit.
     """
+    batch = tuple(depths.shape[:-1]) if isinstance(depths, Tensor) else ()
+    check_tensors(depths=(depths, (*batch, "N")), means2d=(means2d, (*batch, "N", 2)))
+    if not isinstance(radii, Tensor) or radii.shape != means2d.shape:
+        found = f"has shape {list(radii.shape)}" if isinstance(radii, Tensor) else f"is a {type(radii).__name__}"
+        raise ValueError(f"radii {found}, expected a tensor {list(means2d.shape)}")
     shape = depths.shape
     if image_ids is None:
         images = math.prod(shape[:-1])

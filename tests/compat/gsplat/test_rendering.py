@@ -128,6 +128,23 @@ def test_wrong_shapes_types_and_devices_are_named():
             rasterization(*arguments)
 
 
+def test_misfits_of_intersections_are_named():
+    fits = {
+        "means2d": torch.zeros(2, 5, 2),
+        "radii": torch.ones(2, 5, 2, dtype=torch.int32),
+        "depths": torch.ones(2, 5),
+    }
+    for name, value, message in (
+        ("depths", torch.ones(5), r"means2d has shape \[2, 5, 2\], expected \[N, 2\]"),
+        ("means2d", torch.zeros(2, 5, 3), r"means2d has shape \[2, 5, 3\], expected \[2, N, 2\]"),
+        ("radii", torch.ones(2, 5), r"radii has shape \[2, 5\], expected a tensor \[2, 5, 2\]"),
+        ("radii", None, "radii is a NoneType"),
+        ("depths", [1.0], "depths is a builtins.list"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
+            gsplat.isect_tiles(**(fits | {name: value}), tile_size=16, tile_width=3, tile_height=2)
+
+
 def gradients(colors, leaves):
     for leaf in leaves:
         leaf.grad = None
@@ -324,6 +341,27 @@ def test_inputs_that_are_not_contiguous_give_the_same(options, device):
     assert torch.equal(colors, truth)
     for mine, its in zip(gradients(colors, strided), expected, strict=True):
         torch.testing.assert_close(mine, its)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_gaussians_that_are_not_finite_change_no_gradient(model, value, device):
+    options = {"camera_model": model, "rasterize_mode": "antialiased"}
+    leaves, place = scene(device)
+    place[:2] = [tensor.requires_grad_() for tensor in place[:2]]
+    good = [leaf.detach()[5:].requires_grad_() for leaf in leaves]
+    truth, _, _ = rasterization(*good, *place, **options)
+    expected = gradients(truth, [*good, *place[:2]])
+    for index in range(5):
+        bad = [leaf.detach().clone() for leaf in leaves]
+        bad[index][:5] = value
+        bad = [tensor.requires_grad_() for tensor in bad]
+        colors, _, _ = rasterization(*bad, *place, **options)
+        torch.testing.assert_close(colors, truth)
+        for mine, its in zip(gradients(colors, [*bad, *place[:2]]), expected, strict=True):
+            kept = mine[5:] if len(mine) == COUNT else mine
+            torch.testing.assert_close(kept, its, rtol=1e-3, atol=1e-3)
+            assert len(mine) != COUNT or not mine[:5].any()
 
 
 def test_no_gaussians_and_cameras_that_are_singular_show_the_background(device):
