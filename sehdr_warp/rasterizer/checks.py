@@ -114,6 +114,14 @@ def check_position(position: Tensor) -> None:
         raise ValueError(f"position is {place}, expected finite numbers")
 
 
+def check_directions(directions: Tensor) -> None:
+    """Raise ValueError for directions [..., 3] on the CPU that are not finite unit vectors."""
+    if directions.device.type == "cpu":
+        low, high = (float(length) for length in directions.detach().norm(dim=-1).aminmax())
+        if not (low > 0.99 and high < 1.01):
+            raise ValueError(f"directions have lengths from {low:g} to {high:g}, expected unit vectors")
+
+
 def check_cameras(world_to_camera: Tensor, intrinsics: Tensor) -> None:
     """Raise ValueError for a camera on the CPU that is not finite, has a focal length below 0 or cannot be inverted."""
     if world_to_camera.device.type != "cpu":

@@ -10,6 +10,7 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
 from .checks import (
+    check_directions,
     check_opacities,
     check_position,
     check_render_options,
@@ -90,6 +91,7 @@ def rasterize_directions(
     height, width = directions.shape[:2]
     if not height * width:
         raise ValueError(f"directions has shape {list(directions.shape)}, expected [H, W, 3] with at least one pixel")
+    check_directions(directions)
     footprint = EPS2D / focal_length**2
     smoothing = max(EPS2D * pixel_angle**2 - footprint, 0.0)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[1])):

@@ -92,11 +92,22 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
             ValueError,
             "position is .*nan.*, expected finite numbers",
         ),
+        (
+            "directions",
+            torch.ones(2, 2, 3).double(),
+            ValueError,
+            "directions have lengths from 1.73205 to 1.73205, expected unit vectors",
+        ),
+        ("directions", torch.full((2, 2, 3), NAN).double(), ValueError, "directions have lengths from nan to nan"),
     ],
 )
 def test_misfits_of_a_picture_of_the_sphere_are_named(name, value, kind, message):
     tensors = random_scene(count=5).arguments[:5]
-    arguments = {"position": torch.zeros(3).double(), "directions": torch.ones(2, 2, 3).double(), "focal_length": 60.0}
+    arguments = {
+        "position": torch.zeros(3).double(),
+        "directions": torch.eye(3).double()[:2, None],
+        "focal_length": 60.0,
+    }
     with pytest.raises(kind, match=message):
         rasterize_directions(*tensors, **arguments | {name: value})
 
