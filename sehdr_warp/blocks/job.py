@@ -2,6 +2,7 @@
 
 import logging
 import platform
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -49,7 +50,18 @@ def is_finished(folder: Path) -> bool:
     return run.info.is_file() and run.confidence.is_file() and bool(run.read_summary().get("finished"))
 
 
-def train_block(out: Path, index: int, device: str | None, photo_storage: str, versions: str) -> BlockResult:
+class StoppedTraining(RuntimeError):
+    """A training that was stopped before its end, and has saved."""
+
+
+def train_block(
+    out: Path,
+    index: int,
+    device: str | None,
+    photo_storage: str,
+    versions: str,
+    is_over: threading.Event | None = None,
+) -> BlockResult:
     """Train a block to its end, or continue its training.
 
     Args:
@@ -58,13 +70,17 @@ def train_block(out: Path, index: int, device: str | None, photo_storage: str, v
         device: Device to train on; None for the first GPU.
         photo_storage: Where its photos are stored, see load_scene().
         versions: installed_versions() of the machine that merges the blocks.
+        is_over: Set when the job has to end soon; its training then stops and saves.
 
     Returns:
         The result. Errors that a user can act on are returned, so that a job that ran is told from one that died.
+
+    Raises:
+        StoppedTraining: If the training was stopped by is_over or SIGTERM.
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     try:
-        _train(out, index, device, photo_storage, versions)
+        _train(out, index, device, photo_storage, versions, is_over or threading.Event())
     except Exception as error:
         message = as_user_error(error)
         if message is None:
@@ -73,7 +89,9 @@ def train_block(out: Path, index: int, device: str | None, photo_storage: str, v
     return BlockResult(index, None, platform.node())
 
 
-def _train(out: Path, index: int, device: str | None, photo_storage: str, versions: str) -> None:
+def _train(
+    out: Path, index: int, device: str | None, photo_storage: str, versions: str, is_over: threading.Event
+) -> None:
     """Train a block; raise SehdrError if this machine has other versions or photos than that which divided the set."""
     from ..training.train import create_trainer
 
@@ -90,9 +108,10 @@ def _train(out: Path, index: int, device: str | None, photo_storage: str, versio
     plan.check_photos(scene.views)
     trainer = create_trainer(scene, folder, config, device=device, resume=True, data=data, shared=plan.shared)
     for _ in trainer:
-        pass
-    if trainer.iteration < trainer.total:  # By SIGTERM, as before a preemption; not an error of the user's.
-        raise RuntimeError(f"stopped at iteration {trainer.iteration} of {trainer.total}")
+        if is_over.is_set():
+            trainer.stop()
+    if trainer.iteration < trainer.total:
+        raise StoppedTraining(f"stopped at iteration {trainer.iteration} of {trainer.total}")
 
 
 def shared_scene(plan: BlockPlan, index: int, scene: Scene) -> Scene:

@@ -7,6 +7,7 @@ its newest checkpoint; SLURM jobs that reach their time limit or are preempted a
 import logging
 import os
 import platform
+import re
 import secrets
 import time
 from collections import deque
@@ -41,6 +42,7 @@ def run_blocks(
     gpus: int = 1,
     photo_storage: str = "auto",
     slurm: Mapping[str, str] | None = None,
+    slurm_device: str | None = None,
 ) -> None:
     """Train all blocks of a plan that are not finished.
 
@@ -52,6 +54,7 @@ def run_blocks(
             once.
         photo_storage: Where photos are stored, see load_scene().
         slurm: Parameters of SLURM jobs, such as {"partition": "gpu"}; None for this machine.
+        slurm_device: "cpu" for SLURM jobs without a GPU, which the machine that submits them need not have either.
 
     Raises:
         SehdrError: If submitit is missing, or if blocks cannot be trained, after all others have been.
@@ -65,13 +68,17 @@ def run_blocks(
     if not waiting:
         return
     slots = min(gpus, len(waiting)) if slurm is None else len(waiting)
-    executors = _executors(out, device, slots, slurm)
-    arguments = ("cpu" if device.type == "cpu" else None), photo_storage, installed_versions()
+    on_cpu = slurm_device == "cpu" if slurm is not None else device.type == "cpu"
+    executors = (
+        _executors(out, device, slots) if slurm is None else [_slurm_executor(out, slurm, gpu=not on_cpu)] * slots
+    )
+    arguments = ("cpu" if on_cpu else None), photo_storage, installed_versions()
     # Jobs that run beside each other on this machine share its processors.
     job = BlockJob(max(1, thread_count() // slots) if slurm is None and slots > 1 else None)
     tries, errors = dict.fromkeys(waiting, 0), {}
     reached = {index: _newest_checkpoint(folder_of(out, plan, index)) for index in waiting}
     running: dict[int, tuple[int, Any]] = {}
+    notes = None if slurm is None else _waiting_notes()
     try:
         while waiting or running:
             for slot in range(slots):
@@ -82,6 +89,8 @@ def run_blocks(
                 running[slot] = index, _submit(executors[slot], job, out.absolute(), index, *arguments)
                 log.info("%s: training begins, %d photos", plan.blocks[index].name, len(plan.blocks[index].views))
             time.sleep(POLL if slurm is None else SLURM_POLL)
+            if notes is not None:
+                notes.look([submitted.job_id for _, submitted in running.values()])
             for slot, (index, submitted) in list(running.items()):
                 if not submitted.done():
                     continue
@@ -124,7 +133,8 @@ def _submit(executor: Any, job: BlockJob, *arguments: Any) -> Any:
         return executor.submit(job, *arguments)
     except (FailedJobError, OSError) as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-        raise SehdrError(f"SLURM does not take a job ({lines[-1]:.200}); check what --slurm asks for") from None
+        remedy = "check what --slurm asks for; --device cpu asks for no GPU"
+        raise SehdrError(f"SLURM does not take a job ({lines[-1]:.200}); {remedy}") from None
 
 
 def check_devices(device: torch.device, count: int) -> None:
@@ -147,21 +157,9 @@ def visible_gpus(device: torch.device, count: int) -> list[str]:
     return [name.strip() for name in names[first : first + count]]
 
 
-def _executors(out: Path, device: torch.device, slots: int, slurm: Mapping[str, str] | None) -> list[Any]:
-    """Return an executor of submitit for each job that may run at the same time."""
-    submitit = require_extra("submitit", "submitit, which runs blocks as jobs, is not installed", "blocks")
-    # submitit exchanges pickled values through this folder, so it is a new one that nobody can have prepared.
-    logs = out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
-    if slurm is not None:
-        try:
-            executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
-            executor.update_parameters(name="sehdr-warp", **_slurm_parameters(slurm, gpu=device.type == "cuda"))
-        except (RuntimeError, ValueError, NameError, TypeError, AssertionError) as error:
-            problem = (str(error).splitlines() or [type(error).__name__])[0].partition(". Valid")[0]
-            raise SehdrError(
-                f"--slurm cannot be used ({problem:.200}); it needs srun, and names that sbatch knows"
-            ) from None
-        return [executor] * slots
+def _executors(out: Path, device: torch.device, slots: int) -> list[Any]:
+    """Return an executor of submitit for each job that may run at the same time on this machine."""
+    submitit, logs = _submitit(), _logs_folder(out)
     executors = [submitit.LocalExecutor(folder=logs) for _ in range(slots)]
     for executor in executors:
         executor.update_parameters(timeout_min=MONTH)
@@ -173,13 +171,51 @@ def _executors(out: Path, device: torch.device, slots: int, slurm: Mapping[str, 
     return executors
 
 
+def _slurm_executor(out: Path, options: Mapping[str, str], *, gpu: bool) -> Any:
+    """Return submitit's executor for SLURM; raise SehdrError if SLURM is missing or does not know an option."""
+    submitit = _submitit()
+    from .slurm_states import job_watcher
+
+    try:
+        executor = submitit.AutoExecutor(folder=_logs_folder(out), cluster="slurm")
+        executor.update_parameters(name="sehdr-warp", **_slurm_parameters(options, gpu=gpu))
+    except (RuntimeError, ValueError, NameError, TypeError, AssertionError) as error:
+        problem = (str(error).splitlines() or [type(error).__name__])[0].partition(". Valid")[0]
+        raise SehdrError(
+            f"--slurm cannot be used ({problem:.200}); it needs srun, and names that sbatch knows"
+        ) from None
+    submitit.SlurmJob.watcher = job_watcher()
+    return executor
+
+
+def _waiting_notes() -> Any:
+    """Return what reports why jobs wait; its module needs submitit."""
+    from .slurm_states import WaitingNotes
+
+    return WaitingNotes()
+
+
+def _submitit() -> Any:
+    """Return the package submitit; raise SehdrError if it is not installed."""
+    return require_extra("submitit", "submitit, which runs blocks as jobs, is not installed", "blocks")
+
+
+def _logs_folder(out: Path) -> Path:
+    """Return a new folder for logs, and for pickled values that submitit exchanges: nobody can have prepared it."""
+    return out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
+
+
 def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any]:
     """Return the parameters of submitit for SLURM: one GPU a job, and `time` in minutes."""
     parameters: dict[str, Any] = {"timeout_min": DAY} | ({"gpus_per_node": 1} if gpu else {})
     for name, text in options.items():
         value = int(text) if text.isdecimal() and len(text) <= _DIGITS else text
         own = {"time": "timeout_min"}.get(name, name)
+        if own == "timeout_min" and not isinstance(value, int):
+            raise SehdrError(f"--slurm time={text:.100} is no number of minutes; write time=240 for four hours")
         parameters[own if own in parameters else f"slurm_{own}"] = value
+        if own == "cpus_per_task":  # Since SLURM 22.05, srun does not take it over from sbatch.
+            parameters["slurm_srun_args"] = [f"--cpus-per-task={value}"]
     return parameters
 
 
@@ -187,6 +223,8 @@ def _error_of(job: Any, folder: Path) -> str | None:
     """Return why a job ended without a trained block in its folder, in one line; None if the block is trained."""
     exception = job.exception()
     if exception is not None:
+        if (state := re.search(r"has not produced any output \(state: (\w+)", str(exception))) is not None:
+            return f"its process ended without a result (job {job.job_id}, state {state[1]})"
         # submitit reports a traceback between two rules, or in its first line what else became of the job.
         lines = [line.strip() for line in str(exception).splitlines() if line.strip()] or [type(exception).__name__]
         rules = [number for number, line in enumerate(lines) if set(line) == {"-"}]

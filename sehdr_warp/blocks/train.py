@@ -40,6 +40,7 @@ def train_in_blocks(
     device: torch.device,
     gpus: int = 1,
     slurm: Mapping[str, str] | None = None,
+    slurm_device: str | None = None,
     resume: bool = False,
     overwrite: bool = False,
     photo_storage: str = "auto",
@@ -54,6 +55,7 @@ def train_in_blocks(
         device: Device to measure and merge on; blocks train on it and the GPUs that follow it.
         gpus: Blocks to train at once.
         slurm: Parameters of SLURM jobs; None trains on this machine.
+        slurm_device: "cpu" for SLURM jobs without a GPU; else each has one, whatever `device` is.
         resume: Continue; finished blocks are not run again.
         overwrite: Replace a training in blocks in `out`.
         photo_storage: Where photos are stored, see load_scene().
@@ -78,7 +80,8 @@ def train_in_blocks(
         with writing(out):
             make_parents(out / FILE)
         plan.write(out)
-    run_blocks(out, plan, device=device, gpus=gpus, photo_storage=photo_storage, slurm=slurm)
+    jobs = {"photo_storage": photo_storage, "slurm": slurm, "slurm_device": slurm_device}
+    run_blocks(out, plan, device=device, gpus=gpus, **jobs)
     folder = merge_blocks(out, plan)
     run = load_run(out, device=device)
     errors = _measure(run, plan, photo_storage)

@@ -284,6 +284,7 @@ def _train_blocks(args: Train) -> bool:
         device=device,
         gpus=machine.gpus,
         slurm=parse_pairs("--slurm", machine.slurm),
+        slurm_device="cpu" if device.type == "cpu" and machine.device is not None else None,
         resume=output.resume,
         overwrite=output.overwrite,
         photo_storage=_photo_storage(config),

@@ -19,6 +19,7 @@ from sehdr_warp.runs.run_folder import RunFolder
 from ..refusals import call, refused
 
 submitit = pytest.importorskip("submitit")
+slurm_states = pytest.importorskip("sehdr_warp.blocks.slurm_states")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="SLURM runs on Linux")
 
 # Jobs are scripts in $CLUSTER, named by their number; their states are in files beside them.
@@ -51,6 +52,12 @@ SACCT = """#!/bin/bash
 echo 'JobID|State|NodeList'
 for state in "$CLUSTER"/*.state; do echo "$(basename "$state" .state)|$(cat "$state")|node7"; done
 """
+SQUEUE = """#!/bin/bash
+case "$*" in
+    *PENDING*) echo '100|PartitionTimeLimit'; echo '7|Priority';;
+    *) for state in "$CLUSTER"/*.state; do echo "$(basename "$state" .state)|$(cat "$state")"; done;;
+esac
+"""
 SCONTROL = """#!/bin/bash
 [ "$1" = requeue ] && touch "$CLUSTER/$2.requeue"
 """
@@ -63,7 +70,14 @@ def cluster(tmp_path, monkeypatch):
     """Scripts in place of SLURM's programs; the folder of its jobs."""
     programs, jobs = tmp_path / "bin", tmp_path / "jobs"
     jobs.mkdir()
-    scripts = {"sbatch": SBATCH, "start_job": START, "srun": SRUN, "sacct": SACCT, "scontrol": SCONTROL}
+    scripts = {
+        "sbatch": SBATCH,
+        "start_job": START,
+        "srun": SRUN,
+        "sacct": SACCT,
+        "squeue": SQUEUE,
+        "scontrol": SCONTROL,
+    }
     programs.mkdir()
     for name, text in scripts.items():
         (programs / name).write_text(text)
@@ -83,11 +97,11 @@ def survey(tmp_path):
 
 
 def send_once(out, number):
-    """Send a signal to the first block's process when it has written a checkpoint of its training."""
+    """Send a signal to a block's process when both blocks have written a checkpoint of their training."""
     deadline = time.monotonic() + 90
     while time.monotonic() < deadline:
-        begun = [path.parents[1] for path in out.glob("blocks/block_*/checkpoints/iteration_*[1-9]*")]
-        for place in Path("/proc").glob("[0-9]*") if begun else ():
+        begun = {path.parents[1] for path in out.glob("blocks/block_*/checkpoints/iteration_*[1-9]*")}
+        for place in Path("/proc").glob("[0-9]*") if len(begun) == 2 else ():
             with suppress(OSError):
                 words = (place / "cmdline").read_text()
                 if "submitit.core._submit" in words and str(out) in words:
@@ -126,6 +140,38 @@ def test_what_slurm_refuses_is_one_line(cluster, survey, tmp_path, capfd, monkey
     )
     own, ours = capfd.readouterr().err.splitlines()
     assert own == "sbatch: error: invalid partition specified: closed" and ours.startswith("sehdr-warp: SLURM does not")
-    assert own in ours and ours.endswith("check what --slurm asks for")
+    assert own in ours and ours.endswith("check what --slurm asks for; --device cpu asks for no GPU")
+    assert "time=4:00:00 is no number of minutes; write time=240" in line("time=4:00:00")
     monkeypatch.setenv("PATH", "/nowhere")
     assert 'Could not detect "srun"' in line("partition=gpu")
+
+
+def test_a_killed_job_is_noticed_without_accounts(cluster, survey, tmp_path, monkeypatch, capfd):
+    sacct = tmp_path / "bin" / "sacct"
+    sacct.write_text("#!/bin/bash\necho 'Slurm accounting storage is disabled' >&2\nexit 1\n")
+    monkeypatch.setattr(slurm_states, "LOOK_EVERY", 1.0)
+    out = tmp_path / "run"
+    sender = threading.Thread(target=send_once, args=(out, signal.SIGKILL))
+    sender.start()
+    words = ["--schedule.checkpoint-every", "3000", "--slurm", "partition=gpu,time=9"]
+    assert call("train", survey, "--out", out, *FLAGS, *words) == 0
+    sender.join()
+    printed = capfd.readouterr().err
+    assert len(list(cluster.glob("*.sh"))) == 3
+    assert "ended without a result (job 10" in printed and "state FAILED" in printed
+    assert printed.count("SLURM: jobs wait (PartitionTimeLimit); they never start with so much time") == 1
+    assert "Priority" not in printed, "of another job"
+    assert load_run(out).iterations == 200
+
+
+def test_states_that_submitit_does_not_know_are_no_end():
+    watcher = slurm_states.QueueWatcher()
+    for number in "1234":
+        watcher.register_job(number)
+    states = watcher.read_info(b"1|CONFIGURING\n2|TIMEOUT\n3|SUSPENDED\n9|RUNNING\n")
+    assert {number: row["State"] for number, row in states.items()} == {
+        "1": "RUNNING",
+        "2": "TIMEOUT",
+        "3": "RUNNING",
+        "4": "ENDED",
+    }

@@ -192,7 +192,7 @@ def test_blocks_take_the_gpus_that_the_user_made_visible(monkeypatch, first, cou
 
 def test_a_job_of_this_machine_sees_its_gpu_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,GPU-71aa")
-    executors = jobs._executors(tmp_path, torch.device("cuda"), 2, None)
+    executors = jobs._executors(tmp_path, torch.device("cuda"), 2)
     running = [executor.submit(os.getenv, "CUDA_VISIBLE_DEVICES") for executor in executors]
     assert [job.result() for job in running] == ["3", "GPU-71aa"]
 
@@ -214,6 +214,9 @@ def test_slurm_jobs_take_the_parameters(tmp_path):
     executor = submitit.AutoExecutor(folder=tmp_path, cluster="debug")  # Checks names and types as for SLURM.
     executor.update_parameters(name="town", **parameters)
     assert "gpus_per_node" not in jobs._slurm_parameters(slurm, gpu=False)
+    of_srun = jobs._slurm_parameters({"cpus_per_task": "8"}, gpu=False)
+    assert of_srun["slurm_cpus_per_task"] == 8 and of_srun["slurm_srun_args"] == ["--cpus-per-task=8"]
+    executor.update_parameters(**of_srun)
 
 
 def test_the_number_of_blocks_follows_photos_and_gaussians():

@@ -107,7 +107,10 @@ def test_flags_and_fields_on_the_pages_exist(page):
         "--cpus-per-task",
         "--time",
         "--requeue",
-    }  # of pip, Nsight, torchrun and sbatch
+        "--open-mode",
+        "--signal",
+        "--kill-on-bad-exit",
+    }  # of pip, Nsight, torchrun, sbatch and srun
     assert set(re.findall(r"(?<![\w-])(--[a-z][a-z-]*)(?![\w.])", text)) <= known | others
     fields = {path for path, _ in config_fields()}
     parts = "|".join({field.split(".")[0] for field in fields if "." in field})
