@@ -38,7 +38,7 @@ class Timed(Output):
 
     def timing(self) -> dict:
         """Return the device and the number of repetitions."""
-        from sehdr_warp.runs.open import pick_device
+        from sehdr_warp.runs.device import pick_device
 
         return {"device": pick_device(self.device), "repetitions": require_positive("--repetitions", self.repetitions)}
 
@@ -196,7 +196,7 @@ class Stability(Output):
     def measure(self):
         """Measure the cases and print each bound; checks are the cases."""
         from sehdr_warp.check.run_cases import run_cases
-        from sehdr_warp.training.train import pick_device
+        from sehdr_warp.runs.device import pick_device
 
         from .results import new_result
         from .stability.catalogue import choose_cases

@@ -27,7 +27,7 @@ class Check:
 def run_check(options: Check) -> None:
     """Measure every case; raise SehdrError, after everything is written, if one exceeds its bound."""
     from ..files import check_absent, write_json
-    from ..runs.open import pick_device
+    from ..runs.device import pick_device
     from .result import new_result
     from .run_cases import run_cases
     from .splat_cases import POISON_CASES, SPLAT_CASES

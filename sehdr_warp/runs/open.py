@@ -11,41 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, SehdrError
+from .device import pick_device
 from .load_arguments import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
-    import torch
-
     from ..response import Response
     from ..scene import Scene
     from .config import Config
     from .run import Run, Splats
 
 log = logging.getLogger(__name__)
-
-
-def pick_device(device: str | torch.device | None) -> torch.device:
-    """Return the device that a user names, by default the first GPU, or the CPU if there is none.
-
-    Args:
-        device: "cpu", "cuda", "cuda:N", a torch device, or None.
-
-    Raises:
-        InputError: If torch cannot use the device.
-    """
-    import torch
-
-    if device is None:
-        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
-    if not str(device).startswith(("cpu", "cuda")):
-        raise InputError(f"device {device}", "is neither a CPU nor a CUDA GPU", "use cpu or cuda:N")
-    try:
-        result = torch.device(device)
-        torch.empty(0, device=result)
-    except (RuntimeError, AssertionError) as error:
-        problem = f"cannot be used ({str(error).splitlines()[0]})"
-        raise InputError(f"device {device}", problem, "use cpu, or cuda:N of a GPU that torch sees") from None
-    return torch.device("cuda", result.index or 0) if result.type == "cuda" else result
 
 
 def open_run(path: Path, device: str | None) -> Run:

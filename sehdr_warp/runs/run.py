@@ -27,9 +27,9 @@ from ..scene.normalization import Normalization
 from ..splats import read_gaussians
 from .checkpoint import PICTURE, Checkpoint, under
 from .config import Config
+from .device import pick_device
 from .light_estimates import light_estimates
 from .load_arguments import LoadArguments
-from .open import pick_device
 from .run_folder import CameraEntry, RunFolder
 from .run_writer import write_confidence
 

@@ -19,8 +19,9 @@ from tyro.conf import Positional
 from ..errors import InputError, SehdrError, UsageError
 from ..files import require_text
 from ..runs import config_files as configs
+from ..runs.device import pick_device
 from ..runs.load_arguments import LOAD_OPTIONS, LoadArguments
-from ..runs.open import load_saved_scene, pick_device
+from ..runs.open import load_saved_scene
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from ..model.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
 from ..runs.config import Config, OptimizerConfig
 from ..runs.config_files import override_config
-from ..runs.open import pick_device
+from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS
 from .cost import CPU_GAUSSIAN, CPU_PIXEL, START_SECONDS, exchange_seconds, step_seconds

@@ -12,8 +12,8 @@ from ..errors import InputError
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
+from ..runs.device import pick_device
 from ..runs.load_arguments import LoadArguments
-from ..runs.open import pick_device
 from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
 from ..scene import Scene

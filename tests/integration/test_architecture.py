@@ -75,7 +75,7 @@ ALLOWED = {
     },
     "blocks": ANY | {"training", "runs", "scene", "response", "model", "splats", "evaluation.metrics", "process"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "model.exposure"},
-    "check": ANY | {"kernels.constants", "rasterizer", "runs.open"},
+    "check": ANY | {"kernels.constants", "rasterizer", "runs.device"},
 }
 # Packages that only some packages may import.
 ONLY_IN = {

@@ -18,7 +18,7 @@ LARGEST_SIZE = 1e12  # Scene units. The squares of larger ones are not finite in
 
 
 def check_camera_model(camera_model: Any) -> None:
-    """Raise ValueError for what is not one of CAMERA_MODELS."""
+    """Raise ValueError if it is not one of CAMERA_MODELS."""
     if camera_model not in CAMERA_MODELS:
         raise ValueError(f"camera_model {camera_model!r} is none of {', '.join(CAMERA_MODELS)}")
 
@@ -283,12 +283,8 @@ def fully_fused_projection(
         shapes = {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
     if opacities is not None:
         shapes["opacities"] = opacities, (*batch, "N")
-    check_tensors(
-        means=(means, (*batch, "N", 3)),
-        **shapes,
-        viewmats=(viewmats, (*batch, "C", 4, 4)),
-        Ks=(Ks, (*batch, "C", 3, 3)),
-    )
+    cameras = {"viewmats": (viewmats, (*batch, "C", 4, 4)), "Ks": (Ks, (*batch, "C", 3, 3))}
+    check_tensors(means=(means, (*batch, "N", 3)), **shapes, **cameras)
     alphas = torch.ones_like(means[..., 0]) if opacities is None else opacities
     indices = list(product(*map(range, (*batch, viewmats.shape[-3]))))
     if not indices:
@@ -304,8 +300,7 @@ def fully_fused_projection(
         for scene in (tuple(axes),)
     ]  # fmt: skip
     shape = *batch, viewmats.shape[-3]
-    stacked = (torch.stack(each).unflatten(0, shape) for each in zip(*views, strict=True))
-    means2d, conics, depths, lowered, extents = stacked
+    means2d, conics, depths, lowered, extents = (torch.stack(v).unflatten(0, shape) for v in zip(*views, strict=True))
     compensations = lowered / alphas[..., None, :].clamp_min(1e-30) if calc_compensations else None
     radii = extents.ceil().int()
     if not packed:
@@ -315,8 +310,8 @@ def fully_fused_projection(
     packed_compensations = None if compensations is None else compensations.reshape(-1)[rows]
     values = (value.flatten(0, -2)[rows] for value in (radii, means2d, depths[..., None], conics))
     packed_radii, packed_means, packed_depths, packed_conics = values
-    ids = batch_ids, camera_ids, gaussian_ids
-    return *ids, packed_radii, packed_means, packed_depths[:, 0], packed_conics, packed_compensations
+    parts = packed_radii, packed_means, packed_depths[:, 0], packed_conics, packed_compensations
+    return batch_ids, camera_ids, gaussian_ids, *parts
 
 
 def _row(tensor: Tensor | None, place: tuple[int, ...]) -> Tensor | None:
