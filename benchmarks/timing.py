@@ -47,8 +47,7 @@ def time_variants(
     """Time variants in turns; see summary().
 
     On a GPU an event stands before and after each run, with the device idle before, so that the host's time counts if
-    it is the limit. If `apart`, a summary then has also `host_ms`, the median until a run returns to Python, and
-    `device_ms`, the time of its kernels without what passes between them.
+    it is the limit. If `apart`, a summary then has also `host_ms`, the median until a run returns to Python.
     """
     samples: dict[str, list[float]] = {name: [] for name in variants}
     returned: dict[str, list[float]] = {name: [] for name in variants}
@@ -69,8 +68,8 @@ def time_variants(
                 returned[name].append(host)
     summaries = {name: summary(values) for name, values in samples.items()}
     if apart and device.type == "cuda":
-        for name, variant in variants.items():
-            summaries[name] |= {"host_ms": statistics.median(returned[name]), "device_ms": kernel_milliseconds(variant)}
+        for name, values in returned.items():
+            summaries[name] |= {"host_ms": statistics.median(values)}
     return summaries
 
 
@@ -112,7 +111,10 @@ def _milliseconds(variant: Variant, device: torch.device) -> Milliseconds:
 
 
 def kernel_milliseconds(variant: Variant, runs: int = 5) -> float:
-    """Return the time of a run's kernels and copies on the GPU, in the mean of some runs."""
+    """Return the time of a run's kernels and copies on the GPU, in the mean of some runs.
+
+    The process is slower at launching kernels from then on.
+    """
     torch.cuda.synchronize()
     with silent_stderr(), profile(activities=[ProfilerActivity.CUDA]) as recorded:
         for _ in range(runs):

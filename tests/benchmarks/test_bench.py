@@ -179,6 +179,21 @@ def test_gsplat_draws_what_we_draw(monkeypatch):
     assert all(check["passed"] for check in result["checks"])
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="a GPU has times of its own")
+def test_times_of_host_and_gpu_are_apart(monkeypatch):
+    order = []
+    for name in ("time_variants", "kernel_milliseconds"):
+
+        def traced(*args, name=name, real=getattr(kernels, name), **options):
+            order.append(name)
+            return real(*args, **options)
+
+        monkeypatch.setattr(kernels, name, traced)
+    rows = kernels.bench_kernels([Size(150, 40, 32)], [3, 5], torch.device("cuda:0"), **BRIEF)["rows"]
+    assert all(row["device_ms"] > 0 and row["host_ms"] > 0 for row in rows)
+    assert order == sorted(order, reverse=True), "profiling slows what comes after it"
+
+
 def test_tables_leave_out_what_nothing_has_and_mark_what_one_lacks():
     rows = [{"a": 1.234, "b": "x", "c": None}, {"a": None, "b": "yy"}]
     assert markdown_table(rows, {"A=a": ".1f", "b": "", "c": "d"}) == "\n".join(
