@@ -42,8 +42,8 @@ class QueueWatcher(SlurmInfoWatcher):
 def job_watcher() -> SlurmInfoWatcher:
     """Return what tells the states of jobs on this cluster."""
     with suppress(OSError, subprocess.SubprocessError):
-        asked = subprocess.run(["sacct", "--noheader", "--starttime=now"], capture_output=True, timeout=_ASKS)
-        if asked.returncode == 0:
+        query = subprocess.run(["sacct", "--noheader", "--starttime=now"], capture_output=True, timeout=_ASKS)
+        if query.returncode == 0:
             return SlurmInfoWatcher(delay_s=LONGEST)
     log.info("SLURM keeps no accounts here: states of jobs come from squeue")
     return QueueWatcher(delay_s=LONGEST // 10)

@@ -154,7 +154,7 @@ def test_a_killed_job_is_noticed_without_accounts(cluster, survey, tmp_path, mon
     sender = threading.Thread(target=send_once, args=(out, signal.SIGKILL))
     sender.start()
     words = ["--schedule.checkpoint-every", "3000", "--slurm", "partition=gpu,time=9"]
-    assert call("train", survey, "--out", out, *FLAGS, *words) == 0
+    assert call("train", survey, "--out", out, *[*FLAGS, *words]) == 0
     sender.join()
     printed = capfd.readouterr().err
     assert len(list(cluster.glob("*.sh"))) == 3

@@ -91,7 +91,7 @@ def test_a_killed_job_goes_on_and_finished_blocks_are_not_run_again(survey, tmp_
     killer = threading.Thread(target=kill_first_job, args=(out,))
     killer.start()
     words = ["--iterations", "600", "--schedule.checkpoint-every", "3000", "--slurm", "time=10,cpus_per_task=1"]
-    assert call("train", survey, "--out", out, *FLAGS, "--blocks", "2", *words) == 0
+    assert call("train", survey, "--out", out, *[*FLAGS, "--blocks", "2", *words]) == 0
     killer.join()
     results = list(out.glob("blocks/logs/*/*_submitted.pkl"))
     assert len(results) == 3, "two blocks, and one of them again"

@@ -359,8 +359,8 @@ def isect_tiles(
     batch = tuple(depths.shape[:-1]) if isinstance(depths, Tensor) else ()
     check_tensors(depths=(depths, (*batch, "N")), means2d=(means2d, (*batch, "N", 2)))
     if not isinstance(radii, Tensor) or radii.shape != means2d.shape:
-        found = f"has shape {list(radii.shape)}" if isinstance(radii, Tensor) else f"is a {type(radii).__name__}"
-        raise ValueError(f"radii {found}, expected a tensor {list(means2d.shape)}")
+        problem = f"has shape {list(radii.shape)}" if isinstance(radii, Tensor) else f"is a {type(radii).__name__}"
+        raise ValueError(f"radii {problem}, expected a tensor {list(means2d.shape)}")
     shape = depths.shape
     if image_ids is None:
         images = math.prod(shape[:-1])

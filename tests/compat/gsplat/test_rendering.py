@@ -320,7 +320,7 @@ def test_intersections_are_made_when_they_are_read(device):
 )
 def test_copies_of_meta_hold_values(read):
     leaves, place = scene()
-    _, _, info = rasterization(*leaves, *place)
+    _, _, info = rasterization(*leaves, **place._asdict())
     copied = read(info)
     assert list(copied) == list(info)
     assert not any(callable(dict.get(copied, key)) for key in copied)
@@ -332,12 +332,12 @@ def test_copies_of_meta_hold_values(read):
 @pytest.mark.parametrize("options", [{}, {"camera_model": "ortho"}, {"sh_degree": 1}])
 def test_inputs_that_are_not_contiguous_give_the_same(options, device):
     leaves, place = scene(device, coefficients=4 if "sh_degree" in options else 0)
-    truth, _, _ = rasterization(*leaves, *place, **options)
+    truth, _, _ = rasterization(*leaves, **place._asdict(), **options)
     expected = gradients(truth, leaves)
     strided = [torch.stack([leaf.detach()] * 2, dim=-1)[..., 0].requires_grad_() for leaf in leaves]
     transposed = [tensor.mT.contiguous().mT for tensor in place[:2]]
     assert not any(tensor.is_contiguous() for tensor in (*strided, *transposed))
-    colors, _, _ = rasterization(*strided, *transposed, *place[2:], **options)
+    colors, _, _ = rasterization(*[*strided, *transposed], WIDTH, HEIGHT, **options)
     assert torch.equal(colors, truth)
     for mine, its in zip(gradients(colors, strided), expected, strict=True):
         torch.testing.assert_close(mine, its)
@@ -348,15 +348,16 @@ def test_inputs_that_are_not_contiguous_give_the_same(options, device):
 def test_gaussians_that_are_not_finite_change_no_gradient(model, value, device):
     options = {"camera_model": model, "rasterize_mode": "antialiased"}
     leaves, place = scene(device)
-    place[:2] = [tensor.requires_grad_() for tensor in place[:2]]
+    for tensor in place[:2]:
+        tensor.requires_grad_()
     good = [leaf.detach()[5:].requires_grad_() for leaf in leaves]
-    truth, _, _ = rasterization(*good, *place, **options)
+    truth, _, _ = rasterization(*good, **place._asdict(), **options)
     expected = gradients(truth, [*good, *place[:2]])
     for index in range(5):
         bad = [leaf.detach().clone() for leaf in leaves]
         bad[index][:5] = value
         bad = [tensor.requires_grad_() for tensor in bad]
-        colors, _, _ = rasterization(*bad, *place, **options)
+        colors, _, _ = rasterization(*bad, **place._asdict(), **options)
         torch.testing.assert_close(colors, truth)
         for mine, its in zip(gradients(colors, [*bad, *place[:2]]), expected, strict=True):
             kept = mine[5:] if len(mine) == COUNT else mine
