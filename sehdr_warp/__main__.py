@@ -1,10 +1,13 @@
 """`python -m sehdr_warp` and the script `sehdr-warp`: the command line, loaded where interrupts are caught."""
 
+import errno
 import os
 import signal
 import sys
 
 _OUT_OF_MEMORY = b"sehdr-warp: out of memory; raise the limit (ulimit -v), or use smaller photos (--max-size)\n"
+_LITTLE = 4 << 20  # Bytes of address space; a smaller rest is not enough for a module or a picture
+_LONGEST_CHAIN = 20  # Exceptions that one came from
 
 
 def run() -> None:
@@ -19,7 +22,7 @@ def run() -> None:
 
         main()
     except BaseException as error:
-        if isinstance(error, MemoryError) or (isinstance(error, ImportError) and "map segment" in str(error)):
+        if _is_out_of_memory(error):
             # While modules load, or because even the line of main() found no memory: nothing is allocated here.
             os.write(2, _OUT_OF_MEMORY)
             os._exit(1)
@@ -30,6 +33,44 @@ def run() -> None:
         raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # An interrupt while Python ends would show a traceback.
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an exception, or one that it came from, is of exhausted memory.
+
+    Libraries turn a failed allocation into exceptions of any kind, so whatever comes when the address space is used up
+    counts. That this itself finds no memory is an answer as well.
+    """
+    if isinstance(error, (SystemExit, KeyboardInterrupt)):
+        return False
+    try:
+        cause: BaseException | None = error
+        for _ in range(_LONGEST_CHAIN):
+            if cause is None:
+                break
+            if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno == errno.ENOMEM):
+                return True
+            if isinstance(cause, ImportError) and "map segment" in str(cause):
+                return True
+            cause = cause.__cause__ or cause.__context__
+        return _address_space_left() < _LITTLE
+    except MemoryError:
+        return True
+
+
+def _address_space_left() -> float:
+    """Return the bytes that `ulimit -v` leaves this process; infinity without such a limit, or where it is unknown."""
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        with open("/proc/self/statm", "rb") as file:
+            used = int(file.read().split()[0]) * resource.getpagesize()
+    except ImportError:
+        return float("inf")
+    except OSError as error:
+        return 0 if error.errno == errno.ENOMEM else float("inf")
+    return float("inf") if limit == resource.RLIM_INFINITY else limit - used
 
 
 if __name__ == "__main__":

@@ -83,7 +83,7 @@ def _check_flags(options: type, words: list[str], program: str) -> None:
         # A mistyped part of a dotted flag (--los.clipping) is similar to the flag; a missing part (--clipping) is not.
         by_field = {name.rpartition(".")[2].removeprefix("--"): name for name in names if "." in name}
         hint = did_you_mean(flag, names) or (f", did you mean {by_field[flag[2:]]}?" if flag[2:] in by_field else "")
-        raise UsageError(f"{program} has no {flag}{hint or f'; see {program} --help'}")
+        raise UsageError(f"{program} has no {flag:.80}{hint or f'; see {program} --help'}")
 
 
 def _hints(options: type) -> dict[str, typing.Any]:

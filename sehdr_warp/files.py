@@ -15,6 +15,7 @@ import platform
 import re
 import secrets
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import takewhile
@@ -126,6 +127,16 @@ def refuse_links(path: Path, folder: Path) -> None:
             )
 
 
+def has_file(path: Path) -> bool:
+    """Return whether there is a file; raise InputError if a folder, a pipe, a device or a broken link has its name.
+
+    To take these for a missing file would read a set or a run in another way than it says.
+    """
+    if os.path.lexists(path) and not path.is_file():
+        raise InputError(path, "is a folder, a pipe, a device or a broken link, not a file", "remove it")
+    return path.is_file()
+
+
 def plain_size(path: Path) -> int:
     """Return the bytes of a file; raise InputError for a folder, a pipe or a device, which may never end."""
     size = path.stat().st_size
@@ -196,8 +207,8 @@ def read_json(path: Path, limit: int = MAX_JSON_BYTES) -> dict:
 def _unique(pairs: list[tuple[str, Any]]) -> dict:
     values = dict(pairs)
     if len(values) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"the key {next(name for name in names if names.count(name) > 1)!r:.80} stands twice")
+        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise ValueError(f"the key {twice!r:.80} stands twice")
     return values
 
 
@@ -256,7 +267,9 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
 
 
 def require_text(name: Path | str) -> None:
-    """Raise InputError if a name is not UTF-8 text, which JSON, OpenEXR and USD cannot hold."""
+    """Raise InputError if a name is not UTF-8 text, which JSON, OpenEXR and USD cannot hold, or has a zero byte."""
+    if "\0" in str(name):
+        raise InputError(ascii(str(name)), "is a name with a zero byte", "choose another name")
     try:
         str(name).encode()
     except UnicodeEncodeError:

@@ -35,6 +35,19 @@ def memory_left(proc: Path = PROC, mount: Path = MOUNT, environment: Mapping[str
     return max(0, min(free)) if free else None
 
 
+def available_memory() -> int:
+    """Return the bytes of memory that this process may still take without swapping, as far as the system reports."""
+    limits = [1 << 62]
+    with suppress(OSError, ValueError, AttributeError):
+        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    with suppress(OSError, StopIteration, ValueError):
+        lines = (PROC / "meminfo").read_text().splitlines()
+        limits.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
+    if (left := memory_left()) is not None:
+        limits.append(left)
+    return min(limits)
+
+
 @cache
 def processor_limit(proc: Path = PROC, mount: Path = MOUNT) -> int | None:
     """Return the processors that the CPU quotas of the cgroups and a Slurm job leave, rounded up; None without one."""

@@ -10,6 +10,8 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from .errors import InputError
+
 LIST = ".sehdr-warp"
 _LARGEST_LIST = 256 << 20
 """Bytes of a list that is read; a list of a million files has a third of it."""
@@ -56,9 +58,15 @@ def listed(folder: Path) -> set[bytes]:
 
 
 def list_file(temporary: Path, path: Path) -> None:
-    """Add a file that is about to get its name to the list of its folder, in one write, as others may add theirs."""
+    """Add a file that is about to get its name to the list of its folder, in one write, as others may add theirs.
+
+    Raises InputError if a link, a pipe or a device has the list's name.
+    """
     file, line = path.parent / LIST, hash_line(temporary, path.name) + b"\n"
-    handle = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    if os.path.lexists(file) and (file.is_symlink() or not file.is_file()):
+        raise InputError(file, "is a link, a folder, a pipe or a device, not the list of this folder", "move it away")
+    flags = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK"))  # A pipe put there now must not wait.
+    handle = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT | flags, 0o666)
     try:
         if os.write(handle, line) < len(line):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))

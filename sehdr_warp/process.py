@@ -108,6 +108,7 @@ def calm_threads() -> None:
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")  # Its warnings of ranks end in lists of C++ functions.
 
 
 def collect_late() -> None:

@@ -11,6 +11,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import (
     atomic_folder,
     atomic_path,
+    has_file,
     read_bytes,
     read_json,
     read_lines,
@@ -82,9 +83,26 @@ def test_links_devices_and_pipes_are_never_replaced(tmp_path):
         pass
     (tmp_path / LIST).unlink()
     (tmp_path / LIST).symlink_to("a.txt")
-    with pytest.raises(OSError):
-        write(tmp_path / "b.txt")
+    for make in (lambda: None, lambda: os.mkfifo(tmp_path / LIST), (tmp_path / LIST).mkdir):
+        make()
+        with pytest.raises(InputError, match="not the list of this folder"):
+            write(tmp_path / "b.txt")
+        if (tmp_path / LIST).is_dir():
+            (tmp_path / LIST).rmdir()
+        else:
+            (tmp_path / LIST).unlink()
     assert (tmp_path / "a.txt").read_text() == "whole"
+
+
+def test_what_has_the_name_of_a_file_is_not_taken_for_a_missing_one(tmp_path):
+    write(tmp_path / "file", "whole")
+    assert has_file(tmp_path / "file") and not has_file(tmp_path / "none")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("folder", "link", "pipe"):
+        with pytest.raises(InputError, match="not a file; remove it"):
+            has_file(tmp_path / name)
 
 
 def test_a_sealed_folder_tells_when_it_is_damaged(tmp_path):

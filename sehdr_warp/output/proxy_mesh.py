@@ -16,7 +16,7 @@ from ..errors import InputError, SehdrError
 from ..files import atomic_path, check_absent
 from ..progress import track_progress
 from ..scene import Camera
-from ..splats.usd import pxr
+from ..splats.usd import pxr, writing_usd
 from .camera_paths import evenly, training_cameras
 from .depth_fusion import (
     MOST_VIEWS,
@@ -128,8 +128,11 @@ def write_proxy_mesh(
     transform = world_transform(run, axes, up=up, scale=scale)
     mesh = proxy_mesh(run, transform, resolution=resolution, region=region)
     with atomic_path(path, overwrite) as temporary:
-        write = _write_obj if path.suffix.lower() == ".obj" else _write_usd
-        write(temporary, mesh, transform, run)
+        if path.suffix.lower() == ".obj":
+            _write_obj(temporary, mesh, transform, run)
+        else:
+            with writing_usd(path):
+                _write_usd(temporary, mesh, transform, run)
     log.info("%s: %d triangles, voxels of %.3g", path.name, len(mesh.faces), mesh.voxel)
     if mesh.ground is not None:
         log.info("%s", _ground_line(mesh.ground, transform))

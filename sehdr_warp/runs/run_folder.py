@@ -26,7 +26,7 @@ from typing import TypeVar
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
-from ..files import UnreadableError, refuse_links
+from ..files import UnreadableError, has_file, refuse_links
 from ..model.confidence import Evidence
 from ..response import Response
 from ..scene import Camera, Scene
@@ -85,6 +85,7 @@ class RunFolder:
         # Set after the training began: more iterations, up and scale for its files, and the unit of light.
         self.extension, self.orientation = self.path / "extension.json", self.path / "orientation.json"
         self.light_unit = self.path / "light_unit.json"
+        self.blocks = self.path / "blocks.json"
         self.metrics = self.path / "metrics.jsonl"
         self.checkpoints = self.path / "checkpoints"
         self.confidence = self.path / "confidence.safetensors"
@@ -104,10 +105,16 @@ class RunFolder:
                 raise InputError(self.path, problem, remedy)
 
     def refuse_links(self) -> None:
-        """Raise InputError if anything of a run in this folder is a link, whose target is not the run's."""
+        """Raise InputError if anything of a run in this folder is a link, whose target is not the run's.
+
+        What has the name of one of its files must be a plain file: a pipe or a device would be taken for a missing one.
+        """
         files = (self.config, self.scene, self.info, self.plan, self.summary, self.metrics, self.confidence)
-        files += (self.extension, self.orientation, self.light_unit)
-        for path in (*files, self.checkpoints, self.tensorboard, *(self.path / n for n in (".lock", NEW, READY))):
+        files += (self.extension, self.orientation, self.light_unit, self.blocks)
+        for path in files:
+            refuse_links(path, self.path)
+            has_file(path)
+        for path in (self.checkpoints, self.tensorboard, *(self.path / n for n in (".lock", NEW, READY))):
             refuse_links(path, self.path)
         for folder in (*self._checkpoint_folders(), self.path / NEW, self.path / READY):
             for place, folders, names in os.walk(folder):

@@ -12,6 +12,9 @@ MAX_SIDE = 1 << 20
 """Pixels of a side of an image that can be rendered."""
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9
 """Pixels of a focal length; beyond them single precision cannot project."""
+MAX_DISTANCE = 1e18
+"""Length of the translation of a pose, whose square a float32 must hold."""
+_WHOLE = 1 << 53  # Largest number up to which a float of JSON holds every whole number
 
 
 def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
@@ -33,6 +36,13 @@ def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ position
     return pose
+
+
+def whole_number(value: Any, name: str) -> int:
+    """Return a number of JSON that is whole; raise ValueError, naming the field, for any other value."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -_WHOLE <= value <= _WHOLE or value % 1:
+        raise ValueError(f"{name} = {value!r:.40} is not a whole number")
+    return int(value)
 
 
 class ProjectedPoints(NamedTuple):
@@ -105,8 +115,12 @@ class Camera:
         if min(self.fx, self.fy) < MIN_FOCAL or max(self.fx, self.fy) > MAX_FOCAL:
             problem = f"focal lengths ({self.fx:g}, {self.fy:g}) pixels are not between {MIN_FOCAL:g} and {MAX_FOCAL:g}"
             raise ValueError(problem)
+        if max(abs(self.cx), abs(self.cy)) > MAX_FOCAL:
+            raise ValueError(f"cx, cy = {self.cx:g}, {self.cy:g} are beyond {MAX_FOCAL:g} pixels")
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError("world_to_camera is not a finite 4 x 4 matrix")
+        if np.abs(pose[:3, 3]).max() > MAX_DISTANCE:
+            raise ValueError(f"world_to_camera moves by more than {MAX_DISTANCE:g}")
         rotation = pose[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
             raise ValueError("the rotation of world_to_camera is not a proper rotation")
@@ -182,7 +196,7 @@ class Camera:
             KeyError: if a field is missing.
             ValueError: if a value is not possible.
         """
-        width, height = (int(values[name]) for name in ("width", "height"))
+        width, height = (whole_number(values[name], name) for name in ("width", "height"))
         fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
         pose = np.array(values["world_to_camera"], dtype=np.float64)
         distortion = tuple(float(value) for value in values.get("distortion", ()))

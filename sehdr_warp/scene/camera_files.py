@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_json, read_text
-from .camera import Camera
+from .camera import Camera, whole_number
 from .colmap_model import find_model, read_model
 from .dataparser import pose_from_camera_to_world
 from .exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
@@ -43,9 +44,9 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
         cameras = _of_json(path)
     if not cameras:
         raise InputError(path, "lists no cameras", "add at least one")
-    names = [name.lower() for name, _ in cameras]
-    if len(set(names)) < len(names):
-        twice = min((name for name in names if names.count(name) > 1), key=natural_key)
+    names = Counter(name.lower() for name, _ in cameras)
+    if len(names) < len(cameras):
+        twice = min((name for name, count in names.items() if count > 1), key=natural_key)
         raise InputError(path, f"camera name {twice!r} is used twice", "give every camera its own name")
     for i, (name, camera) in enumerate(cameras):
         if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
@@ -95,7 +96,7 @@ def _list(path: Path) -> list[Any]:
 
 def _inria(entry: dict, path: Path) -> Camera:
     """Read position and rotation (rows) of camera to world in OpenCV axes, fx and fy in pixels; centred axis."""
-    width, height = int(entry["width"]), int(entry["height"])
+    width, height = (whole_number(entry[name], name) for name in ("width", "height"))
     matrix = np.c_[np.array(entry["rotation"], np.float64).reshape(3, 3), np.array(entry["position"], np.float64)]
     pose = pose_from_camera_to_world(matrix, path, str(entry["img_name"]))
     return Camera(width, height, float(entry["fx"]), float(entry["fy"]), width / 2, height / 2, pose)
@@ -103,7 +104,8 @@ def _inria(entry: dict, path: Path) -> Camera:
 
 def _nerfstudio(entry, index: int, values: dict, path: Path, back: np.ndarray | None) -> Camera:
     """Read an entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows), fov (vertical, degrees)."""
-    width, height, fov = int(values["render_width"]), int(values["render_height"]), float(entry["fov"])
+    width, height = (whole_number(values[name], name) for name in ("render_width", "render_height"))
+    fov = float(entry["fov"])
     matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
     if not 1e-6 <= fov < 180:
         raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")

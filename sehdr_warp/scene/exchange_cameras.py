@@ -6,6 +6,7 @@ and offsets of the filmback. Coordinates come back with +Y up and in meters, as 
 
 import logging
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,9 +92,10 @@ def usd_camera_arrays(path: Path) -> dict[str, Any]:
         if prim.IsA(UsdGeom.Camera) and prim.IsActive()
     ]
     stems = [prim.GetName() for prim in prims]
+    count = Counter(stems)
     names, lenses, matrices = [], [], []
     for prim, stem in zip(prims, stems, strict=True):
-        if stems.count(stem) > 1:  # Several cameras have this name, so the whole path names each.
+        if count[stem] > 1:  # Several cameras have this name, so the whole path names each.
             stem = str(prim.GetPath()).strip("/").replace("/", "_")
         camera, times = UsdGeom.Camera(prim), _sample_times(stage, prim)
         size = [(prim.GetAttribute(name).Get() if prim.HasAttribute(name) else 0) or 0 for name in USD_SIZE]
@@ -165,7 +167,10 @@ def _read_chan(path: Path) -> ExchangeCameras:
     from scipy.spatial.transform import Rotation
 
     cameras, (width, height) = [], _SIZE
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    lines = read_text(path).splitlines()
+    if len(lines) > _MOST_FRAMES:
+        raise InputError(path, f"has {len(lines)} lines, more than {_MOST_FRAMES} frames", "render it in parts")
+    for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from ..errors import InputError
-from ..files import read_bytes
+from ..files import has_file, read_bytes
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, ExifExposure, exif_exposure, parse_number
 from .images import PHOTO_SUFFIXES
@@ -137,7 +137,7 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
     places, listing = dict.fromkeys((source, *reversed(bases), *(image.parent for image in images))), Listing()
     times, notes = {}, _unread_lists(places)
     for place in places:
-        if not (place / EXPOSURES).is_file():
+        if not has_file(place / EXPOSURES):
             continue
         table = _read_times(place / EXPOSURES)
         names = _names_of(images, [*bases, place])

@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 from ..errors import InputError, did_you_mean
+from ..files import has_file
 from .colmap_model import find_model
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
 from .exposure import choose_exposure, with_exposure_times
@@ -132,7 +133,7 @@ def _read(folder: Path) -> DataparserOutputs:
     """Parse by the first layout that fits, the most specific one first."""
 
     def has(*names: str) -> bool:
-        return all((folder / name).is_file() for name in names)
+        return all(has_file(folder / name) for name in names)
 
     model = find_model(folder, anywhere=True)
     beside = model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None

@@ -13,7 +13,6 @@ import shutil
 import sys
 import tempfile
 import weakref
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 
 from ..caches import cache_folder, usable
 from ..errors import InputError
-from ..limits import memory_left
+from ..limits import available_memory
 from .types import View
 
 _LARGE = 1 << 14  # Bytes; smaller arrays are pickled
@@ -201,19 +200,6 @@ class PhotoKeeper:
         # Views are at most as large as their photos; masks and truth are floats.
         self.file = PhotoFile(max(_LEAST, 2 * size, self.pixels * _MOST_BYTES), folder)
         self.note = f"photos: {sizes}: they are read from a nameless file in {folder}, which goes with this process"
-
-
-def available_memory() -> int:
-    """Return the bytes of memory that this process may still take without swapping, as far as the system reports."""
-    limits = [1 << 62]
-    with suppress(OSError, ValueError, AttributeError):
-        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    with suppress(OSError, StopIteration, ValueError):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        limits.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
-    if (limit := memory_left()) is not None:
-        limits.append(limit)
-    return min(limits)
 
 
 def _folder() -> Path:

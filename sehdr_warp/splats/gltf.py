@@ -24,6 +24,7 @@ _FLOAT, _POINTS, _VERTICES = 5126, 0, 34962
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TYPES = {5120: ("<i1", 127), 5121: ("<u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535), _FLOAT: ("<f4", 1)}
 _DAMAGED = "export it again"
+_MOST_PARTS = 10_000  # Primitives that nodes show; each takes a fraction of a millisecond
 
 
 def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
@@ -81,12 +82,16 @@ def read_glb(path: Path) -> GaussianArrays:
     """
     described, binary = _chunks(path)
     try:
-        parts = []
+        parts, total = [], 0
         for number, matrix in _shown_meshes(described, path):
-            mesh = described["meshes"][number]
+            mesh = _item(described, "meshes", number)
             for primitive in mesh["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):
                     gaussians = _primitive(described, binary, mesh, primitive, path)
+                    total += gaussians.count
+                    if len(parts) >= _MOST_PARTS or total > len(binary):
+                        problem = f"shows {total} Gaussians, more than its {len(binary)} bytes, by nodes of one mesh"
+                        raise InputError(path, problem, "export each Gaussian once")
                     parts.append(gaussians if np.allclose(matrix, np.eye(4)) else _move(gaussians, matrix, path))
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
@@ -130,19 +135,22 @@ def _shown_meshes(described: dict, path: Path) -> list[tuple[int, np.ndarray]]:
     """Return the mesh and the world transform of each node with a mesh; of a file without nodes all meshes, unmoved."""
     nodes = described.get("nodes", [])
     parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
+    worlds: dict[int, np.ndarray] = {}
     meshes = []
     for number, node in enumerate(nodes):
         if "mesh" not in node:
             continue
-        matrix, above = _node_matrix(node), number
-        for _ in nodes:
-            if above not in parents:
-                break
+        chain, above = [number], number
+        while above in parents and above not in worlds:
             above = parents[above]
-            matrix = _node_matrix(nodes[above]) @ matrix
-        else:
-            raise InputError(path, "has nodes that hold each other", _DAMAGED)
-        meshes.append((node["mesh"], matrix))
+            chain.append(above)
+            if len(chain) > len(nodes):
+                raise InputError(path, "has nodes that hold each other", _DAMAGED)
+        for each in reversed(chain):
+            if each not in worlds:
+                above = worlds[parents[each]] if each in parents else np.eye(4)
+                worlds[each] = above @ _node_matrix(_item(described, "nodes", each))
+        meshes.append((node["mesh"], worlds[number]))
     return meshes or [(number, np.eye(4)) for number in range(len(described["meshes"]))]
 
 
@@ -188,10 +196,22 @@ def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
     return described, data[28 + length :]
 
 
+def _item(described: dict, kind: str, index: Any) -> dict:
+    """Return an element of a list of the description; raise ValueError for a number that is none of it."""
+    if type(index) is not int or not 0 <= index < len(described[kind]):
+        raise ValueError(f"{kind} has no {index!r:.20}")
+    return described[kind][index]
+
+
 def _accessor(described: dict, binary: bytes, index: int, columns: int) -> np.ndarray:
     """Return [count, columns] float32; raise ValueError or KeyError if the file is damaged."""
-    accessor = described["accessors"][index]
-    view = described["bufferViews"][accessor["bufferView"]]
+    accessor = _item(described, "accessors", index)
+    if "sparse" in accessor:
+        raise ValueError(f"accessor {index} is sparse, which is not read")
+    view = _item(described, "bufferViews", accessor["bufferView"])
+    buffer = _item(described, "buffers", view["buffer"])
+    if view["buffer"] != 0 or "uri" in buffer:
+        raise ValueError(f"buffer {view['buffer']} is not in the file")
     kind, one = _TYPES[accessor["componentType"]]
     if _WIDTHS[accessor["type"]] != columns or (one > 1 and not accessor.get("normalized")):
         raise ValueError(f"accessor {index} is {accessor['type']}")

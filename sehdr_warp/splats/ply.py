@@ -17,6 +17,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import atomic_path, plain_size
+from ..limits import available_memory
 from .arrays import LONGEST_TIME, SHORTEST_TIME, GaussianArrays, degree_of, read_matrix, warn_of_compensation
 from .compressed_ply import unpack_ply
 
@@ -27,6 +28,8 @@ _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
 _GROUPS = ("x y z", "scale_0 scale_1 scale_2", "rot_0 rot_1 rot_2 rot_3", "opacity", "f_dc_0 f_dc_1 f_dc_2")
 _MOST_HEADER = 1 << 16
+_MEMORY_PER_BYTE = 2.5
+"""Bytes of memory for each byte of a file: its columns as arrays, once by property and once by Gaussian, and checks."""
 
 
 def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
@@ -155,12 +158,20 @@ def _check_header(path: Path) -> None:
     header = read_start.partition(b"end_header")[0]
     if not header.startswith(b"ply") or size == len(header):
         raise InputError(path, "is not a PLY file", _DAMAGED)
+    _require_memory(path, path.stat().st_size)
     claimed = [int(number) for number in re.findall(rb"^element\s+\S+\s+(\d{1,19})\s*$", header, re.MULTILINE)]
     smallest = len(re.findall(rb"^property\s", header, re.MULTILINE)) if len(claimed) == 1 else 1
     if sum(claimed) * smallest > path.stat().st_size:
         raise InputError(
             path, f"claims {sum(claimed)} elements, more than its {path.stat().st_size} bytes hold", _DAMAGED
         )
+
+
+def _require_memory(path: Path, size: int) -> None:
+    """Raise InputError for a file whose Gaussians this machine has no memory for."""
+    if (needed := _MEMORY_PER_BYTE * size) > (free := available_memory()):
+        problem = f"takes about {needed / 1e9:.3g} GB of memory to read, and {free / 1e9:.3g} GB are free"
+        raise InputError(path, problem, "use a smaller file, or a machine with more memory")
 
 
 def _start(path: Path) -> bytes:

@@ -25,7 +25,9 @@ from .packing import CODES, codebook, from_smallest_three, logits, morton_order,
 
 _LARGEST_PALETTE, _PER_ENTRY, _ACROSS = 1 << 14, 2, 64  # Entries; Gaussians for each; entries side by side
 _COEFFICIENTS = (0, 3, 8, 15)  # Of degrees 0 to 3, without the constant one
-_MOST_BYTES, _MOST_PIXELS = 1 << 30, 1 << 26
+_MOST_BYTES, _MOST_PIXELS, _MOST_META = 1 << 30, 1 << 26, 1 << 24
+_SPARE_PIXELS, _PIXEL_BYTES = 1 << 20, 5
+"""Pixels of a picture beyond four for each Gaussian, and bytes that an incompressible one of them may take."""
 _DAMAGED = "export it again"
 # What a damaged file makes of its numbers, names and pictures; RuntimeError includes encrypted entries.
 _FAULTS = (KeyError, IndexError, TypeError, ValueError, OSError, AttributeError, RuntimeError, OverflowError)
@@ -114,7 +116,14 @@ def read_sog(path: Path) -> GaussianArrays:
         # Some tools pack the folder, not the files in it.
         above = next((name[: -len("meta.json")] for name in archive.namelist() if name.endswith("/meta.json")), "")
         above = "" if "meta.json" in archive.namelist() else above
-        gaussians = gaussians_of_files(lambda name: archive.read(above + name), path)
+        sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+
+        def read(name: str, limit: int) -> bytes:
+            if sizes.get(above + name, 0) > limit:
+                raise ValueError(f"{name} has {sizes[above + name]} bytes")
+            return archive.read(above + name)
+
+        gaussians = gaussians_of_files(read, path)
     warn_of_compensation(path, gaussians.compensated, "its meta.json says antialias")
     return gaussians
 
@@ -129,22 +138,27 @@ def refusing_damage(path: Path) -> Iterator[None]:
         raise InputError(path, f"is damaged SOG ({error!r:.120})", _DAMAGED) from None
 
 
-def gaussians_of_files(read: Callable[[str], bytes], path: Path) -> GaussianArrays:
-    """Return the Gaussians of a SOG of version 2; read() returns the content of a file of it, errors name `path`."""
-    meta = json.loads(read("meta.json"))
+def gaussians_of_files(read: Callable[[str, int], bytes], path: Path) -> GaussianArrays:
+    """Return the Gaussians of a SOG of version 2; errors name `path`.
+
+    read() returns the content of a file of it, and raises for one of more bytes than its second argument.
+    """
+    meta = json.loads(read("meta.json", _MOST_META))
     if meta.get("version") != 2:
         problem = f"is SOG of version {meta.get('version', 1)!r:.20}"
         raise InputError(path, problem, "version 2 is read; save it as that with SplatTransform, or as PLY")
     return _gaussians(read, meta, path)
 
 
-def _gaussians(read: Callable[[str], bytes], meta: dict[str, Any], path: Path) -> GaussianArrays:
+def _gaussians(read: Callable[[str, int], bytes], meta: dict[str, Any], path: Path) -> GaussianArrays:
     count = int(meta["count"])
     if not 0 < count <= _MOST_PIXELS:
         raise ValueError(f"count {count}")
 
+    most = min(_MOST_PIXELS, 4 * count + _SPARE_PIXELS)
+
     def texels(part: str, index: int = 0) -> np.ndarray:
-        values = _picture(read, meta[part]["files"][index]).reshape(-1, 4)
+        values = _picture(read, meta[part]["files"][index], most).reshape(-1, 4)
         if len(values) < count:
             raise ValueError(f"{part} has {len(values)} texels for {count} Gaussians")
         return values[:count]
@@ -168,7 +182,7 @@ def _gaussians(read: Callable[[str], bytes], meta: dict[str, Any], path: Path) -
     harmonics[:, 0] = levels("sh0")[color[:, :3]]
     if degree:
         columns = texels("shN", 1).astype(int)
-        entries = _picture(read, meta["shN"]["files"][0])
+        entries = _picture(read, meta["shN"]["files"][0], _SPARE_PIXELS)
         entries = entries.reshape(len(entries) * _ACROSS, _COEFFICIENTS[degree], 4)[..., :3]
         harmonics[:, 1:] = levels("shN")[entries[columns[:, 0] + 256 * columns[:, 1]]]
     return GaussianArrays(
@@ -184,9 +198,10 @@ def _gaussians(read: Callable[[str], bytes], meta: dict[str, Any], path: Path) -
     )
 
 
-def _picture(read: Callable[[str], bytes], name: str) -> np.ndarray:
-    with Image.open(io.BytesIO(read(name)), formats=["WEBP", "PNG"]) as image:
-        if image.width * image.height > _MOST_PIXELS:
+def _picture(read: Callable[[str, int], bytes], name: str, most: int) -> np.ndarray:
+    """Return the texels [H, W, 4] of a picture of at most `most` pixels."""
+    with Image.open(io.BytesIO(read(name, _PIXEL_BYTES * most)), formats=["WEBP", "PNG"]) as image:
+        if image.width * image.height > most:
             raise ValueError(f"{name} has {image.width} x {image.height} pixels")
         return np.asarray(image.convert("RGBA"))
 

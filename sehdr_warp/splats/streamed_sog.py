@@ -72,7 +72,11 @@ def read_streamed_sog(path: Path) -> GaussianArrays:
             if chunk in chunks:
                 raise ValueError("a chunk is listed twice")
             folder = chunk.parent
-            gaussians = gaussians_of_files(lambda name, folder=folder: read_bytes(contained(folder, name, path)), chunk)
+
+            def read(name: str, limit: int, folder: Path = folder) -> bytes:
+                return read_bytes(contained(folder, name, path), limit)
+
+            gaussians = gaussians_of_files(read, chunk)
             chunks[chunk] = gaussians.rows(_rows(ranges, gaussians.count))
         if not chunks:
             raise ValueError("no node has Gaussians of level 0")

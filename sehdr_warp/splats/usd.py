@@ -4,6 +4,8 @@ As in 3D Gaussian Splatting, which the schema stands for, a color is max(sum + 0
 radiance less 0.5. Coefficients of a Gaussian stand side by side; scales are linear and opacities in [0, 1].
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,23 +43,28 @@ def open_stage(path: Path) -> Any:
 
 def write_usd(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     """Write a .usda, .usdc or .usdz file; arguments as in write_gaussians."""
-    Sdf, Tf = pxr("Sdf"), pxr("Tf")
     packed = path.suffix.lower() == ".usdz"
-    with atomic_path(path, overwrite) as temporary:
+    with atomic_path(path, overwrite) as temporary, writing_usd(path):
         layer = temporary.with_suffix(".usdc") if packed else temporary
         try:
             _write_stage(layer, gaussians)
-            package = pxr("UsdUtils").CreateNewUsdzPackage
-            if packed and not package(Sdf.AssetPath(str(layer)), str(temporary), "splats.usdc"):
+            package, asset = pxr("UsdUtils").CreateNewUsdzPackage, pxr("Sdf").AssetPath(str(layer))
+            if packed and not package(asset, str(temporary), "splats.usdc"):
                 raise SehdrError(f"{path}: cannot be packed as USDZ; write .usdc instead")
-        except Tf.ErrorException as error:
-            reason = " ".join(str(error).split())
-            raise SehdrError(
-                f"{path}: cannot be written ({reason:.160}); free space or choose another folder"
-            ) from None
         finally:
             if packed:
                 layer.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing_usd(path: Path) -> Iterator[None]:
+    """Turn OpenUSD's errors while `path` is written (a full disk) into a SehdrError of one line."""
+    errors = pxr("Tf").ErrorException
+    try:
+        yield
+    except errors as error:
+        reason = " ".join(str(error).split())
+        raise SehdrError(f"{path}: cannot be written ({reason:.160}); free space or choose another folder") from None
 
 
 def _write_stage(path: Path, gaussians: GaussianArrays) -> None:

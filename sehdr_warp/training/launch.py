@@ -23,6 +23,8 @@ from ..errors import InputError, SehdrError
 
 FILE_STORE = "SEHDR_RANKS"
 """Environment variable with the file through which the ranks of --gpus find each other."""
+_MOST_RANKS = 1 << 14
+"""Processes of a training; the server of the ranks takes memory for each that is announced."""
 GRACE = 5.0  # Seconds that other ranks have to end after one has ended, and again after SIGTERM
 
 
@@ -72,24 +74,38 @@ class RankInfo:
 
 
 def rank_from_environment() -> RankInfo | None:
-    """Return the info that a launcher sets for this process; None if there is no launcher, or one process."""
+    """Return the info that a launcher sets for this process; None if there is no launcher, or one process.
+
+    Raises SehdrError for numbers that no launcher sets.
+    """
 
     def number(name: str, default: int) -> int:
         with suppress(KeyError, ValueError):
             return int(os.environ[name])
         return default
 
-    try:
-        rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-    except (KeyError, ValueError):
+    if not {"RANK", "WORLD_SIZE"} <= os.environ.keys():
         return None
+    rank, count = number("RANK", -1), number("WORLD_SIZE", 0)
+    _check_number("WORLD_SIZE", count, 1, _MOST_RANKS)
+    _check_number("RANK", rank, 0, count - 1)
     local_count = number("LOCAL_WORLD_SIZE", count)
+    _check_number("LOCAL_WORLD_SIZE", local_count, 1, count)
     local_rank, node = number("LOCAL_RANK", rank % local_count), number("GROUP_RANK", rank // local_count)
     nodes = number("GROUP_WORLD_SIZE", -(-count // local_count))
+    _check_number("LOCAL_RANK", local_rank, 0, local_count - 1)
     if nodes * local_count != count:
         problem = f"{count} ranks on {nodes} nodes, and {local_count} on this one"
         raise SehdrError(f"{problem}: start as many on each, with --nproc-per-node")
+    _check_number("GROUP_RANK", node, 0, nodes - 1)
     return RankInfo(rank, count, local_rank, local_count, node, nodes) if count > 1 else None
+
+
+def _check_number(name: str, value: int, least: int, most: int) -> None:
+    """Raise SehdrError if an environment variable of a launcher is not a number from `least` to `most`."""
+    if not least <= value <= most:
+        problem = f"{name} = {os.environ.get(name, value)!s:.40} is not a number from {least} to {most}"
+        raise SehdrError(f"{problem}: start with torchrun or --gpus, or unset RANK")
 
 
 def installed_versions() -> str:
@@ -131,6 +147,8 @@ def open_store(info: RankInfo, patience: float) -> dist.Store:
         problem = f"RANK and WORLD_SIZE are set, and {' and '.join(missing)} not"
         raise SehdrError(f"{problem}: start with torchrun or --gpus, or unset RANK")
     host, port = os.environ["MASTER_ADDR"], os.environ["MASTER_PORT"]
+    if not (port.isascii() and port.isdigit() and 0 < int(port[:9]) < 1 << 16):
+        raise SehdrError(f"MASTER_PORT = {port:.40} is not a port from 1 to 65535: start with torchrun, or unset RANK")
     of_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     serves = info.rank == 0 and not of_agent
     try:

@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 
 TIMEOUT = "SEHDR_RANK_TIMEOUT"
 LONGEST_SILENCE = 600.0  # Seconds that a step of another rank may take; the environment variable above overrides it
+_SHORTEST_SILENCE = 0.1
 GO, WAIT, END = 2, 1, 0
 _EVER = timedelta(days=30)  # Disables torch's own timeouts, which end a process with long stack traces
 _POLL = 0.1
@@ -312,9 +313,17 @@ class Ranks:
 
 
 def patience() -> float:
-    """Return the seconds that another rank may be silent."""
-    timeout = os.environ.get(TIMEOUT, "")
-    return float(timeout) if timeout.replace(".", "", 1).isdigit() else LONGEST_SILENCE
+    """Return the seconds that another rank may be silent; raise SehdrError for a value that is not a number of them."""
+    if not (timeout := os.environ.get(TIMEOUT, "")):
+        return LONGEST_SILENCE
+    try:
+        seconds = float(timeout)
+    except ValueError:
+        seconds = 0.0
+    if not _SHORTEST_SILENCE <= seconds <= _EVER.total_seconds():
+        least, most = _SHORTEST_SILENCE, _EVER.total_seconds()
+        raise SehdrError(f"{TIMEOUT} = {timeout:.40} is not a number of seconds from {least:g} to {most:g}: correct it")
+    return seconds
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.wide_camera import pixel_directions
 
+from ..full_disk import full_disk
 from .helpers import AnalyticRun, Entry, Rendered
 
 pytest.importorskip("skimage")
@@ -230,3 +231,10 @@ def test_files_are_not_replaced(tmp_path):
     (tmp_path / "proxy.obj").write_text("mine")
     with pytest.raises(InputError):
         write_proxy_mesh(BallOnFloor(), tmp_path / "proxy.obj")
+
+
+def test_a_full_disk_ends_in_one_line(tmp_path):
+    pytest.importorskip("pxr")
+    with pytest.raises(SehdrError, match="proxy.usdc: cannot be written") as caught, full_disk():
+        write_proxy_mesh(BallOnFloor(), tmp_path / "proxy.usdc", resolution=48)
+    assert "\n" not in str(caught.value) and not any(tmp_path.iterdir())

@@ -32,6 +32,18 @@ def test_nerfstudio_paths_come_back_from_the_dataparsers_space(tmp_path, logged)
         nerfstudio(tmp_path, POSE)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("width", 8.5), ("width", True), ("width", "8"), ("cx", 1e300), ("world_to_camera", 1e300)]
+)
+def test_numbers_that_cannot_be_are_refused(tmp_path, name, value):
+    moved = [[1, 0, 0, value], *np.eye(4).tolist()[1:]]
+    camera = {"width": 8, "height": 8, "fx": 9, "fy": 9, "cx": 4, "cy": 4, "world_to_camera": POSE.tolist()}
+    values = camera | {name: moved if name == "world_to_camera" else value}
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": [values]}))
+    with pytest.raises(InputError, match=f"camera 0 cannot be used.*{name}"):
+        load_cameras(tmp_path / "cameras.json")
+
+
 def test_a_colmap_model_is_a_camera_file(tmp_path):
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)

@@ -160,6 +160,37 @@ BAD = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (("accessors", 0, "bufferView"), -1, "bufferViews has no -1"),
+        (("accessors", 0, "sparse"), {"count": 1}, "accessor 0 is sparse"),
+        (("buffers", 0, "uri"), "scene.bin", "buffer 0 is not in the file"),
+        (("nodes",), [{"mesh": 0}] * 100_000, "Gaussians, more than its .* bytes"),
+    ],
+)
+def test_glb_that_says_what_is_not_read_is_refused(tmp_path, place, value, words):
+    write_gaussians(tmp_path / "a.glb", gaussians(degree=0, color_model="display"))
+    data = (tmp_path / "a.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = at = json.loads(data[20 : 20 + length])
+    for key in place[:-1]:
+        at = at[key]
+    at[place[-1]] = value
+    text = json.dumps(tree).encode()
+    head = struct.pack("<5I", 0x46546C67, 2, 0, len(text), 0x4E4F534A)
+    (tmp_path / "b.glb").write_bytes(head + text + data[20 + length :])
+    with pytest.raises(InputError, match=words):
+        read_gaussians(tmp_path / "b.glb")
+
+
+def test_ply_larger_than_the_memory_is_refused_unread(tmp_path, monkeypatch):
+    write_gaussians(tmp_path / "a.ply", gaussians(degree=0, color_model="display"))
+    monkeypatch.setattr("sehdr_warp.splats.ply.available_memory", lambda: 1000)
+    with pytest.raises(InputError, match="GB of memory to read"):
+        read_gaussians(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_refused_in_one_line(tmp_path, name):
     if name.endswith(".usda"):

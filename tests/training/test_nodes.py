@@ -17,7 +17,8 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder, describe_scene
 from sehdr_warp.training.following import _check_same_photos
-from sehdr_warp.training.launch import RankInfo, rank_from_environment
+from sehdr_warp.training.launch import RankInfo, open_store, rank_from_environment
+from sehdr_warp.training.ranks import patience
 
 from ..refusals import call
 from .toy import toy_scene
@@ -146,3 +147,33 @@ def test_nodes_start_as_many_processes_each(monkeypatch):
         rank_from_environment()
     monkeypatch.setenv("GROUP_WORLD_SIZE", "3")
     assert rank_from_environment() == RankInfo(2, 3, 0, 1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("RANK", value) for value in ("x", "3", "-1")),
+        *(("WORLD_SIZE", value) for value in ("0", "1000000000")),
+        *(("LOCAL_WORLD_SIZE", "0"), ("LOCAL_RANK", "7"), ("GROUP_RANK", "-1")),
+    ],
+)
+def test_numbers_that_no_launcher_sets_are_refused(monkeypatch, name, value):
+    for each, number in {"RANK": "1", "WORLD_SIZE": "3", name: value}.items():
+        monkeypatch.setenv(each, number)
+    with pytest.raises(SehdrError, match=f"{name} = {value} is not a number from"):
+        rank_from_environment()
+
+
+@pytest.mark.parametrize("port", ["x", "0", "99999", "9" * 5000])
+def test_ports_that_cannot_be_are_refused(monkeypatch, port):
+    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
+    monkeypatch.setenv("MASTER_PORT", port)
+    with pytest.raises(SehdrError, match="is not a port from 1 to 65535"):
+        open_store(RankInfo.on_one_node(0, 2), 1.0)
+
+
+@pytest.mark.parametrize("seconds", ["nan", "-1", "x", "inf"])
+def test_times_that_cannot_be_are_refused(monkeypatch, seconds):
+    monkeypatch.setenv("SEHDR_RANK_TIMEOUT", seconds)
+    with pytest.raises(SehdrError, match=f"SEHDR_RANK_TIMEOUT = {seconds} is not a number of seconds"):
+        patience()
