@@ -162,7 +162,12 @@ def zero_surface(distance: np.ndarray, has_depth: np.ndarray, voxel: np.ndarray)
         raise SehdrError("there is no surface to mesh; take another --crop, or train longer") from None
     vertices, faces = surface[:2]
     finite = np.isfinite(vertices).all(axis=1)
-    return vertices, faces[finite[faces].all(axis=1)]
+    faces = faces[finite[faces].all(axis=1)]
+    # Blender calls a mesh invalid whose triangles have a corner twice, or are there twice.
+    corners = np.sort(faces, axis=1)
+    once = np.zeros(len(faces), bool)
+    once[np.unique(corners, axis=0, return_index=True)[1]] = True
+    return vertices, faces[once & (np.diff(corners, axis=1) > 0).all(axis=1)]
 
 
 def marching_cubes_function() -> Any:

@@ -367,5 +367,6 @@ def _ending(path: Path, summary: dict) -> str:
     cameras = "" if scores else " --cameras train"
     return f"""{path}: {result}, {summary["train_seconds"]:.1f} s on {summary["device"]}
 look at it:         sehdr-warp view {run}
+page to send:       sehdr-warp export {run} --out scene.html
 exposure brackets:  sehdr-warp render {run} --out {views}{cameras} --evs=-4,-2,0,2,4
 pictures, splats:   sehdr-warp report {run} --out {report};  sehdr-warp export {run} --out scene.ply"""

@@ -95,7 +95,7 @@ for index, normal in enumerate(facts["normals"]):
     render(scene, f"lit_{index}.exr", (8, 8))
 
 scene = reset()
-for name in ("splats.glb", "splats.usdc"):
+for name in ("splats.glb", "splats.usdc", "proxy.usdc"):
     if (folder / name).exists():
         load = bpy.ops.import_scene.gltf if name.endswith("glb") else bpy.ops.wm.usd_import
         report[name] = sorted(load(filepath=str(folder / name)))

@@ -14,6 +14,7 @@ import pytest
 from sehdr_warp.output.environment_map import latlong, solid_angles
 from sehdr_warp.output.export import export
 from sehdr_warp.output.exr import exr_header, rgb_channels, write_exr
+from sehdr_warp.output.proxy_mesh import write_proxy_mesh
 from sehdr_warp.output.render_views import render_views, select_cameras
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.scene.hdr_files import read_hdr
@@ -52,6 +53,10 @@ def opened(tmp_path_factory):
     scene = run_of(folder, splats([(0, 0, 0), (1, 0, 0)], [0.9, 0.5]))
     for name in ("splats.glb", "splats.usdc"):
         export(scene, folder / name)
+    if importlib.util.find_spec("skimage"):
+        from .test_proxy_mesh import BallOnFloor
+
+        write_proxy_mesh(BallOnFloor(), folder / "proxy.usdc", resolution=48)
     facts = {"points": points.tolist(), "radius": RADIUS, "frames": FRAMES, "size": SIZE, "normals": NORMALS}
     (folder / "facts.json").write_text(json.dumps(facts))
     script = Path(__file__).with_name("blender_script.py")
@@ -102,6 +107,7 @@ def test_a_map_lights_as_it_should(opened):
 def test_files_are_imported_without_warnings(opened):
     _, report, output, *_ = opened
     assert report["splats.glb"] == report["splats.usdc"] == ["FINISHED"]
+    assert report.get("proxy.usdc", ["FINISHED"]) == ["FINISHED"]
     assert report["picture"]["size"] == list(SIZE) and "Rec.709" in report["picture"]["space"]
     lines = [line for line in output.splitlines() if "warning" in line.lower() or "error" in line.lower()]
     assert [line for line in lines if "blender_script.py" not in line] == []  # Of the script itself

@@ -105,6 +105,14 @@ def test_no_triangle_is_without_area():
     assert len(faces) > 500 and np.linalg.norm(np.cross(second - first, third - first), axis=1).min() > 1e-6
 
 
+def test_each_triangle_is_there_once():
+    """Thin walls of distances that are exactly 0 have a triangle from either side."""
+    distance = np.random.default_rng(0).integers(-1, 2, (14, 14, 14)).astype(float)
+    corners = np.sort(zero_surface(distance, np.ones(distance.shape, bool), np.ones(3))[1], axis=1)
+    assert len(corners) > 500 and len(np.unique(corners, axis=0)) == len(corners)
+    assert (np.diff(corners, axis=1) > 0).all()
+
+
 def test_the_floor_is_found_and_a_tilt_of_it(mesh):
     assert mesh.ground is not None
     assert mesh.ground.height == pytest.approx(FLOOR, abs=0.3 * mesh.voxel) and mesh.ground.tilt < 0.5
