@@ -31,6 +31,7 @@ DEVIATION = 0.05
 """Standard deviation of the logarithm of decoded light: 8 bits of map and photo, and a map of fewer pixels."""
 _HEAD_BYTES = 1 << 18  # In which a file names a second picture: behind EXIF and a profile
 _ISO_JPEG = b"urn:iso:std:iso:ts:21496:-1\0"
+_HDRGM = "http://ns.adobe.com/hdr-gain-map/1.0/"
 _APPLE_AUX = "urn:com:apple:photo:2020:aux:hdrgainmap"
 _MOST_XMP = 1 << 22  # Bytes that describe a gain map; phones write about a thousand
 _MOST_STOPS = 16.0  # Between white and the largest light; encoders state 1 to 6
@@ -147,7 +148,7 @@ def _of_jpeg(path: Path) -> GainMap | None:
         photo, exif = image.size, exif_of(image)
         for second in _further_pictures(image, path):
             iso = next((data for _, data in getattr(second, "applist", ()) if data.startswith(_ISO_JPEG)), None)
-            xmp = _text(second.info.get("xmp", b""))
+            xmp = _with_usual_prefix(_text(second.info.get("xmp", b"")))
             if iso is not None and len(iso) > len(_ISO_JPEG) + 4:
                 make = _of_iso(iso[len(_ISO_JPEG) :])
             elif "hdrgm:" in xmp:
@@ -240,6 +241,12 @@ def _pixels(image: Image.Image, photo: tuple[int, int]) -> np.ndarray:
     image = image if image.mode in ("L", "RGB") else image.convert("RGB")
     values = np.asarray(image)
     return (values.reshape(*values.shape[:2], -1) / np.float32(255)).astype(np.float32)
+
+
+def _with_usual_prefix(xmp: str) -> str:
+    """Return XMP whose names of Adobe's gain map begin with `hdrgm:`, whatever prefix it binds to their namespace."""
+    bound = re.search(rf"""xmlns:(\w{{1,40}})\s*=\s*["']{re.escape(_HDRGM)}["']""", xmp)
+    return xmp if bound is None or bound[1] == "hdrgm" else re.sub(rf"\b{bound[1]}:", "hdrgm:", xmp)
 
 
 def _text(data: Any) -> str:

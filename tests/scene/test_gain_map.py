@@ -74,7 +74,10 @@ def hdrgm(**more):
     return xmp_segment(fields | {"HDRCapacityMax": str(STOPS)} | more)
 
 
-@pytest.mark.parametrize("segment", [iso_segment(), hdrgm()], ids=["iso", "xmp"])
+OTHER_PREFIX = 0xFFE1, hdrgm()[1].replace(b"hdrgm:", b"gm:").replace(b"xmlns:hdrgm", b"xmlns:gm")
+
+
+@pytest.mark.parametrize("segment", [iso_segment(), hdrgm(), OTHER_PREFIX], ids=["iso", "xmp", "xmp by another prefix"])
 def test_gain_maps_in_jpeg(tmp_path, segment):
     light, base, gain = pair()
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [segment])
