@@ -282,6 +282,8 @@ def _contradictions(config: Config) -> Iterator[str]:
     learned, display = config.response.name == "learned", model.radiance == "display"
     if fusion.enabled and len(fusion.exposures) < 2:
         yield f"fusion.exposures = {list(fusion.exposures)} is too few; a fusion needs two or more"
+    if repeated := [text for text in dict.fromkeys(fusion.exposures) if fusion.exposures.count(text) > 1]:
+        yield f"fusion.exposures = {list(fusion.exposures)} has {repeated[0]} more than once; give each exposure once"
     if display:
         for path in ("fusion.enabled", "loss.linear_weight", "loss.hdr_weight"):
             if value := attrgetter(path)(config):

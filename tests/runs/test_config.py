@@ -190,6 +190,7 @@ def test_base_and_overrides(tmp_path):
         ({"model.radiance": "display", "fusion.enabled": True}, "fusion.enabled = True needs radiance"),
         ({"model.radiance": "display", "loss.hdr_weight": 1.0}, r"loss.hdr_weight = 1\.0 needs radiance"),
         ({"fusion.enabled": True, "fusion.exposures": ["1x"]}, "two or more"),
+        ({"fusion.exposures": ["1/8x", "1x", "1/8x"]}, "1/8x more than once"),
         ({"response.name": "learned", "fusion.enabled": True}, "fusion.enabled = .* needs a known response"),
         ({"response.name": "learned", "model.radiance": "display"}, "model.radiance = .* needs a known response"),
         ({"loss.anchor_weight": 0.5}, r'anchor_weight = 0\.5 has no effect: needs response.name = "learned"'),
