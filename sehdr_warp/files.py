@@ -245,7 +245,7 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
     """Check before the work that a file or folder can be written; arguments as in atomic_path.
 
     Raises:
-        InputError: If a file, or a folder that is not empty, would have to be replaced without leave or is not this
+        InputError: If a file, or a folder that is not empty, would be replaced without permission or is not this
             program's, or if something else is in the way.
         SehdrError: If it cannot be written.
     """

@@ -49,7 +49,7 @@ class Evidence:
 
     @property
     def contributes(self) -> Tensor:
-        """[N] bool, whether a Gaussian changes any photo by more than an 8-bit code, summed over its pixels."""
+        """Mask [N] of the Gaussians that change any photo by more than an 8-bit code, summed over its pixels."""
         return self.peak > MIN_CONTRIBUTION
 
     def rows(self, index: Tensor) -> "Evidence":

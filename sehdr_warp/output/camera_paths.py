@@ -235,7 +235,7 @@ def _check(cameras: Sequence[Camera], count: int) -> None:
         remedy = "give a file of cameras, or a file of Gaussians beside its cameras.json (export --cameras)"
         raise SehdrError(f"{problem}; {remedy}")
     if not 1 <= count <= _LONGEST:
-        raise SehdrError(f"a camera path of {count} views cannot be; ask for a count of 1 to {_LONGEST}")
+        raise SehdrError(f"a camera path cannot have {count} views; ask for a count of 1 to {_LONGEST}")
 
 
 def _positions(cameras: Sequence[Camera]) -> np.ndarray:
@@ -243,7 +243,7 @@ def _positions(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _axes(cameras: Sequence[Camera], axis: int) -> np.ndarray:
-    """[n, 3] the cameras' x, y or z axes in world coordinates."""
+    """Return the cameras' x, y or z axes [n, 3] in world coordinates."""
     return np.stack([camera.world_to_camera[axis, :3] for camera in cameras])
 
 
@@ -253,7 +253,7 @@ def _unit(vector: np.ndarray, *, fallback: np.ndarray) -> np.ndarray:
 
 
 def look_at_pose(position: np.ndarray, focus: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """[4, 4] camera to world, OpenCV axes."""
+    """Return the pose [4, 4] of a camera that looks at a focus: camera to world, OpenCV axes."""
     forward = _unit(focus - position, fallback=np.array([0.0, 0, 1]))
     right = _unit(np.cross(forward, up), fallback=np.linalg.svd(forward[None])[2][1])
     pose = np.eye(4)

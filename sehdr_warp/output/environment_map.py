@@ -107,7 +107,7 @@ def write_environment_map(
         if value not in allowed:
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")
     if size < 16 or size % 2 or size > _LARGEST:
-        raise SehdrError(f"size {size} cannot be; give an even number of pixels from 16 to {_LARGEST}")
+        raise SehdrError(f"size {size} is not usable; give an even number of pixels from 16 to {_LARGEST}")
     color_space(colorspace)
     transform = world_transform(run, axes, up=up, scale=scale)
     exposure = exposure_of_white(run, reference_white)
@@ -344,7 +344,7 @@ def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], tra
         name = at.partition(":")[2]
         if name not in cameras:
             some = ", ".join(list(cameras)[:5])
-            raise SehdrError(f"camera {name!r} is none of the scene's ({some} ...); see scene.json of the run")
+            raise SehdrError(f"camera {name!r} is not one of the scene's ({some} ...); see scene.json of the run")
         return cameras[name].position
     try:
         position = np.array([float(v) for v in (at.split(",") if isinstance(at, str) else at)])

@@ -89,7 +89,7 @@ def export(
     if path.name == STREAMED_SOG:
         check_absent(path.parent, overwrite, folder=True)
         if cameras:
-            raise InputError(path, "takes its folder for itself, without cameras", "leave --cameras out")
+            raise InputError(path, "fills its folder, which has no place for cameras", "leave --cameras out")
     for file in (path, *[beside] * cameras):
         check_absent(file, overwrite)  # Before minutes of fitting.
     if axes is None:
@@ -158,7 +158,7 @@ def _check(path: Path, kind: str, file_model: str | None, exposure_time: float |
     if exposure_time is not None and not 0 < exposure_time < math.inf:
         raise SehdrError(f"exposure time {exposure_time:g} is not positive and finite; give seconds")
     if degree is not None and not 0 <= degree <= 3:
-        raise SehdrError(f"harmonics of degree {degree} cannot be; give 0 to 3")
+        raise SehdrError(f"harmonics of degree {degree} are not supported; give 0 to 3")
 
 
 def loss_in_words(decibels: float) -> str:

@@ -122,7 +122,7 @@ def write_proxy_mesh(
 
     Raises:
         InputError: For an unknown suffix, or if the file exists.
-        SehdrError: If scikit-image or OpenUSD is missing, for values that cannot be, or if there is no surface.
+        SehdrError: If scikit-image or OpenUSD is missing, for values out of range, or if there is no surface.
     """
     path, region = Path(path), check_mesh(path, resolution, crop, overwrite)
     transform = world_transform(run, axes, up=up, scale=scale)

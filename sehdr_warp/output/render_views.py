@@ -206,7 +206,7 @@ def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
     except (ValueError, TypeError):
         width = height = 0
     if min(width, height) < 1 or width * height > MAX_PIXELS:
-        raise SehdrError(f"size {size!r} cannot be; write width and height in pixels, such as 1920x1080")
+        raise SehdrError(f"size {size!r} is not usable; write width and height in pixels, such as 1920x1080")
     return width, height
 
 

@@ -119,7 +119,7 @@ def world_transform(
         scale: Meters for each unit of the scene; None for the one kept with the run, that of the photos' GPS, or 1.
 
     Raises:
-        SehdrError: For values that cannot be, or options that exclude each other.
+        SehdrError: For values out of range, or options that exclude each other.
     """
     if axes not in AXES:
         raise SehdrError(f"axes {axes!r} is not one of {', '.join(AXES)}")

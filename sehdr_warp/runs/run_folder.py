@@ -157,7 +157,7 @@ class RunFolder:
             return config
         iterations = self._read(self.extension, read_object).get("iterations")
         if not isinstance(iterations, int) or iterations < config.schedule.iterations:
-            raise InputError(self.extension, f"iterations = {iterations!r:.40} cannot be", REMEDY)
+            raise InputError(self.extension, f"iterations = {iterations!r:.40} is not usable", REMEDY)
         return override_config(config, {"schedule.iterations": iterations})
 
     def read_info(self) -> dict:

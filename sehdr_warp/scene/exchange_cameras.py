@@ -179,7 +179,7 @@ def _read_chan(path: Path) -> ExchangeCameras:
             problem = f"line {number} is not frame, 3 coordinates, 3 angles and the vertical field of view"
             raise InputError(path, problem, "export the camera with its field of view") from None
         if not (0 < fov < 180 and math.isfinite(x + y + z + rx + ry + rz) and abs(frame) < 1e9):
-            problem = f"line {number} has field of view {fov:g} or coordinates that cannot be"
+            problem = f"line {number} has field of view {fov:g} or coordinates out of range"
             raise InputError(path, problem, "export the camera again")
         matrix = np.eye(4)
         angles = {"x": rx, "y": ry, "z": rz}

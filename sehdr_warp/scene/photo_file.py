@@ -199,7 +199,9 @@ class PhotoKeeper:
             raise InputError(folder, f"{sizes}, and {_gigabytes(disk)} of this disk", remedy)
         # Views are at most as large as their photos; masks and truth are floats.
         self.file = PhotoFile(max(_LEAST, 2 * size, self.pixels * _MOST_BYTES), folder)
-        self.note = f"photos: {sizes}: they are read from a nameless file in {folder}, which goes with this process"
+        self.note = (
+            f"photos: {sizes}: they are read from a nameless file in {folder}, which is deleted when this process ends"
+        )
 
 
 def _folder() -> Path:

@@ -128,7 +128,7 @@ def noisy(exposure: np.ndarray, saturation: float, noise: SensorNoise, rng: np.r
 
 
 def _recolor(scene: Scene, views: Sequence[View]) -> np.ndarray:
-    """[P, 3] float32 colors of the points in the new photos."""
+    """Return the colors [P, 3] float32 of the points in the new photos."""
     colors = scene.point_colors.astype(np.float32)
     nearest = np.full(len(colors), np.inf)
     for old, new in zip(scene.views, views, strict=True):
@@ -186,7 +186,7 @@ def truth_path(folder: Path, split: str, place: int) -> Path:
 
 
 def write_radiance(path: Path, radiance: np.ndarray, **options) -> None:
-    """[H, W, 3] as OpenEXR; options: as write_exr takes them."""
+    """Write [H, W, 3] as OpenEXR; options are those of write_exr."""
     write_exr(path, dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True)), overwrite=True, **options)
 
 

@@ -218,7 +218,7 @@ def check_fields(scene: Scene, config: Config) -> None:
 def _response(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     name = config.response.name
     if facts.light_known:
-        return Decision({}, "no search", "the photos hold light itself")
+        return Decision({}, "no search", "the photos state light, not codes of a curve")
     if name != "auto":
         return Decision({}, "no search", "learned with the scene" if name == "learned" else f"response.name is {name}")
     origin = "files of a camera" if facts.from_camera else "files of unknown origin"
@@ -236,7 +236,7 @@ def _light(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
             f"{facts.clipped:.1%} of the pixels are clipped",
         )
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
-    reason = f"{facts.truths} float pictures hold all light: behind a photo's curve the brightest would hardly count"
+    reason = f"{facts.truths} float pictures have any brightness: on a photo's curve, bright errors would weigh little"
     return Decision(fields, "in the mu-law", reason)
 
 
@@ -250,7 +250,7 @@ def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Decisi
         return Decision({}, "plain scaling", reason)
     unfused: dict[str, object] = {"fusion.enabled": False}
     unfused |= {} if config.loss.hdr_truth and facts.truths else {"loss.linear_weight": 0.0}
-    reason = f"{len(config.fusion.exposures)} brackets of one base hold no light of their own; {reason}"
+    reason = f"{len(config.fusion.exposures)} brackets computed from one base add no light; {reason}"
     return Decision(unfused, "plain scaling", reason)
 
 
@@ -260,7 +260,7 @@ def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Dec
         return Decision({}, "none", f"loss.linear_weight = 0; {truths}")
     if config.loss.hdr_truth and facts.truths:
         return Decision({}, "against truth", truths)
-    return Decision({"loss.linear_weight": 0.0}, "none", f"{truths}: against its own brackets a base learns nothing")
+    return Decision({"loss.linear_weight": 0.0}, "none", f"{truths}: its own brackets would teach the base nothing")
 
 
 def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
@@ -278,7 +278,9 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> D
         choice = f"mcmc, growing to at most {most} Gaussians" if start < most else "mcmc without growth"
         if facts.around:
             fields["mcmc.prune_near_angle"] = PRUNE_NEAR_ANGLE
-            reason += "; the cameras look all around from within, where wide Gaussians would veil them"
+            reason += (
+                "; the cameras look all around from within, where wide Gaussians near them would cover the picture"
+            )
         return Decision(fields, choice, f"{reason}; {start} to start with")
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.cap_max, max(most, 2 * facts.points))

@@ -276,7 +276,7 @@ class Ranks:
         except RuntimeError as error:
             time.sleep(_GRACE)
             log.debug("%s", error)
-            raise RanksLost(f"{self.info} lost another, which has ended: {ENDING}") from error
+            raise RanksLost(f"{self.info} cannot reach another rank, which has ended: {ENDING}") from error
 
     def _check_versions(self) -> None:
         """Raise SehdrError if a rank runs other versions of packages."""

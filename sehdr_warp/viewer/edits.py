@@ -70,7 +70,7 @@ class LightGains:
             stops: Gain of each light that has one, by its index.
 
         Raises:
-            SehdrError: For a gain that cannot be, or a model whose lights cannot be scaled.
+            SehdrError: For a gain out of range, or a model whose lights cannot be scaled.
         """
         model = run.field
         if model.color_model.encoded or model.fusion is not None:

@@ -93,7 +93,7 @@ class LiveTraining(ViewerScene):
     def control(self, what: str) -> None:
         """Pause, resume, or make one step and then pause."""
         if what not in ("pause", "resume", "step"):
-            raise ValueError(f"{what!r} is none of pause, resume, step")
+            raise ValueError(f"{what!r} is not one of pause, resume, step")
         self.paused = what != "resume"
         self._steps += what == "step"
 

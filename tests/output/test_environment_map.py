@@ -229,11 +229,11 @@ def test_a_fill_is_the_light_of_what_is_seen():
 
 def test_points_and_options_that_cannot_be(tmp_path, run, logged):
     for options, words in (
-        ({"at": "camera:x"}, r"'x' is none of the scene's \(0, 1, 2"),
+        ({"at": "camera:x"}, r"'x' is not one of the scene's \(0, 1, 2"),
         ({"at": "1,2"}, "neither x,y,z nor camera:NAME nor center"),
         ({"at": "1,2,nan"}, "neither"),
         ({"at": "1e6,0,0"}, "nothing of the scene is seen"),
-        ({"size": 7}, "size 7 cannot be"),
+        ({"size": 7}, "size 7 is not usable"),
         ({"layout": "ball"}, "is not one of latlong, cube"),
     ):
         with pytest.raises(SehdrError, match=words):

@@ -51,9 +51,11 @@ def test_a_block_that_refuses_at_once_has_nothing_compiled():
 def test_what_cannot_be_compiled_is_no_end_of_the_block(monkeypatch):
     monkeypatch.setattr(precompile, "PATIENCE", 0.0)
     broken = make_kernel(2.0)
-    monkeypatch.setattr(precompile.wp, "load_module", lambda *_, **__: 1 / 0)
+    tried = threading.Event()
+    monkeypatch.setattr(precompile.wp, "load_module", lambda *_, **__: tried.set() or 1 / 0)
     with precompile.precompiled([broken]):
-        time.sleep(0.05)
+        assert tried.wait(10)
+    assert not is_loaded(broken)
 
 
 def test_a_training_launches_what_was_compiled_ahead():

@@ -60,20 +60,6 @@ def test_the_cameras_gradient_is_of_all_gaussians(device):
     torch.testing.assert_close(by_lens[2:], visible.double().expand(2))
 
 
-def test_a_retained_graph_gives_the_same_gradients_again(device):
-    inputs, (means2d, *_) = project_scene(device)
-    leaves = [tensor for tensor in inputs if tensor.requires_grad]
-    loss = means2d.square().sum()
-    first = torch.autograd.grad(loss, leaves, retain_graph=True, allow_unused=True)
-    second = torch.autograd.grad(loss, leaves, allow_unused=True)
-    for one, other in zip(first, second, strict=True):
-        assert (one is None) == (other is None)
-        if one is not None:  # A GPU sums the camera's gradient in any order.
-            torch.testing.assert_close(one, other, rtol=0, atol=1e-3 if one.is_cuda else 0)
-    with pytest.raises(RuntimeError, match="second time"):
-        loss.backward()
-
-
 @pytest.mark.parametrize("differentiated", [False, True], ids=["dropped", "differentiated"])
 def test_memory_goes_without_the_garbage_collector(device, differentiated):
     gc.disable()

@@ -110,7 +110,7 @@ def two_nodes(tmp_path_factory):
 def test_two_nodes_train_the_same_bits_as_one_although_one_is_lost(one_node, two_nodes):
     out, (printed, _) = two_nodes
     assert result(out) == one_node
-    assert "lost another, which has ended" in printed and "rank 0 of 2 on node 0" in printed
+    assert "cannot reach another rank, which has ended" in printed and "rank 0 of 2 on node 0" in printed
 
 
 def test_one_node_goes_on(two_nodes):

@@ -149,7 +149,7 @@ def test_an_interrupt_ends_a_pause_and_errors_reach_who_asked():
     threading.Thread(target=lambda: list(live.attend()), daemon=True).start()
     with pytest.raises(ZeroDivisionError):
         live.render(None)
-    with pytest.raises(ValueError, match="none of pause"):
+    with pytest.raises(ValueError, match="not one of pause"):
         live.control("explode")
 
 
