@@ -39,7 +39,10 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     if path.is_dir():
         cameras = _of_colmap(path)
     elif path.suffix.lower() in EXCHANGE_SUFFIXES:
-        cameras = read_exchange_cameras(path).cameras
+        exchange = read_exchange_cameras(path)
+        cameras = exchange.cameras
+        if not exchange.up_stated:
+            log.warning("%s: states no upAxis; +Y counts as up, as in USD", path)
     else:
         cameras = _of_json(path)
     if not cameras:

@@ -4,7 +4,6 @@ OpenUSD: the whole chain of parents at every frame counts, as do the stage's up 
 and offsets of the filmback. Coordinates come back with +Y up and in meters, as files of this package are written.
 """
 
-import logging
 import math
 from collections import Counter
 from pathlib import Path
@@ -27,7 +26,6 @@ USD_WORLD_MATRIX = "sehdr:worldMatrix"
 """Entry of a stage's customLayerData: 16 numbers by rows, from the scene's own coordinates to the stage's."""
 CHAN_ROTATION = "zxy"
 """Order of a .chan file's rotations about fixed axes, as Nuke and Blender take it by default."""
-log = logging.getLogger(__name__)
 _SIZE = (1920, 1080)  # Pixels of a camera whose file states none
 _MOST_FRAMES = 100_000
 
@@ -38,10 +36,12 @@ class ExchangeCameras(NamedTuple):
     Attributes:
         cameras: Name and camera, in the file's order; a moving camera is one for each frame, NAME_0001 and so on.
         world_matrix: [4, 4] from the scene's own coordinates to the file's, if the file states it; else None.
+        up_stated: Whether the file states its up axis, or needs none.
     """
 
     cameras: list[tuple[str, Camera]]
     world_matrix: np.ndarray | None = None
+    up_stated: bool = True
 
 
 def read_exchange_cameras(path: Path) -> ExchangeCameras:
@@ -62,10 +62,8 @@ def _read_usd(path: Path) -> ExchangeCameras:
             cameras.append((name, _usd_camera(lens, matrix, path, name)))
         except (ValueError, OverflowError, ZeroDivisionError) as error:
             raise InputError(path, f"camera {name} cannot be used ({error!s:.120})", "correct the camera") from None
-    if not arrays["up_stated"]:
-        log.warning("%s: states no upAxis; +Y counts as up, as in USD", path)
     world = arrays["world_matrix"]
-    return ExchangeCameras(cameras, world if world.any() else None)
+    return ExchangeCameras(cameras, world if world.any() else None, bool(arrays["up_stated"]))
 
 
 def usd_camera_arrays(path: Path) -> dict[str, Any]:
