@@ -21,6 +21,9 @@ def quality_tables(result: dict) -> Iterable[str]:
         row["to_bound"] = None if bound is row else row["gt_max"] - bound["gt_max"]
     yield "## In short: the middle exposure, one seed, the curve known"
     yield markdown_table(in_short(rows), SHORT)
+    if len(by_curve := curves_in_short(rows)) > 1:
+        yield f"## `{by_curve[0]['method']}` by the photos' curve: the middle exposure, one seed, the curve known"
+        yield markdown_table(by_curve, BY_CURVE)
     for (curve,), mine in groups([row for row in rows if row["response"] in (KNOWN, LEARNED)], "curve").items():
         suffix = "" if curve == rows[0]["curve"] else f", curve {curve}"
         for tables in (_irradiance_tables, _energy_tables):
@@ -78,6 +81,7 @@ def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
 
 SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": "", "irradiance off": ".0%", "worst room": ".0%"}
 SHORT |= {"light energy": ".2f", "5th to 95th percentile": ""}
+BY_CURVE = {"curve": "", "clips": ".1%"} | {title: form for title, form in SHORT.items() if title != "method"}
 
 
 def in_short(rows: Sequence[Mapping]) -> list[dict]:
@@ -102,6 +106,16 @@ def in_short(rows: Sequence[Mapping]) -> list[dict]:
         for (method, response), mine in groups(middle, "method", "response").items()
         if response in (KNOWN, LEARNED)
     ]
+
+
+def curves_in_short(rows: Sequence[Mapping]) -> list[dict]:
+    """Return in_short()'s row of the first method for each curve, and "clips": the mean share of clipped pixels."""
+    table = []
+    for (curve,), mine in groups([row for row in rows if row["method"] == rows[0]["method"]], "curve").items():
+        if line := in_short(mine):
+            used = [row for row in mine if row["exposure"] == EXPOSURES // 2 and row["response"] in (KNOWN, LEARNED)]
+            table.append(line[0] | {"curve": curve, "clips": _over_rows(used, "clipped_share", fmean)})
+    return table
 
 
 def _over_rows(rows: Sequence[Mapping], field: str, summary: Callable[[list[float]], float]) -> float | None:

@@ -20,6 +20,14 @@ from .photos import Camera, Photos
 
 PHOTOS, BATCH, SIZE = 384, 32, 96
 RIDGE = 10.0
+SETS = {
+    "plain": {},
+    "camera": {},
+    "bright lamps": {"stretch_share": 1.0},
+    "lights put in": {"light_share": 1.0},
+    "overexposed": {"overexposed_share": 1.0},
+}
+"""Names of the sets of photos, and what is in them beside what the panoramas hold."""
 AREAS = (30, 300, 3000, 3 * SIZE**2)  # Most clipped values of a photo in a row of energies
 MU = 5000.0
 
@@ -29,7 +37,8 @@ def judge(
 ) -> dict:
     """Return figures of each estimate on photos of unseen panoramas.
 
-    Photos are plain (sRGB, no noise), by cameras, and by cameras with lamps brighter than in the panoramas.
+    Photos are plain (sRGB, no noise), by cameras, by cameras with lamps brighter than in the panoramas, with lamps,
+    windows and screens put in, and overexposed.
 
     For each estimate: rms (stops, all clipped values alike), level (spread of the mean error of photos, stops), light
     (median over photos of |log2| of total clipped light over the truth), psnr and worst (mu-law dB over whole photos,
@@ -38,8 +47,8 @@ def judge(
     """
     learned = _collect(network, pack, chosen, seed + 100, device, plain=True)
     result = {}
-    for name, plain, stretch in (("plain", True, 0.0), ("camera", False, 0.0), ("bright lamps", False, 1.0)):
-        photos = _collect(network, pack, unseen, seed, device, plain=plain, stretch_share=stretch)
+    for name, shares in SETS.items():
+        photos = _collect(network, pack, unseen, seed, device, plain=name == "plain", **shares)
         constant = float(np.mean(list(learned["level"])))
         ridge = _ridge(learned["cues"], learned["level"])
         guesses = {
@@ -99,9 +108,12 @@ def _collect(
     *,
     plain: bool,
     stretch_share: float = 0.0,
+    light_share: float = 0.0,
+    overexposed_share: float = 0.0,
 ) -> dict:
     """Return lists over photos: truth, mean and deviation of clipped values, cues, and what else figures need."""
-    camera = Camera(pack, device, chosen, rooms=False, seed=seed, stretch_share=stretch_share)
+    shares = {"stretch_share": stretch_share, "light_share": light_share, "overexposed_share": overexposed_share}
+    camera = Camera(pack, device, chosen, rooms=False, seed=seed, **shares)
     pixels: dict = {name: [] for name in ("truth", "mean", "deviation", "cues", "level", "clipped", "exposure")}
     for _ in range(PHOTOS // BATCH):
         photos = camera.take(BATCH, SIZE, plain=plain)

@@ -11,7 +11,8 @@ from torch import Tensor
 from .panoramas import Pack
 
 SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
-MOST_CLIPPED, LEAST_CLIPPED = 0.7, 5e-4  # Shares of a photo's pixels
+MOST_CLIPPED, LEAST_CLIPPED = 0.35, 5e-4  # Shares of the pixels of a photo that is not overexposed
+OVEREXPOSED_SHARE, OVEREXPOSED = 0.3, (0.1, 0.95)  # Share of the photos, and the shares of their pixels that clip
 ROOM_SHARE = 0.35  # Of the photos of a training
 STRETCH_SHARE, MOST_STRETCH = 0.5, 2.2
 """Share of photos whose small lights are raised to a random power, and the largest power. Panoramas of 512 columns
@@ -20,6 +21,12 @@ LIGHT_WINDOW, MOST_LIGHT = 4, 0.004
 """A light is small where at most a share MOST_LIGHT of the photo is above white within a square of 1 / LIGHT_WINDOW of
 its width around it. At twice the share nothing is raised: a window or a sky is as bright in a panorama as it is. A
 pixel of such a panorama is 0.7 degrees wide, and 3 x 3 of them cover up to 0.36 % of a photo."""
+LIGHT_SHARE, MOST_LIGHTS = 0.4, 3  # Share of the photos that lights are put into, and the largest number of lights
+LAMP_RADII, LAMP_STOPS = (0.003, 0.06), (2.0, 11.0)
+"""Radii of round lamps over the photo's width, and stops of their light over the photo's median."""
+PANEL_SIZES, PANEL_STOPS = (0.04, 0.5), (1.0, 8.0)
+"""Half sides of windows and screens over the photo's width, and stops of their mean light over the photo's median."""
+HEIGHTS = (1.5, 40.0)  # Distances of lights from the surface behind them, over their radii
 PAGE_SHARE = 0.2  # Of the photos, those with a white surface that is no lamp
 PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
 LEVELS = 255
@@ -50,6 +57,8 @@ class Camera:
         rooms: bool,
         seed: int,
         stretch_share: float = STRETCH_SHARE,
+        light_share: float = LIGHT_SHARE,
+        overexposed_share: float = OVEREXPOSED_SHARE,
     ):
         """Copy panoramas, rooms and curves to the device.
 
@@ -60,8 +69,10 @@ class Camera:
             rooms: whether rooms are photographed too.
             seed: of every random number.
             stretch_share: of the photos, unless they are plain.
+            light_share: share of the photos that lights are put into, unless they are plain.
+            overexposed_share: share of the photos of which up to 95 % clip, unless they are plain.
         """
-        self.stretch_share = stretch_share
+        self.stretch_share, self.light_share, self.overexposed_share = stretch_share, light_share, overexposed_share
         self.device, self.random = torch.device(device), np.random.default_rng(seed)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         panoramas = torch.from_numpy(pack.panoramas[chosen]).permute(0, 3, 1, 2)
@@ -127,17 +138,22 @@ class Camera:
         """Photograph radiance [B, 3, S, S] at random exposures."""
         count = len(radiance)
         if not plain:
-            radiance = radiance * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
+            radiance = self._with_lights(radiance) * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
         brightest = radiance.amax(1).flatten(1)
         # Half of the photos choose white by the share that clips, half by a distance from the middle grey.
-        share = 2.0 ** self._uniform(count, math.log2(LEAST_CLIPPED), math.log2(MOST_CLIPPED / 2))[:, 0, 0, 0]
+        share = 2.0 ** self._uniform(count, math.log2(LEAST_CLIPPED), math.log2(MOST_CLIPPED))[:, 0, 0, 0]
         if plain:
             share = torch.from_numpy(self.random.choice(PLAIN_SHARES, count)).to(share)
+        else:
+            over = self._uniform(count, 0, 1)[:, 0, 0, 0] < self.overexposed_share
+            share = torch.where(over, self._uniform(count, *OVEREXPOSED)[:, 0, 0, 0], share)
         ranks = ((1 - share) * (brightest.shape[1] - 1)).long()
         by_share = brightest.sort(1).values.gather(1, ranks[:, None])
         by_middle = brightest.median(1, keepdim=True).values * 2 ** self._uniform(count, 0.5, 9)[:, 0, 0]
         most = brightest.sort(1).values[:, int((1 - LEAST_CLIPPED) * (brightest.shape[1] - 1)), None]
         first = (torch.rand(count, 1, generator=self.generator, device=self.device) < 0.5) | plain
+        if not plain:
+            first = first | over[:, None]
         white = torch.where(first, by_share, torch.minimum(by_middle, most)).clamp_min(1e-12)
         exposure = radiance / white[:, :, None, None]
         if not plain:
@@ -168,6 +184,67 @@ class Camera:
         brightest = exposure.amax(1, keepdim=True)
         power = 1 + (power - 1) * _smallness(brightest > 1)
         return exposure * brightest.clamp_min(1) ** (power - 1)
+
+    def _with_lights(self, radiance: Tensor) -> Tensor:
+        """Return radiance [B, 3, S, S], some with round lamps, windows and screens that light what is around them.
+
+        A surface at a distance h behind a light of radiance L and radius r receives L pi r^2 h / (d^2 + h^2)^1.5 at a
+        distance d from its foot. The surface reflects it as it reflects the photo's mean radiance.
+        """
+        count, size = len(radiance), radiance.shape[-1]
+        steps = (torch.arange(size, device=self.device) + 0.5) / size
+        has_lights = self._uniform(count, 0, 1) < self.light_share
+        median = radiance.amax(1).flatten(1).median(1).values.clamp_min(1e-6)[:, None, None, None]
+        ambient = radiance.mean((1, 2, 3), keepdim=True).clamp_min(1e-6)
+        panel = self._uniform(count, 0, 1) < 0.5
+        tint = 2 ** (0.6 * self._uniform(count, -1, 1, 3))
+        colored = self._uniform(count, 0, 1) < 0.15
+        tint = torch.where(colored, torch.softmax(4 * self._uniform(count, -1, 1, 3), 1) * 3, tint)
+        lamp_light = median * 2 ** self._uniform(count, *LAMP_STOPS)
+        panel_light = median * 2 ** self._uniform(count, *PANEL_STOPS)
+        lamp_radius = _log_range(self._uniform(count, 0, 1), *LAMP_RADII)
+        half_width, half_height = (_log_range(self._uniform(count, 0, 1), *PANEL_SIZES) for _ in range(2))
+        half_width = torch.where(panel, half_width, lamp_radius * 2 ** self._uniform(count, -0.3, 3).clamp_min(0))
+        half_height = torch.where(panel, half_height, lamp_radius)
+        content = torch.where(panel, self._panel_content(radiance, steps), 1.0) * tint
+        light = torch.where(panel, panel_light, lamp_light)
+        area = half_width * half_height
+        height = area.sqrt() * _log_range(self._uniform(count, 0, 1), *HEIGHTS)
+        number = 1 + (self._uniform(count, 0, 1) ** 2 * MOST_LIGHTS)
+        glow, lights, covered = 0.0, torch.zeros_like(radiance), torch.zeros_like(radiance[:, :1])
+        for k in range(MOST_LIGHTS):
+            used = has_lights & (number > k) & ~(panel & (k > 0))
+            across = steps[None, None, None, :] - self._uniform(count, -0.1, 1.1)
+            down = steps[None, None, :, None] - self._uniform(count, -0.1, 1.1)
+            turn = self._uniform(count, -0.15, 0.15)
+            u, v = turn.cos() * across + turn.sin() * down, turn.cos() * down - turn.sin() * across
+            box = torch.maximum(u.abs() - half_width, v.abs() - half_height)
+            disc = (torch.hypot(u / half_width, v / half_height) - 1) * half_height
+            inside = ((0.5 - size * torch.where(panel, box, disc)).clamp(0, 1) * used).to(radiance)
+            lights = lights * (1 - inside) + inside * light * content
+            covered = covered * (1 - inside) + inside
+            glow = glow + light * tint * area * height / (u**2 + v**2 + height**2) ** 1.5 * used
+        return radiance * (1 + glow / ambient) * (1 - covered) + lights
+
+    def _panel_content(self, radiance: Tensor, steps: Tensor) -> Tensor:
+        """Return [B, 3, S, S] of mean about 1: other views, colored cells, or plain light, some behind bars."""
+        count, size = len(radiance), len(steps)
+        other = radiance.roll(1, 0)
+        other = other / other.mean((1, 2, 3), keepdim=True).clamp_min(1e-9)
+        places = self._uniform(count, 0, 1, 48)[:, :, 0]
+        colors = torch.softmax(2.5 * self._uniform(count, -1, 1, 72).reshape(count, 24, 3), 2) * 3
+        across, down = (
+            (steps.repeat(size)[None, None] - places[:, :24]),
+            (steps.repeat_interleave(size)[None, None] - places[:, 24:]),
+        )
+        nearest = (across**2 + down**2).argmin(1)
+        cells = colors.gather(1, nearest[..., None].expand(-1, -1, 3)).permute(0, 2, 1).reshape(count, 3, size, size)
+        kind = self._uniform(count, 0, 1)
+        content = torch.where(kind < 0.4, other, torch.where(kind < 0.75, cells, torch.ones_like(other)))
+        period, phase = _log_range(self._uniform(count, 0, 1), 0.06, 0.4), self._uniform(count, 0, 1)
+        bars = torch.maximum(*((steps.reshape(shape) / period + phase) % 1 for shape in ((1, 1, 1, -1), (1, 1, -1, 1))))
+        has_bars = self._uniform(count, 0, 1) < 0.4
+        return torch.where(has_bars & (bars > 0.9), 0.02 * content, content)
 
     def _with_pages(self, exposure: Tensor) -> Tensor:
         """Return exposures [B, 3, S, S], some with a sheet, a wall or snow that is lit to about white, not a lamp."""
@@ -205,6 +282,11 @@ class Camera:
         decoded = torch.einsum("kc,bchw->bkhw", torch.linalg.inv(luma), blocks.reshape(count, 3, height, width))
         used = torch.rand(count, 1, 1, 1, generator=self.generator, device=self.device) < 0.6
         return torch.where(used, decoded.clamp(0, 1), encoded)
+
+
+def _log_range(part: Tensor, low: float, high: float) -> Tensor:
+    """Return the value at each part of a range, even in the logarithm."""
+    return low * (high / low) ** part
 
 
 def _smallness(above: Tensor) -> Tensor:

@@ -22,6 +22,8 @@ _SETS = {
     "plain": "sRGB, 8 bits, 0.2 to 20 % of the pixels at white",
     "camera": "random camera curves, white balance, noise, JPEG and exposures; the curve known to a fifth of a stop",
     "bright lamps": "the same, small lights raised to a random power of up to 2.2",
+    "lights put in": "as camera, with lamps, windows and screens put in",
+    "overexposed": "as camera, 10 to 95 % of the pixels at white",
 }
 _AREAS = {"30": "up to 30", "300": "31 to 300", "3000": "301 to 3000", "27648": "more"}
 _TEXT = """# The prior for light above white
@@ -43,8 +45,8 @@ five of the ten panoramas. By quarters of the deviation:
 | -: | -: | -: |
 {quarters}
 
-Trainings hold light at its expected value, the mean of a log-normal distribution. Its sum over that of the true light,
-all photos together, by the number of values that clip in a photo of 96 x 96 pixels:
+The mean of a log-normal value, summed, over the sum of the true light, all photos together, by the number of values
+that clip in a photo of 96 x 96 pixels. Trainings count half of the variance, so they expect less:
 
 | photos | {areas} |
 | --- |{rules}
@@ -64,7 +66,7 @@ def main() -> None:
     )
     network = figures["camera"]["network"]
     rows = [f"| {row['deviation']:.2f} | {row['rms']:.2f} | {row['within']:.0%} |" for row in network["by_deviation"]]
-    ratios = {name: figures[name]["network"]["energy"] for name in _SETS}
+    ratios = {name: figures[name]["network"]["energy"] for name in _SETS if name in figures}
     energies = [f"| {name} | {' | '.join(f'{row[area]:.2f}' for area in _AREAS)} |" for name, row in ratios.items()]
     values = {"page": PAGE, "tables": tables, "within": network["within_one_deviation"], "quarters": "\n".join(rows)}
     values |= {"areas": " | ".join(_AREAS.values()), "rules": " -: |" * len(_AREAS), "energies": "\n".join(energies)}

@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.prior import LightPrior, coarse_size, combined_estimates, load_prior
-from sehdr_warp.prior.estimate import ESTIMATE_DEVIATION, WEIGHTS, LightEstimate
+from sehdr_warp.prior.estimate import ESTIMATE_DEVIATION, VARIANCE_SHARE, WEIGHTS, LightEstimate
 from sehdr_warp.prior.network import LightNetwork
 
 
@@ -48,7 +48,7 @@ def test_estimates_are_there_where_the_photo_clips_alone():
     estimate = small_prior().estimate(exposure, clipped)
     inside = clipped[..., 0]
     deviation = math.log(2) * estimate.deviation[inside]
-    expected = math.log(2) * estimate.mean[inside] + deviation.square() / 2  # Of a log-normal value
+    expected = math.log(2) * estimate.mean[inside] + VARIANCE_SHARE * deviation.square() / 2
     assert torch.allclose(known.log_light[..., :3][inside].float(), expected, rtol=2e-3)
     assert torch.allclose(1 / known.certainty[inside].float(), math.log(2) * estimate.deviation[inside], rtol=2e-3)
 
@@ -76,7 +76,7 @@ class FixedPrior:
 
     def estimate(self, exposure, clipped):
         deviation = 0.3 + self.expected / 4
-        return LightEstimate(self.expected - deviation**2 * math.log(2) / 2, deviation)
+        return LightEstimate(self.expected - VARIANCE_SHARE * deviation**2 * math.log(2) / 2, deviation)
 
 
 def test_photos_that_hold_a_light_agree_on_the_mean_of_their_expected_light():

@@ -63,7 +63,9 @@ def lamp_and_window(tmp_path, brighter: str) -> Pack:
 def test_small_lights_alone_are_made_brighter(tmp_path, brighter, raised):
     pack = lamp_and_window(tmp_path, brighter)
     usual, stretched = (
-        Camera(pack, "cpu", np.array([0]), rooms=False, seed=5, stretch_share=share).take(96, 64)
+        Camera(
+            pack, "cpu", np.array([0]), rooms=False, seed=5, stretch_share=share, light_share=0, overexposed_share=0
+        ).take(96, 64)
         for share in (0.0, 1.0)
     )
     lights = (usual.truth > 2) & (stretched.clipped > 0)
@@ -77,3 +79,36 @@ def test_small_lights_alone_are_made_brighter(tmp_path, brighter, raised):
         assert (stops > 0.01).float().mean() < 0.1
     # A channel below white may clip with its lamp, never the other way around.
     assert (stretched.clipped >= usual.clipped).float().mean() > 0.999
+
+
+def test_overexposed_photos_clip_up_to_nearly_all(pack):
+    shares = [
+        Camera(pack, "cpu", np.array([0]), rooms=False, seed=5, overexposed_share=share, light_share=0)
+        .take(64, 64)
+        .clipped.amax(1)
+        .mean((1, 2))
+        for share in (0.0, 1.0)
+    ]
+    assert shares[0].quantile(0.9) < 0.55 < shares[1].quantile(0.8) and shares[1].min() > 0.05
+
+
+def test_lights_that_are_put_in_are_bright_and_light_what_is_around_them(tmp_path):
+    grey = Pack(
+        np.full((1, 64, 128, 3), 0.2, np.float32),
+        np.array([False]),
+        ["a"],
+        np.zeros((0, 1, 8, 8, 3), np.float32),
+        curves(tmp_path / "none.mat"),
+    )
+    unlit, lit = (
+        Camera(
+            grey, "cpu", np.array([0]), rooms=False, seed=7, light_share=share, stretch_share=0, overexposed_share=0
+        ).take(64, 64)
+        for share in (0.0, 1.0)
+    )
+    # Without them only pages clip, by half a stop.
+    assert unlit.truth.max() < 1 and lit.truth.max() > 4
+    assert (lit.truth.flatten(1).max(1).values > 2).float().mean() > 0.25
+    # Around lights the wall is brighter than elsewhere: values of a photo differ by more than noise and pages.
+    deviation = [photos.exposure.clamp_min(1e-3).log2().flatten(1).std(1).median() for photos in (unlit, lit)]
+    assert deviation[1] > 1.5 * deviation[0]
