@@ -116,9 +116,9 @@ def _time_steps(ranks: Ranks | None, size: Size, device: torch.device, repetitio
             step()
         wait(device)
         mean = (time.perf_counter() - started) * 1e3 / (STEPS * repetitions)
-        whole = amortize(trainer, step)["amortize_ms"]
+        whole = amortize(trainer, step)["amortized_ms"]
         trainer.gather()  # Raises an error if the Gaussians of the ranks differ.
-    return {"photo_ms": mean / photos, "amortize_ms": whole / photos, "repetitions": STEPS * repetitions}
+    return {"photo_ms": mean / photos, "amortized_ms": whole / photos, "repetitions": STEPS * repetitions}
 
 
 def _config(size: Size) -> Config:

@@ -282,15 +282,15 @@ def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, straig
 def guide_items(items: dict) -> dict:
     """A scene for albedo and normals: every surface diffuse, of its own or a varnish's albedo, or white; the sky a
     white ball beyond all things and within the cameras' far plane."""
-    white, items = two_sided(type="diffuse", reflectance=_WHITE), {}
+    white, guides = two_sided(type="diffuse", reflectance=_WHITE), {}
     for name, item in items.items():
         if not isinstance(item, dict):
-            items[name] = item
+            guides[name] = item
         elif item["type"] == "envmap":
-            items[name] = {"type": "sphere", "radius": 500.0, "flip_normals": True, "bsdf": white}
+            guides[name] = {"type": "sphere", "radius": 500.0, "flip_normals": True, "bsdf": white}
         elif "bsdf" in item:
             layer = {} if "emitter" in item else item["bsdf"].get("layer", {})
             paint = layer.get("reflectance") or layer.get("diffuse_reflectance") or _WHITE
             plain = {key: value for key, value in item.items() if key != "emitter"}
-            items[name] = plain | {"bsdf": two_sided(type="diffuse", reflectance=paint)}
-    return items
+            guides[name] = plain | {"bsdf": two_sided(type="diffuse", reflectance=paint)}
+    return guides

@@ -221,7 +221,7 @@ def test_interpolation_passes_through_its_cameras():
 def test_paths_need_cameras():
     with pytest.raises(SehdrError, match=r"no training views.*export --cameras"):
         interpolate([], 3)
-    with pytest.raises(SehdrError, match="path of 0 views"):
+    with pytest.raises(SehdrError, match="path cannot have 0 views"):
         orbit(arc(3, 30), 0, 1)
 
 

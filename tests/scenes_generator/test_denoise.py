@@ -23,7 +23,7 @@ def reflectance(item):
 def test_guides_see_albedo_and_white_for_what_has_none(tmp_path):
     stage = Stage(SimpleNamespace(), np.random.default_rng(0), tmp_path)
     paint, white = {"type": "rgb", "value": [0.2, 0.3, 0.4]}, [1.0, 1.0, 1.0]
-    for material in (stage.matt([0.2, 0.3, 0.4]), stage.varnished([0.2, 0.3, 0.4]), stage.metal(), stage.glass()):
+    for material in (stage.matt([0.2, 0.3, 0.4]), stage.varnish([0.2, 0.3, 0.4]), stage.metal(), stage.glass()):
         stage.add(type="sphere", radius=2.0, bsdf=material)
     stage.lamp((0, 0, 1), 0.1, (50, 40, 30))
     stage.add(type="envmap", sampling_weight=1.0)
