@@ -37,5 +37,5 @@ class Client:
 
 def own_path(path: str) -> str:
     """Return the path of a request without its query, and without the prefix that some proxies leave there."""
-    match = re.search(r"/(photo/[^/]+|[^/]*)$", path.partition("?")[0])
+    match = re.search(r"/(photo/[^/]+/[^/]+|[^/]*)$", path.partition("?")[0])
     return match[0] if match else path

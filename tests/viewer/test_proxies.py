@@ -60,7 +60,7 @@ def test_queries_are_ignored_and_addresses_are_relative(serve):
 def test_a_prefix_that_a_proxy_leaves_does_not_matter(serve, prefix):
     """jupyter-server-proxy's /proxy/absolute/PORT/ and nginx without a trailing slash; visdom pull request 978."""
     server = serve()
-    for path in ("/", "/viewer.js", "/scene"):
+    for path in ("/", "/viewer.js", "/scene", "/photo/0/1"):
         assert ask(server, prefix + path)[0::2] == ask(server, path)[0::2]
     assert ask(server, f"{prefix}/nothing")[0] == 404
 
