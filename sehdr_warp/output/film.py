@@ -6,7 +6,7 @@ grading.
 
 import logging
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -87,7 +87,9 @@ def write_film(
     fps: float = 24.0,
     transfer: str = "sdr",
     ev_ramp: tuple[float, float] = (0.0, 0.0),
+    exposed: bool = False,
     overwrite: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> Path:
     """Render a film of cameras, one each frame, at the size of the first, and return its path.
 
@@ -101,7 +103,10 @@ def write_film(
             Rec.2020 in which the photos' white is 203 cd/m2 and light is kept up to 1000. "logc3", "slog3", "acescct":
             10-bit ProRes 4444 (.mov) in which the photos' white is a reflectance of 1.
         ev_ramp: Stops from the photos' exposure at the first and the last frame, changing evenly.
+        exposed: Expose and clip SDR as a camera does, instead of tone mapping. Also done if the ramp moves.
         overwrite: Replace a film that exists.
+        tell: Receives a line of progress at each frame, as the viewer shows it; by default the log has one now and
+            then.
 
     Raises:
         SehdrError: Without PyAV (the extra `film`) or its encoder.
@@ -115,7 +120,8 @@ def write_film(
     width, height = (max(2, side - side % 2) for side in (first.width, first.height))
     gain = run.base_time * display_gain(run.response)
     stops = np.linspace(*ev_ramp, len(cameras))
-    tone_map = shared_tone_map(run, cameras) if transfer == "sdr" and ev_ramp[0] == ev_ramp[1] else None
+    mapped = transfer == "sdr" and not exposed and ev_ramp[0] == ev_ramp[1]
+    tone_map = shared_tone_map(run, cameras) if mapped else None
     options = {"movflags": "faststart"} if out.suffix.lower() in _FASTSTART else {}
     with atomic_path(out, overwrite) as temporary:
         try:
@@ -130,7 +136,7 @@ def write_film(
                 context = stream.codec_context
                 context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
                 context.color_range = 1
-                for camera, ev in zip(_with_progress(cameras, out), stops):
+                for camera, ev in zip(_with_progress(cameras, out, tell), stops):
                     hdr = as_array(run.render(camera.resized(width, height)).hdr) * np.float32(2.0**ev)
                     encoded = tone_map(hdr) if tone_map else encode(hdr * np.float32(gain), transfer)
                     for packet in stream.encode(_frame(av, encoded, kind)):
@@ -204,11 +210,13 @@ def _frame(av: Any, encoded: np.ndarray, kind: Transfer) -> Any:
     return converted
 
 
-def _with_progress(cameras: Sequence[Camera], out: Path) -> Iterator[Camera]:
-    """Yield the cameras, and report progress as a stage."""
+def _with_progress(cameras: Sequence[Camera], out: Path, tell: Callable[[str], None] | None) -> Iterator[Camera]:
+    """Yield the cameras, and report progress as a stage and through `tell`."""
     with stage(f"{out.name}: frames", len(cameras), log) as progress:
         for index, camera in enumerate(cameras):
             progress.update(index)
+            if tell and index:
+                tell(progress.line())
             yield camera
 
 
