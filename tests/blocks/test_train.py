@@ -93,8 +93,8 @@ def test_the_merged_run_is_as_good_as_one_training(merged, survey, tmp_path):
     whole, blocks = (load_run(path).metrics()[-1]["psnr_ldr"] for path in (tmp_path / "whole", merged))
     assert blocks > whole - 0.2
     borders = json.loads((merged / "summary.json").read_text())["borders"]
-    # Borders are some 150 pixels here: with three seeds they were 1.5 to 3.2 dB below the rest. A survey of 400 photos
-    # has them 3 dB above it.
+    # Borders are some 150 pixels here, so chance decides: with three seeds they were 1.5 to 3.2 dB below the rest, with
+    # one thread 1.7 dB above it to 0.4 below. In two runs with 400 photos they were 2.8 dB above it and 0.3 below.
     assert borders["border"] > borders["elsewhere"] - 4 and borders["share"] > 0.01
 
 
