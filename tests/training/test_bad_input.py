@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.training.train import train
 
-from .wall_and_lamp import in_lamp, photographed, texture, wall_and_lamp
+from .wall_and_lamp import WALL, in_lamp, photographed, texture, wall_and_lamp
 
 SHORT = {"response.name": "linear", "schedule.iterations": 80, "densification.cap_max": 2500}
 SHORT |= {"plan.keep": tuple(name for name in SHORT if name != "response.name")}
@@ -70,3 +71,77 @@ def test_exposure_that_drifts_by_four_stops_unsaid(tmp_path, device):
     ]
     assert np.log2(max(times) / min(times)) < 0.15
     assert decibels(run, run.normalize_photos(unsaid)) > 26
+
+
+# White things that photos clip stay white; a lamp does not.
+BY_SRGB = {"response.name": "srgb", "schedule.iterations": 250, "densification.cap_max": 2500}
+BY_SRGB |= {"plan.keep": tuple(name for name in BY_SRGB if name != "response.name")}
+
+
+def waves(places) -> np.ndarray:
+    """[H, W, 1] smooth waves of 0 to 1 over places [H, W, 2]."""
+    x, y = places[..., :1], places[..., 1:]
+    return 0.5 + 0.25 * np.sin(2.1 * x + 1.3 * y) + 0.25 * np.sin(1.7 * y - 2.6 * x + 1)
+
+
+def wall(_, places):
+    """A white wall, evenly lit, beside a darker floor."""
+    return np.where(places[..., 1:] < 0.5, 0.9 + 0.4 * waves(places), 0.4 * texture(places))
+
+
+def snow(_, places):
+    """Snow below a blue sky."""
+    return np.where(places[..., 1:] > -0.4, (0.75 + 0.6 * waves(places)) * [0.96, 0.98, 1.0], [0.25, 0.4, 0.7])
+
+
+def page(_, places):
+    """A printed page on a dark table."""
+    x, y = places[..., :1], places[..., 1:]
+    inside = (np.abs(x) < 0.8) & (np.abs(y) < 1.0)
+    letters = (np.sin(18 * y) > 0.4) & (np.sin(23 * x) + np.sin(9 * x + 5 * y) > 0) & (np.abs(x) < 0.65)
+    return np.where(inside, np.where(letters, 0.08, 1.3), 0.5 * texture(places))
+
+
+def lamp(position, places):
+    """A lamp 60 times as bright as white before a wall that it hardly lights."""
+    rays = np.concatenate([(places - position[:2]) / WALL, np.ones_like(places[..., :1])], -1)
+    return np.where(in_lamp(position, rays)[..., None], 60.0, 0.5 * texture(places))
+
+
+def clipped_light(run, scene, surface) -> tuple[float, float, float]:
+    """Return the light of clipped pixels over white: the mean of the scene, of the truth, and the scene's largest."""
+    ours, truth = [], []
+    for view in scene.views:
+        column, row = np.meshgrid(np.arange(view.camera.width) + 0.5, np.arange(view.camera.height) + 0.5)
+        rays = np.stack([(column - view.camera.cx) / view.camera.fx, (row - view.camera.cy) / view.camera.fy], -1)
+        position = view.camera.position
+        light = np.broadcast_to(surface(position, position[:2] + rays * WALL), view.codes.shape)
+        clipped = (view.codes >= view.levels).all(2)
+        rendered = run.render(view.camera).hdr.cpu().numpy() / run.field.response.white
+        ours.append(rendered[clipped])
+        truth.append(light[clipped])
+    ours, truth = np.concatenate(ours), np.concatenate(truth)
+    return float(ours.mean()), float(truth.mean()), float(np.quantile(ours, 0.99))
+
+
+def train_on(surface, folder, device):
+    def light_at(position, rays):
+        return np.broadcast_to(surface(position, position[:2] + rays[..., :2] / rays[..., 2:] * WALL), rays.shape)
+
+    scene = photographed(light_at, response="srgb")
+    torch.manual_seed(0)
+    return train(scene, folder, BY_SRGB, device=device), scene
+
+
+# The largest mean over white that passes. A page on a dark table looks like a window, so it comes out brightest.
+@pytest.mark.parametrize(("surface", "most"), [(wall, 2.6), (snow, 2.8), (page, 4.6)])
+def test_white_things_do_not_become_lamps(tmp_path, device, surface, most):
+    run, scene = train_on(surface, tmp_path / "run", device)
+    mean, true, largest = clipped_light(run, scene, surface)
+    assert true < 1.35 and 1 < mean < most and largest < 4 * most
+
+
+def test_a_lamp_does(tmp_path, device):
+    run, scene = train_on(lamp, tmp_path / "run", device)
+    mean, true, _ = clipped_light(run, scene, lamp)
+    assert true > 20 and mean > 8
