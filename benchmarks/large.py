@@ -71,7 +71,7 @@ def _train(scene: Scene, config: Config, device: str) -> dict:
     training = create_trainer(scene, scratch / "run", config, device=device)
     for step in training:
         if step.iteration == step.total // WARM_UP:
-            training.timed(partial(wait, training.device))
+            training.run_timed(partial(wait, training.device))
             begun = training.seconds
         memory = held_memory(training.device) or 0
     row = {"method": "sehdr-warp", "gaussians": training.run.gaussian_count, "seconds": training.seconds - begun}

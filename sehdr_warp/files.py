@@ -216,7 +216,7 @@ _LONGEST_NAME, _LONGEST_PATH = 255, 3000
 """Bytes of the name of a file on almost all file systems, and of a path below the data folder."""
 
 
-def contained(folder: Path, name: str, source: Path) -> Path:
+def resolve_inside(folder: Path, name: str, source: Path) -> Path:
     """Return the file that `name` (read from `source`) means inside `folder`.
 
     Links inside the folder that lead out of it are refused like `..`: a downloaded data set must not be able to read

@@ -25,14 +25,14 @@ def seal(folder: Path) -> None:
 def is_sealed(folder: Path) -> bool:
     """Return whether a folder holds the files of its list, all of them unchanged."""
     with suppress(OSError):
-        return set() != listed(folder) <= set(_lines(folder))
+        return set() != read_list(folder) <= set(_lines(folder))
     return False
 
 
 def first_foreign(path: Path) -> Path | None:
     """Return the first file at or in a path that this program did not write, or that was changed since; else None."""
     folder = path if path.is_dir() else path.parent
-    own = listed(folder)
+    own = read_list(folder)
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_symlink() or not (file.is_dir() or file == folder / LIST):
             name = file.relative_to(folder).as_posix()
@@ -48,7 +48,7 @@ def hash_line(file: Path, name: str) -> bytes:
     return os.fsencode(f"{digest}  {name}".replace("\n", "\\n"))
 
 
-def listed(folder: Path) -> set[bytes]:
+def read_list(folder: Path) -> set[bytes]:
     """Return the lines of a folder's list; none if there is no list, or what has its name is no plain file."""
     file = folder / LIST
     with suppress(OSError):

@@ -249,7 +249,7 @@ def run_environment_map(args: EnvironmentMap) -> None:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
-    from .render_views import PATHS, SPLITS, check_cameras, framed, read_size, render_views, select_cameras
+    from .render_views import PATHS, SPLITS, check_cameras, read_size, reframe, render_views, select_cameras
     from .world_transform import world_transform
 
     if args.out is None and args.video is None:
@@ -287,7 +287,7 @@ def run_render(args: Render) -> None:
         transform = world_transform(run, **vars(args.world))
         cameras = [camera for _, camera in select_cameras(run, **path, transform=transform, up=args.world.up)]
         if args.size is not None:
-            cameras = [framed(camera, *read_size(args.size)) for camera in cameras]
+            cameras = [reframe(camera, *read_size(args.size)) for camera in cameras]
         film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}
         files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
         if len(cameras) == 1:

@@ -132,7 +132,7 @@ def render_views(
     views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
     if size is not None:
         width, height = read_size(size)
-        views = [(name, framed(camera, width, height)) for name, camera in views]
+        views = [(name, reframe(camera, width, height)) for name, camera in views]
     camera_files = _camera_files(views, transform, fps, moving=str(cameras) not in SPLITS)
     empty = []
     with ExitStack() as stack:
@@ -210,7 +210,7 @@ def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
     return width, height
 
 
-def framed(camera: Camera, width: int, height: int) -> Camera:
+def reframe(camera: Camera, width: int, height: int) -> Camera:
     """Return a camera of another size with the same vertical field of view and pixel aspect ratio.
 
     The picture shows more or less at the sides.

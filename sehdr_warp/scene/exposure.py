@@ -12,7 +12,7 @@ from ..files import has_file, read_bytes
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, ExifExposure, exif_exposure, parse_number
 from .images import PHOTO_SUFFIXES
-from .names import Listing, bases_of, folded
+from .names import Listing, bases_of, fold_name
 
 EXPOSURES = "exposures.json"
 _LISTS = ("exposures", "exposure_times", "exposure")  # Names under which people list times in other files
@@ -184,21 +184,21 @@ def _read_times(path: Path) -> Mapping[str, float]:
 
 
 def _names_of(images: Sequence[Path], bases: Sequence[Path]) -> dict[str, list[Path]]:
-    """Map each way to name photos, folded(), to those that it fits: paths below the bases, then names alone."""
+    """Map each way to name photos, fold_name(), to those that it fits: paths below the bases, then names alone."""
     exact: dict[str, list[Path]] = {}
     alone: dict[str, list[Path]] = {}
     for image in images:
         paths = {image.relative_to(base) for base in bases if image.is_relative_to(base)}
         for key in {key for path in paths for key in (path.as_posix(), path.with_suffix("").as_posix())}:
-            exact.setdefault(folded(key), []).append(image)
+            exact.setdefault(fold_name(key), []).append(image)
         for key in {image.name, image.stem}:
-            alone.setdefault(folded(key), []).append(image)
+            alone.setdefault(fold_name(key), []).append(image)
     return alone | exact
 
 
 def _spellings(name: str) -> list[str]:
     """Return the ways to look up a name of exposures.json: as it is, without suffix, and if absolute its last parts."""
-    plain = folded(_plain(name))
+    plain = fold_name(_plain(name))
     path = PurePosixPath(plain)
     ends = [plain]
     if path.is_absolute() or re.match("[a-z]:/", plain):

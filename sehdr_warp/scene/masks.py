@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..files import contained
+from ..files import resolve_inside
 from .dataparser import UNPLACED, ImageRecord
 from .images import LDR_SUFFIXES, open_image, read_ldr
-from .names import Listing, bases_of, folded, natural_key, without_mask_ending
+from .names import Listing, bases_of, fold_name, natural_key, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
@@ -52,7 +52,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     )
     places = _mask_folders(folder)
     files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
-    index = [{folded(key): file for file, key in reversed(keys.items())} for keys in files.values()]
+    index = [{fold_name(key): file for file, key in reversed(keys.items())} for keys in files.values()]
     beside = {parent: _masks_beside(parent) for parent in {record.image.parent for record in records}}
     common = _common_mask(folder, records)
     masked, mask_files = [], set()
@@ -60,10 +60,10 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         keys = _photo_keys(record, bases, shared)
         near = beside[record.image.parent]
         tables = [*((masks, keys) for masks in index), (near, [record.image.name, record.image.stem])]
-        candidates = (masks.get(folded(key)) for masks, names in tables for key in names)
+        candidates = (masks.get(fold_name(key)) for masks, names in tables for key in names)
         mask = record.mask or next((file for file in candidates if file is not None), None)
         if mask is not None and record.mask is None:
-            mask = contained(folder, mask.relative_to(folder).as_posix(), folder)
+            mask = resolve_inside(folder, mask.relative_to(folder).as_posix(), folder)
         if mask is None and common is not None and _has_shape(common, record):
             mask = common.file
         mask_files.add(mask)
@@ -156,7 +156,7 @@ def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> _CommonMask | 
     file = next((folder / name for name in names if (folder / name).is_file()), None)
     if file is None:
         return None
-    with open_image(contained(folder, file.name, folder), mask=True) as image:
+    with open_image(resolve_inside(folder, file.name, folder), mask=True) as image:
         return _CommonMask(file, *image.size)
 
 
@@ -187,13 +187,13 @@ def _files_below(place: Path) -> list[Path]:
 
 
 def _masks_beside(parent: Path) -> dict[str, Path]:
-    """Map folded() names or stems of photos to the masks in the photos' own folder, or in a mask folder there."""
+    """Map fold_name() names or stems of photos to the masks in the photos' own folder, or in a mask folder there."""
     if not parent.is_dir():
         return {}
     files = (file for file in parent.iterdir() if file.suffix.lower() in LDR_SUFFIXES)
-    masks = {folded(key): file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
+    masks = {fold_name(key): file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
     inner = (file for place in _mask_folders(parent) for file in _files_below(place) if file.parent == place)
-    return {folded(without_mask_ending(file.stem)): file for file in inner} | masks
+    return {fold_name(without_mask_ending(file.stem)): file for file in inner} | masks
 
 
 def _mask_folders(folder: Path) -> list[Path]:
@@ -201,7 +201,7 @@ def _mask_folders(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     inner = [place for place in sorted(folder.iterdir()) if place.name.lower() in MASK_FOLDERS and place.is_dir()]
-    inner = [contained(folder, place.name, folder) for place in inner]
+    inner = [resolve_inside(folder, place.name, folder) for place in inner]
     return sorted(inner, key=lambda place: MASK_FOLDERS.index(place.name.lower()))
 
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 
-from ..files import contained
+from ..files import resolve_inside
 from .dataparser import ImageRecord
 from .images import PHOTO_SUFFIXES
 
@@ -97,7 +97,7 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         names = {inner: None}
     elif PureWindowsPath(name).anchor and "\0" not in name:
         return None
-    places = [contained(folder, each, source) for each in names]
+    places = [resolve_inside(folder, each, source) for each in names]
     image = next((place for place in places if os.path.isfile(place)), None)
     image = image or next((photo for place in places if (photo := sibling(place, PHOTO_SUFFIXES))), None)
     return image or next((photo for each in names if (photo := _alike(folder, each, source))), None)
@@ -112,7 +112,7 @@ def _inside(folder: Path, name: str, source: Path) -> str | None:
         return None
     for start in range(max(above, 1), len(parts)):
         end = "/".join(parts[start:])
-        place = contained(folder, end, source)
+        place = resolve_inside(folder, end, source)
         if os.path.isfile(place) or sibling(place, PHOTO_SUFFIXES) or sibling(Path(f"{place}.png"), PHOTO_SUFFIXES):
             return end
     return None
@@ -126,25 +126,25 @@ def _alike(folder: Path, name: str, source: Path) -> Path | None:
     parts = [part for part in name.split("/") if part not in ("", ".")]
     if not parts:
         return None
-    if len(parts) > 1 and folded(parts[0]) == folded(folder.name):
+    if len(parts) > 1 and fold_name(parts[0]) == fold_name(folder.name):
         return find_image(folder, "/".join(parts[1:]), source)
     place = folder
     for part in parts[:-1]:
         names = _entries(place)
-        if folded(part) not in names:
+        if fold_name(part) not in names:
             return None
-        place /= names[folded(part)]
+        place /= names[fold_name(part)]
     names = _entries(place)
     stem = PureWindowsPath(parts[-1]).stem
     # A name may have no suffix, and a dot all the same.
-    stems = folded(parts[-1]), folded(stem)
+    stems = fold_name(parts[-1]), fold_name(stem)
     endings = dict.fromkeys((stems[0], *(each + suffix for each in stems for suffix in PHOTO_SUFFIXES)))
     match = next((names[ending] for ending in endings if ending in names), None)
-    photo = None if match is None else contained(folder, (place / match).relative_to(folder).as_posix(), source)
+    photo = None if match is None else resolve_inside(folder, (place / match).relative_to(folder).as_posix(), source)
     return photo if photo is not None and os.path.isfile(photo) else None
 
 
-def folded(name: str) -> str:
+def fold_name(name: str) -> str:
     """Return a name in which upper and lower case, and the forms of an accent, are the same."""
     return unicodedata.normalize("NFC", name).casefold()
 
@@ -160,7 +160,7 @@ def _entries(folder: Path) -> Mapping[str, str]:
 @lru_cache(maxsize=64)
 def _entries_at(folder: Path, changed: int) -> Mapping[str, str]:
     """Return _entries(); `changed` is when the folder changed."""
-    return {folded(name): name for name in sorted(os.listdir(folder), reverse=True)}
+    return {fold_name(name): name for name in sorted(os.listdir(folder), reverse=True)}
 
 
 def distinct(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[str]]:

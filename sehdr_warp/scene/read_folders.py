@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..errors import InputError
-from ..files import contained, read_bytes, read_json
+from ..files import read_bytes, read_json, resolve_inside
 from .colmap_model import SparseModel, find_model, other_models, read_model
 from .copies import copies_note, find_copies
 from .dataparser import NO_POINTS, UNPLACED, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
@@ -138,7 +138,7 @@ def read_hdr_gs(folder: Path) -> DataparserOutputs:
     seconds, notes = _hdr_gs_seconds(folder, 1 + max(key for files in exposures.values() for key in files))
     for view, (lens, pose) in poses.items():
         hdr = sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES)
-        hdr = hdr and contained(folder, hdr.relative_to(folder).as_posix(), folder)
+        hdr = hdr and resolve_inside(folder, hdr.relative_to(folder).as_posix(), folder)
         for key, image in sorted(exposures.get(view, {}).items()):
             records.append(ImageRecord(view, image, lens, pose, key, seconds[key] if seconds else None, hdr=hdr))
     if not records:
@@ -151,7 +151,7 @@ def _poses_by_view(folder: Path) -> tuple[PointCloud, dict[str, tuple]]:
     model, source = _model(folder)
     poses = {}
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
-        view = re.sub(r"_\d+$", "", contained(folder, entry.name, source).stem)
+        view = re.sub(r"_\d+$", "", resolve_inside(folder, entry.name, source).stem)
         poses.setdefault(view, (entry.lens, entry.world_to_camera))
     return model.cloud, poses
 

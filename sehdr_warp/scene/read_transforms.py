@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..files import contained, read_json
+from ..files import read_json, resolve_inside
 from .colmap_model import find_model, read_ply_points, read_points
 from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
@@ -118,7 +118,7 @@ def read_hdr_nerf(folder: Path) -> DataparserOutputs:
                 raise InputError(truth, "HDR truth not found", _INCOMPLETE)
             present = []
             for key, (file, time) in sorted(exposures.items()):
-                image = hdr if photo_response and hdr else contained(folder, file, times_path)
+                image = hdr if photo_response and hdr else resolve_inside(folder, file, times_path)
                 if image.is_file():
                     lens, view = frame_lens(values, frame, image, path), Path(_plain(name)).name
                     present.append(
@@ -206,7 +206,7 @@ def _frame_record(folder: Path, path: Path, values: dict, frame: dict, image: Pa
 def _mask_file(folder: Path, name: Any, path: Path) -> Path:
     """Return the mask that a frame states, by the rules of photos' names; a path without a file if it is not there."""
     if not isinstance(name, str):
-        return contained(folder, name, path)
+        return resolve_inside(folder, name, path)
     return find_image(folder, name, path) or folder / PureWindowsPath(name).name
 
 

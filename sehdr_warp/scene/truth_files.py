@@ -7,11 +7,11 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from ..files import contained
+from ..files import resolve_inside
 from .dataparser import ImageRecord
 from .hdr_files import is_without_colors
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
-from .names import bases_of, folded
+from .names import bases_of, fold_name
 
 TRUTH_FOLDERS = ("hdr", "exr")
 _MOST_NAMED = 3
@@ -49,9 +49,9 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         image, hdr = record.image, record.hdr
         if _may_have_truth(record):
             keys = [_key(image.relative_to(base)) for base in bases if image.is_relative_to(base)]
-            keys += [folded(image.stem)] * (stems[folded(image.stem)] <= 1)
+            keys += [fold_name(image.stem)] * (stems[fold_name(image.stem)] <= 1)
             candidates = ((place, files[place].get(key)) for key in keys for place in places)
-            near = image.parent, beside[image.parent].get(folded(image.stem))
+            near = image.parent, beside[image.parent].get(fold_name(image.stem))
             hdr = next((_inside(place, file, folder) for place, file in (*candidates, near) if file), None)
             hdr = None if hdr is not None and is_without_colors(hdr) else hdr
         result.append(replace(record, hdr=hdr))
@@ -72,7 +72,7 @@ def _may_have_truth(record: ImageRecord) -> bool:
 
 def _inside(place: Path, file: Path, folder: Path) -> Path:
     """Return a file in a folder, or raise InputError if it is a link that leads out of it."""
-    return contained(place, file.relative_to(place).as_posix(), folder)
+    return resolve_inside(place, file.relative_to(place).as_posix(), folder)
 
 
 def _truth_folders(folder: Path) -> list[Path]:
@@ -80,7 +80,7 @@ def _truth_folders(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     places = [place for place in sorted(folder.iterdir()) if place.name.lower() in TRUTH_FOLDERS and place.is_dir()]
-    places = [contained(folder, place.name, folder) for place in places]
+    places = [resolve_inside(folder, place.name, folder) for place in places]
     return sorted(places, key=lambda place: TRUTH_FOLDERS.index(place.name.lower()))
 
 
@@ -89,19 +89,19 @@ def _float_files(place: Path) -> list[Path]:
 
 
 def _beside(parent: Path) -> dict[str, Path]:
-    """Map folded() stems to the float pictures of a folder."""
+    """Map fold_name() stems to the float pictures of a folder."""
     if not parent.is_dir():
         return {}
     files = (file for file in sorted(parent.iterdir(), reverse=True) if file.suffix.lower() in HDR_SUFFIXES)
-    return {folded(file.stem): file for file in files if file.is_file()}
+    return {fold_name(file.stem): file for file in files if file.is_file()}
 
 
 def _stems_below(folder: Path) -> Counter:
-    """Count the folded() stems of the photos below a folder."""
+    """Count the fold_name() stems of the photos below a folder."""
     names = (Path(name) for _, _, files in os.walk(folder) for name in files)
-    return Counter(folded(name.stem) for name in islice(names, _MOST_FILES) if name.suffix.lower() in LDR_SUFFIXES)
+    return Counter(fold_name(name.stem) for name in islice(names, _MOST_FILES) if name.suffix.lower() in LDR_SUFFIXES)
 
 
 def _key(path: Path) -> str:
-    """Return a relative path without suffix, folded()."""
-    return folded(path.with_suffix("").as_posix())
+    """Return a relative path without suffix, fold_name()."""
+    return fold_name(path.with_suffix("").as_posix())

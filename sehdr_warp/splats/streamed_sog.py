@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import __version__
 from ..errors import InputError
-from ..files import atomic_folder, contained, read_bytes, read_json
+from ..files import atomic_folder, read_bytes, read_json, resolve_inside
 from .arrays import GaussianArrays
 from .sog import gaussians_of_files, refusing_damage, sog_files
 
@@ -68,13 +68,13 @@ def read_streamed_sog(path: Path) -> GaussianArrays:
         for index, ranges in sorted(parts.items()):
             if index < 0:
                 raise ValueError(f"file {index}")
-            chunk = contained(path.parent, meta["filenames"][index], path)
+            chunk = resolve_inside(path.parent, meta["filenames"][index], path)
             if chunk in chunks:
                 raise ValueError("a chunk is listed twice")
             folder = chunk.parent
 
             def read(name: str, limit: int, folder: Path = folder) -> bytes:
-                return read_bytes(contained(folder, name, path), limit)
+                return read_bytes(resolve_inside(folder, name, path), limit)
 
             gaussians = gaussians_of_files(read, chunk)
             chunks[chunk] = gaussians.rows(_rows(ranges, gaussians.count))

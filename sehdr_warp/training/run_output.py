@@ -76,7 +76,7 @@ class RunOutput:
         if save and iteration < trainer.total:
             self.checkpoint(trainer)
         if self._tensorboard and trainer.came_to(self._log_every):
-            figures = {"loss": trainer.timed(lambda: trainer.loss), "psnr": trainer.timed(trainer.psnr)}
+            figures = {"loss": trainer.run_timed(lambda: trainer.loss), "psnr": trainer.run_timed(trainer.psnr)}
             self._log(trainer, "train", figures | {"gaussians": trainer.field.gaussians.count})
 
     def evaluate(self, trainer: Trainer) -> None:

@@ -146,7 +146,7 @@ class Trainer:
             try:
                 while self._agree_to_continue():
                     before = self.seconds
-                    self.timed(self.step)
+                    self.run_timed(self.step)
                     if self.output is not None:
                         self.output.after_step(self)
                     yield TrainingProgress(self, self._pace.seconds_left(self, self.seconds - before))
@@ -326,7 +326,7 @@ class Trainer:
             self.ranks.reduce_to_leader(list(self.strategy.state_dict(self.field.gaussians.count).values()))
             self.ranks.check_equal(self.field.gaussians.tensors(), self.iteration)
 
-    def timed(self, function: Callable[[], T]) -> T:
+    def run_timed(self, function: Callable[[], T]) -> T:
         """Call a function whose time, with what the device had left to do, counts as time of the training."""
         started = time.perf_counter()
         try:
@@ -337,7 +337,7 @@ class Trainer:
     def synchronize(self) -> None:
         """Wait for the device, as part of the training's time."""
         if self.device.type == "cuda":
-            self.timed(lambda: torch.cuda.synchronize(self.device))
+            self.run_timed(lambda: torch.cuda.synchronize(self.device))
 
     @property
     def loss(self) -> float:

@@ -33,12 +33,12 @@ class TrainingProgress:
     @property
     def loss(self) -> float:
         """Loss of the step."""
-        return self._trainer.timed(lambda: self._trainer.loss)
+        return self._trainer.run_timed(lambda: self._trainer.loss)
 
     @property
     def psnr(self) -> float:
         """PSNR of the step's photo, dB."""
-        return self._trainer.timed(self._trainer.psnr)
+        return self._trainer.run_timed(self._trainer.psnr)
 
     @property
     def gaussians(self) -> int:

@@ -12,7 +12,7 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.perceptual import load_lpips
-from sehdr_warp.files import contained
+from sehdr_warp.files import resolve_inside
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import load_scene
 from sehdr_warp.viewer.commands import View
@@ -249,8 +249,8 @@ def test_names_of_a_set_stay_inside(tmp_path, name):
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "out").symlink_to(tmp_path)
     with pytest.raises(InputError):
-        contained(tmp_path / "set", name, tmp_path / "set" / "transforms.json")
-    assert contained(tmp_path / "set", "a/b.png", tmp_path).name == "b.png"
+        resolve_inside(tmp_path / "set", name, tmp_path / "set" / "transforms.json")
+    assert resolve_inside(tmp_path / "set", "a/b.png", tmp_path).name == "b.png"
 
 
 def test_the_viewer_listens_on_this_machine_alone():

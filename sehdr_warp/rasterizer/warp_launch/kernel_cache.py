@@ -19,7 +19,7 @@ import warp as wp
 from ...caches import usable, user_cache
 from ...errors import SehdrError
 from ...files import atomic_path
-from ...own_files import LIST, hash_line, listed
+from ...own_files import LIST, hash_line, read_list
 
 _log = logging.getLogger("sehdr_warp.rasterizer")
 # Named by their content; neither what is being compiled nor what Warp compiles anew in its place.
@@ -41,7 +41,7 @@ def select_folder() -> None:
 def discard_damaged() -> None:
     """Discard damaged modules; call it after wp.init(), before the first launch."""
     cache = Path(wp.config.kernel_cache_dir or "")
-    now, before = _lines(cache), listed(cache)
+    now, before = _lines(cache), read_list(cache)
     names = {line[66:] for line in now}
     damaged = {os.fsdecode(line[66:]).partition("/")[0] for line in before - now if line[66:] in names}
     for module in damaged:
