@@ -168,6 +168,13 @@ def trial_table(rows: Iterable[Mapping]) -> tuple[list[dict], dict[str, str]]:
 def _trust_tables(result: dict) -> Iterable[str]:
     yield f"## The trial, seed {result['seed']}"
     yield markdown_table(*trial_table(result["rows"]))
+    if "outsider" in result:
+        counts = ("cases", "held", "mended", "failing")
+        rows = [dict(row) for row in result["outsider"]]
+        total = {"family": "all"} | {name: sum(row[name] for row in rows) for name in counts}
+        yield "## Cases of an outsider"
+        yield "By somebody who had seen neither sources nor trial; *held*: at first, *failing*: after the mends."
+        yield markdown_table([*rows, total], {"family": "", **dict.fromkeys(counts, "d"), "found": ""})
     if "fuzz" in result:
         rows = []
         for (reader,), each in groups(result["fuzz"], "reader").items():

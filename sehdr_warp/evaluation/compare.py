@@ -117,14 +117,21 @@ def _cells(rows: Sequence[ComparedRuns]) -> list[list[str]]:
     return cells
 
 
+_FORMULAS = tuple("=+-@\t\r")  # First letters of cells that spreadsheets run
+
+
 def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
-    """Return means and standard deviations in full precision; a missing one is empty."""
+    """Return means and standard deviations in full precision; a missing one is empty.
+
+    A name that a spreadsheet would take for a formula gets an apostrophe before it.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["run", "scene", "seeds", *(name for column in COLUMNS for name in (column, f"{column}_sd"))])
     for row in rows:
         values = [value for column in COLUMNS for value in (row.mean(column), row.deviation(column))]
-        writer.writerow([row.label, row.scene, row.count, *values])
+        names = (f"'{name}" if name.startswith(_FORMULAS) else name for name in (row.label, row.scene))
+        writer.writerow([*names, row.count, *values])
     return text.getvalue()
 
 

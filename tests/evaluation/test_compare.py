@@ -47,6 +47,12 @@ def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):
     assert r"26.00 $\pm$ 1.41" in latex and r"room\_1" in latex and latex.count(r"\\") == 3
 
 
+def test_names_are_no_formulas_of_a_spreadsheet(tmp_path):
+    for name, cell in (("=cmd|' C calc'!A0", "'=cmd|' C calc'!A0"), ("@SUM(1)", "'@SUM(1)"), ("a", "a")):
+        (row,) = csv.DictReader(comparison_csv(compare_runs([trained(tmp_path / name)])).splitlines())
+        assert row["run"] == cell
+
+
 def test_runs_that_have_not_ended_are_marked(tmp_path):
     stopped, whole = trained(tmp_path / "a"), trained(tmp_path / "b", seed=1)
     stopped.iterations = 60

@@ -154,6 +154,7 @@ def _run(words, folder, said, count, kill_at, prepare) -> None:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
     except BaseException:  # noqa: BLE001
         traceback.print_exc()
+        sys.stderr.flush()  # os._exit() would lose it.
     finally:
         os._exit(code)
 
