@@ -27,9 +27,7 @@ from .own_files import first_foreign, list_file, seal
 
 _REFUSALS = "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE"
 _WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(errno, name)}
-
-# The largest file that is read whole: the biggest COLMAP models in use (Mip-NeRF 360, city captures) are well under it.
-MAX_FILE_BYTES = 4 << 30
+MAX_FILE_BYTES = 4 << 30  # Of a file that is read whole; the biggest COLMAP models (city captures) are well under it
 MAX_JSON_BYTES = 256 << 20
 _MAX_LINE = 16 << 20
 
@@ -44,8 +42,7 @@ def atomic_path(path: Path | str, overwrite: bool = False, *, internal: bool = F
     Args:
         path: The file.
         overwrite: A file that this program wrote may be replaced.
-        internal: `path` is a name of the program's own in a folder of its own: any file there is replaced, and the
-            list is not kept.
+        internal: `path` is a name of the program's own in its own folder: any file there is replaced, none is listed.
 
     Raises:
         InputError: If `path` exists (unless it may be replaced), or is a folder, a link or a device.
@@ -85,8 +82,7 @@ def _written_beside(path: Path, overwrite: bool, internal: bool, folder: bool) -
                 list_file(temporary, path)
             _put(temporary, path)
         except BaseException as error:
-            if isinstance(error, SehdrError):
-                # Whoever writes names files by the temporary name, which means nothing to the user.
+            if isinstance(error, SehdrError):  # It names the temporary file, which means nothing to the user.
                 error.args = tuple(str(item).replace(str(temporary), str(path)) for item in error.args)
             remove(temporary)
             with suppress(OSError):  # Someone else has put a file there in the meantime.
@@ -122,16 +118,12 @@ def refuse_links(path: Path, folder: Path) -> None:
         if place == folder:
             return
         if place.is_symlink():
-            raise InputError(
-                place, "is a link, and links in it are not followed", "copy what it leads to into its place"
-            )
+            problem = "is a link, and links in it are not followed"
+            raise InputError(place, problem, "copy what it leads to into its place")
 
 
 def has_file(path: Path) -> bool:
-    """Return whether there is a file; raise InputError if a folder, a pipe, a device or a broken link has its name.
-
-    To take these for a missing file would read a set or a run in another way than it says.
-    """
+    """Return whether there is a file; raise InputError if a folder, a pipe, a device or a broken link has its name."""
     if os.path.lexists(path) and not path.is_file():
         raise InputError(path, "is a folder, a pipe, a device or a broken link, not a file", "remove it")
     return path.is_file()
@@ -149,8 +141,9 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """Return the whole file; raise InputError if it is missing, unreadable, empty or larger than `limit` bytes."""
     try:
         if (size := plain_size(path)) > limit:
-            problem = f"{size} bytes is more than the limit of {limit}"
-            raise InputError(path, problem, "check that this is the right file")
+            raise InputError(
+                path, f"{size} bytes is more than the limit of {limit}", "check that this is the right file"
+            )
         data = path.read_bytes()
     except FileNotFoundError:
         raise InputError(path, "file not found", "check the name") from None
@@ -162,10 +155,7 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_text(path: Path, limit: int = MAX_FILE_BYTES, errors: str = "strict") -> str:
-    """Return the whole file as UTF-8 text; raise InputError as read_bytes does, and if it is not text.
-
-    errors: of bytes.decode.
-    """
+    """Return the whole file as UTF-8 text; raise InputError as read_bytes does, and if bytes.decode finds errors."""
     try:
         return read_bytes(path, limit).decode("utf-8-sig", errors)
     except UnicodeDecodeError as error:
@@ -407,6 +397,4 @@ def _finite(value: Any) -> Any:
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value

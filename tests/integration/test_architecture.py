@@ -38,7 +38,7 @@ ALLOWED = {
     "progress": set(),
     "caches": set(),
     "files": {"errors", "own_files"},
-    "own_files": set(),
+    "own_files": {"errors"},
     "arguments": {"errors"},
     "splats": ANY,
     "rasterizer": ANY | {"kernels"},
