@@ -26,7 +26,7 @@ OTHER = "torch's own"
 KERNELS = {
     "projection": ("project_*_forward",),
     "harmonics": ("evaluate_*", "jacobian_backward_*"),
-    "activations": ("activate_*",),
+    "activations": ("activate_*", "sum_opacities*"),
     "lists": ("pack_splats_*", "key_by_*", "emit_*", "find_tile_ranges_*", "*radix_sort*", "*DeviceScan*"),
     "blend": ("blend_forward_*", "pad_rows_*"),
     "response and fusion": (

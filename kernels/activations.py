@@ -1,4 +1,4 @@
-"""Exposures and opacities of Gaussians from their parameters, one launch each way in place of torch's four and five."""
+"""Exposures of Gaussians from their parameters, and the penalty on their opacities, in one launch each way."""
 
 from functools import cache
 
@@ -47,60 +47,66 @@ def exposures_backward_kernel(dtype):
 
 
 @cache
-def opacities_kernel(dtype):
-    """Return the kernel of sigmoids and of the shares of `weight` times their mean, launched over T threads.
+def opacity_penalty_kernel(dtype):
+    """Return the kernel of the shares of `weight` times the mean of the opacities that count, launched over T threads.
 
-    opacities: [N] sigmoids of the logits. shares: [T], each thread's part of the weighted mean. active_count: [1]
-    number of Gaussians that the mean counts, of which those behind have an opacity of 0; None for all.
+    opacities: [N]. extents: [N, 2] of projected Gaussians, 0 for those that are not in view; None if all count.
+    moments: [N] Adam's second moments, with which those out of view count; None for zeros. shares: [T], each thread's
+    part. active_count: [1] number that the mean divides by, of which those behind have an opacity of 0; None for N.
     """
     real = dtype
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def activate_opacities(
+    def sum_opacities(
         first: int,
-        logits: wp.array(dtype=real), weight: real, active_count: wp.array(dtype=wp.int32),
-        opacities: wp.array(dtype=real), shares: wp.array(dtype=real),
+        opacities: wp.array(dtype=real), extents: wp.array2d(dtype=real), moments: wp.array(dtype=real), weight: real,
+        active_count: wp.array(dtype=wp.int32), shares: wp.array(dtype=real),
     ):
         thread = first + wp.tid()
-        part = weight / real(logits.shape[0])
+        part = weight / real(opacities.shape[0])
         if active_count:
             part = weight / real(active_count[0])
         total = real(0.0)
-        for i in range(thread, logits.shape[0], shares.shape[0]):
-            opacity = real(1.0) / (real(1.0) + wp.exp(-logits[i]))
-            total += opacity
-            opacities[i] = opacity
+        for i in range(thread, opacities.shape[0], shares.shape[0]):
+            counts = bool(True)
+            if extents:
+                counts = extents[i, 0] > real(0.0)
+                if moments and moments[i] > real(0.0):
+                    counts = True
+            if counts:
+                total += opacities[i]
         shares[thread] = total * part
 
-    return activate_opacities
+    return sum_opacities
 
 
 @cache
-def opacities_backward_kernel(dtype):
-    """Return the backward pass of opacities_kernel(), launched over N threads.
+def opacity_penalty_backward_kernel(dtype):
+    """Return the backward pass of opacity_penalty_kernel(), launched over N threads.
 
-    logit_gradients: [N] from opacity_gradients [N] and mean_gradient [1], either of which may be None. active_count: as
-    of opacities_kernel().
+    opacity_gradients: [N] from penalty_gradient [1]. The other arguments are those of opacity_penalty_kernel().
     """
     real = dtype
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def activate_opacities_backward(
+    def sum_opacities_backward(
         first: int,
-        opacities: wp.array(dtype=real), weight: real, active_count: wp.array(dtype=wp.int32),
-        opacity_gradients: wp.array(dtype=real), mean_gradient: wp.array(dtype=real),
-        logit_gradients: wp.array(dtype=real),
+        extents: wp.array2d(dtype=real), moments: wp.array(dtype=real), weight: real,
+        active_count: wp.array(dtype=wp.int32), penalty_gradient: wp.array(dtype=real),
+        opacity_gradients: wp.array(dtype=real),
     ):
         i = first + wp.tid()
+        part = weight / real(opacity_gradients.shape[0])
+        if active_count:
+            part = weight / real(active_count[0])
+        counts = bool(True)
+        if extents:
+            counts = extents[i, 0] > real(0.0)
+            if moments and moments[i] > real(0.0):
+                counts = True
         gradient = real(0.0)
-        if opacity_gradients:
-            gradient = opacity_gradients[i]
-        if mean_gradient:
-            part = weight / real(opacities.shape[0])
-            if active_count:
-                part = weight / real(active_count[0])
-            gradient += part * mean_gradient[0]
-        opacity = opacities[i]
-        logit_gradients[i] = gradient * opacity * (real(1.0) - opacity)
+        if counts:
+            gradient = part * penalty_gradient[0]
+        opacity_gradients[i] = gradient
 
-    return activate_opacities_backward
+    return sum_opacities_backward

@@ -315,7 +315,7 @@ def first_rows(moments: dict[str, Tensor], count: int) -> dict[str, Tensor]:
     return {key: moment[:count] for key, moment in moments.items()}
 
 
-def moments_of(optimizer: Any, parameter: nn.Parameter) -> dict[str, Tensor]:
+def moments_of(optimizer: Any, parameter: Tensor) -> dict[str, Tensor]:
     """Return the optimizer's tensors with one row per Gaussian: all but Adam's step counter."""
     state = {} if optimizer is None else optimizer.state.get(parameter, {})
     return {key: value for key, value in state.items() if torch.is_tensor(value) and value.shape == parameter.shape}

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_harmonics
-from ..rasterizer.activations import opacities_with_penalty
+from ..rasterizer.activations import opacity_penalty
 from ..response import Response
 from ..scene import Camera
 from ..scene.normalization import Normalization
@@ -21,8 +21,7 @@ from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
 
-_DECODED_AT_ONCE = 1 << 19
-"""Pixels."""
+_DECODED_AT_ONCE = 1 << 19  # Pixels
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class TrainRender:
         rendering: Result of the rasterizer: alpha, projected means, radii.
         photo_exposure: Exposure of this photo, the input of the response; None if colors are encoded before they are
             composited.
-        opacity_penalty: opacity_weight times the mean opacity, a scalar; None without a weight.
+        opacity_penalty: Penalty on the opacities, a scalar; None without a weight.
     """
 
     encoded: Tensor | None
@@ -149,6 +148,7 @@ class RadianceField(nn.Module):
         encode: bool = True,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
         opacity_weight: float = 0.0,
+        opacity_moments: Tensor | None = None,
     ) -> TrainRender:
         """Render a training view, differentiably.
 
@@ -162,12 +162,15 @@ class RadianceField(nn.Module):
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
                 harmonics have in this direction; the harmonics themselves then get no gradient.
             opacity_weight: Weight of the mean opacity in opacity_penalty.
+            opacity_moments: [N] Adam's second moments of the opacities, see opacity_penalty().
         """
-        gaussians, opacities, penalty = self.gaussians, None, None
-        if opacity_weight:
-            opacities, penalty = opacities_with_penalty(
-                gaussians.opacity_logits, opacity_weight, gaussians.active_count
-            )
+        opacities = self.gaussians.opacities()
+
+        def penalty(rendering: Rendering) -> Tensor | None:
+            arguments = opacity_moments, opacity_weight, self.gaussians.active_count
+            extents = rendering.extents if camera.directions is None else None  # Of wide cameras all count.
+            return opacity_penalty(opacities, extents, *arguments) if opacity_weight else None
+
         ratio = exposure_time / self.base_time
         values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:
@@ -177,7 +180,7 @@ class RadianceField(nn.Module):
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-            return TrainRender(encoded=image, exposure=None, base=None, rendering=rendering, opacity_penalty=penalty)
+            return TrainRender(image, None, None, rendering, opacity_penalty=penalty(rendering))
         base, fused = self._exposures(values)  # The same tensor without fusion.
         color_sets = {"fused": fused}
         if self.tone_map == "gaussian":
@@ -186,16 +189,14 @@ class RadianceField(nn.Module):
             color_sets = encoded | color_sets if needs_exposure else encoded
         if "base" in extra_images and self.fusion is not None:
             color_sets["base"] = base
-        features = (
-            torch.cat(list(color_sets.values()), dim=1) if len(color_sets) > 1 else next(iter(color_sets.values()))
-        )
+        first, *others = color_sets.values()
+        features = torch.cat([first, *others], dim=1) if others else first
         rendering = self._rasterize(camera, features, max_intersections, opacities)
         # A single image is not split, because the derivative of a split is a copy.
         parts = rendering.image.split(3, dim=2) if len(color_sets) > 1 else (rendering.image,)
         images = dict(zip(color_sets, parts, strict=True))
         encoded, exposure, photo_exposure = images.get("encoded"), images.get("fused"), None
         if self.tone_map == "pixel":
-            # Usually the ratio is 1.
             photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(photo_exposure) if encode else None
         return TrainRender(
@@ -204,7 +205,7 @@ class RadianceField(nn.Module):
             base=images.get("base", exposure),
             rendering=rendering,
             photo_exposure=photo_exposure,
-            opacity_penalty=penalty,
+            opacity_penalty=penalty(rendering),
         )
 
     @torch.no_grad()

@@ -7,8 +7,8 @@ from torch.nn.functional import hardtanh
 from ..kernels.activations import (
     exposures_backward_kernel,
     exposures_kernel,
-    opacities_backward_kernel,
-    opacities_kernel,
+    opacity_penalty_backward_kernel,
+    opacity_penalty_kernel,
 )
 from .torch_contract import once_differentiable
 from .warp_launch.launching import launch, warp_scalar
@@ -52,38 +52,54 @@ class _BoundedExponential(torch.autograd.Function):
         return result, None
 
 
-def opacities_with_penalty(logits: Tensor, weight: float, active_count: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return the sigmoids of [N] logits, N >= 1, and `weight` times their mean, a scalar; differentiable once.
+def opacity_penalty(
+    opacities: Tensor,
+    extents: Tensor | None,
+    moments: Tensor | None,
+    weight: float,
+    active_count: Tensor | None = None,
+) -> Tensor:
+    """Return `weight` times the sum of the opacities that count over the number of Gaussians, a scalar.
 
-    active_count: [1] int32 on the device, how many the mean counts, if those behind them have a sigmoid of 0.
+    Gaussians in view count, and those that were in view since they were added or copied. Of the others, Adam would know
+    no gradient but this one, and fade them by several times its rate until a photo shows them: where few photos show a
+    place, they would be gone by then.
+
+    Args:
+        opacities: [N] opacities, float32 or float64.
+        extents: [N, 2] half-extents of the projected Gaussians, 0 if culled (Rendering.extents); None counts all.
+        moments: [N] Adam's second moments of the opacities, 0 from an addition or copy on until a photo shows the
+            Gaussian; None for zeros.
+        weight: Weight of the mean.
+        active_count: [1] int32 on the device, the number of Gaussians if those behind them have an opacity of 0.
     """
-    if logits.device.type == "cuda":
-        return _Opacities.apply(logits, weight, active_count)
-    opacities = torch.sigmoid(logits)
-    return opacities, weight * (opacities.mean() if active_count is None else opacities.sum() / active_count[0])
+    if opacities.device.type == "cuda":
+        return _OpacityPenalty.apply(opacities, extents, moments, weight, active_count)
+    if extents is not None:
+        counts = extents[:, 0] > 0
+        opacities = opacities * (counts if moments is None else counts | (moments > 0))
+    return weight * opacities.sum() / (len(opacities) if active_count is None else active_count[0])
 
 
-class _Opacities(torch.autograd.Function):
+class _OpacityPenalty(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, logits, weight, active_count):
-        logits = logits.detach().contiguous()
-        opacities, shares = torch.empty_like(logits), logits.new_empty(min(len(logits), MEAN_THREADS))
-        launch(
-            opacities_kernel(warp_scalar(logits.dtype)), len(shares), logits, weight, active_count, opacities, shares
-        )
-        ctx.weight, ctx.active_count = weight, active_count
-        ctx.save_for_backward(opacities)
-        ctx.set_materialize_grads(False)
-        return opacities, shares.sum()
+    def forward(ctx, opacities, extents, moments, weight, active_count):
+        opacities = opacities.detach().contiguous()
+        extents = None if extents is None else extents.detach()
+        shares = opacities.new_empty(min(len(opacities), MEAN_THREADS))
+        kernel = opacity_penalty_kernel(warp_scalar(opacities.dtype))
+        launch(kernel, len(shares), opacities, extents, moments, weight, active_count, shares)
+        # The moments change after the backward pass, in the optimizer step, and are not of the graph.
+        ctx.moments, ctx.weight, ctx.active_count, ctx.count = moments, weight, active_count, len(opacities)
+        ctx.save_for_backward(*(() if extents is None else (extents,)))
+        return shares.sum()
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_opacities, grad_mean):
-        (opacities,) = ctx.saved_tensors
-        result = torch.empty_like(opacities)
-        kernel, inputs = (
-            opacities_backward_kernel(warp_scalar(opacities.dtype)),
-            (opacities, ctx.weight, ctx.active_count),
-        )
-        launch(kernel, len(opacities), *inputs, grad_opacities, grad_mean, result)
-        return result, None, None
+    def backward(ctx, penalty_gradient):
+        extents = next(iter(ctx.saved_tensors), None)
+        result = penalty_gradient.new_empty(ctx.count)
+        kernel = opacity_penalty_backward_kernel(warp_scalar(result.dtype))
+        inputs = extents, ctx.moments, ctx.weight, ctx.active_count
+        launch(kernel, ctx.count, *inputs, penalty_gradient.reshape(1), result)
+        return result, None, None, None, None

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ..model.adam import Adam
+from ..model.gaussians import moments_of
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients, Rendering
 from ..rasterizer.training_step import differentiate
@@ -127,6 +128,7 @@ class GradientStep:
         """
         target, camera, field = view.target, view.camera, self._field
         sh_gradients: list[Tensor] = []
+        opacity_moments = moments_of(self._optimizer, field.gaussians.opacity_logits).get("exp_avg_sq")
         render = field.render_train_view(
             camera,
             view.exposure_time,
@@ -136,6 +138,7 @@ class GradientStep:
             encode=self.needs_encoded,
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
             opacity_weight=options.opacity_weight,
+            opacity_moments=opacity_moments,
         )
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in the step.
         needs_means2d_grad = options.needs_means2d_grad

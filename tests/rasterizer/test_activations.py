@@ -1,5 +1,4 @@
-"""Exposures and opacities of parameters: the kernels against torch's own operations in float64, and finite
-differences."""
+"""Exposures of parameters and the penalty on opacities: kernels against torch in float64, and finite differences."""
 
 import math
 
@@ -7,13 +6,13 @@ import pytest
 import torch
 
 from sehdr_warp.rasterizer import activations
-from sehdr_warp.rasterizer.activations import bounded_exponential, opacities_with_penalty
+from sehdr_warp.rasterizer.activations import bounded_exponential, opacity_penalty
 
 from .scenes import finite_differences, random_like, relative_error
 
 BOUND = 2.5
 EXPONENTIALS = [bounded_exponential, activations._BoundedExponential.apply]
-OPACITIES = [opacities_with_penalty, activations._Opacities.apply]
+PENALTIES = [opacity_penalty, activations._OpacityPenalty.apply]
 
 
 @pytest.mark.parametrize("function", EXPONENTIALS)
@@ -53,40 +52,39 @@ def test_exponentials_at_and_beyond_the_bounds(device, function):
     assert values.grad[0].tolist() == [0, 0, 0] and values.grad[1, :2].tolist() == [0, 1]
 
 
-@pytest.mark.parametrize("function", OPACITIES)
+def opacities_in_view(count, device, dtype=torch.float32):
+    """Return opacities, extents of which about a third are 0, and second moments of which about a half are."""
+    generator = torch.Generator().manual_seed(0)
+    opacities, moments = torch.rand(2, count, generator=generator, dtype=torch.float64)
+    extents = torch.rand(count, 2, generator=generator, dtype=torch.float64).sub(0.2).clamp_min(0)
+    extents[extents.amin(1) == 0] = 0  # Culled Gaussians have neither.
+    return [values.to(device, dtype) for values in (opacities, extents, moments.sub(0.5).clamp_min(0))]
+
+
+@pytest.mark.parametrize("function", PENALTIES)
 @pytest.mark.parametrize("count", [1, 7, 40_000])
 @pytest.mark.parametrize("spare", [None, 0, 5])
-@pytest.mark.parametrize("which", [(1.0, 0.0), (0.0, 3.0), (1.0, 3.0)])
-def test_opacities_their_mean_and_its_gradient_are_torchs_in_float64(device, count, function, spare, which):
-    logits = (2 * torch.randn(count, generator=torch.Generator().manual_seed(0))).to(device)
-    truth, live = logits.double().requires_grad_(), None
+@pytest.mark.parametrize("counted", ["all", "in view", "in view or moving"])
+def test_the_penalty_is_the_sum_of_what_counts_over_the_number_of_gaussians(device, function, count, spare, counted):
+    opacities, extents, moments = opacities_in_view(count, device)
+    visible, moving = extents[:, 0] > 0, moments > 0
+    counts = {"all": torch.ones_like(visible), "in view": visible, "in view or moving": visible | moving}[counted]
+    expected, active_count = 1.5 * float((opacities.double() * counts).sum()) / count, None
     if spare is not None:
-        logits = torch.cat([logits, torch.full((spare,), -1e4, device=device)])
-        live = torch.tensor([count], dtype=torch.int32, device=device)
-    opacities, mean = function(logits.requires_grad_(), 1.5, live)
-    true_opacities = torch.sigmoid(truth)
-    true_mean = 1.5 * true_opacities.mean()
-    weights = random_like(opacities, 1)
-    # What nobody asks for has no gradient at all.
-    of = [w * x for w, x in zip(which, ((opacities * weights).sum(), mean), strict=True) if w]
-    true_of = [w * x for w, x in zip(which, ((true_opacities * weights[:count]).sum(), true_mean), strict=True) if w]
-    sum(of).backward()
-    sum(true_of).backward()
-    assert mean.item() == pytest.approx(true_mean.item(), rel=1e-6)
-    assert relative_error(opacities[:count], true_opacities) < 1e-6 and not opacities[count:].any()
-    assert relative_error(logits.grad[:count], truth.grad) < 1e-5
-    assert not logits.grad[count:].any()
+        opacities = torch.cat([opacities, opacities.new_zeros(spare)])
+        extents = torch.cat([extents, extents.new_zeros(spare, 2)])
+        moments = torch.cat([moments, moments.new_zeros(spare)])
+        active_count = torch.tensor([count], dtype=torch.int32, device=device)
+    arguments = None if counted == "all" else extents, moments if counted == "in view or moving" else None
+    penalty = function(opacities.requires_grad_(), *arguments, 1.5, active_count)
+    (3 * penalty).backward()
+    assert penalty.item() == pytest.approx(expected, rel=1e-5, abs=1e-12)
+    torch.testing.assert_close(opacities.grad[:count], (4.5 / count * counts).float())
 
 
-@pytest.mark.parametrize("function", OPACITIES)
-def test_the_gradient_of_opacities_is_that_of_finite_differences(device, function):
-    logits = torch.linspace(-4, 4, 11, dtype=torch.float64, device=device)
-    weights = random_like(logits, 1)
-
-    def loss(values):
-        opacities, mean = function(values, 0.7, None)
-        return (opacities * weights).sum() + 2 * mean
-
-    numeric = finite_differences(loss, [logits], 0)
-    loss(logits.requires_grad_()).backward()
-    assert relative_error(logits.grad, numeric) < 1e-9
+@pytest.mark.parametrize("function", PENALTIES)
+def test_the_gradient_of_the_penalty_is_that_of_finite_differences(device, function):
+    opacities, extents, moments = opacities_in_view(11, device, torch.float64)
+    numeric = finite_differences(lambda values: 2 * function(values, extents, moments, 0.7, None), [opacities], 0)
+    (2 * function(opacities.requires_grad_(), extents, moments, 0.7, None)).backward()
+    assert relative_error(opacities.grad, numeric) < 1e-9

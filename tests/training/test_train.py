@@ -195,6 +195,23 @@ def test_opacities_are_not_pulled_down_once_none_are_relocated(scene):
     assert means[last_refinement - 1] < 0.5 * means[0] and means[-1] > means[last_refinement - 1]
 
 
+def test_new_gaussians_do_not_fade_before_a_photo_shows_them(scene, device):
+    config = quick(length=60, **{"densification.refine_start_iter": 55, "loss.opacity_weight": 10.0})
+    trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), device))
+    gaussians = trainer.field.gaussians
+    for _ in range(10):
+        trainer.step()
+    added = gaussians.rows(torch.arange(3, device=device))
+    added["means"] = added["means"] + 1e3  # Out of view of all cameras.
+    gaussians.append(added, trainer.optimizer)
+    before = gaussians.opacities().detach().clone()
+    for _ in range(20):
+        trainer.step()
+    after = gaussians.opacities().detach()
+    assert torch.equal(after[-3:], before[-3:])
+    assert after[:-3].mean() < 0.9 * before[:-3].mean()
+
+
 @pytest.mark.parametrize("variant", ["default", "adc"])
 def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
     config = override_config(VARIANTS[variant], {"schedule.sh_degree_interval": 2})
