@@ -34,9 +34,8 @@ RATES_FOR = 30_000  # Length of the trainings that 3DGS's learning rates are for
 RATE_POWER, MAX_RATE_SCALE = 0.22, 2.5  # Rates of shorter trainings grow with this power, up to this factor
 SCALED_RATE_PHOTOS = 40  # Largest number of photos for that: scenes with 10 to 21 photos gain, with 52 and 84 lose
 SCALED_RATES = "means", "means_final", "log_scales", "opacity_logits", "harmonics_rest"
-MAX_EXPOSURE_RATIO = (
-    2.0**16
-)  # Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white
+MAX_EXPOSURE_RATIO = 2.0**16
+"""Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white."""
 COMPENSATION = "exposure-compensation"  # Name of the decision that compensation.py adds
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
