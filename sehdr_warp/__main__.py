@@ -52,6 +52,9 @@ def _is_out_of_memory(error: BaseException) -> bool:
                 return True
             if isinstance(cause, ImportError) and "map segment" in str(cause):
                 return True
+            # Python says this where it found no memory for the exception itself.
+            if isinstance(cause, SystemError) and "without exception set" in str(cause):
+                return True
             cause = cause.__cause__ or cause.__context__
         return _address_space_left() < _LITTLE
     except MemoryError:

@@ -529,7 +529,7 @@ def test_sets_of_an_outsider(space, place, value, codes):
         at = at[key]
     at[place[-1]] = value
     put(space / "photos" / "transforms.json", tree)
-    either = place[0] == "w" or place[-1] == "transform_matrix" or str(value).startswith("http")  # Left out and named
+    either = place[0] == "w" or place[-1] == "transform_matrix" or str(value).startswith(("http", "/"))  # Left out
     tried(space, SHORT, EITHER if either else codes)
 
 
