@@ -28,10 +28,10 @@ def idle_nodes() -> int:
     if shutil.which("sinfo") is None:
         return 0
     try:
-        asked = subprocess.run(["sinfo", "-h", "-t", "idle", "-o", "%D"], capture_output=True, text=True, timeout=10)
+        answer = subprocess.run(["sinfo", "-h", "-t", "idle", "-o", "%D"], capture_output=True, text=True, timeout=10)
     except subprocess.TimeoutExpired:
         return 0
-    return sum(int(line) for line in asked.stdout.split() if line.isdigit())
+    return sum(int(line) for line in answer.stdout.split() if line.isdigit())
 
 
 pytestmark = pytest.mark.skipif(idle_nodes() < 2, reason="needs a SLURM cluster with two idle nodes")

@@ -1,4 +1,4 @@
-"""Where a training starts: focus, drawn points, colors, and the choice of a response."""
+"""Start of a training: focus, random points, colors, and the choice of a response."""
 
 import dataclasses
 

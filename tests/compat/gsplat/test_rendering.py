@@ -360,8 +360,8 @@ def test_gaussians_that_are_not_finite_change_no_gradient(model, value, device):
         colors, _, _ = rasterization(*bad, **place._asdict(), **options)
         torch.testing.assert_close(colors, truth)
         for mine, its in zip(gradients(colors, [*bad, *place[:2]]), expected, strict=True):
-            kept = mine[5:] if len(mine) == COUNT else mine
-            torch.testing.assert_close(kept, its, rtol=1e-3, atol=1e-3)
+            in_view = mine[5:] if len(mine) == COUNT else mine
+            torch.testing.assert_close(in_view, its, rtol=1e-3, atol=1e-3)
             assert len(mine) != COUNT or not mine[:5].any()
 
 
