@@ -3,8 +3,9 @@
 python -m benchmarks.blocks OUT --json blocks.json
 
 benchmarks.survey makes the photos. Blocks train as many steps on each photo as the whole does. With three GPUs the
-whole trains on the third beside the blocks, with two after blocks were trained at once. Copies of the merged run are
-rendered from the disk and shown by `sehdr-warp view`. Each row is also a line of OUT/rows.jsonl as soon as it is known.
+whole trains on the third, beside blocks that are not timed, with two after blocks were trained at once. Copies of the
+merged run are rendered from the disk and shown by `sehdr-warp view`. Each row is also a line of OUT/rows.jsonl as soon
+as it is known.
 """
 
 import json
@@ -16,7 +17,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -112,9 +113,10 @@ class Study:
 class _Spans(logging.Handler):
     """Note when the training of each block begins and ends, monotonic seconds."""
 
-    def __init__(self) -> None:
-        """Begin with none."""
+    def __init__(self, first_done: Callable[[], None] | None) -> None:
+        """Begin with none; call `first_done` once the first AT_ONCE blocks have ended."""
         super().__init__()
+        self.first_done = first_done
         self.begin: dict[str, float] = {}
         self.end: dict[str, float] = {}
 
@@ -125,6 +127,8 @@ class _Spans(logging.Handler):
             self.begin[name] = time.monotonic()
         elif message.startswith("finished"):
             self.end[name] = time.monotonic()
+            if self.first_done is not None and len(self.end) == AT_ONCE:
+                self.first_done()
 
 
 def run_study(study: Study) -> None:
@@ -142,16 +146,16 @@ def run_study(study: Study) -> None:
     at_once = min(AT_ONCE, len(devices))
     arguments = data, config.model_dump(), study.out / "whole", devices[-1].type
     whole = multiprocessing.get_context("spawn").Process(target=_train_whole, args=arguments, daemon=True)
-    if len(devices) > AT_ONCE:
+
+    def start_whole() -> None:
         with _one_visible(devices[-1]):
             whole.start()
-    # The two longest blocks train first, beside each other.
+
+    # The two longest blocks train first, beside each other and without the whole, which would make them slower.
     pair = sorted(plan.blocks, key=lambda block: -block.fraction)[:AT_ONCE]
-    spans = _train_blocks(study, plan, "at_once", at_once)
-    beside_whole = whole.pid is not None
-    if not beside_whole:
-        with _one_visible(devices[-1]):
-            whole.start()
+    spans = _train_blocks(study, plan, "at_once", at_once, start_whole if len(devices) > AT_ONCE else None)
+    if whole.pid is None:
+        start_whole()
     both = max(spans[block.name][1] for block in pair)
     merge_blocks(study.out / "at_once", plan)
     run = load_run(study.out / "at_once", device=study.device)
@@ -162,15 +166,17 @@ def run_study(study: Study) -> None:
     errors = measure_seams(run, views, plan.division)
     study.add(f"{study.count} blocks, {at_once} at once, merged", **figures, peak_memory_bytes=peak, **asdict(errors))
     names = " and ".join(block.name for block in pair)
-    study.add(f"{names} at once", seconds=both, beside_whole=beside_whole)
+    study.add(f"{names} at once", seconds=both, beside_whole=False)
+    whole.join(max(1.0, study.left - 3 * both))
     if study.left > 2.2 * both:
         for block in plan.blocks:
             if block not in pair:  # Finished blocks are not trained again.
                 place = Path(FOLDER) / block.name
                 shutil.copytree(study.out / "at_once" / place, study.out / "one_by_one" / place)
+        beside_whole = whole.is_alive()
         alone = _train_blocks(study, plan, "one_by_one", 1)
         seconds = max(end for _, end in alone.values())
-        study.add(f"{names}, one after the other", seconds=seconds, ratio=both / seconds, beside_whole=whole.is_alive())
+        study.add(f"{names}, one after the other", seconds=seconds, ratio=both / seconds, beside_whole=beside_whole)
     whole.join(max(1.0, study.left - 15))
     if not whole.is_alive() and (study.out / "whole" / "summary.json").is_file():
         _add_whole(study, run, views, plan)
@@ -231,8 +237,10 @@ def _train_whole(data: LoadArguments, config: Mapping[str, Any], out: Path, devi
             log.info("iteration %d: %.2f ms a step, %d Gaussians", progress.iteration, step_ms, progress.gaussians)
 
 
-def _train_blocks(study: Study, plan: BlockPlan, name: str, at_once: int) -> dict[str, tuple[float, float]]:
-    """Train the unfinished blocks in OUT/name and add a row for each.
+def _train_blocks(
+    study: Study, plan: BlockPlan, name: str, at_once: int, first_done: Callable[[], None] | None = None
+) -> dict[str, tuple[float, float]]:
+    """Train the unfinished blocks in OUT/name and add a row for each; see _Spans for `first_done`.
 
     Returns:
         For each of them when it began and ended, seconds from the start of the first.
@@ -240,7 +248,7 @@ def _train_blocks(study: Study, plan: BlockPlan, name: str, at_once: int) -> dic
     out = study.out / name
     out.mkdir(exist_ok=True)
     plan.write(out)
-    handler = _Spans()
+    handler = _Spans(first_done)
     logging.getLogger("sehdr_warp").addHandler(handler)
     began = time.monotonic()
     try:
