@@ -201,8 +201,8 @@ def _config(study: Study) -> Config:
 
 
 def _warm_up(study: Study, plan: BlockPlan, data: LoadArguments, config: Config) -> None:
-    """Compile kernels before anything is timed."""
-    scene = load_saved_scene({**data, "views": list(plan.blocks[0].views)[:12]}, response="srgb")
+    """Compile kernels before anything is timed, with a block's photos: few Gaussians take other kernels."""
+    scene = load_saved_scene({**data, "views": list(plan.blocks[0].views)}, response="srgb")
     short = override_config(config, {"schedule.iterations": WARM_UP})
     create_trainer(scene, study.out / "warm", short, device=study.device, overwrite=True).train()
     if study.device.type == "cuda":
