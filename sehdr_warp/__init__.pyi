@@ -7,9 +7,14 @@ from .evaluation.folder import evaluate_folder
 from .output.brackets import write_brackets
 from .output.environment_map import write_environment_map
 from .output.export import export
+from .output.film import write_film
+from .output.lights import write_lights
 from .output.proxy_mesh import write_proxy_mesh
-from .output.render_views import render_views
+from .output.render_views import render_views, select_cameras
 from .output.report import write_report
+from .output.scene_page import write_scene_page
+from .output.splat_edits import SplatEdits
+from .output.world_transform import write_orientation
 from .rasterizer import Rendering, differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim
 from .response import Response, response_by_name, response_names
 from .runs.config import Config
@@ -33,6 +38,7 @@ __all__ = [
     "Run",
     "Scene",
     "SehdrError",
+    "SplatEdits",
     "Splats",
     "Trainer",
     "TrainingProgress",
@@ -58,13 +64,18 @@ __all__ = [
     "render_views",
     "response_by_name",
     "response_names",
+    "select_cameras",
     "spherical_harmonics",
     "ssim",
     "train",
     "write_brackets",
     "write_environment_map",
+    "write_film",
+    "write_lights",
+    "write_orientation",
     "write_proxy_mesh",
     "write_report",
+    "write_scene_page",
 ]
 
 __version__: str

@@ -230,7 +230,7 @@ def check_cameras(cameras: str | Path) -> None:
 
 
 def select_cameras(
-    run,
+    run: "RenderableScene",
     cameras: str | Path,
     *,
     camera: str | None = None,

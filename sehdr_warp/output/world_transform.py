@@ -236,9 +236,15 @@ def read_orientation(run: "RenderableScene") -> Orientation:
 
 
 def write_orientation(run: "RenderableScene", *, up: Sequence[float] | None = None, scale: float | None = None) -> Path:
-    """Keep an up direction [3], scene coordinates, and a scale, meters per unit, with a run; return the file.
+    """Keep an up direction and a scale with a run, which all of its files then follow; return the file that holds them.
 
-    None leaves what is kept.
+    Args:
+        run: From load_run or train.
+        up: Direction [3] in the scene's own coordinates; None leaves what is kept.
+        scale: Meters for each unit of the scene; None leaves what is kept.
+
+    Raises:
+        SehdrError: For a file of Gaussians, or a value that cannot be.
     """
     path = Path(run.path) / ORIENTATION_FILE
     if not path.parent.is_dir():

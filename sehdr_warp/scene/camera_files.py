@@ -21,6 +21,8 @@ from .read_transforms import frame_lens, frame_pose, frames_of, pose_from_opengl
 
 log = logging.getLogger(__name__)
 _DATAPARSER = "dataparser_transforms.json"
+_UNREAD = {".abc": "Alembic", ".fbx": "FBX", ".nk": "Nuke script", ".blend": "Blender"}
+"""Files with cameras that no well-kept library for Python reads."""
 
 
 def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
@@ -36,6 +38,9 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
         InputError: if the file is damaged, a pose or size is not possible, or two cameras share a name.
     """
     path = Path(path)
+    if path.suffix.lower() in _UNREAD:
+        problem = f"{_UNREAD[path.suffix.lower()]} files are not read"
+        raise InputError(path, problem, "export the camera as OpenUSD (.usda or .usdc), or from Nuke as .chan")
     if path.is_dir():
         cameras = _of_colmap(path)
     elif path.suffix.lower() in EXCHANGE_SUFFIXES:

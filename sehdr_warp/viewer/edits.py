@@ -1,7 +1,7 @@
 """Edits of a page: crops and gains of lights with undo, and the up direction and scale that are kept with a run."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from ..errors import SehdrError
 from ..model.lights import Light
 from ..output.splat_edits import SplatEdits
 from ..output.world_transform import world_transform, write_orientation
+from ..scene import View
 from ..splats.arrays import HARMONIC_0
 
 MOST_GAIN = 20.0
@@ -37,15 +38,21 @@ class EditedOpacities:
             SehdrError: If nothing is left; the scene then stays as it was.
         """
         logits = run.field.gaussians.opacity_logits
-        original = logits.detach().clone() if self.original is None else self.original
-        if edits is None:
-            mask = np.ones(len(original), bool)
-        else:
-            means = run.field.gaussians.means.detach().cpu().numpy()
-            opacities = torch.sigmoid(original).cpu().numpy()
-            mask = edits.mask(opacities, world_transform(run).points(means), run)
+        shown = logits.detach().clone()
+        original = shown if self.original is None else self.original
         with torch.no_grad():
-            logits.copy_(original)
+            logits.copy_(original)  # Views and masks are counted on the whole scene.
+        mask = np.ones(len(original), bool)
+        if edits is not None:
+            means = run.field.normalization.scene_points(run.field.gaussians.means.detach().cpu().numpy())
+            opacities = torch.sigmoid(original).cpu().numpy()
+            try:
+                mask = edits.mask(opacities, world_transform(run).points(means), run)
+            except SehdrError:
+                with torch.no_grad():
+                    logits.copy_(shown)
+                raise
+        with torch.no_grad():
             logits[torch.from_numpy(~mask).to(logits.device)] = _HIDDEN_LOGIT
         self.original = None if edits is None else original
         return int(mask.sum())
@@ -95,10 +102,24 @@ class LightGains:
         self.original = original if stops else None
 
 
-def edits_of(request: dict) -> SplatEdits | None:
-    """Return the edits that a page asks for; None for none. Raises SehdrError for a region that cannot be."""
-    crop, cut = (None if request.get(name) is None else str(request[name]) for name in ("crop", "cut"))
-    return SplatEdits(crop=crop, cut=cut) if crop or cut else None
+def edits_of(request: dict, photos: Callable[[], Sequence[View]]) -> SplatEdits | None:
+    """Return the edits that a page asks for; None for none.
+
+    Args:
+        request: Any of the regions "crop" and "cut", "min_opacity", "min_views" and "mask_only".
+        photos: Returns the photos with their masks, for "mask_only".
+
+    Raises:
+        SehdrError: For a value that cannot be, or masks that are not there.
+    """
+    edits: dict[str, Any] = {
+        name: kind(request[name])
+        for name, kind in (("crop", str), ("cut", str), ("min_opacity", float), ("min_views", int))
+        if request.get(name) is not None
+    }
+    if request.get("mask_only"):
+        edits["mask_views"] = photos()
+    return SplatEdits(**edits) if edits else None
 
 
 def orient(run: Any, request: dict) -> None:

@@ -114,9 +114,11 @@ class Viewer:
             return "application/octet-stream", frame
         if path in ("/edit", "/orientation") and self.training is None:
             run = self._run(request)
-            self.on_renderer(
-                client, partial(run.edit, edits_of(request)) if path == "/edit" else partial(orient, run, request)
-            )
+            if path == "/edit":
+                edits = edits_of(request, partial(self._photos_of, int(request.get("run", 0))))
+                self.on_renderer(client, partial(run.edit, edits))
+            else:
+                self.on_renderer(client, partial(orient, run, request))
             run.turned()
             return "application/json", json.dumps(run.facts()).encode()
         if path in ("/lights", "/gain") and self.training is None:
@@ -169,6 +171,13 @@ class Viewer:
         if not 0 <= index < len(self.runs):
             raise Refusal(404, "no such run")
         return self.runs[index]
+
+    def _photos_of(self, index: int) -> list[Any]:
+        """Return the photos of a run; raise SehdrError if they are gone."""
+        if self._photos is None:
+            raise SehdrError("the photos, whose masks these would be, are not here")
+        with self._reading:
+            return list(self._photos(index).values())
 
     def _photo(self, name: str, client: Client) -> bytes:
         """Return the photo of a run and a view by their indices, as PNG."""

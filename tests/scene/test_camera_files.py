@@ -55,6 +55,14 @@ def test_a_colmap_model_is_a_camera_file(tmp_path):
         load_cameras(model)
 
 
+@pytest.mark.parametrize(("suffix", "name"), [(".abc", "Alembic"), (".FBX", "FBX")])
+def test_camera_files_of_other_programs_are_told_what_to_export(tmp_path, suffix, name):
+    path = tmp_path / f"shot{suffix}"
+    path.write_bytes(b"Ogawa\xff\x00")
+    with pytest.raises(InputError, match=f"shot{suffix}: {name} files are not read; export the camera as OpenUSD"):
+        load_cameras(path)
+
+
 def test_moving_usd_cameras_give_a_camera_a_frame(tmp_path):
     Usd, UsdGeom, Gf = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Gf"))
     stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))

@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from sehdr_warp.model.lights import Light, LightShape
+from sehdr_warp.output.splat_edits import SplatEdits
 from sehdr_warp.output.world_transform import world_transform
-from sehdr_warp.scene import Camera
+from sehdr_warp.scene import Camera, View
+from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Server, Viewer
 
@@ -123,6 +125,49 @@ def test_a_crop_is_shown_and_undone(server):
     np.testing.assert_array_equal(frame(server, view)[0], before)
 
 
+def test_regions_are_those_of_a_scene_that_is_trained_in_other_coordinates(tmp_path):
+    run = run_of(tmp_path, splats([(0, 0, 0), (1, 0, 0)], [0.9, 0.9]))
+    run.path, run.field.normalization = tmp_path, Normalization(np.array([0.5, 0, 0]), 4.0)
+    with torch.no_grad():
+        run.field.gaussians.means.sub_(torch.tensor([0.5, 0, 0])).div_(4)
+    scene = ViewerScene(run, "run")
+    x, y, z = world_transform(run).points(np.array([1.0, 0, 0]))
+    scene.edit(SplatEdits(cut=f"box:{x - 0.2},{y - 0.2},{z - 0.2},{x + 0.2},{y + 0.2},{z + 0.2}"))
+    assert (torch.sigmoid(run.field.gaussians.opacity_logits) > 0.1).flatten().tolist() == [True, False]
+
+
+def test_floaters_faint_and_unmasked_gaussians_are_left_out(tmp_path):
+    """Each edit counts on the whole scene, whatever the one before it hid."""
+    run = run_of(tmp_path, splats([(0, 0, 0), (1, 0, 0), (0, 0, -20)], [0.9, 0.5, 0.9]))
+    run.path, photo = tmp_path, run.cameras[2].camera
+    x, _, z, _ = photo.world_to_camera @ np.array([0.5, 0, 0, 1])
+    beyond = np.arange(photo.width) > photo.fx * x / z + photo.cx
+    codes = np.zeros((photo.height, photo.width, 3), np.uint8)
+    mask = np.tile(np.float32(beyond), (photo.height, 1))
+    photos = {"2": View("2", codes, photo, 1.0, "train", mask)}
+    with Server(Viewer([ViewerScene(run, "run")], lambda index: photos), port=18600) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        logits = run.field.gaussians.opacity_logits
+
+        def shown(**request):
+            assert edit(server, **request)[0] == 200
+            return (torch.sigmoid(logits) > 0.1).flatten().tolist()
+
+        x, y, z = world_transform(run).points(np.zeros(3))
+        assert shown(cut=f"sphere:{x},{y},{z},0.2") == [False, True, True]
+        assert shown(min_views=2) == [True, True, False]
+        assert shown(min_opacity=0.6) == [True, False, True]
+        assert sum(shown(mask_only=True)) == 1
+        assert edit(server, min_opacity=0.95)[0] == 409
+        assert sum(shown()) == 3
+        server.shutdown()
+
+
+def test_masks_that_are_not_there_are_told(server):
+    status, words = edit(server, mask_only=True)
+    assert status == 409 and "photos" in words
+
+
 def test_up_and_scale_are_kept_with_the_run(server, tmp_path):
     status, _, content = ask(server, "/orientation", {"up": [0, 0, 1]})
     assert status == 200 and np.allclose(np.array(json.loads(content)["upright"])[1, :3], [0, 0, 1])
@@ -176,6 +221,12 @@ def test_undo_goes_back_one_edit_at_a_time(server):
         edit("#crop", 1, "--crop sphere:")
         edit("#undo", 1, "part.ply --cut")
         assert "--crop" not in page.inner_text("#edited")
+        edit("#undo", 2, "all of it is shown")
+        pick((1, 0, 0), (1.2, 0, 0))
+        page.select_option("#shape", "box")
+        edit("#cut", 1, "--cut box:")
+        edit("#floaters", 1, "--min-views 2")
+        edit("#undo", 1, "--cut box:")
         edit("#undo", 2, "all of it is shown")
         assert page.locator("#undo").is_disabled()
         pick((0, 0, 0), (0.5, 0, 0))

@@ -434,18 +434,32 @@ $("setUp").addEventListener("click", () => {
   const up = normal.map(x => x * (dot(normal, add(camera.position, a, -1)) < 0 ? -1 : 1));
   change("orientation", {up}, () => { camera.up = up; return "kept: files are upright by this floor"; });
 });
-for (const name of ["crop", "cut"]) $(name).addEventListener("click", async () => {
-  const [a, b] = state.points.map(upright), region = "sphere:" + [...a, Math.hypot(...add(b, a, -1))].map(x => x.toPrecision(5)).join(",");
-  state.regions.push({...state.regions.at(-1), [name]: region});
-  if (!await edit()) state.regions.pop();  // As where nothing would be left
-});
+// The first point is the center of a region, and the second lies on its rim: of a sphere, or of a box with equal sides.
+function region({shape, points}) {
+  const [a, b] = points.map(upright), offsets = add(b, a, -1), half = Math.max(...offsets.map(Math.abs));
+  const values = shape === "box" ? [...a.map(x => x - half), ...a.map(x => x + half)] : [...a, Math.hypot(...offsets)];
+  return `${shape}:${values.map(x => x.toPrecision(5)).join(",")}`;
+}
+async function leaveOut(part) {
+  state.regions.push({...state.regions.at(-1), ...part});
+  if (await edit()) return;
+  state.regions.pop();  // As where nothing would be left
+  fader();
+}
+for (const name of ["crop", "cut"]) $(name).addEventListener("click", () => leaveOut({[name]: {shape: $("shape").value, points: [...state.points]}}));
+$("floaters").addEventListener("click", () => leaveOut({min_views: 2}));
+$("unmasked").addEventListener("click", () => leaveOut({mask_only: true}));
+$("faint").addEventListener("change", () => leaveOut({min_opacity: Number($("faint").value)}));
+const fader = () => { $("faint").value = state.regions.at(-1).min_opacity || 0; };
 $("undo").addEventListener("click", () => {
   if (state.regions.length > 1) state.regions.pop();
+  fader();
   edit();
 });
 function edit() {
-  const region = state.regions.at(-1), flags = Object.entries(region).map(([flag, text]) => ` --${flag} ${text}`).join("");
-  return change("edit", region, () => flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.name} --out part.ply${flags}` : "all of it is shown");
+  const edits = Object.fromEntries(Object.entries(state.regions.at(-1)).map(([name, value]) => [name, value.points ? region(value) : value]));
+  const flags = Object.entries(edits).map(([name, value]) => ` --${name.replace("_", "-")}` + (value === true ? "" : ` ${value}`)).join("");
+  return change("edit", edits, () => flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.name} --out part.ply${flags}` : "all of it is shown");
 }
 measured();
 
