@@ -101,6 +101,10 @@ class Study:
         """Seconds that are left."""
         return self.seconds - (time.monotonic() - self.began)
 
+    def seconds_left(self, but: float) -> float:
+        """Return the seconds to wait for a process if `but` seconds are to be left; at least 1, at most a day."""
+        return min(max(1.0, self.left - but), 86_400.0)
+
     @property
     def devices(self) -> list[torch.device]:
         """Devices from the first on: of the blocks that train at once, and of the whole."""
@@ -167,7 +171,7 @@ def run_study(study: Study) -> None:
     study.add(f"{study.count} blocks, {at_once} at once, merged", **figures, peak_memory_bytes=peak, **asdict(errors))
     names = " and ".join(block.name for block in pair)
     study.add(f"{names} at once", seconds=both, beside_whole=False)
-    whole.join(max(1.0, study.left - 3 * both))
+    whole.join(study.seconds_left(3 * both))
     if study.left > 2.2 * both:
         for block in plan.blocks:
             if block not in pair:  # Finished blocks are not trained again.
@@ -177,7 +181,7 @@ def run_study(study: Study) -> None:
         alone = _train_blocks(study, plan, "one_by_one", 1)
         seconds = max(end for _, end in alone.values())
         study.add(f"{names}, one after the other", seconds=seconds, ratio=both / seconds, beside_whole=beside_whole)
-    whole.join(max(1.0, study.left - 15))
+    whole.join(study.seconds_left(15))
     if not whole.is_alive() and (study.out / "whole" / "summary.json").is_file():
         _add_whole(study, run, views, plan)
     if study.left > COPY_SECONDS:
