@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from ..model.confidence import Evidence, gather_evidence
 from ..model.radiance_field import RadianceField
 from ..model.residual_regions import MAX_LISTED, compare_photos, regions_to_dict
 from ..runs.checkpoint import first_not_finite
-from ..runs.config import Config
+from ..runs.config import Config, ScheduleConfig
 from ..runs.run import Run, load_run
 from ..runs.run_writer import RunWriter, write_confidence
 from ..scene import View
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 CURVE_POINTS = 200  # Points of the curves in TensorBoard
+LEAST_SECONDS = 10.0  # Between checkpoints, unless the interval is set: one of a million Gaussians takes 1 to 2 s
 MAX_DB = 100.0  # Score of identical images, so that a mean over views is finite
 
 
@@ -50,7 +52,10 @@ class RunOutput:
         self.folder, self._is_block = folder, is_block
         total = config.schedule.iterations
         self._evaluate_at = {config.scaled(n) for n in config.schedule.evaluate_at} | {total}
-        self._checkpoint_every = config.scaled(config.schedule.checkpoint_every)
+        every = config.schedule.checkpoint_every
+        self._checkpoint_every = config.scaled(every)
+        self._least_seconds = LEAST_SECONDS if every == ScheduleConfig().checkpoint_every else 0.0
+        self._saved_at = time.monotonic()
         self._log_every = max(1, total // CURVE_POINTS)
         self._tensorboard = tensorboard
         self._writer: Any = None  # Created at the first log, when the run folder has been begun.
@@ -73,7 +78,7 @@ class RunOutput:
             self.evaluate(trainer)
         if save:
             trainer.gather()
-        if save and iteration < trainer.total:
+        if save and iteration < trainer.total and time.monotonic() - self._saved_at >= self._least_seconds:
             self.checkpoint(trainer)
         if self._tensorboard and trainer.came_to(self._log_every):
             figures = {"loss": trainer.run_timed(lambda: trainer.loss), "psnr": trainer.run_timed(trainer.psnr)}
@@ -109,6 +114,7 @@ class RunOutput:
         self._run = None  # A run that was loaded before is older.
         keep = trainer.config.schedule.keep_checkpoints
         self.folder.write_checkpoint(state.tensors, state.values | {"seconds": trainer.seconds}, keep=keep)
+        self._saved_at = time.monotonic()
 
     def finish(self, trainer: Trainer, *, complete: bool) -> None:
         """Write the last checkpoint and the summary; if complete, also the confidence, and the regions that differ.

@@ -14,6 +14,7 @@ from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import codes_of
+from sehdr_warp.training import run_output
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.run_output import evaluate_views
 from sehdr_warp.training.train import create_trainer, train
@@ -39,6 +40,16 @@ def test_every_variant_learns_and_loads_as_it_was_trained(scene, trained, varian
     again = evaluate_views(run.field, scene.test_views, run.config.model.sh_degree)
     assert again["psnr_ldr"] == pytest.approx(last["psnr_ldr"], abs=1e-4)
     assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
+
+
+@pytest.mark.parametrize(("every", "apart", "saved"), [(5000, 10.0, 2), (5000, 0.0, 7), (5001, 10.0, 7)])
+def test_checkpoints_are_seconds_apart_unless_their_interval_is_set(scene, tmp_path, monkeypatch, every, apart, saved):
+    """The default of 5000 iterations of 30,000 are 2 of 12 here; one more is of the start."""
+    monkeypatch.setattr(run_output, "LEAST_SECONDS", apart)
+    fields = {"schedule.keep_checkpoints": 9, "schedule.checkpoint_every": every}
+    train(scene, tmp_path / "run", override_config(quick(length=12), fields), device="cpu")
+    names = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
+    assert len(names) == saved and names[-1] == "iteration_00000012", names
 
 
 def test_a_scene_without_points_starts_from_drawn_ones(tmp_path):

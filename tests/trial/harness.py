@@ -28,7 +28,9 @@ from tests.training.toy import toy_scene
 
 SEED = 19
 COMMANDS = {
-    "train": "train photos --out run --preset demo --response hdr-nerf --iterations 24 --device cpu --seed 3",
+    # Checkpoints of the default interval are 10 s apart.
+    "train": "train photos --out run --preset demo --response hdr-nerf --iterations 24 --device cpu --seed 3 "
+    "--schedule.checkpoint-every 4800",
     "render": "render run --out made --cameras all --evs=-2,0 --device cpu --overwrite",
     "export": "export run --out made/scene.ply --kind hdr --overwrite",
     "export usd": "export run --out made/scene.usda --overwrite",
