@@ -82,13 +82,13 @@ HELD_BY = {
     ],
     "What has the name of a run's or a set's file": [
         "test_files.py::test_what_has_the_name_of_a_file_is_not_taken_for_a_missing_one",
-        "trial/test_outsider.py::test_kinds_of_files_of_a_run_of_an_outsider",
-        "trial/test_outsider.py::test_kinds_of_files_of_a_set_of_an_outsider",
+        "trial/test_outsider_runs.py::test_kinds_of_files_of_a_run_of_an_outsider",
+        "trial/test_outsider_sets.py::test_kinds_of_files_of_a_set_of_an_outsider",
     ],
     "Environment variables of a launcher": [
         "training/test_nodes.py::test_numbers_that_no_launcher_sets_are_refused",
         "training/test_nodes.py::test_ports_that_cannot_be_are_refused",
-        "trial/test_outsider.py::test_ranks_of_an_outsider",
+        "trial/test_outsider_output.py::test_ranks_of_an_outsider",
     ],
     "Names in a data set stay inside": [
         f"{HERE}_names_of_a_set_stay_inside",
