@@ -12,9 +12,9 @@ _LONGEST_CHAIN = 20  # Exceptions that one came from
 
 def run() -> None:
     """Run the command line of this process and exit, see cli.main()."""
-    interrupted = bool
+    is_interrupted = bool
     try:
-        from .process import interrupted, prepare, use_utf8
+        from .process import is_interrupted, prepare, use_utf8
 
         use_utf8()
         prepare()
@@ -27,7 +27,7 @@ def run() -> None:
             os.write(2, _OUT_OF_MEMORY)
             os._exit(1)
         # An interrupt while modules load or main() ends, or an exception into which a library turned it.
-        if isinstance(error, KeyboardInterrupt) or (interrupted() and not isinstance(error, SystemExit)):
+        if isinstance(error, KeyboardInterrupt) or (is_interrupted() and not isinstance(error, SystemExit)):
             print("sehdr-warp: interrupted", file=sys.stderr)
             sys.exit(130)
         raise

@@ -49,7 +49,7 @@ def hash_line(file: Path, name: str) -> bytes:
 
 
 def read_list(folder: Path) -> set[bytes]:
-    """Return the lines of a folder's list; none if there is no list, or what has its name is no plain file."""
+    """Return the lines of a folder's list; none if there is no list, or what has its name is not a plain file."""
     file = folder / LIST
     with suppress(OSError):
         if file.is_file() and not file.is_symlink() and file.stat().st_size <= _LARGEST_LIST:

@@ -111,7 +111,7 @@ def _leave(ended: threading.Event, code: int) -> None:
 
 
 @contextmanager
-def signals_kept() -> Iterator[None]:
+def preserve_signals() -> Iterator[None]:
     """Put the program's signal handlers back after an import whose library installs its own."""
     yield
     if threading.current_thread() is threading.main_thread():

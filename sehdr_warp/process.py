@@ -79,8 +79,8 @@ def prepare() -> None:
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # As nohup asks.
             signal.signal(number, handler)
     hook, thread_hook = sys.unraisablehook, threading.excepthook
-    sys.unraisablehook = lambda event: None if interrupted() else hook(event)
-    threading.excepthook = lambda event: None if interrupted() else thread_hook(event)
+    sys.unraisablehook = lambda event: None if is_interrupted() else hook(event)
+    threading.excepthook = lambda event: None if is_interrupted() else thread_hook(event)
 
 
 def use_utf8() -> None:
@@ -140,7 +140,7 @@ def return_memory() -> None:
         ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, 1 << 20)
 
 
-def interrupted() -> bool:
+def is_interrupted() -> bool:
     """Return whether Ctrl-C was pressed a moment ago: whatever is raised now may be its effect."""
     return time.monotonic() - _interrupted < _SOON
 
@@ -148,7 +148,7 @@ def interrupted() -> bool:
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt, unless it was raised a moment ago or modules are being imported."""
     global _interrupted
-    if not interrupted() and not _postpone(number, frame):
+    if not is_interrupted() and not _postpone(number, frame):
         _interrupted = time.monotonic()
         raise KeyboardInterrupt
 

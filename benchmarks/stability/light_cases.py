@@ -9,7 +9,7 @@ import torch
 from sehdr_warp.check.case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
 from sehdr_warp.model.color_models import EXPOSURE_FLOOR
 from sehdr_warp.model.fusion import NeuralExposureFusion
-from sehdr_warp.model.radiance_field import TrainRender
+from sehdr_warp.model.renders import TrainRender
 from sehdr_warp.rasterizer import ssim
 from sehdr_warp.rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from sehdr_warp.response import Response, response_by_name

@@ -321,7 +321,7 @@ def _pixels(scene: Scene, max_size: int | None) -> float:
 
 
 def _photo_bytes(views: Sequence[View]) -> dict[str, int]:
-    """Return the sizes of the files of photos by the names of their views; without those that are no files."""
+    """Return the sizes of the files of photos by the names of their views; without those that are not files."""
     files = {view.name: view.source for view in views if view.source is not None}
     return {name: file.stat().st_size for name, file in files.items() if file.is_file()}
 

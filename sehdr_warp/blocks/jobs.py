@@ -212,7 +212,7 @@ def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any
         value = int(text) if text.isdecimal() and len(text) <= _DIGITS else text
         own = {"time": "timeout_min"}.get(name, name)
         if own == "timeout_min" and not isinstance(value, int):
-            raise SehdrError(f"--slurm time={text:.100} is no number of minutes; write time=240 for four hours")
+            raise SehdrError(f"--slurm time={text:.100} is not a number of minutes; write time=240 for four hours")
         parameters[own if own in parameters else f"slurm_{own}"] = value
         if own == "cpus_per_task":  # Since SLURM 22.05, srun does not take it over from sbatch.
             parameters["slurm_srun_args"] = [f"--cpus-per-task={value}"]

@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..output.images import safe_names
 from ..scene import Scene, View
 from ..scene.hdr_files import read_hdr
+from ..subsets import first_names
 from .evaluate import Evaluation
 
 log = logging.getLogger(__name__)
@@ -69,7 +70,7 @@ def evaluate_folder(folder: Path | str, truth: Scene, *, lpips_weights: Path | s
     extra = sorted(set(files) - set(stems.values()))
     for what, which in (("views have no file", missing), ("files belong to no view", extra)):
         if which:
-            log.warning("%d %s: %s", len(which), what, ", ".join(which[:5]) + (", ..." if len(which) > 5 else ""))
+            log.warning("%d %s: %s", len(which), what, first_names(which, 5))
     training = [view for view in truth.train_views if view.name in pictures and view.hdr is not None]
     evaluation = Evaluation(FolderPredictions(folder, pictures), truth, "cpu", lpips_weights, views, training or views)
     scale_from = "train" if training else "scored"

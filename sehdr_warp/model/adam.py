@@ -63,23 +63,11 @@ class Adam:
             active_count: [1] int32, number of Gaussians, if parameters have more rows; the gradients of the other rows
                 are 0.
         """
-        factored = FIRST_HARMONIC if harmonics is not None else ()
-        grouped = [
-            (group, parameter)
-            for group in self.param_groups
-            for parameter in group["params"]
-            if parameter.grad is not None or group.get("name") in factored
-        ]
-        # Factored harmonics first: their gradients depend on the means before the step.
-        grouped.sort(key=lambda pair: pair[1].grad is not None)
+        grouped = self._with_gradient(factored=harmonics is not None)
         parameters = [parameter for _, parameter in grouped]
         skipped = parameters[0].new_zeros(()) if skipped is None else skipped
         applied = 1 - skipped if applied is None else applied
-        for parameter in parameters:
-            if not self.state[parameter]:
-                moments = (torch.zeros_like(parameter, memory_format=torch.contiguous_format) for _ in range(2))
-                self.state[parameter] = {"step": torch.zeros((), device=parameter.device)}
-                self.state[parameter] |= zip(("exp_avg", "exp_avg_sq"), moments, strict=True)
+        self._create_states(parameters)
         # A list on both sides: torch reads a single tensor on the host, which CUDA graph capture does not allow.
         steps = [self.state[p]["step"] for p in parameters]
         torch._foreach_add_(steps, [applied] * len(steps))  # pyright: ignore[reportPrivateImportUsage]
@@ -108,3 +96,21 @@ class Adam:
                     **options,
                 )
         adam_steps(steps_with_gradient, skipped, **options, active_count=active_count)
+
+    def _with_gradient(self, *, factored: bool) -> list[tuple[dict, Tensor]]:
+        """Return group and parameter of all that have a gradient; those of factored harmonics come first.
+
+        The gradients of factored harmonics depend on the means before the step.
+        """
+        names = FIRST_HARMONIC if factored else ()
+        pairs = [(group, parameter) for group in self.param_groups for parameter in group["params"]]
+        pairs = [pair for pair in pairs if pair[1].grad is not None or pair[0].get("name") in names]
+        return sorted(pairs, key=lambda pair: pair[1].grad is not None)
+
+    def _create_states(self, parameters: Iterable[Tensor]) -> None:
+        """Create the state of parameters that have none: no step, moments of 0."""
+        for parameter in parameters:
+            if not self.state[parameter]:
+                moments = (torch.zeros_like(parameter, memory_format=torch.contiguous_format) for _ in range(2))
+                self.state[parameter] = {"step": torch.zeros((), device=parameter.device)}
+                self.state[parameter] |= zip(("exp_avg", "exp_avg_sq"), moments, strict=True)

@@ -34,7 +34,7 @@ class ColorModel:
         """Return [N, 3] start values of the harmonics' constant part from encoded values [N, 3] in [0, 1]."""
         return np.log(response.start_exposures(_clip_to_codes(encoded)))
 
-    def brightened(self, value: Tensor, logarithm: Tensor) -> Tensor:
+    def brighten(self, value: Tensor, logarithm: Tensor) -> Tensor:
         """Return values [N, 3] whose exposures are exp(logarithm) times those of `value`."""
         return value + logarithm
 
@@ -56,7 +56,7 @@ class LinearModel(ColorModel):
         """Return exposures of encoded values [N, 3], as in ColorModel."""
         return response.start_exposures(_clip_to_codes(encoded))
 
-    def brightened(self, value, logarithm):
+    def brighten(self, value, logarithm):
         """Return exposures, multiplied."""
         return value * logarithm.exp()
 

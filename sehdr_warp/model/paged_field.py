@@ -18,7 +18,8 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..scene import Camera
 from .gaussians import PARAMETER_NAMES, Gaussians
-from .radiance_field import DirectionalRender, RadianceField, RenderedView
+from .radiance_field import RadianceField
+from .renders import DirectionalRender, RenderedView
 
 CELL = 1 << 16  # Gaussians of a cell
 DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its cell, standard deviations

@@ -1,11 +1,11 @@
 """The radiance field: Gaussians rendered as base exposure, fused HDR exposure and encoded values.
 
-Every color set that a step needs is a group of three channels of one rasterisation, so that geometry is projected,
+Every color set that a step needs is a group of three channels of one rasterization, so that geometry is projected,
 sorted and blended once.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,65 +20,9 @@ from .camera_tensors import CameraTensors
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
+from .renders import DirectionalRender, RenderedView, TrainRender
 
 _DECODED_AT_ONCE = 1 << 19  # Pixels
-
-
-@dataclass(frozen=True)
-class TrainRender:
-    """A differentiable render of a training view; images [H, W, 3], None if they were not requested.
-
-    Attributes:
-        encoded: Encoded values, extended beyond [0, 1] as by Response.encode_extended.
-        exposure: Exposure of the HDR color at the base time (I^h dt_1 in the paper); None for encoded color models.
-        base: Exposure of the base color at the base time (I^b); the same tensor as `exposure` without fusion.
-        rendering: Result of the rasterizer: alpha, projected means, radii.
-        photo_exposure: Exposure of this photo, the input of the response; None if colors are encoded before they are
-            composited.
-        opacity_penalty: Penalty on the opacities, a scalar; None without a weight.
-    """
-
-    encoded: Tensor | None
-    exposure: Tensor | None
-    base: Tensor | None
-    rendering: Rendering
-    photo_exposure: Tensor | None = None
-    opacity_penalty: Tensor | None = None
-
-
-@dataclass(frozen=True)
-class RenderedView:
-    """A rendered view of a trained scene, composited over black.
-
-    Attributes:
-        hdr: [H, W, 3] float32 scene-linear radiance, >= 0, not multiplied by an exposure time.
-        alpha: [H, W] coverage in [0, 1].
-        depth: [H, W] mean distance along the camera's axis if alpha is above 0.001, else 0; world units.
-    """
-
-    hdr: Tensor
-    alpha: Tensor
-    depth: Tensor
-
-
-@dataclass(frozen=True)
-class DirectionalRender:
-    """A rendered environment: a trained scene along given directions from one point, composited over black.
-
-    Attributes:
-        hdr: [H, W, 3] as in RenderedView.
-        alpha: [H, W] as in RenderedView.
-        distance: [H, W] mean distance if alpha is above 0.001, else 0; world units.
-        confidence: [H, W] in [0, 1], as from render_confidence; None if it was not measured.
-        clipped: [H, W] in [0, 1], the mean of the shares that render_directions() was called with, weighted by light;
-            None without shares.
-    """
-
-    hdr: Tensor
-    alpha: Tensor
-    distance: Tensor
-    confidence: Tensor | None
-    clipped: Tensor | None = None
 
 
 class RadianceField(nn.Module):
@@ -165,22 +109,38 @@ class RadianceField(nn.Module):
             opacity_moments: [N] Adam's second moments of the opacities, see opacity_penalty().
         """
         opacities = self.gaussians.opacities()
-
-        def penalty(rendering: Rendering) -> Tensor | None:
-            arguments = opacity_moments, opacity_weight, self.gaussians.active_count
-            extents = rendering.extents if camera.directions is None else None  # Of wide cameras all count.
-            return opacity_penalty(opacities, extents, *arguments) if opacity_weight else None
-
         ratio = exposure_time / self.base_time
         values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.encoded:
-            rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, opacities)
-            image = rendering.image
-            if ratio != 1.0:
-                image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-            return TrainRender(image, None, None, rendering, opacity_penalty=penalty(rendering))
+            render = self._render_display_colors(camera, values, opacities, ratio, max_intersections)
+        else:
+            color_sets = self._color_sets(values, ratio, extra_images)
+            render = self._render_color_sets(camera, color_sets, opacities, ratio, max_intersections, encode=encode)
+        if not opacity_weight:
+            return render
+        extents = render.rendering.extents if camera.directions is None else None  # Of wide cameras all count.
+        penalty = opacity_penalty(opacities, extents, opacity_moments, opacity_weight, self.gaussians.active_count)
+        return replace(render, opacity_penalty=penalty)
+
+    def _render_display_colors(
+        self,
+        camera: CameraTensors,
+        values: Tensor,
+        opacities: Tensor,
+        ratio: float | Tensor,
+        max_intersections: int | None,
+    ) -> TrainRender:
+        """Render a photo of display colors, at `ratio` times the base time."""
+        rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, opacities)
+        image = rendering.image
+        if ratio != 1.0:
+            image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
+        return TrainRender(image, None, None, rendering)
+
+    def _color_sets(self, values: Tensor, ratio: float | Tensor, extra_images: frozenset[str]) -> dict[str, Tensor]:
+        """Return the colors [N, 3] that a training view needs, by name: any of encoded, fused and base."""
         base, fused = self._exposures(values)  # The same tensor without fusion.
         color_sets = {"fused": fused}
         if self.tone_map == "gaussian":
@@ -189,6 +149,19 @@ class RadianceField(nn.Module):
             color_sets = encoded | color_sets if needs_exposure else encoded
         if "base" in extra_images and self.fusion is not None:
             color_sets["base"] = base
+        return color_sets
+
+    def _render_color_sets(
+        self,
+        camera: CameraTensors,
+        color_sets: dict[str, Tensor],
+        opacities: Tensor,
+        ratio: float | Tensor,
+        max_intersections: int | None,
+        *,
+        encode: bool,
+    ) -> TrainRender:
+        """Render the images of color sets in one rasterization; see render_train_view()."""
         first, *others = color_sets.values()
         features = torch.cat([first, *others], dim=1) if others else first
         rendering = self._rasterize(camera, features, max_intersections, opacities)
@@ -199,18 +172,11 @@ class RadianceField(nn.Module):
         if self.tone_map == "pixel":
             photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(photo_exposure) if encode else None
-        return TrainRender(
-            encoded=encoded,
-            exposure=exposure,
-            base=images.get("base", exposure),
-            rendering=rendering,
-            photo_exposure=photo_exposure,
-            opacity_penalty=penalty(rendering),
-        )
+        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure)
 
     @torch.no_grad()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
-        """Render the HDR view of a camera, with depth as a fourth channel of the same rasterisation.
+        """Render the HDR view of a camera, with depth as a fourth channel of the same rasterization.
 
         The depth of a camera that is not a pinhole is the distance from it.
         """

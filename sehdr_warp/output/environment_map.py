@@ -5,22 +5,23 @@ import logging
 from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import SehdrError
 from ..files import check_absent
 from ..scene import Camera
-from .camera_paths import common_focus, training_cameras
+from .camera_paths import training_cameras
 from .colorspace import color_space, from_rec709
 from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr, write_radiance
 from .images import as_array
 from .light_shares import light_shares
 from .light_unit import EFFICACY, luminance_of_one
+from .map_center import find_center
 from .render_views import provenance
 from .tonemap import exposure_of_white
-from .world_transform import AXES, WorldTransform, describe, world_transform
+from .world_transform import AXES, describe, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -32,9 +33,6 @@ SUFFIXES = (".exr", ".hdr")
 # nearer than _NEAR times the spread of the cameras in more than half of all directions: the point is inside something.
 COVERED, _LEAST_COVERED, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
 _WHOLE = 99.5  # Per cent of all directions that count as all
-# Photos walk around what they look at if most of them look at it within this cosine and they stand on all sides of it;
-# what is nearer to it than this part of the distance of the nearest camera is then left out of a map at the center.
-_FACING, _SIDES, _CLEARANCE = 0.7, 0.5, 0.5
 _FINEST = {"latlong": 4096, "cube": 1024}  # Most pixels across that are rendered for a map that is smaller
 _MOST_PIXELS = 1 << 21  # Of those, at once
 _COARSE, _DARKEST = 128, 1e-9  # Inpainting: columns of the coarse map, and the least light
@@ -101,59 +99,37 @@ def write_environment_map(
         InputError: If the file exists or a pixel is not finite.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise SehdrError(f"{path}: an environment map is one of {', '.join(SUFFIXES)}; choose a suffix")
-    for name, value, allowed in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):
-        if value not in allowed:
-            raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")
-    if size < 16 or size % 2 or size > _LARGEST:
-        raise SehdrError(f"size {size} is not usable; give an even number of pixels from 16 to {_LARGEST}")
+    _check_options(path, size, layout, axes, beyond)
     color_space(colorspace)
     transform = world_transform(run, axes, up=up, scale=scale)
     exposure = exposure_of_white(run, reference_white)
-    if beyond is not None and not 0 <= beyond < np.inf:
-        raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the units of exported files")
     check_absent(path, overwrite)
-    cameras = {entry.name: entry.camera for entry in run.cameras}
     photos = training_cameras(run)
-    if isinstance(at, str) and at == "center":
-        position, clearance = map_center(photos)
-    else:
-        position, clearance = _point(at, cameras, transform), 0.0
-    place = transform.points(position)
-    if beyond is None:
-        beyond = transform.scale * clearance
-        if beyond:
-            text = "the photos walk around (%s): the map is what surrounds that point beyond %.3g; --beyond changes it"
-            log.info(text, ", ".join(f"{value:.4g}" for value in place), beyond)
+    center = find_center(run, photos, at, beyond, transform)
     to_world = transform.rotation.T
     directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in photos])) if photos else 0.0
-    options = {"beyond": beyond / transform.scale, "shares": run.clipped_share()}
-    rendered = render_map(run, position, size, layout, to_world.T, focal, **options)
-    hdr, alpha, distance = rendered.hdr, rendered.alpha, rendered.distance
+    options = {"beyond": center.beyond, "shares": run.clipped_share()}
+    rendered = render_map(run, center.position, size, layout, to_world.T, focal, **options)
     weight = solid_angles(size, layout)
-    _judge(run, position, photos, alpha, distance, weight)
-    added = np.zeros_like(hdr)
+    _judge(run, center.position, photos, rendered.alpha, rendered.distance, weight)
+    added = np.zeros_like(rendered.hdr)
     if inpaint:
-        added = (1 - alpha[..., None]) * inpainted_light(hdr, alpha, directions, weight)
-    clipped = rendered.clipped
-    shares = light_shares(hdr, added, clipped, weight, run.response.white / run.base_time)
-    coverage = 100 * weight[alpha > COVERED].sum() / weight.sum()
+        light = inpainted_light(rendered.hdr, rendered.alpha, directions, weight)
+        added = (1 - rendered.alpha[..., None]) * light
+    shares = light_shares(rendered.hdr, added, rendered.clipped, weight, run.response.white / run.base_time)
+    coverage = 100 * weight[rendered.alpha > COVERED].sum() / weight.sum()
     rest = "" if inpaint or coverage > _WHOLE else "; the rest is black, --inpaint fills it with the light around it"
     log.info("%s: %.0f %% of all directions seen%s", path.name, coverage, rest)
     log.info("its light is\n%s", shares.table())
-    hdr = exposure * from_rec709(hdr + added, colorspace)
+    hdr = exposure * from_rec709(rendered.hdr + added, colorspace)
     luminance = luminance_of_one(run)
     if path.suffix.lower() == ".hdr":
         absolute = 1.0 if luminance is None else EFFICACY / luminance
         write_radiance(path, hdr, exposure=exposure * absolute, overwrite=overwrite)
         return path
-    data = {"distance.Z": distance * transform.scale}
-    if rendered.confidence is not None:
-        data["confidence"] = rendered.confidence
-    if clipped is not None:
-        data["clipped"] = clipped
+    place = transform.points(center.position)
+    beyond = center.beyond * transform.scale if beyond is None else beyond
     facts = {**provenance(run), "position": json.dumps(place.tolist()), "axes": axes}
     facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(asdict(shares))}
     facts |= {"worldMatrix": describe(transform)}
@@ -161,11 +137,25 @@ def write_environment_map(
     header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
     header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
-    parts = [Part(rgb_channels(hdr) | {"A": alpha}, header, "rgba"), Part(data, as_data(header), "data")]
+    data = rendered.data_channels(transform.scale)
+    parts = [Part(rgb_channels(hdr) | {"A": rendered.alpha}, header, "rgba"), Part(data, as_data(header), "data")]
     pixel_type = write_multipart_exr(path, parts, pixel=pixel, overwrite=overwrite)
     if pixel_type != pixel:
         log.info("%s: holds values above 65504, which half cannot; written as float", path.name)
     return path
+
+
+def _check_options(path: Path, size: int, layout: str, axes: str, beyond: float | None) -> None:
+    """Raise SehdrError for options that are out of range."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise SehdrError(f"{path}: an environment map is one of {', '.join(SUFFIXES)}; choose a suffix")
+    for name, value, allowed in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):
+        if value not in allowed:
+            raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")
+    if size < 16 or size % 2 or size > _LARGEST:
+        raise SehdrError(f"size {size} is not usable; give an even number of pixels from 16 to {_LARGEST}")
+    if beyond is not None and not 0 <= beyond < np.inf:
+        raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the units of exported files")
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +175,11 @@ class RenderedMap:
     distance: np.ndarray
     confidence: np.ndarray | None
     clipped: np.ndarray | None
+
+    def data_channels(self, scale: float) -> dict[str, np.ndarray]:
+        """Return the channels of the file's part `data`; `scale` is the length of a scene unit in the file's units."""
+        channels = {"distance.Z": self.distance * scale, "confidence": self.confidence, "clipped": self.clipped}
+        return {name: values for name, values in channels.items() if values is not None}
 
 
 def render_map(
@@ -310,65 +305,6 @@ def inpainted_light(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, 
     wrapped = np.pad(light.reshape(rows, columns, 3), ((0, 0), (1, 1), (0, 0)), mode="wrap")
     at = np.stack([down - 0.5, across + 0.5])
     return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)
-
-
-class MapCenter(NamedTuple):
-    """Position from which a map of a whole scene is rendered, and what is left out of it.
-
-    Attributes:
-        position: [3], scene coordinates.
-        beyond: Distance within which Gaussians are left out, scene units; 0 leaves out none.
-    """
-
-    position: np.ndarray
-    beyond: float
-
-
-def map_center(photos: list[Camera]) -> MapCenter:
-    """Return the mean place of the training cameras, or, if they walk around something, what surrounds that.
-
-    Raises SehdrError without cameras.
-    """
-    if not photos:
-        raise SehdrError("the scene has no cameras, so no center; say where with --at x,y,z")
-    focus = subject_of_walk(photos)
-    if focus is None:
-        return MapCenter(np.mean([camera.position for camera in photos], axis=0), 0.0)
-    nearest = min(float(np.linalg.norm(camera.position - focus)) for camera in photos)
-    return MapCenter(focus, _CLEARANCE * nearest)
-
-
-def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], transform: WorldTransform) -> np.ndarray:
-    """Return the point [3] that `at` names, in the scene's coordinates; its numbers are in those of the transform."""
-    if isinstance(at, str) and at.startswith("camera:"):
-        name = at.partition(":")[2]
-        if name not in cameras:
-            some = ", ".join(list(cameras)[:5])
-            raise SehdrError(f"camera {name!r} is not one of the scene's ({some} ...); see scene.json of the run")
-        return cameras[name].position
-    try:
-        position = np.array([float(v) for v in (at.split(",") if isinstance(at, str) else at)])
-    except (ValueError, TypeError):
-        position = np.array([])
-    if position.shape != (3,) or not np.isfinite(position).all():
-        raise SehdrError(f"point {at!r} is neither x,y,z nor camera:NAME nor center")
-    return transform.inverse().points(position)
-
-
-def subject_of_walk(photos: list[Camera]) -> np.ndarray | None:
-    """Return the point that cameras stand around and look at; None if they do not, as in a room seen from within."""
-    focus = common_focus(photos) if len(photos) > 3 else None
-    if focus is None:
-        return None
-    offsets = np.stack([camera.position for camera in photos]) - focus
-    distances = np.linalg.norm(offsets, axis=1, keepdims=True)
-    if distances.min() <= 1e-6 * distances.max():
-        return None
-    towards = -offsets / distances
-    facing = np.sum(towards * np.stack([camera.world_to_camera[2, :3] for camera in photos]), axis=1)
-    # Cameras on one side have a mean direction of nearly unit length, cameras all around one of nearly zero.
-    around = np.linalg.norm(towards.mean(0)) < _SIDES
-    return focus if np.mean(facing > _FACING) > 0.8 and around else None
 
 
 def _judge(

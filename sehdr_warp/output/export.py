@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from ..splats import (
     read_gaussians,
     write_gaussians,
 )
-from ..splats.arrays import concatenated
+from ..splats.arrays import join_gaussians
 from ..subsets import every_nth
 from .camera_paths import training_cameras
 from .splat_edits import SplatEdits, most_visible, without_strays
@@ -92,15 +92,11 @@ def export(
             raise InputError(path, "fills its folder, which has no place for cameras", "leave --cameras out")
     for file in (path, *[beside] * cameras):
         check_absent(file, overwrite)  # Before minutes of fitting.
-    if axes is None:
-        turn = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) != is_y_down(path) else np.eye(3)
-        upright = to_file = WorldTransform(turn, np.zeros(3))
-    else:
-        upright = world_transform(run, axes, up=up, scale=scale)
-        to_file = file_transform(upright, path) if axes == "upright" else upright
+    upright, to_file = _file_coordinates(run, path, axes, up, scale)
     time = run.base_time if exposure_time is None else float(exposure_time)
     radiance = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
     color_model = "display" if kind == "ldr" else radiance
+    most = None if edits.max_gaussians is None else max(1, edits.max_gaussians // (1 + len(merge)))
     whole, parts = [], []
     for scene in (run, *merge):
         means = scene.field.gaussians.means.detach().cpu().numpy()
@@ -108,13 +104,8 @@ def export(
         gaussians = _gaussians_in_colors(scene, color_model, time)
         whole.append(gaussians)
         mask = edits.mask(gaussians.opacities, upright.points(gaussians.means), scene)
-        part = gaussians.rows(mask)
-        if edits.max_gaussians is not None and part.count > (most := max(1, edits.max_gaussians // (1 + len(merge)))):
-            subset = gaussians.rows(most_visible(mask, most, scene))
-            picture = _gaussians_renderer(part, time) if edits.changes_pictures else _photo_renderer(scene, time)
-            part = subset if color_model != "display" else refine(subset, picture, training_cameras(scene))
-        parts.append(without_strays(part, training_cameras(scene)))
-    gaussians = concatenated(parts)
+        parts.append(_select_rows(scene, gaussians, mask, most, edits, time))
+    gaussians = join_gaussians(parts)
     file_gaussians = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
     if isinstance(run, Splats) and run.world_matrix is not None:
         file_gaussians = replace(file_gaussians, world_matrix=to_file.matrix @ run.world_matrix)
@@ -130,6 +121,42 @@ def export(
         if path_is_lossy(path):
             _log_file_loss(path, run, reference, to_file, kind, time)
     return path
+
+
+class _FileCoordinates(NamedTuple):
+    """Maps from the scene's own coordinates to upright ones, which edits are in, and to those of the file."""
+
+    upright: WorldTransform
+    to_file: WorldTransform
+
+
+def _file_coordinates(
+    run: "RenderableScene", path: Path, axes: str | None, up: str | Sequence[float] | None, scale: float | None
+) -> _FileCoordinates:
+    """Return the coordinates of a file, by the arguments of export()."""
+    if axes is None:
+        turn = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) != is_y_down(path) else np.eye(3)
+        turned = WorldTransform(turn, np.zeros(3))
+        return _FileCoordinates(turned, turned)
+    upright = world_transform(run, axes, up=up, scale=scale)
+    return _FileCoordinates(upright, file_transform(upright, path) if axes == "upright" else upright)
+
+
+def _select_rows(
+    run: "RenderableScene",
+    gaussians: GaussianArrays,
+    mask: np.ndarray,
+    most: int | None,
+    edits: SplatEdits,
+    time: float,
+) -> GaussianArrays:
+    """Return the Gaussians of a mask without strays; the most visible ones, refined, if they are more than `most`."""
+    part = gaussians.rows(mask)
+    if most is not None and part.count > most:
+        subset = gaussians.rows(most_visible(mask, most, run))
+        picture = _gaussians_renderer(part, time) if edits.changes_pictures else _photo_renderer(run, time)
+        part = refine(subset, picture, training_cameras(run)) if gaussians.color_model == "display" else subset
+    return without_strays(part, training_cameras(run))
 
 
 def _gaussians_in_colors(run: "RenderableScene", color_model: str, time: float) -> GaussianArrays:

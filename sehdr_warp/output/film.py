@@ -128,14 +128,7 @@ def write_film(
             # FFmpeg takes what stands before a colon for a protocol, and would connect to a URL.
             name = f"file:{temporary.absolute()}"
             with av.open(name, "w", format=container_format, options=options) as container:
-                stream = container.add_stream(kind.codec, rate=Fraction(fps).limit_denominator(1001))
-                stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
-                stream.options = _encoder_options(kind, min(width, height))
-                if kind.codec == "libx265":
-                    stream.codec_context.codec_tag = "hvc1"  # What Apple's players look for.
-                context = stream.codec_context
-                context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
-                context.color_range = 1
+                stream = _add_stream(container, kind, fps, width, height)
                 for camera, ev in zip(_with_progress(cameras, out, tell), stops):
                     hdr = as_array(run.render(camera.resized(width, height)).hdr) * np.float32(2.0**ev)
                     encoded = tone_map(hdr) if tone_map else encode(hdr * np.float32(gain), transfer)
@@ -147,6 +140,19 @@ def write_film(
             remedy = f"choose {'.mov' if transfer in LOG_CURVES else '.mp4'} or another size"
             raise SehdrError(f"{out}: cannot be written as a film ({error}); {remedy}") from error
     return out
+
+
+def _add_stream(container: Any, kind: Transfer, fps: float, width: int, height: int) -> Any:
+    """Add the video stream of a film to a container of PyAV, and return it."""
+    stream = container.add_stream(kind.codec, rate=Fraction(fps).limit_denominator(1001))
+    stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
+    stream.options = _encoder_options(kind, min(width, height))
+    context = stream.codec_context
+    if kind.codec == "libx265":
+        context.codec_tag = "hvc1"  # What Apple's players look for.
+    context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
+    context.color_range = 1
+    return stream
 
 
 def _encoder_options(kind: Transfer, side: int) -> dict[str, str]:

@@ -31,7 +31,7 @@ _CLOSER = 0.6  # Tangent of the field of view of an opening view, at least this 
 # Parts of the picture that an opening view may show less if it is nearer to the middle of the photos by their extent,
 # if it looks as most of them do by a right angle, and if it holds the whole subject instead of nothing of it.
 _ASIDE, _TURNED, _WHOLE = 0.4, 0.4, 0.8
-_STEEP = 0.9  # Sine of the pitch from which a camera looks down, and level is no direction of its picture
+_STEEP = 0.9  # Sine of the pitch from which a camera looks down, and level is not a direction of its picture
 _NEAR, _BLOCKED = 0.3, 10  # A view is blocked if this per cent of its middle is nearer than this part of the distance
 
 
@@ -105,7 +105,7 @@ def opening_view(run: "RenderableScene") -> Camera | None:
     witnesses = evenly(photos, _WITNESSES)
 
     def score(camera: Camera) -> float:
-        coverage = _share_shown(run, camera.within(_SIZE), witnesses)
+        coverage = _visible_share(run, camera.within(_SIZE), witnesses)
         aside = float(np.linalg.norm(camera.position - middle)) / extent
         whole = 1.0
         if focus is not None and radius is not None:
@@ -135,7 +135,7 @@ def _opening_of(
     return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
 
 
-def _share_shown(run: "RenderableScene", camera: Camera, witnesses: Sequence[Camera]) -> float:
+def _visible_share(run: "RenderableScene", camera: Camera, witnesses: Sequence[Camera]) -> float:
     """Return the share of a picture whose surface several other cameras have in their pictures."""
     points = _surface(run, camera)
     if not len(points):

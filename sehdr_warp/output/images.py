@@ -78,11 +78,11 @@ def safe_names(names: Sequence[str]) -> list[str]:
     cleaned = [_FORBIDDEN.sub("_", name).strip().lstrip(".").rstrip(". ") for name in names]
     # The file system's limit counts bytes, and prefixes and suffixes still come.
     cleaned = [name.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore") or "view" for name in cleaned]
-    reserved, taken_names, result = {name.casefold() for name in cleaned}, set(), []
+    reserved, used_names, result = {name.casefold() for name in cleaned}, set(), []
     for name in cleaned:
         candidate, number = name, 2
-        while candidate.casefold() in taken_names or (number > 2 and candidate.casefold() in reserved):
+        while candidate.casefold() in used_names or (number > 2 and candidate.casefold() in reserved):
             candidate, number = f"{name}_{number}", number + 1
-        taken_names.add(candidate.casefold())
+        used_names.add(candidate.casefold())
         result.append(candidate)
     return result

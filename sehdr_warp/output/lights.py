@@ -12,10 +12,11 @@ import torch
 from ..errors import SehdrError
 from ..files import atomic_path, check_absent
 from .camera_paths import training_cameras
-from .environment_map import COVERED, envmap, inpainted_light, latlong, map_center, render_map, solid_angles
+from .environment_map import COVERED, envmap, inpainted_light, latlong, render_map, solid_angles
 from .exr import exr_header, rgb_channels, write_exr
 from .images import as_array
 from .light_unit import luminance_of_one
+from .map_center import map_center
 from .render_views import provenance
 from .world_transform import WorldTransform, world_transform
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".usda")
 UNSEEN = ("inpaint", "black")
-MAP_SIZE = 1024  # Pixels across of the map of what is no light
+MAP_SIZE = 1024  # Pixels across of the map of what is not a light
 _STAGE = """#usda 1.0
 (
     customLayerData = {{

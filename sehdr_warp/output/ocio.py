@@ -37,7 +37,7 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
         read, files = _open_config(OCIO, config)
         read.validate()
     except refused as error:
-        raise InputError(config, f"is no OpenColorIO config ({_line(error):.120})", "give a .ocio file") from None
+        raise InputError(config, f"is not an OpenColorIO config ({_line(error):.120})", "give a .ocio file") from None
     if not read.hasRole(_ROLE):
         raise InputError(config, f"has no role {_ROLE}, by which light enters", "take a config for OpenColorIO 2")
     display, _, name = view.rpartition("/")
@@ -75,7 +75,7 @@ def _check_archive(path: Path) -> None:
             size = sum(entry.file_size for entry in archive.infolist())
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise InputError(
-            path, f"is no archive of a config ({error!s:.80})", "archive it again with ocioarchive"
+            path, f"is not an archive of a config ({error!s:.80})", "archive it again with ocioarchive"
         ) from None
     if size > _LARGEST:
         raise InputError(path, f"unpacks to {size} bytes, more than {_LARGEST}", "use the config without an archive")

@@ -2,12 +2,12 @@
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ..progress import track_progress
 from ..scene import Camera, load_cameras
 from ..scene.exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
 from ..scene.images import MAX_PIXELS
+from ..subsets import first_names
 from .aovs import ViewData, data_parts, read_aovs
 from .brackets import Brackets, PictureHeader, bracket_exposures
 from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
@@ -106,14 +107,11 @@ def render_views(
         InputError: If a file would be replaced or a pixel is not finite.
     """
     out = Path(out)
-    bracketed = evs is not None or exposures is not None
-    if (multipart or ldr_brackets or group_by != "view") and not bracketed:
-        raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
-    captured = datetime.now().replace(microsecond=0)
-    header = PictureHeader(run.base_time, colorspace, captured, provenance(run), luminance_of_one(run))
-    stored_pixel_type((), pixel)
+    header = PictureHeader(
+        run.base_time, colorspace, datetime.now().replace(microsecond=0), provenance(run), luminance_of_one(run)
+    )
     brackets = None
-    if bracketed:
+    if evs is not None or exposures is not None:
         brackets = Brackets(
             exposures=bracket_exposures(run.base_time, evs=evs, exposures=exposures),
             header=header,
@@ -123,10 +121,11 @@ def render_views(
             response=run.response,
             group_by=group_by,
         )
+    elif multipart or ldr_brackets or group_by != "view":
+        raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
+    stored_pixel_type((), pixel)
     exposure = exposure_of_white(run, reference_white)
-    if (ocio is None) != (view is None):
-        raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
-    display_transform = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
+    display_transform = _display_transform(run, ocio, view)
     aovs = read_aovs(aovs) if aovs else ()
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
@@ -142,35 +141,87 @@ def render_views(
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
         bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if brackets else None
         tone_map = display_transform or shared_tone_map(run, [camera for _, camera in views])
+        hdr_writer = _HdrWriter(run, hdr_folder, header, exposure, transform, pixel, aovs)
         for index, (name, view_camera) in track_progress("rendering views", views, log):
-            rendered, confidence = run.render(view_camera), run.render_confidence(view_camera)
-            hdr = as_array(rendered.hdr)
-            if confidence is None and index == 0:
+            rendered = _render(run, view_camera)
+            if rendered.confidence is None and index == 0:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            camera_in_file = transform.camera(view_camera)
-            depth = as_array(rendered.depth) * np.float32(transform.scale)
-            attributes = header.of(name, exposure, camera_in_file, worldMatrix=describe(transform))
-            channels = rgb_channels(from_rec709(hdr, colorspace) * exposure)
-            channels |= {"A": as_array(rendered.alpha), "Z": depth}
-            if confidence is not None:
-                channels["confidence"] = as_array(confidence)
-            parts = [Part(channels, attributes, "rgba" if aovs else "")]
-            parts += data_parts(aovs, ViewData(run, view_camera, camera_in_file, channels["A"], depth), attributes)
-            if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
-                log.info("%s: holds values above 65504, which half cannot; written as float", name)
-            write_picture(preview_folder / f"{name}.png", quantize(tone_map(hdr)))
+            hdr_writer.write(name, view_camera, rendered)
+            write_picture(preview_folder / f"{name}.png", quantize(tone_map(rendered.hdr)))
             if bracket_writer is not None:
-                bracket_writer.write(name, hdr, camera_in_file)
-            if channels["A"].mean() < _LEAST_ALPHA:
+                bracket_writer.write(name, rendered.hdr, transform.camera(view_camera))
+            if rendered.alpha.mean() < _LEAST_ALPHA:
                 empty.append(name)
     if empty:
-        names = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
+        names = first_names(empty, 5)
         problem = "see nothing of the scene, or next to nothing: are they in its coordinates, and do they look at it?"
         log.warning("%d of %d cameras (%s) %s", len(empty), len(views), names, problem)
     files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
     if bracket_writer is not None:
         files += [*bracket_writer.files(), out / "brackets.json"]
     return [*files, *(out / name for name in camera_files)]
+
+
+class _ViewImages(NamedTuple):
+    """A rendered view; [H, W, 3] linear Rec.709 radiance, and [H, W] of the others, as in RenderedView."""
+
+    hdr: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    confidence: np.ndarray | None
+
+
+def _render(run: "RenderableScene", camera: Camera) -> _ViewImages:
+    """Render a view and copy it to the CPU."""
+    view, confidence = run.render(camera), run.render_confidence(camera)
+    confidence = None if confidence is None else as_array(confidence)
+    return _ViewImages(as_array(view.hdr), as_array(view.alpha), as_array(view.depth), confidence)
+
+
+@dataclass(frozen=True)
+class _HdrWriter:
+    """Writes the EXR files of `hdr/`.
+
+    Attributes:
+        run: Scene to render AOVs of.
+        folder: Folder for the files.
+        header: EXR attributes of all views.
+        exposure: Factor from radiance to the file's values.
+        transform: To the coordinates of files.
+        pixel: "half" (float if half would overflow) or "float".
+        aovs: Names of AOVS.
+    """
+
+    run: "RenderableScene"
+    folder: Path
+    header: PictureHeader
+    exposure: float
+    transform: WorldTransform
+    pixel: str
+    aovs: Sequence[str]
+
+    def write(self, name: str, camera: Camera, rendered: _ViewImages) -> None:
+        """Write a view, whose camera is in the scene's own coordinates."""
+        camera_in_file = self.transform.camera(camera)
+        depth = rendered.depth * np.float32(self.transform.scale)
+        attributes = self.header.of(name, self.exposure, camera_in_file, worldMatrix=describe(self.transform))
+        channels = rgb_channels(from_rec709(rendered.hdr, self.header.colorspace) * self.exposure)
+        channels |= {"A": rendered.alpha, "Z": depth}
+        if rendered.confidence is not None:
+            channels["confidence"] = rendered.confidence
+        parts = [Part(channels, attributes, "rgba" if self.aovs else "")]
+        parts += data_parts(self.aovs, ViewData(self.run, camera, camera_in_file, rendered.alpha, depth), attributes)
+        if write_multipart_exr(self.folder / f"{name}.exr", parts, pixel=self.pixel) != self.pixel:
+            log.info("%s: holds values above 65504, which half cannot; written as float", name)
+
+
+def _display_transform(
+    run: "RenderableScene", ocio: str | None, view: str | None
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return the function that encodes previews through OpenColorIO; None without a config."""
+    if (ocio is None) != (view is None):
+        raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
+    return None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
 
 
 def _camera_files(
@@ -255,7 +306,7 @@ def select_cameras(
     check_cameras(cameras)
     text, choices = str(cameras), ", ".join(SPLITS + PATHS)
     if camera is not None and text in SPLITS + PATHS:
-        raise SehdrError(f"--camera {camera}: chooses from a file of cameras, and --cameras {text} is none")
+        raise SehdrError(f"--camera {camera}: chooses from a file of cameras, which --cameras {text} is not")
     if text in SPLITS:
         views = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
         if not views:

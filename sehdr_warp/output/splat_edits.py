@@ -138,7 +138,7 @@ class SplatEdits:
             if goes.any():
                 log.info("left out: %d Gaussians (%.0f %%) %s", goes.sum(), 100 * goes.mean(), reason)
         if not mask.any():
-            raise _nothing_left(upright_means)
+            raise _empty_file_error(upright_means)
         return mask
 
     def check_regions(self, upright_means: np.ndarray) -> None:
@@ -147,7 +147,7 @@ class SplatEdits:
         for outside in self._outside(upright_means).values():
             removed |= outside
         if removed.all():
-            raise _nothing_left(upright_means)
+            raise _empty_file_error(upright_means)
 
     def _outside(self, upright_means: np.ndarray) -> dict[str, np.ndarray]:
         """Return [N] which Gaussians crop and cut remove, by what the log says of them."""
@@ -159,7 +159,7 @@ class SplatEdits:
         return steps
 
 
-def _nothing_left(upright_means: np.ndarray) -> SehdrError:
+def _empty_file_error(upright_means: np.ndarray) -> SehdrError:
     low, high = (np.percentile(upright_means, q, axis=0) for q in (2, 98))
     extent = " to ".join(", ".join(f"{v:.3g}" for v in corner) for corner in (low, high))
     return SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in upright coordinates")

@@ -91,7 +91,7 @@ class LightPrior:
 
 
 class Prior(Protocol):
-    """An estimator of clipped light: LightPrior, or another for photos of cameras that are no pinholes."""
+    """An estimator of clipped light: LightPrior, or another for photos of cameras that are not pinholes."""
 
     def size(self, height: int, width: int) -> tuple[int, int]:
         """Return the size of an estimate of a photo."""
@@ -121,7 +121,7 @@ def combined_estimates(
     Args:
         exposure: [H, W, 3], as of LightPrior.estimate.
         clipped: [H, W, 3] bool.
-        prior: LightPrior, or another for a photo by a camera that is no pinhole; None leaves it out.
+        prior: LightPrior, or another for a photo by a camera that is not a pinhole; None leaves it out.
         stated_light: [H, W, 3] in multiples of white, at least 1 where it is known, as View.light_above_white has it.
         stated_deviation: standard deviation of its natural logarithm.
 

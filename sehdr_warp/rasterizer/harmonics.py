@@ -39,7 +39,7 @@ def spherical_harmonics(
         [N, 3], differentiable with respect to every tensor.
 
     Raises:
-        TypeError: for what is no tensor.
+        TypeError: for what is not a tensor.
         ValueError: for a degree out of range, and for shapes, dtypes or devices that do not fit.
     """
     degree, constant, rest = check_harmonics(degree, coefficients, means, camera_position)

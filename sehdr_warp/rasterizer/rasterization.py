@@ -281,7 +281,7 @@ def render_projected(
     if options.depth:
         features = torch.cat([features, depths[:, None]], 1)
     features = features.contiguous()
-    # In place on memory that the projection's graph has saved: as data, so that it is no change of a saved tensor.
+    # In place on memory that the projection's graph has saved: as data, so that it is not a change of a saved tensor.
     inputs = RasterInputs(projected._replace(extents=extents.data), features)
     pool = get_or_create_pool(flatten(inputs), options) if replays and store_absolute is None else None
     replayed = None if pool is None else pool.replay(flatten(inputs), options, (extents.data,))

@@ -32,7 +32,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
         number of threads.
 
     Raises:
-        TypeError: for what is no tensor.
+        TypeError: for what is not a tensor.
         ValueError: if shapes, types or devices differ or are others.
     """
     return _Similarity.apply(a, b, True)

@@ -143,7 +143,7 @@ def pack_splats(
 
     Culls Gaussians whose features are not finite: sets their rows of inputs.projected.extents to 0 in place.
 
-    pads: whether to make PackedSplats.padded; by default on a GPU, if the channels are no multiple of four.
+    pads: whether to make PackedSplats.padded; by default on a GPU, if the channels are not a multiple of four.
     """
     features = inputs.features
     count, channels = features.shape

@@ -64,7 +64,7 @@ def calibrate_codes(
         raise InputError(name, f"channel {channel!r} is not one of {', '.join(CHANNELS)}", "name one, or none for all")
     stops = np.log2(np.asarray(times, np.float64))
     if len(photos) < 2 or len(photos) != len(stops):
-        raise InputError(name, f"{len(photos)} photo(s) with {len(stops)} time(s) are no exposure stack", _REMEDY)
+        raise InputError(name, f"{len(photos)} photo(s) with {len(stops)} time(s) are not an exposure stack", _REMEDY)
     if not np.isfinite(stops).all() or np.ptp(stops) < 0.1:
         raise InputError(name, "every photo has the same exposure time", _REMEDY)
     if len({photo.shape for photo in photos}) > 1:

@@ -180,7 +180,7 @@ class Response(ABC):
         array = np.asarray(argument)
         if array.dtype not in (np.float32, np.float64):
             array = array.astype(np.float32 if array.dtype == np.float16 else np.float64)
-        # A copy: a negative stride or a read-only array is no tensor.
+        # A copy: a negative stride or a read-only array is not a tensor.
         return function(torch.from_numpy(np.array(array, order="C"))).numpy()
 
     def __repr__(self) -> str:

@@ -79,7 +79,7 @@ def select_response(
         method: "posterior" judges edges (Lin et al. 2004), clipped pixels, the spread and smoothness of light, and
             a prior; it needs none of them. Without `candidates`, and for photos that are not a camera's own, a smooth
             family of cameras' curves stands beside the formulae: a formula with a quarter of the posterior is taken;
-            else the posterior's mean of log exposure at each code, a table that is none of the candidates.
+            else the posterior's mean of log exposure at each code, a table beside the candidates.
             "paper" is SeHDR, section 3.3: the curve that does best on one photo "by dynamic range and smoothness"; the
             paper gives no formula, ours is ResponseScore.paper_score.
         from_camera: the photos are a camera's own JPEGs, with the prior of cameras.

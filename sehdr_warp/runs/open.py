@@ -58,7 +58,7 @@ def load_saved_scene(data: LoadArguments, **options: Any) -> Scene:
     from ..scene import load_scene
 
     path = data.get("path")
-    assert path is not None, "who has no path says so before"
+    assert path is not None, "the caller checks the path"
     saved: dict[str, Any] = {name: data.get(name) for name in (*LOAD_OPTIONS, "views")}
     scene = load_scene(path, **saved | options)
     for note in scene.notes:

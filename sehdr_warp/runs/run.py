@@ -18,7 +18,8 @@ from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.lights import Light, find_lights
 from ..model.paged_field import PagedField
-from ..model.radiance_field import DirectionalRender, RadianceField, RenderedView
+from ..model.radiance_field import RadianceField
+from ..model.renders import DirectionalRender, RenderedView
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure_compensation import ExposureCompensation

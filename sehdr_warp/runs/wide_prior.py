@@ -32,7 +32,7 @@ class _Face:
 
 
 class WidePrior:
-    """The prior for the photos of one camera that is no pinhole, by perspective faces that overlap."""
+    """The prior for the photos of one camera that is not a pinhole, by perspective faces that overlap."""
 
     def __init__(self, prior: LightPrior, camera: Camera):
         """Prepare the faces.

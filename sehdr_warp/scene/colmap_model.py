@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files import read_bytes, read_lines
 from .dataparser import NO_POINTS, PointCloud, pose_from_quaternion
 from .lens import CAMERA_MODELS, Lens
-from .names import is_kept_by_system
+from .names import is_system_file
 
 # pycolmap is not used here: it hangs on a damaged count and accepts a truncated file as a whole one.
 MAX_NAME_BYTES = 4096
@@ -56,7 +56,7 @@ def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:
     """Return the folder that holds a model's cameras, or None.
 
     Looks for sparse/0, sparse, or a text export (sparse/txt, sparse_txt, sparse_txt/0) in the folder itself, then in
-    its colmap/ and dense/; `anywhere` also in the folder itself without sparse/ and in folders of it that are no sets.
+    its colmap/ and dense/; `anywhere` also in the folder itself without sparse/ and in folders of it that are not sets.
     Of several models sparse/0, sparse/1 ... it is the one with the most images.
     """
     names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
@@ -84,7 +84,7 @@ def _model_elsewhere(folder: Path) -> Path | None:
         for place in places:
             with suppress(OSError), os.scandir(place) as entries:
                 names = sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
-                inner += [place / name for name in names if name not in _NO_MODELS and not is_kept_by_system(name)]
+                inner += [place / name for name in names if name not in _NO_MODELS and not is_system_file(name)]
         # A folder with `images` is a set of its own.
         places = [each for each in inner[:_MOST_PLACES] if not (each / "images").is_dir()]
     return None

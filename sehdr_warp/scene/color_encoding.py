@@ -133,7 +133,7 @@ class ColorEncoding:
         return EncodedImage(codes, alpha, brighter, max(DEVIATION, deviation))
 
 
-def stated_encoding(image: Image.Image) -> ColorEncoding | None:
+def encoding_of(image: Image.Image) -> ColorEncoding | None:
     """Return what an opened image states of its colors, None if it states nothing.
 
     Later statements are ignored: PNG's cICP, the ICC profile, PNG's sRGB, gAMA and cHRM, TIFF's chromaticities, EXIF.

@@ -161,7 +161,7 @@ def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
     u, stretch, vt = np.linalg.svd(matrix[:3, :3])
     rotation = u @ vt
     if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(rotation) < 0:
-        problem = f"pose of {name!r:.90} is no rotation (stretch {np.round(stretch, 4).tolist()})"
+        problem = f"pose of {name!r:.90} is not a rotation (stretch {np.round(stretch, 4).tolist()})"
         raise InputError(source, problem, remedy)
     if not np.abs(matrix[:3, 3]).max() < 1e12:
         raise InputError(source, f"position of {name!r:.90} is {matrix[:3, 3].tolist()}", "check the units")

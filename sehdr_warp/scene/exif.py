@@ -117,7 +117,7 @@ def _number(value: Any) -> float | None:
 
 
 def parse_number(text: str) -> float | None:
-    """Return the number that a text states as photographers write it (`1/125`, `0,008`), None if it is no number."""
+    """Return the number that a text states as photographers write it (`1/125`, `0,008`), None if it is not a number."""
     whole, _, parts = text.strip(" \0s").replace(",", ".").partition("/")
     try:
         return float(whole) / float(parts or 1)

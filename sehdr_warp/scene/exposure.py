@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from ..errors import InputError
 from ..files import has_file, read_bytes
+from ..subsets import first_names
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, ExifExposure, exif_exposure, parse_number
 from .images import PHOTO_SUFFIXES
@@ -17,7 +18,6 @@ from .names import Listing, bases_of, fold_name
 EXPOSURES = "exposures.json"
 _LISTS = ("exposures", "exposure_times", "exposure")  # Names under which people list times in other files
 _LIST_SUFFIXES = (".csv", ".txt", ".tsv")
-_MOST_NAMED = 3
 
 
 def choose_exposure(
@@ -50,7 +50,7 @@ def choose_exposure(
     selected = [record for record in records if record.exposure_key in (None, key)]
     missing = sorted({record.view for record in records} - {record.view for record in selected})
     if missing:
-        notes.append(f"{len(missing)} views without exposure {key} were left out: {', '.join(missing[:5])}")
+        notes.append(f"{len(missing)} views without exposure {key} were left out: {first_names(missing, 5)}")
     return selected, notes
 
 
@@ -82,21 +82,21 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
         by_exif, more = _exif_times(unlisted)
         exif_times = iter(by_exif)
         times, notes = [next(exif_times) if time is None else time for time in times], [*notes, *more]
-    stated_times = [time for time in times if time is not None]
+    known_times = [time for time in times if time is not None]
     for record, time in zip(records, times, strict=True):
         if time is not None and not SHORTEST <= time <= LONGEST:
             remedy = f"correct it, or state every image's seconds in {EXPOSURES}"
             raise InputError(record.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", remedy)
-    if 2 * len(stated_times) <= len(records):
-        ignored = f"; those of {len(stated_times)} photos are not counted" if stated_times else ""
-        state = "no exposure times were found" if not stated_times else "most photos state no exposure time"
+    if 2 * len(known_times) <= len(records):
+        ignored = f"; those of {len(known_times)} photos are not counted" if known_times else ""
+        state = "no exposure times were found" if not known_times else "most photos state no exposure time"
         notes.append(f"{state}: each view counts as 1 s{ignored}")
         return [replace(record, exposure_time=1.0) for record in records], False, notes
-    shortest, longest = min(stated_times), max(stated_times)
+    shortest, longest = min(known_times), max(known_times)
     if longest > shortest * 1.01:
         span = f"{shutter(shortest)} to {shutter(longest)}".replace(" s to", " to")
         notes.append(f"exposures differ: {span} ({math.log2(longest / shortest):.1f} stops); each view keeps its own")
-    middle = math.exp(sum(map(math.log, stated_times)) / len(stated_times))
+    middle = math.exp(sum(map(math.log, known_times)) / len(known_times))
     timed = [
         replace(record, exposure_time=middle if time is None else time, time_known=time is not None)
         for record, time in zip(records, times, strict=True)
@@ -153,12 +153,10 @@ def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, 
             elif not any(listing.holds(f"{base}/{_plain(name)}") for base in {place, *bases, *parents}):
                 strange.append(name)
         if strange:
-            text = ", ".join(f"{name:.90}" for name in strange[:_MOST_NAMED]) + (
-                " ..." if len(strange) > _MOST_NAMED else ""
-            )
+            text = first_names([f"{name:.90}" for name in strange])
             notes.append(f"{EXPOSURES}: {len(strange)} of its {len(table)} names belong to no photo: {text}")
         if ambiguous:
-            text = ", ".join(ambiguous[:_MOST_NAMED])
+            text = first_names(ambiguous)
             notes.append(f"{EXPOSURES}: {len(ambiguous)} names fit several photos, and need their folders: {text}")
     return times, notes
 

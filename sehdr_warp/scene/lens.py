@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..parallel import signals_kept
+from ..parallel import preserve_signals
 from .camera import FISHEYES, Camera
 from .wide_camera import WIDEST_PINHOLE, fisheye_angles
 
@@ -143,7 +143,7 @@ class Undistortion:
         Raises:
             InputError: if the distortion cannot be inverted.
         """
-        with signals_kept():
+        with preserve_signals():
             import pycolmap
 
         described = f"distortion {lens.model} {lens.params}"

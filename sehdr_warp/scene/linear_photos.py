@@ -162,10 +162,10 @@ def _open(path: Path) -> Iterator[Any]:
     try:
         # LibRaw prints of damage, too.
         with silent_stderr(), rawpy.imread(str(path)) as raw:
-            # Linear raw has no filter; what has neither, or other colors, is no photo of a camera known here.
+            # Linear raw has no filter; what has neither, or other colors, is not a photo of a camera known here.
             linear = raw.raw_pattern is None and raw.raw_type == rawpy.RawType.Stack and read_dng(path) is not None
             if raw.num_colors != 3 or not (linear or raw.raw_pattern is not None):
-                raise InputError(path, "is no photo through a filter of three colors", _REMEDY)
+                raise InputError(path, "is not a photo through a filter of three colors", _REMEDY)
             yield raw
     except rawpy.LibRawError as error:
         read_dng(path)  # Its own words come first, for example of a compression that LibRaw does not know.

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..files import resolve_inside
+from ..subsets import first_names
 from .dataparser import UNPLACED, ImageRecord
 from .images import LDR_SUFFIXES, open_image, read_ldr
 from .names import Listing, bases_of, fold_name, natural_key, without_mask_ending
@@ -17,7 +18,6 @@ from .names import Listing, bases_of, fold_name, natural_key, without_mask_endin
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
 _COMMON = ("mask", "camera_mask")  # Stems of a mask of all photos
-_MOST_NAMED = 3
 _MOST_LABELS = 31  # Larger values are weights relative to white
 _LOSSY = (".jpg", ".jpeg")  # Their dark pixels may be noise
 _MATERIAL = 0.5  # Range of alpha that is a mask beside color that varies, too
@@ -74,7 +74,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         strange = [file for file, key in keys.items() if file not in mask_files and not _is_photo(key, bases, listing)]
         names = [file.relative_to(place).as_posix() for file in strange]
         if names:
-            names_text = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
+            names_text = first_names(names)
             count = "1 file that fits" if len(names) == 1 else f"{len(names)} files that fit"
             notes.append(f"{place.name}/ holds {count} no photo: {names_text}; {_REMEDY}")
     used = {place for mask in mask_files if mask is not None for place in mask.parents}
@@ -217,7 +217,7 @@ def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list
     for place in places:
         others = sorted(file for file in place.rglob("*") if file.suffix.lower() in _OTHER_MASKS)
         if others:
-            names_text = ", ".join(file.name for file in others[:_MOST_NAMED]) + " ..." * (len(others) > _MOST_NAMED)
+            names_text = first_names([file.name for file in others])
             count = f"{len(others)} files" if len(others) > 1 else "1 file"
             notes.append(f"{place.name}/ holds {count} of kinds that are not read as masks: {names_text}; use PNG")
     if not folder.is_dir():

@@ -11,10 +11,9 @@ from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 
 from ..files import resolve_inside
+from ..subsets import first_names
 from .dataparser import ImageRecord
 from .images import PHOTO_SUFFIXES
-
-_MOST_NAMED = 3
 
 
 def natural_key(name: str) -> tuple:
@@ -175,7 +174,7 @@ def distinct(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[st
         keys.add(key)
     if not names:
         return unique, []
-    text = ", ".join(names[:_MOST_NAMED]) + " ..." * (len(names) > _MOST_NAMED)
+    text = first_names(names)
     count = f"{len(names)} photos are" if len(names) > 1 else "1 photo is"
     return unique, [f"{count} listed more than once, and counted once: {text}"]
 
@@ -213,7 +212,7 @@ def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted((file for file in photos if file.is_file()), key=lambda file: natural_key(file.name))
 
 
-def is_kept_by_system(folder: str) -> bool:
+def is_system_file(folder: str) -> bool:
     """Return whether a folder's name is one that systems and network storage use for copies and thumbnails."""
     return folder.startswith((".", "@", "#", "$")) or folder == "__MACOSX"
 

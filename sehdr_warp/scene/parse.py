@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..errors import InputError, did_you_mean
 from ..files import has_file
+from ..subsets import first_names
 from .colmap_model import find_model
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
 from .exposure import choose_exposure, with_exposure_times
@@ -161,7 +162,7 @@ def _with_splits(
     if not held_out:
         return records, ("no views are held out for testing",)
     names = [name for name, record in zip(unique_names(records), records, strict=True) if record.split == "test"]
-    names_text = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    names_text = first_names(names, 5)
     are = "is" if len(names) == 1 else "are"
     return records, (f"{len(names)} of {len(records)} views {are} held out for testing: {names_text}",)
 

@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError
-from .color_encoding import note_of, stated_encoding
+from ..subsets import first_names
+from .color_encoding import encoding_of, note_of
 from .dataparser import UNPLACED, ImageRecord
 from .hdr_files import hdr_size
 from .heif import avif_bits
@@ -48,7 +49,7 @@ def usable_photos(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], st
             usable.append(_check_size(record))
         except InputError as error:
             problems.append(error)
-    notes += left_out(problems, len(selected))
+    notes += unusable_notes(problems, len(selected))
     if kind == "encoded":
         notes += note_of({record.image: record.encoding for record in usable})
         if deep := [record.image.name for record in usable if avif_bits(record.image) > 8]:
@@ -87,7 +88,7 @@ def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
     raise InputError(record.image, problem, "use the images that the cameras were solved for")
 
 
-def left_out(problems: Sequence[InputError], count: int) -> list[str]:
+def unusable_notes(problems: Sequence[InputError], count: int) -> list[str]:
     """Return a note on the photos, of `count`, that have a problem and cannot be used.
 
     Raises:
@@ -124,7 +125,7 @@ def _check_size(record: ImageRecord) -> ImageRecord:
     """Return the photo with what its file states of its colors. Raises InputError if it cannot be used."""
     if kind_of(record.image) == "encoded":
         with open_image(record.image) as image:
-            record = replace(record, encoding=stated_encoding(image))
+            record = replace(record, encoding=encoding_of(image))
     if record.lens is UNPLACED:
         photo_sizes(record.image)
     else:
@@ -133,7 +134,7 @@ def _check_size(record: ImageRecord) -> ImageRecord:
 
 
 def _names_text(names: Sequence[str]) -> str:
-    listing = ", ".join(names[:_MOST_NAMED]) + (" ..." if len(names) > _MOST_NAMED else "")
+    listing = first_names(names)
     return f"{len(names)} photos: {listing}" if len(names) > 1 else listing
 
 

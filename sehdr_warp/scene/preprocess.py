@@ -2,8 +2,8 @@
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -25,7 +25,7 @@ from .linear_photos import float_codes, kind_of, linear_codes
 from .masks import mask_note, read_mask
 from .names import unique_names
 from .photo_file import PhotoKeeper
-from .photos import fitted_lens, left_out, read_photo
+from .photos import fitted_lens, read_photo, unusable_notes
 from .primaries import linear_to_srgb
 from .srgb_codes import bands_of
 from .types import Scene, View, codes_of
@@ -75,10 +75,11 @@ def preprocess(
             problems.append(view)
         else:
             views.append(keeper.store(view))
-    damaged = left_out(problems, len(names))
-    training = [view for view in views if view.split == "train"] or views
-    for _ in checked_content(((view.codes, view.mask) for view in training), dataset.folder):
-        pass
+    damaged = unusable_notes(problems, len(names))
+    content = ContentCheck()
+    for view in [view for view in views if view.split == "train"] or views:
+        content.add(view.codes, view.mask)
+    content.require_content(dataset.folder)
     masks = mask_note(list(preprocessor.mask_shares.values()), len(preprocessor.labeled_masks))
     if preprocessor.transparent:
         meaning = "are left out" if dataset.alpha == "mask" else "count as black light"
@@ -90,33 +91,33 @@ def preprocess(
     return Scene(dataset.name, dataset.format, tuple(views), points, colors, times_known, notes, response=response)
 
 
-def checked_content(photos: Iterable[tuple[np.ndarray, np.ndarray | None]], folder: Path) -> Iterator[np.ndarray]:
-    """Yield the codes of photos, then refuse sets with less than one sample in a thousand between black and white.
+class ContentCheck:
+    """Counts the samples of photos that are neither black nor white. Large photos are sampled on a grid."""
 
-    Args:
-        photos: codes and mask of each. Large photos are sampled on a grid of about a million pixels.
-        folder: to name in the error.
+    def __init__(self) -> None:
+        """Start without photos."""
+        self._visible = self._total = 0
+        self._light = 0.0
 
-    Raises:
-        InputError: after the last photo, if they show nothing.
-    """
-    visible = total = 0
-    light = 0.0
-    for codes, mask in photos:
+    def add(self, codes: np.ndarray, mask: np.ndarray | None = None) -> None:
+        """Count a photo, [H, W, 3], by about a million of its pixels, of which the mask [H, W] may leave some out."""
         step = max(1, round((codes.shape[0] * codes.shape[1] / 1e6) ** 0.5))
         values, white = codes[::step, ::step], np.iinfo(codes.dtype).max
         values = values if mask is None else values[mask[::step, ::step] > 0.5]
-        visible += int(((values > white * 1.5 / 255) & (values < white * (1 - 1.5 / 255))).sum())
-        total, light = total + values.size, light + float(values.sum(dtype=np.float64)) / white
-        yield codes
-        del codes, values  # Free the memory before the next photo is read.
-    if visible < total * 1e-3 or total == 0:
-        if total == 0:
+        self._visible += int(((values > white * 1.5 / 255) & (values < white * (1 - 1.5 / 255))).sum())
+        self._total += values.size
+        self._light += float(values.sum(dtype=np.float64)) / white
+
+    def require_content(self, folder: Path) -> None:
+        """Raise InputError, which names the folder, if fewer than one sample in a thousand shows something."""
+        if self._total == 0:
             remedy = "masks keep what is white, and transparent photos their opaque pixels"
             raise InputError(folder, "masks or transparency leave out all pixels of the training photos", remedy)
-        state = f"black or white in {100 - 100 * visible / total:.1f} % (mean {light / total:.3f})"
-        remedy = "expose them so that the scene shows, or choose another exposure index"
-        raise InputError(folder, f"the training photos are {state}", remedy)
+        if self._visible < self._total * 1e-3:
+            share, mean = 100 - 100 * self._visible / self._total, self._light / self._total
+            state = f"black or white in {share:.1f} % (mean {mean:.3f})"
+            remedy = "expose them so that the scene shows, or choose another exposure index"
+            raise InputError(folder, f"the training photos are {state}", remedy)
 
 
 def read_codes(record: ImageRecord) -> EncodedImage:
@@ -162,6 +163,32 @@ def _read_stored(record: ImageRecord, *, oriented: bool, masked: bool = False) -
     return _StoredPhoto(photo, encoding)
 
 
+@dataclass(frozen=True)
+class _Resampler:
+    """Undistorts and averages images from the size of a photo to that of its view.
+
+    Attributes:
+        working: The photo's lens, at the size in which it is undistorted.
+        undistortion: Of that lens; None for a pinhole.
+        camera: Camera of the view.
+    """
+
+    working: Lens
+    undistortion: Undistortion | None
+    camera: Camera
+
+    def __call__(self, image: np.ndarray, values: Callable[[slice], np.ndarray | None] | None = None) -> np.ndarray:
+        """Return [H, W] or [H, W, C] of the view's size; `values` as in area_average()."""
+        if self.undistortion is None:
+            return _shrink(image, self.camera, values)
+        return _shrink(self.undistortion.apply(_shrink(image, self.working, values)), self.camera)
+
+    def borders(self) -> list[np.ndarray]:
+        """Return the mask of what the photo shows of the view, if it does not show all of it."""
+        inside = None if self.undistortion is None else self.undistortion.inside
+        return [] if inside is None else [_shrink(inside, self.camera)]
+
+
 class _Preprocessor:
     def __init__(self, max_size: int | None, response: "Response", alpha: str):
         self.max_size, self.response, self.alpha = max_size, response, alpha
@@ -184,53 +211,33 @@ class _Preprocessor:
             return error
 
     def view(self, record: ImageRecord, name: str) -> View:
+        """Return the view of a photo; raise InputError if a file of it cannot be used."""
         lens, oriented = (record.lens, False) if record.derived else fitted_lens(record)
-        working, undistortion, full = lens, None, lens.camera(record.world_to_camera)
-        if not (lens.is_pinhole or record.derived):
-            # Distortion is smooth: undistorting at twice the final size or more is exact to a fraction of a pixel.
-            factor = 1 if self.max_size is None else max(lens.width, lens.height) // (2 * self.max_size)
-            if factor > 1:
-                working = lens.resized(round(lens.width / factor), round(lens.height / factor))
-            # The map of a lens is as large as an image; the photos of a set mostly share one lens.
-            with self._alone:
-                if self._last is None or self._last[0] != working:
-                    self._last = working, Undistortion(working)
-                undistortion = self._last[1]
-            full = undistortion.camera(record.world_to_camera)
-        camera = full.within(self.max_size)
-
-        def warped(image: np.ndarray, values: Callable[[slice], np.ndarray | None] | None = None) -> np.ndarray:
-            """Undistort and average [H, W] or [H, W, C] from the photo's size to the camera's; see area_average."""
-            if not undistortion:
-                return _shrink(image, camera, values)
-            return _shrink(undistortion.apply(_shrink(image, working, values)), camera)
-
-        hdr = None if record.hdr is None else warped(_read_truth(record.hdr, lens, camera, undistortion is not None))
-        if hdr is not None and record.hdr == record.image:
-            hdr *= np.float32(record.light_scale)
+        resample = self._resampler(record, lens)
+        camera = resample.camera
+        hdr = None
+        if record.hdr is not None:
+            hdr = resample(_read_truth(record.hdr, lens, camera, resample.undistortion is not None))
+            if record.hdr == record.image:
+                hdr *= np.float32(record.light_scale)
         time, split = record.seconds, record.split or "train"
         stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented, self.labeled_masks)
         self.mask_shares[name] = None if stored is None else float(stored.mean())
         if record.derived and hdr is not None:  # Compute HDR-NeRF's photo from the truth at the final size.
-            mask = _by_solid_angle(None if stored is None else warped(stored), camera)
+            mask = _by_solid_angle(None if stored is None else resample(stored), camera)
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
         photo, encoding = _read_stored(record, oriented=oriented, masked=self.alpha == "mask")
+        masks = resample.borders()
+        if stored is not None:
+            masks.append(resample(stored))
         if photo.alpha is not None:
             self.transparent.add(name)
-        alpha, resized = photo.alpha, (camera.width, camera.height) != (lens.width, lens.height)
-        averaged = undistortion is not None or resized or (alpha is not None and self.alpha != "mask")
-        to_shared = getattr(self.response, "to_shared", None)  # Of a response whose channels differ
-        if to_shared is not None or not averaged:
-            photo, encoding = encoding.convert(photo), ColorEncoding("sRGB")
-        photo = photo if to_shared is None else replace(photo, pixels=to_shared(photo.pixels))
-        masks = [] if undistortion is None or undistortion.inside is None else [_shrink(undistortion.inside, camera)]
-        if stored is not None:
-            masks.append(warped(stored))
-        if alpha is not None and self.alpha == "mask":
-            masks.append(warped(alpha))
-            alpha = None
-        photo = self._average(replace(photo, alpha=alpha), encoding, warped) if averaged else photo
+            if self.alpha == "mask":
+                masks.append(resample(photo.alpha))
+        photo = self._resampled(
+            photo, encoding, resample, resized=(camera.width, camera.height) != (lens.width, lens.height)
+        )
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         return View(
@@ -246,7 +253,33 @@ class _Preprocessor:
             light_above_white_deviation=photo.above_white_deviation,
         )
 
-    def _average(self, photo: EncodedImage, encoding: ColorEncoding, warped: Callable) -> EncodedImage:
+    def _resampler(self, record: ImageRecord, lens: Lens) -> _Resampler:
+        """Return the resampler of a photo; photos of one lens in a row share its map, which is as large as an image."""
+        if lens.is_pinhole or record.derived:
+            return _Resampler(lens, None, lens.camera(record.world_to_camera).within(self.max_size))
+        # Distortion is smooth: undistorting at twice the final size or more is exact to a fraction of a pixel.
+        factor = 1 if self.max_size is None else max(lens.width, lens.height) // (2 * self.max_size)
+        if factor > 1:
+            lens = lens.resized(round(lens.width / factor), round(lens.height / factor))
+        with self._alone:
+            if self._last is None or self._last[0] != lens:
+                self._last = lens, Undistortion(lens)
+            undistortion = self._last[1]
+        return _Resampler(lens, undistortion, undistortion.camera(record.world_to_camera).within(self.max_size))
+
+    def _resampled(
+        self, photo: EncodedImage, encoding: ColorEncoding, resample: _Resampler, *, resized: bool
+    ) -> EncodedImage:
+        """Return a photo in sRGB's colors at the size of its view; its transparency is that of masks, or blended in."""
+        alpha = None if self.alpha == "mask" else photo.alpha
+        averaged = resample.undistortion is not None or resized or alpha is not None
+        to_shared = getattr(self.response, "to_shared", None)  # Of a response whose channels differ
+        if to_shared is not None or not averaged:
+            photo, encoding = encoding.convert(photo), ColorEncoding("sRGB")
+        photo = photo if to_shared is None else replace(photo, pixels=to_shared(photo.pixels))
+        return self._average(replace(photo, alpha=alpha), encoding, resample) if averaged else photo
+
+    def _average(self, photo: EncodedImage, encoding: ColorEncoding, resample: _Resampler) -> EncodedImage:
         """Return the codes of the mean light, and the light above white that is left in it.
 
         Colors that are not sRGB's are converted on the way, because codes of all pixels would take time and memory.
@@ -281,8 +314,8 @@ class _Preprocessor:
             clipped = clipped if above is None else clipped & (above[rows] == 0)
             return clipped.astype(np.float32) if clipped.any() else None
 
-        light = warped(codes, lambda rows: weighted(light_of(rows), rows))
-        clipped = warped(codes, lambda rows: weighted(clipped_in(rows), rows))
+        light = resample(codes, lambda rows: weighted(light_of(rows), rows))
+        clipped = resample(codes, lambda rows: weighted(clipped_in(rows), rows))
         with self._alone:
             encoded = self.response.encode(light)
         # A mean over clipped samples is a lower bound, so a pixel counts as clipped if half of its area is.

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_bytes, read_json, resolve_inside
+from ..subsets import first_names
 from .colmap_model import SparseModel, find_model, other_models, read_model
 from .copies import copies_note, find_copies
 from .dataparser import NO_POINTS, UNPLACED, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
@@ -22,7 +23,7 @@ from .linear_photos import color_matrix
 from .names import (
     distinct,
     find_image,
-    is_kept_by_system,
+    is_system_file,
     list_images,
     natural_key,
     renamed_note,
@@ -272,7 +273,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
         raise InputError(folder, problem, _remedy_without_photos(folder))
     if len(photos) == 1 and (inner := _folders_with_photos(folder)):
         raise InputError(
-            photos[0], "is the only photo there", f"give one of its folders with photos: {_listing(inner)}"
+            photos[0], "is the only photo there", f"give one of its folders with photos: {first_names(inner, 5)}"
         )
     copies = find_copies(photos)
     photos = [photo for photo in photos if photo not in copies]
@@ -282,7 +283,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
         place = model.relative_to(folder).as_posix()
         notes.append(f"the COLMAP model in {place} names none of these photos and is not used")
     if photos[0].parent == folder and (inner := [name for name in _folders_with_photos(folder) if name not in _OTHERS]):
-        notes.append(f"photos in folders of it are not read: {_listing(inner)}")
+        notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
     records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)
     names = tuple(photo.name for photo in copies)
     return DataparserOutputs("photos", tuple(records), notes=tuple(notes), mentioned=names)
@@ -337,7 +338,7 @@ def _remedy_without_photos(folder: Path) -> str:
     with suppress(OSError):
         if inner := _folders_with_photos(folder):
             poses = "".join(f"; {note}" for note in _foreign_poses(folder))
-            return f"give one of its folders with photos: {_listing(inner)}{poses}"
+            return f"give one of its folders with photos: {first_names(inner, 5)}{poses}"
         for file in sorted(folder.iterdir()):
             suffix = file.suffix.lower()
             if suffix in VIDEO_SUFFIXES:
@@ -358,17 +359,13 @@ def _folders_with_photos(folder: Path) -> list[str]:
     for root, folders, _ in os.walk(folder):
         place = Path(root).relative_to(folder)
         deepest = len(place.parts) >= _DEEPEST
-        folders[:] = [] if deepest else sorted(name for name in folders if not is_kept_by_system(name))
+        folders[:] = [] if deepest else sorted(name for name in folders if not is_system_file(name))
         if place.parts and list_images(folder / place, PHOTO_SUFFIXES):
             above = folder / place.parent
             has_cameras = any((above / name).is_file() for name in _CAMERA_FILES) or find_model(above) is not None
             is_set = place.parent.parts and has_cameras
             result[(place.parent if is_set else place).as_posix()] = None
     return list(result)
-
-
-def _listing(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + " ..." * (len(names) > 5)
 
 
 def _foreign_poses(folder: Path) -> list[str]:

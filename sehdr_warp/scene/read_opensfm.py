@@ -11,7 +11,7 @@ from ..files import read_text
 from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud
 from .lens import Lens
 from .names import find_image, natural_key
-from .photos import left_out
+from .photos import unusable_notes
 
 FILE = "reconstruction.json"
 _PLACES = (FILE, f"opensfm/{FILE}")  # The second is OpenDroneMap's, whose images lie beside opensfm/
@@ -57,7 +57,7 @@ def read_opensfm(folder: Path) -> DataparserOutputs:
             records.append(ImageRecord(image.stem, image, lens, _pose(shots[name], path, name), oriented=True))
         except InputError as error:
             unusable.append(error)
-    notes = left_out(unusable, len(records) + len(unusable))
+    notes = unusable_notes(unusable, len(records) + len(unusable))
     if not records:
         raise InputError(images, f"none of the {len(shots)} images of {FILE} is here", "copy the whole set")
     if absent:

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
@@ -12,13 +12,14 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_json, resolve_inside
+from ..subsets import first_names
 from .colmap_model import find_model, read_ply_points, read_points
 from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .lens import Lens
 from .names import distinct, find_image, renamed_note, sibling
-from .photos import left_out, photo_sizes
+from .photos import photo_sizes, unusable_notes
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
@@ -33,15 +34,48 @@ def read_transforms(folder: Path) -> DataparserOutputs:
     else:
         other = "test" if (folder / "transforms_test.json").is_file() else "val"
         files = [(folder / "transforms_train.json", "train"), (folder / f"transforms_{other}.json", "test")]
-    records, absent, cloud = [], [], NO_POINTS
-    photo_names: list[tuple[str, Path]] = []
-    unusable: list[InputError] = []
-    untimed: list[InputError] = []
-    missing: list[str] = []
+    read, cloud, missing = _Frames(), NO_POINTS, []
     for path, split in files:
         if split == "test" and not path.is_file():
             continue
         values = read_json(path)
+        read.add_file(folder, path, values, split)
+        if not len(cloud[0]):
+            cloud = _points(folder, path, values)
+        points_file = values.get("ply_file_path")
+        if isinstance(points_file, str) and _points_file(folder, points_file, path) is None:
+            missing.append(f"the points that {path.name} states are not here: {points_file!r:.90}")
+    notes = read.notes(folder)
+    records, repeated = distinct(read.records)
+    records, unmasked = _without_missing_masks(records)
+    notes += [*repeated, *missing, *unmasked]
+    in_splits = [record for record in records if record.split]
+    if 0 < len(in_splits) < len(records):
+        count = len(records) - len(in_splits)
+        notes.append(f"{count} frames belong to neither the train nor the test split and were left out")
+    return DataparserOutputs("transforms", tuple(in_splits or records), "background", cloud=cloud, notes=tuple(notes))
+
+
+@dataclass
+class _Frames:
+    """Frames of transforms.json.
+
+    Attributes:
+        records: of the frames that can be used.
+        absent: names of frames without a photo.
+        photos: names and photos of the frames that have one.
+        unusable: errors of poses, whose frames are left out.
+        untimed: errors of exposure times, which are left out.
+    """
+
+    records: list[ImageRecord] = field(default_factory=list)
+    absent: list[str] = field(default_factory=list)
+    photos: list[tuple[str, Path]] = field(default_factory=list)
+    unusable: list[InputError] = field(default_factory=list)
+    untimed: list[InputError] = field(default_factory=list)
+
+    def add_file(self, folder: Path, path: Path, values: dict, split: str | None) -> None:
+        """Add the frames of a file; `split` is that of all of them, None if the file states it by frame."""
         frames = frames_of(values, path)
         splits = _named_splits(values, frames)
         for name, frame in frames:
@@ -49,44 +83,35 @@ def read_transforms(folder: Path) -> DataparserOutputs:
             try:
                 pose = frame_pose(frame, path, name)
             except InputError as error:
-                unusable.append(error)
+                self.unusable.append(error)
                 continue
             if image is None:
-                absent.append(name)
+                self.absent.append(name)
                 continue
-            photo_names.append((name, image))
+            self.photos.append((name, image))
             record = _frame_record(folder, path, values, frame, image, split or splits.get(_plain(name)))
             time = frame.get("exposure_time", values.get("exposure_time"))
             try:
                 seconds = None if time is None else parse_seconds(time, path, name)
             except InputError as error:
-                untimed.append(error)
+                self.untimed.append(error)
                 seconds = None
-            records.append(replace(record, world_to_camera=pose, exposure_time=seconds))
-        if not len(cloud[0]):
-            cloud = _points(folder, path, values)
-        stated_points = values.get("ply_file_path")
-        if isinstance(stated_points, str) and _points_file(folder, stated_points, path) is None:
-            missing.append(f"the points that {path.name} states are not here: {stated_points!r:.90}")
-    notes = tuple(left_out(unusable, len(records) + len(absent) + len(unusable)))
-    if not records:
-        raise InputError(
-            folder / _plain(absent[0]), f"image file not found, nor any of {len(absent)} frames", _INCOMPLETE
-        )
-    notes += (*_absent_note(absent, len(records)), *renamed_note(photo_names))
-    if 2 * len(untimed) > len(records):
-        raise untimed[0]
-    if untimed:
-        notes += (f"{len(untimed)} of {len(records)} frames state no usable exposure time: {untimed[0].problem}",)
-    records, repeated = distinct(records)
-    notes += (*repeated, *missing)
-    records, unmasked = _without_missing_masks(records)
-    notes += unmasked
-    in_splits = [record for record in records if record.split]
-    if 0 < len(in_splits) < len(records):
-        count = len(records) - len(in_splits)
-        notes += (f"{count} frames belong to neither the train nor the test split and were left out",)
-    return DataparserOutputs("transforms", tuple(in_splits or records), "background", cloud=cloud, notes=notes)
+            self.records.append(replace(record, world_to_camera=pose, exposure_time=seconds))
+
+    def notes(self, folder: Path) -> list[str]:
+        """Return notes on the frames that cannot be used; raise InputError if too few can."""
+        count = len(self.records)
+        notes = unusable_notes(self.unusable, count + len(self.absent) + len(self.unusable))
+        if not count:
+            problem = f"image file not found, nor any of {len(self.absent)} frames"
+            raise InputError(folder / _plain(self.absent[0]), problem, _INCOMPLETE)
+        notes += [*_absent_note(self.absent, count), *renamed_note(self.photos)]
+        if 2 * len(self.untimed) > count:
+            raise self.untimed[0]
+        if self.untimed:
+            problem = self.untimed[0].problem
+            notes.append(f"{len(self.untimed)} of {count} frames state no usable exposure time: {problem}")
+        return notes
 
 
 def read_hdr_nerf(folder: Path) -> DataparserOutputs:
@@ -164,7 +189,7 @@ def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:
     """Return a note on frames, `absent` by name, whose photos are missing beside `count` frames that have one."""
     if not absent:
         return ()
-    names_text = ", ".join(absent[:3]) + (" ..." if len(absent) > 3 else "")
+    names_text = first_names(absent)
     return (f"{len(absent)} of {len(absent) + count} frames have no photo and were left out: {names_text}",)
 
 
@@ -173,7 +198,7 @@ def _without_missing_masks(records: list[ImageRecord]) -> tuple[list[ImageRecord
     absent = [record.mask for record in records if record.mask is not None and not record.mask.is_file()]
     if not absent:
         return records, ()
-    names = ", ".join(mask.name for mask in absent[:3]) + (" ..." if len(absent) > 3 else "")
+    names = first_names([mask.name for mask in absent])
     note = f"{len(absent)} masks that frames state are not here, and their photos count whole: {names}"
     return [replace(record, mask=None) if record.mask in absent else record for record in records], (note,)
 

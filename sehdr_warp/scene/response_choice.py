@@ -15,7 +15,7 @@ from .exif import are_camera_jpegs
 from .gain_map import MOST_STOPS_IN_CODES, has_gain_map, read_gain_map
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix
-from .preprocess import checked_content, read_codes
+from .preprocess import ContentCheck, read_codes
 from .types import View
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def check_response(dataset: DataparserOutputs, *, response: "str | Path | Respon
         return
     allowed = {"auto", CURVES[dataset.kind]} | ({"linear"} if dataset.kind == "linear" else set())
     if str(response) not in allowed:
-        problem = f"its photos are {dataset.kind}: their light is known, and response {response} is not theirs"
+        problem = f"its photos are {dataset.kind}: their light is known, and response {response} does not apply"
         raise InputError(path, problem, "leave the response out")
 
 
@@ -140,9 +140,9 @@ def as_gain_mapped(dataset: DataparserOutputs) -> DataparserOutputs:
 
 def _select_for_dataset(dataset: DataparserOutputs, method: str, candidates: Sequence[str]) -> "ResponseSelection":
     """Select the response from the codes of a sample of the training photos, which are read one by one."""
-    records = dataset.training
+    records, content = dataset.training, ContentCheck()
 
-    def codes() -> Iterator[tuple[np.ndarray, None]]:
+    def codes() -> Iterator[np.ndarray]:
         for record in _sample(records, method):
             try:
                 image = read_codes(record)
@@ -150,14 +150,15 @@ def _select_for_dataset(dataset: DataparserOutputs, method: str, candidates: Seq
                 continue  # Preprocessing names it.
             if image.alpha is not None:  # Transparent pixels have no color.
                 image.pixels[image.alpha < 1] = 0
-            photo = image.pixels, None
+            pixels = image.pixels
             del image  # Free the memory before the next photo is read.
-            yield photo
-            del photo
+            content.add(pixels)
+            yield pixels
+            del pixels
+        content.require_content(dataset.folder)
 
-    photos = checked_content(codes(), dataset.folder)
     files = [None if record.derived else record.image for record in records]
-    return select_for_codes(photos, files, method, candidates)
+    return select_for_codes(codes(), files, method, candidates)
 
 
 def _sample(photos: Sequence, method: str) -> Sequence:

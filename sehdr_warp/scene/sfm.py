@@ -22,13 +22,14 @@ import numpy as np
 from PIL import Image
 
 from ..errors import InputError, SehdrError
-from ..parallel import run_interruptibly, signals_kept
+from ..parallel import preserve_signals, run_interruptibly
 from ..progress import Stage, stage, track_progress
+from ..subsets import first_names
 from .cached_folder import cached_folder
 from .colmap_model import SparseModel, read_model
 from .colmap_rows import counted_rows
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
-from .photos import left_out, read_photo
+from .photos import read_photo, unusable_notes
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -64,10 +65,10 @@ class Reconstruction:
         registered = {int(Path(image.name).stem) for image in self.model.images}
         unregistered, notes = [photo.name for i, photo in enumerate(photos) if i not in registered], []
         if unregistered:
-            first = ", ".join(unregistered[:5]) + (", ..." if len(unregistered) > 5 else "")
+            first = first_names(unregistered, 5)
             notes.append(f"{len(unregistered)} of {len(photos)} photos could not be placed and were left out: {first}")
         if self.weak:
-            first = ", ".join(photos[i].name for i in self.weak[:5]) + (", ..." if len(self.weak) > 5 else "")
+            first = first_names([photos[i].name for i in self.weak], 5)
             notes.append(
                 f"{len(self.weak)} photos share few points with others, so their places are uncertain: {first}; "
                 "more photos in between help"
@@ -201,7 +202,7 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
         values = np.asarray(image)
         visible |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
         image.save(folder / image_name(i), compress_level=1)
-    for note in left_out(problems, len(photos)):
+    for note in unusable_notes(problems, len(photos)):
         _log.warning("%s", note)
     if not visible:
         problem = "the photos are all black or all white"
@@ -342,7 +343,7 @@ def run_mapper(database: Path, work: Path, count: int, source: Path, *, name: st
 @contextlib.contextmanager
 def quiet_colmap():
     """Suppress pycolmap's log on the terminal except fatal errors."""
-    with signals_kept():  # Its log would end the process with a trace of its stack.
+    with preserve_signals():  # Its log would end the process with a trace of its stack.
         import pycolmap
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, int(pycolmap.logging.FATAL)

@@ -55,13 +55,13 @@ def are_panoramas(photos: Sequence[Path]) -> bool:
         if abs(width - 2 * height) > _SKEW:
             return False
     judged = photos[:: max(1, len(photos) // _JUDGED)][:_JUDGED]
-    projections = {kind for photo in judged if (kind := _stated_projection(photo))}
+    projections = {kind for photo in judged if (kind := _projection_of(photo))}
     if projections:
         return projections == {"equirectangular"}
     return float(np.median([_seam(photo) for photo in judged])) < _SEAM
 
 
-def _stated_projection(photo: Path) -> str | None:
+def _projection_of(photo: Path) -> str | None:
     """Return the projection that a photo's XMP states, in lower case."""
     if kind_of(photo) != "encoded":
         return None

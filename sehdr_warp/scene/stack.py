@@ -41,7 +41,7 @@ def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list
     """
     files = list_images(folder, LDR_SUFFIXES) if folder.is_dir() else []
     if not files:
-        raise InputError(folder, "is no folder of photos", "give a folder of one scene at several exposure times")
+        raise InputError(folder, "is not a folder of photos", "give a folder of one scene at several exposure times")
     if times is None:
         records = [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in files]
         records, times_known, notes = with_exposure_times(records, folder)

@@ -8,13 +8,13 @@ from itertools import islice
 from pathlib import Path
 
 from ..files import resolve_inside
+from ..subsets import first_names
 from .dataparser import ImageRecord
 from .hdr_files import is_without_colors
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
 from .names import bases_of, fold_name
 
 TRUTH_FOLDERS = ("hdr", "exr")
-_MOST_NAMED = 3
 _MOST_FILES = 1 << 20  # Files among which photos of one name are looked for
 
 
@@ -23,7 +23,7 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
 
     Truth lies beside the photo, or in `hdr/` or `exr/` of the data folder under the photo's path below the data folder
     or below the folder of all photos, or under its file name alone if no two photos share that. Files of
-    passes such as depth, which hold no colors, are no truth.
+    passes such as depth, which hold no colors, are not truth.
 
     Args:
         records: the photos; truth that the set states itself stays.
@@ -60,7 +60,7 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     for place in places:
         others = sorted(file.relative_to(place).as_posix() for file in files[place].values() if file not in in_use)
         if others:
-            listing = ", ".join(others[:_MOST_NAMED]) + " ..." * (len(others) > _MOST_NAMED)
+            listing = first_names(others)
             count = f"{len(others)} files that are" if len(others) > 1 else "1 file that is"
             notes.append(f"{place.name}/ holds {count} the truth of no photo: {listing}")
     return result, notes

@@ -4,10 +4,11 @@ import os
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
+from ..subsets import first_names
 from .dataparser import ImageRecord
 from .heif import HEIF_SUFFIXES, heif_installed
 from .images import PHOTO_SUFFIXES
-from .names import bases_of, is_kept_by_system, natural_key, without_mask_ending
+from .names import bases_of, is_system_file, natural_key, without_mask_ending
 
 # What tools write beside photos, and nobody takes for one.
 _QUIET = {
@@ -17,7 +18,6 @@ _QUIET = {
     ".sh",
 }  # fmt: skip
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
-_MOST_NAMED = 3
 _MOST_FILES = 20_000  # Files that are looked at
 
 
@@ -53,7 +53,8 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         place = os.path.commonpath([file.parent for file in photos])
         count_text = f"{len(photos)} photos" if len(photos) > 1 else "1 photo"
         where = Path(place).relative_to(folder).as_posix() if Path(place) != folder else "the folder"
-        notes.append(f"{count_text} of {where} {'are' if len(photos) > 1 else 'is'} in no view: {_names_text(photos)}")
+        names_text, are = first_names([file.name for file in photos]), "are" if len(photos) > 1 else "is"
+        notes.append(f"{count_text} of {where} {are} in no view: {names_text}")
     if others:
         notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
     return notes
@@ -71,7 +72,9 @@ def _by_suffix(files: Sequence[Path]) -> str:
     kinds: dict[str, list[Path]] = {}
     for file in files:
         kinds.setdefault(file.suffix.lower().removeprefix(".").upper(), []).append(file)
-    parts = [f"{len(each)} {kind} ({_names_text(each, 1)})" for kind, each in sorted(kinds.items())]
+    parts = [
+        f"{len(each)} {kind} ({first_names([file.name for file in each], 1)})" for kind, each in sorted(kinds.items())
+    ]
     needs = any(file.suffix.lower() in HEIF_SUFFIXES for file in files) and not heif_installed()
     return ", ".join(parts) + ("; HEIC photos need pillow-heif: pip install 'sehdr-warp[phone]'" if needs else "")
 
@@ -84,7 +87,7 @@ def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
     count = 0
     for place in places:
         for root, folders, names in os.walk(place) if deep else [(place, [], os.listdir(place))]:
-            folders[:] = [name for name in folders if not is_kept_by_system(name)]
+            folders[:] = [name for name in folders if not is_system_file(name)]
             for name in sorted(names, key=natural_key):
                 count += 1
                 if count > _MOST_FILES:
@@ -92,7 +95,3 @@ def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
                 file = Path(root) / name
                 if not name.startswith(".") and file.is_file():
                     yield file
-
-
-def _names_text(files: Sequence[Path], most: int = _MOST_NAMED) -> str:
-    return ", ".join(file.name for file in files[:most]) + (" ..." if len(files) > most else "")

@@ -18,7 +18,7 @@ from ..errors import InputError, require_extra
 from ..sandbox import read_sandboxed
 from .chroma import upsample_chroma
 from .images import MAX_PIXELS, check_size
-from .video_color import VideoColor, stated_color
+from .video_color import VideoColor, read_color
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -84,7 +84,7 @@ def open_clip(path: Path) -> Clip:
             raise InputError(path, f"its frames have {width} x {height} pixels", f"give {_SMALLEST} and more a side")
         size = (height, width) if _orientation(frame).turns % 2 else (width, height)
         seconds = float(container.duration or 0) / 1e6
-        color = stated_color(container, stream, frame, path)
+        color = read_color(container, stream, frame, path)
         return Clip(path, size, seconds, color, bool(frame.interlaced_frame), aspect != 1)
 
 
@@ -258,7 +258,7 @@ def _orientation(frame: Any) -> _Orientation:
 
 
 def _container(path: Path, *, threads: bool = True) -> Any:
-    """Return PyAV's open container. Raises InputError for a file that is none."""
+    """Return PyAV's open container. Raises InputError for another kind of file."""
     import av
 
     try:

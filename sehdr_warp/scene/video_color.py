@@ -32,7 +32,7 @@ _LUMA = {
     7: (0.212, 0.087),
     9: (0.2627, 0.0593),
 }
-# Matrix coefficients that are no luma and color differences of encoded values; FFmpeg does not convert them either.
+# Matrix coefficients that are not luma and color differences of encoded values; FFmpeg does not convert them either.
 _OTHER_MATRICES = {8: "YCgCo", 10: "constant-luminance BT.2020", 11: "Y'D'zD'x", 12: "YCbCr of its own primaries",
                    13: "constant-luminance YCbCr of its own primaries", 14: "ICtCp", 15: "IPT-C2", 16: "YCgCo-Re",
                    17: "YCgCo-Ro"}  # fmt: skip
@@ -92,7 +92,7 @@ class VideoColor:
         return np.asarray(matrix, np.float64)
 
 
-def stated_color(container: Any, stream: Any, frame: Any, path: Path) -> VideoColor:
+def read_color(container: Any, stream: Any, frame: Any, path: Path) -> VideoColor:
     """Return the colors that stream, frame and metadata state.
 
     Raises:

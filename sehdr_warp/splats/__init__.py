@@ -45,7 +45,9 @@ def check_suffix(path: Path | str, *others: str) -> str:
     if name == "meta.json":
         raise InputError(path, "is SOG in pieces", "zip it and the pictures beside it as scene.sog")
     if suffix not in (*SUFFIXES, STREAMED_SOG, *others):
-        why = f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is no splat file"
+        why = (
+            f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is not a splat file"
+        )
         raise InputError(path, why, f"use one of {' '.join((*SUFFIXES, STREAMED_SOG, *others))}")
     return suffix
 

@@ -155,7 +155,7 @@ def warn_of_compensation(path: Path, compensated: bool, statement: str) -> None:
         )
 
 
-def concatenated(parts: Sequence[GaussianArrays]) -> GaussianArrays:
+def join_gaussians(parts: Sequence[GaussianArrays]) -> GaussianArrays:
     """Return several sets of Gaussians in one space, of one color model and exposure, as one of the largest degree."""
     degree = max(part.degree for part in parts)
     padded = [part.padded(degree) for part in parts]

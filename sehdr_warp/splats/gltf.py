@@ -14,7 +14,7 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import HARMONIC_0, GaussianArrays, concatenated, degree_of, read_matrix
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, join_gaussians, read_matrix
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPACE = "srgb_rec709_display"
@@ -83,7 +83,7 @@ def read_glb(path: Path) -> GaussianArrays:
     described, binary = _chunks(path)
     try:
         parts, total = [], 0
-        for number, matrix in _shown_meshes(described, path):
+        for number, matrix in _scene_meshes(described, path):
             mesh = _item(described, "meshes", number)
             for primitive in mesh["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):
@@ -97,7 +97,7 @@ def read_glb(path: Path) -> GaussianArrays:
         raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
     if not parts:
         raise InputError(path, f"has no primitive with {EXTENSION}", "export Gaussians by the ratified extension")
-    return concatenated(parts)
+    return join_gaussians(parts)
 
 
 def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path: Path) -> GaussianArrays:
@@ -131,7 +131,7 @@ def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path
     )
 
 
-def _shown_meshes(described: dict, path: Path) -> list[tuple[int, np.ndarray]]:
+def _scene_meshes(described: dict, path: Path) -> list[tuple[int, np.ndarray]]:
     """Return the mesh and the world transform of each node with a mesh; of a file without nodes all meshes, unmoved."""
     nodes = described.get("nodes", [])
     parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
@@ -192,12 +192,12 @@ def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"its description is not JSON ({error!s:.80})", _DAMAGED) from None
     if kind != _JSON or not isinstance(described, dict):
-        raise InputError(path, "its first chunk is no description", _DAMAGED)
+        raise InputError(path, "its first chunk is not a description", _DAMAGED)
     return described, data[28 + length :]
 
 
 def _item(described: dict, kind: str, index: Any) -> dict:
-    """Return an element of a list of the description; raise ValueError for a number that is none of it."""
+    """Return an element of a list of the description; raise ValueError for an index out of range."""
     if type(index) is not int or not 0 <= index < len(described[kind]):
         raise ValueError(f"{kind} has no {index!r:.20}")
     return described[kind][index]

@@ -43,18 +43,7 @@ def write_sog(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 def sog_files(gaussians: GaussianArrays) -> Iterator[tuple[str, str | bytes]]:
     """Yield name and content of each file of a SOG: meta.json first, then the pictures."""
     gaussians = gaussians.rows(morton_order(gaussians.means))
-    count, degree = gaussians.count, gaussians.degree
-    width = math.ceil(math.sqrt(count) / 4) * 4
-    height = math.ceil(count / width / 4) * 4
-    pictures: dict[str, np.ndarray] = {}
-
-    def picture(name: str, columns: np.ndarray) -> str:
-        texels = np.full((width * height, 4), 255, np.uint8)
-        texels[:count, : columns.shape[1]] = columns
-        texels[count:, :3] = 0
-        pictures[name] = texels.reshape(height, width, 4)
-        return name
-
+    pictures = _Pictures(gaussians.count)
     spread = np.sign(gaussians.means) * np.log1p(np.abs(gaussians.means.astype(np.float64)))
     low, high = spread.min(axis=0), spread.max(axis=0)
     fixed = np.rint((spread - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.uint16)
@@ -66,50 +55,73 @@ def sog_files(gaussians: GaussianArrays) -> Iterator[tuple[str, str | bytes]]:
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": f"sehdr-warp {__version__}"},
-        "count": count,
+        "count": gaussians.count,
         "antialias": gaussians.compensated,
         "means": {
             "mins": low.tolist(),
             "maxs": high.tolist(),
-            "files": [picture("means_l.webp", fixed & 255), picture("means_u.webp", fixed >> 8)],
+            "files": [pictures.add("means_l.webp", fixed & 255), pictures.add("means_u.webp", fixed >> 8)],
         },
-        "scales": {"codebook": scale_levels.tolist(), "files": [picture("scales.webp", scale_codes)]},
-        "quats": {"files": [picture("quats.webp", turns.astype(np.uint8))]},
+        "scales": {"codebook": scale_levels.tolist(), "files": [pictures.add("scales.webp", scale_codes)]},
+        "quats": {"files": [pictures.add("quats.webp", turns)]},
         "sh0": {
             "codebook": color_levels.tolist(),
-            "files": [picture("sh0.webp", np.concatenate([color_codes, opacity[:, None]], axis=1))],
+            "files": [pictures.add("sh0.webp", np.concatenate([color_codes, opacity[:, None]], axis=1))],
         },
         "sehdr": {"base_exposure_time": gaussians.base_time},
     }
     if gaussians.world_matrix is not None:
         meta["sehdr"]["world_matrix"] = gaussians.world_matrix.tolist()
-    if degree:
-        entries = min(_LARGEST_PALETTE, max(count // _PER_ENTRY, min(count, _ACROSS)))
-        higher = gaussians.harmonics[:, 1:].reshape(count, -1)
-        centers, labels = palette(higher, entries)
-        levels, codes = codebook(centers)
-        rows = math.ceil(entries / _ACROSS)
-        texels = np.zeros((rows * _ACROSS, _COEFFICIENTS[degree], 4), np.uint8)
-        texels[..., 3] = 255
-        texels[:entries, :, :3] = codes.reshape(entries, -1, 3)
-        pictures["shN_centroids.webp"] = texels.reshape(rows, -1, 4)
-        columns = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
-        meta["shN"] = {
-            "count": entries,
-            "bands": degree,
-            "codebook": levels.tolist(),
-            "files": ["shN_centroids.webp", picture("shN_labels.webp", columns.astype(np.uint8))],
-        }
+    if gaussians.degree:
+        meta["shN"] = _add_higher_harmonics(gaussians, pictures)
     yield "meta.json", json.dumps(meta)
-    for name, texels in pictures.items():
+    for name, texels in pictures.texels.items():
         buffer = io.BytesIO()
         Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=100, method=4)
         yield name, buffer.getvalue()
 
 
+class _Pictures:
+    """The pictures of a SOG.
+
+    Attributes:
+        texels: [height, width, 4] uint8 by file name.
+    """
+
+    def __init__(self, count: int):
+        """Start without pictures, for so many Gaussians, each of which has a pixel in all but one of them."""
+        self.count, self.texels = count, {}
+        self.width = math.ceil(math.sqrt(count) / 4) * 4
+        self.height = math.ceil(count / self.width / 4) * 4
+
+    def add(self, name: str, columns: np.ndarray) -> str:
+        """Add a picture of columns [count, C] of values from 0 to 255, up to four; return its name."""
+        texels = np.full((self.width * self.height, 4), 255, np.uint8)
+        texels[: self.count, : columns.shape[1]] = columns
+        texels[self.count :, :3] = 0
+        self.texels[name] = texels.reshape(self.height, self.width, 4)
+        return name
+
+
+def _add_higher_harmonics(gaussians: GaussianArrays, pictures: _Pictures) -> dict[str, Any]:
+    """Add the pictures of the harmonics above degree 0, a palette and each Gaussian's entry; return their meta data."""
+    count, degree = gaussians.count, gaussians.degree
+    entries = min(_LARGEST_PALETTE, max(count // _PER_ENTRY, min(count, _ACROSS)))
+    centers, labels = palette(gaussians.harmonics[:, 1:].reshape(count, -1), entries)
+    levels, codes = codebook(centers)
+    rows = math.ceil(entries / _ACROSS)
+    texels = np.zeros((rows * _ACROSS, _COEFFICIENTS[degree], 4), np.uint8)
+    texels[..., 3] = 255
+    texels[:entries, :, :3] = codes.reshape(entries, -1, 3)
+    pictures.texels["shN_centroids.webp"] = texels.reshape(rows, -1, 4)
+    columns = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
+    files = ["shN_centroids.webp", pictures.add("shN_labels.webp", columns)]
+    return {"count": entries, "bands": degree, "codebook": levels.tolist(), "files": files}
+
+
 def read_sog(path: Path) -> GaussianArrays:
     """Read a .sog file of version 2."""
-    read_bytes(path)  # Refuses what is no plain file or too large
+    read_bytes(path)  # Refuses what is not a plain file or too large
     with refusing_damage(path), zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
             raise InputError(path, "unpacks to more than 1 GiB", _DAMAGED)

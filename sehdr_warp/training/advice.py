@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..subsets import first_names
+
 STILL_RISING = 0.2  # dB that held-out photos gained in the last third of a training that was too short
 UNFINISHED = 0.5  # dB gained there from which blur, and not movement, explains what differs from the photos
 FALLING = 0.5  # dB that they lost since their best in a training that overfits; seeds differ by up to 0.3 dB
@@ -76,7 +78,7 @@ def _exposure_jump(offsets: Mapping[str, float], again: str) -> str | None:
     jumps = sorted((name for name in offsets if abs(offsets[name]) >= EXPOSURE_JUMP), key=lambda n: -abs(offsets[n]))
     if not jumps:
         return None
-    names = ", ".join(f"{name} {offsets[name]:+.1f}" for name in jumps[:3]) + (", ..." if len(jumps) > 3 else "")
+    names = first_names([f"{name} {offsets[name]:+.1f}" for name in jumps])
     what = f"{len(jumps)} photo{'s are' if len(jumps) > 1 else ' is'} brighter or darker than the scene as a whole"
     remedy = f"state their exposure times in exposures.json beside the photos, or leave them out: {again}"
     return f"{what} (stops: {names}), as where exposure or sun changed: {remedy}"
@@ -91,6 +93,6 @@ def _movement(unexplained: Mapping[str, Any] | None, train_photos: int, again: s
     if stops[len(stops) // 2] < _REGION_STOPS:
         return None
     photos = list(dict.fromkeys(region["photo"] for region in worst))
-    names = ", ".join(photos[:3]) + (", ..." if len(photos) > 3 else "")
+    names = first_names(photos)
     text = "photos and scene differ in many places, as where people or leaves move"
     return f"{text} (worst in {names}): paint these black in masks/PHOTO.png beside the photos: {again}"

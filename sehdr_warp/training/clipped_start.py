@@ -51,7 +51,7 @@ def brighten_clipped(field: RadianceField, views: Sequence[View], estimates: Seq
             sums = sums + weight * (known[:, :3] + math.log(field.base_time / view.exposure_time))
             weights += weight
     excess = torch.where(is_white[chosen], (sums / weights).clamp_min(0), 0)
-    gaussians.harmonics_dc[chosen, 0] = model.brightened(values[chosen], excess) / HARMONIC_0
+    gaussians.harmonics_dc[chosen, 0] = model.brighten(values[chosen], excess) / HARMONIC_0
     return int((excess > 0).any(1).sum())
 
 

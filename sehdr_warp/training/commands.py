@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 from tyro.conf import Positional
@@ -22,6 +22,9 @@ from ..runs import config_files as configs
 from ..runs.device import pick_device
 from ..runs.load_arguments import LOAD_OPTIONS, LoadArguments
 from ..runs.open import load_saved_scene
+
+if TYPE_CHECKING:
+    from ..runs.run_writer import RunWriter
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +91,7 @@ class MachineOptions:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a scene from photos of one exposure. What the scene does not need is left out; what you name stays."""
+    """Train a scene from photos of one exposure. What it does not need is left out; options you set stay."""
 
     removed_flags: ClassVar[Mapping[str, str]] = {
         **{configs.flag_of(path): advice for path, advice in configs.GONE.items()},
@@ -156,41 +159,26 @@ def _run_as_rank(words: list[str]) -> None:
 
 def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, or print a plan, on this rank."""
-    from ..runs.run_writer import RunWriter
     from .losses import check_dataset_truth
 
-    output, resumed = args.output, None
-    out = None if args.training.plan_only else output.out
-    if out is None and not args.training.plan_only:
-        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
-    if out is not None:
-        # What can be refused is refused before the photos are read, which may take minutes.
-        folder = RunWriter(out)
-        if folder.prepare(resume=output.resume, overwrite=output.overwrite):
-            resumed = folder
-        elif output.resume:
-            log.info("%s holds no run yet: a training begins there", out)
+    plan_only, output = args.training.plan_only, args.output
+    # What can be refused is refused before the photos are read, which may take minutes.
+    resumed = None if plan_only else _run_to_resume(output)
     data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
     config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     options = config.response
     selection = {"method": options.method, "candidates": options.candidates, "photo_storage": _photo_storage(config)}
-    if out is not None:
+    if not plan_only:
         check_dataset_truth(data, config)
-    with nullcontext() if out is None or device.type != "cpu" else _precompiling(config):
+    with nullcontext() if plan_only or device.type != "cpu" else _precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
             from .following import PhotoRequest
 
             ranks.request_photos(PhotoRequest(data, {"response": options.name, **selection}))
         scene = load_saved_scene(data, response=options.name, **selection)
-        if out is None:
-            from ..blocks import estimate
-            from .plan import make_plan
-
-            plan = make_plan(scene, config, device)
-            cost = estimate.estimate(plan, device, args.machine.gpus)
-            values = plan.to_dict() | {"cost": estimate.to_dict(*cost)}
-            print(json.dumps(values) if output.json else plan.table() + estimate.table(*cost))
+        if plan_only:
+            _print_plan(args, scene, config, device)
             return
         from ..console import run_with_progress
         from ..viewer.live import serve_training
@@ -199,7 +187,7 @@ def _train(args: Train, ranks=None) -> None:
 
         trainer = create_trainer(
             scene,
-            out,
+            output.out,
             config,
             device=device,
             resume=output.resume,
@@ -210,10 +198,35 @@ def _train(args: Train, ranks=None) -> None:
         )
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
-        with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
+        with serve_training(trainer, str(output.out)) if output.view else nullcontext(trainer) as steps:
             run_with_progress(steps, trainer.total)
     photos = len(trainer.scene.train_views)
     _print_result(args, trainer.run, partial(advice, train_photos=photos, scene=data.get("path") or "SCENE"))
+
+
+def _run_to_resume(output: OutputOptions) -> "RunWriter | None":
+    """Return the run that --resume continues, None for a new one; raise SehdrError if --out cannot be used."""
+    from ..runs.run_writer import RunWriter
+
+    if output.out is None:
+        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
+    folder = RunWriter(output.out)
+    if folder.prepare(resume=output.resume, overwrite=output.overwrite):
+        return folder
+    if output.resume:
+        log.info("%s holds no run yet: a training begins there", output.out)
+    return None
+
+
+def _print_plan(args: Train, scene, config, device) -> None:
+    """Print the plan of a training and its cost."""
+    from ..blocks import estimate
+    from .plan import make_plan
+
+    plan = make_plan(scene, config, device)
+    cost = estimate.estimate(plan, device, args.machine.gpus)
+    values = plan.to_dict() | {"cost": estimate.to_dict(*cost)}
+    print(json.dumps(values) if args.output.json else plan.table() + estimate.table(*cost))
 
 
 def _photo_storage(config) -> str:

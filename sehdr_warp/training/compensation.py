@@ -189,7 +189,7 @@ def estimates_compensation(scene: Scene, config: Config, response: Response) -> 
 
 def estimate_compensation(scene: Scene, config: Config, response: Response, device: torch.device | str) -> Compensation:
     """Match points between the photos of a scene and estimate the compensation that explains their differences."""
-    times_stated = scene.exposure_times_known and config.model.exposure_compensation != "always"
+    times_known = scene.exposure_times_known and config.model.exposure_compensation != "always"
     views, others = scene.train_views, scene.test_views
     cameras = [view.camera for view in others]
 
@@ -206,21 +206,21 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
 
     def no_drift(matcher: Matcher) -> Compensation:
         least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
-        reason = "do not contradict the stated times" if times_stated else f"differ by less than {least}"
+        reason = "do not contradict the stated times" if times_known else f"differ by less than {least}"
         return Compensation(None, matcher, Decision({}, "none", f"matched points {reason}", COMPENSATION))
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=tuple(prefetch_map(at_matching_size, views, RESIZED_AT_ONCE)))
     matcher = matcher_of(small)
-    if times_stated and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
+    if times_known and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
         return no_drift(matcher)
     matched, guess = match(matcher), initial_gains(small.views, response)
-    if not times_stated and len(matched) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
+    if not times_known and len(matched) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
         matched = max(matched, match(matcher_of(guess.normalize_photos(small, response))), key=len)
     if len(matched) < MIN_POINTS:
         return no_drift(matcher)
     compensation = fit(matched)
-    parts = _explanatory_parts(compensation, views, matched, response, times_stated)
+    parts = _explanatory_parts(compensation, views, matched, response, times_known)
     if not (parts.exposure or parts.white_balance or parts.vignetting):
         return no_drift(matcher)
     # Match again in photos that are already similar: more points are found.
@@ -229,7 +229,7 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     return Compensation(
         compensation,
         matcher_of(compensation.normalize_photos(small, response)),
-        _decision(compensation, parts, times_stated),
+        _decision(compensation, parts, times_known),
     )
 
 
@@ -247,19 +247,19 @@ def _explanatory_parts(
     views: Sequence[View],
     matched: MatchedPoints,
     response: Response,
-    times_stated: bool,
+    times_known: bool,
 ) -> Parts:
     """Return the parts of gains that explain how photos differ at shared points."""
     before = matched.disagreement(views, response, None)
     after = matched.disagreement(views, response, compensation.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
-    exposure = white_balance = not times_stated and compensation.stops >= MIN_STOPS and explains
+    exposure = white_balance = not times_known and compensation.stops >= MIN_STOPS and explains
     if not exposure and (
-        compensation.white_balance >= MIN_WHITE_BALANCE or (times_stated and _exceeds_stated(compensation, views))
+        compensation.white_balance >= MIN_WHITE_BALANCE or (times_known and _exceeds_stated(compensation, views))
     ):
         drift, colors = _cross_validate(views, matched, response)
         exposure = (
-            times_stated
+            times_known
             and compensation.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS
             and drift <= MAX_REMAINING_CROSS
         )
@@ -304,7 +304,7 @@ def _cross_validate(views: Sequence[View], matched: MatchedPoints, response: Res
     return float(drift), float(colors)
 
 
-def _decision(compensation: ExposureCompensation, parts: Parts, times_stated: bool) -> Decision:
+def _decision(compensation: ExposureCompensation, parts: Parts, times_known: bool) -> Decision:
     """Return the line of the plan for gains that are corrected."""
     figures = []
     if parts.exposure:
@@ -314,5 +314,5 @@ def _decision(compensation: ExposureCompensation, parts: Parts, times_stated: bo
     if parts.vignetting:
         figures.append(f"{compensation.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
-    choice = f"taken out of the photos{over if times_stated else ''}"
+    choice = f"taken out of the photos{over if times_known else ''}"
     return Decision({}, choice, f"matched points differ by {', '.join(figures)}", COMPENSATION, always_log=True)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError
-from ..model.radiance_field import RadianceField, TrainRender
+from ..model.radiance_field import RadianceField
+from ..model.renders import TrainRender
 from ..rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from ..rasterizer.code_residual import CodeScale, code_residual, code_values
 from ..rasterizer.photo_loss import photo_loss
@@ -304,7 +305,7 @@ def check_dataset_truth(data: LoadArguments, config: Config) -> None:
     if not config.loss.uses_hdr or removed:
         return
     path = data.get("path")
-    assert path is not None, "who has no path says so before"
+    assert path is not None, "the caller checks the path"
     dataset = parse_dataset(path, exposure_index=data.get("exposure_index"), holdout=data.get("holdout"))
     records = zip(unique_names(dataset.records), dataset.records, strict=True)
     views = [(name, record.hdr is not None) for name, record in records if record.split == "train"]

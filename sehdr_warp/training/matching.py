@@ -300,7 +300,7 @@ def seed_gaussians(
         times = field.base_time / float(view.exposure_time)
         excess = expected_excess(target.estimates, pixels[:, 1:].long(), matcher.size(index), times)
         is_white = start >= starts[-1] - TOLERANCE
-        start = field.color_model.brightened(start, torch.where(is_white, excess, 0))
+        start = field.color_model.brighten(start, torch.where(is_white, excess, 0))
     rest = field.gaussians.harmonics_rest
     nearer = (MAX_DISTANCE / matches.points.norm(dim=1)).clamp_max(1.0)
     quaternions = torch.zeros(bound, 4, device=rest.device)

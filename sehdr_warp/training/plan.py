@@ -235,7 +235,7 @@ def _light(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
             f"{facts.clipped:.1%} of the pixels are clipped",
         )
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
-    reason = f"{facts.truths} float pictures have any brightness: on a photo's curve, bright errors would weigh little"
+    reason = f"{facts.truths} float pictures have any brightness: on a photo's curve, errors of highlights count little"
     return Decision(fields, "in the mu-law", reason)
 
 
@@ -259,7 +259,7 @@ def _linear_loss(facts: SceneFacts, config: Config, device: torch.device) -> Dec
         return Decision({}, "none", f"loss.linear_weight = 0; {truths}")
     if config.loss.hdr_truth and facts.truths:
         return Decision({}, "against truth", truths)
-    return Decision({"loss.linear_weight": 0.0}, "none", f"{truths}: its own brackets would teach the base nothing")
+    return Decision({"loss.linear_weight": 0.0}, "none", f"{truths}: its own brackets give no training signal")
 
 
 def _densification(facts: SceneFacts, config: Config, device: torch.device) -> Decision:

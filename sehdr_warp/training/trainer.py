@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from ..errors import SehdrError
-from ..model.radiance_field import RadianceField, RenderedView
+from ..model.radiance_field import RadianceField
+from ..model.renders import RenderedView
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..rasterizer.tile_lists import MAX_SINGLE_SORT
 from ..response.learned import EXACT_BELOW

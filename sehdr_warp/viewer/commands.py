@@ -45,7 +45,7 @@ def run_view(args: View) -> None:
     if not args.runs:
         raise UsageError("view needs RUN, the folder of a run; see sehdr-warp view --help")
     if not 0 <= args.port < 65536:
-        raise UsageError(f"--port {args.port}: is no port; give 1 to 65535, or 0 for any")
+        raise UsageError(f"--port {args.port}: is not a port; give 1 to 65535, or 0 for any")
     for origin in args.origin:
         if not re.fullmatch(r"https?://[A-Za-z0-9.-]+(:[0-9]+)?", origin):
             raise UsageError(f"--origin {origin}: write it as https://NAME or https://NAME:PORT")

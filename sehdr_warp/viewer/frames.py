@@ -39,7 +39,7 @@ class ViewerScene:
         """Show a run under a name."""
         self.run, self.name, self.clipped = run, name, clipped
         self.lock, self.version = SceneLock(), 0
-        self.opacities, self.shown_count = EditedOpacities(), None
+        self.opacities, self.visible_count = EditedOpacities(), None
         self._opened: list[dict[str, Any] | None] = []
         self._start_lights()
 
@@ -52,7 +52,7 @@ class ViewerScene:
         """Show another run from now on."""
         with self.lock.changing():
             self.run, self.clipped = run, clipped
-            self.opacities, self.shown_count = EditedOpacities(), None
+            self.opacities, self.visible_count = EditedOpacities(), None
             self._start_lights()
             self.version += 1
 
@@ -93,7 +93,7 @@ class ViewerScene:
         """Show what edits leave of the scene, or all of it for None; see EditedOpacities.apply."""
         with self.lock.changing():
             count = self.opacities.apply(self.run, edits)
-            self.shown_count = None if edits is None else count
+            self.visible_count = None if edits is None else count
             self.version += 1
 
     def turned(self) -> None:
@@ -176,8 +176,8 @@ class ViewerScene:
             "name": self.name,
             "version": self.version,
             "scene": self.scene_name,
-            "gaussians": self.gaussian_count if self.shown_count is None else self.shown_count,
-            "edited": self.shown_count is not None,
+            "gaussians": self.gaussian_count if self.visible_count is None else self.visible_count,
+            "edited": self.visible_count is not None,
             "iterations": self.iterations,
             "response": self.response.name,
             "base_time": self.base_time,

@@ -398,7 +398,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Answer a request that is none, without all of its words."""
+        """Answer a request that is not HTTP, without quoting it."""
         super().send_error(code, None if message is None else message[:100], explain)
 
     def log_message(self, format: str, *args) -> None:

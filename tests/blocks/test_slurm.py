@@ -141,7 +141,7 @@ def test_what_slurm_refuses_is_one_line(cluster, survey, tmp_path, capfd, monkey
     own, ours = capfd.readouterr().err.splitlines()
     assert own == "sbatch: error: invalid partition specified: closed" and ours.startswith("sehdr-warp: SLURM does not")
     assert own in ours and ours.endswith("check what --slurm asks for; --device cpu asks for no GPU")
-    assert "time=4:00:00 is no number of minutes; write time=240" in line("time=4:00:00")
+    assert "time=4:00:00 is not a number of minutes; write time=240" in line("time=4:00:00")
     monkeypatch.setenv("PATH", "/nowhere")
     assert 'Could not detect "srun"' in line("partition=gpu")
 

@@ -8,7 +8,7 @@ from PIL import Image
 
 from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
 from sehdr_warp.scene import Camera, Scene, View, look_at
-from sehdr_warp.scene.color_encoding import stated_encoding
+from sehdr_warp.scene.color_encoding import encoding_of
 from sehdr_warp.scene.exif import exif_exposure
 from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
 from sehdr_warp.scene.gravity import find_up
@@ -155,7 +155,7 @@ def read_icc(path: Path):
         return None
     pixels = read_photo(photo).pixels
     with open_image(photo) as image:
-        encoding = stated_encoding(image)
+        encoding = encoding_of(image)
     return encoding.to_linear(pixels) if encoding is not None else None
 
 

@@ -106,6 +106,6 @@ def test_a_killed_job_goes_on_and_finished_blocks_are_not_run_again(survey, tmp_
 
 def test_what_slurm_refuses_is_one_line(survey, tmp_path, capfd):
     words = ["train", survey, "--out", tmp_path / "run", *FLAGS, "--blocks", "2", "--overwrite", "--slurm"]
-    assert "time=4:00:00 is no number of minutes; write time=240" in refused(capfd, *words, "time=4:00:00")
+    assert "time=4:00:00 is not a number of minutes; write time=240" in refused(capfd, *words, "time=4:00:00")
     assert call(*words, "partition=no_such_partition,time=1", "-q") == 1
     assert "check what --slurm asks for" in capfd.readouterr().err.splitlines()[-1]

@@ -15,10 +15,10 @@ from sehdr_warp.output.environment_map import (
     latlong,
     render_map,
     solid_angles,
-    subject_of_walk,
     write_environment_map,
 )
 from sehdr_warp.output.exr import write_radiance
+from sehdr_warp.output.map_center import subject_of_walk
 from sehdr_warp.output.world_transform import WorldTransform, world_transform
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr

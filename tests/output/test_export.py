@@ -32,7 +32,7 @@ def test_suffix_and_kind_decide(tmp_path, run, logged):
 
 
 def test_a_wrong_suffix_is_told_all_that_export_writes(tmp_path):
-    with pytest.raises(InputError, match=r"scene: is no splat file; use one of \.ply .* \.glb .* \.html$"):
+    with pytest.raises(InputError, match=r"scene: is not a splat file; use one of \.ply .* \.glb .* \.html$"):
         run_export(Export(run=tmp_path, out=tmp_path / "scene"))
     with pytest.raises(InputError, match=r"holds 8 bits .* \.html$"):
         run_export(Export(run=tmp_path, out=tmp_path / "scene.splat"))

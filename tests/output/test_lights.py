@@ -14,7 +14,7 @@ from sehdr_warp.output.lights import lights_table, write_lights
 from sehdr_warp.output.world_transform import WorldTransform, world_transform
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
-from sehdr_warp.splats.arrays import concatenated
+from sehdr_warp.splats.arrays import join_gaussians
 
 from .helpers import Entry, camera
 from .test_environment_map import lamps
@@ -109,7 +109,7 @@ def test_the_map_of_a_walk_around_something_is_what_surrounds_it(tmp_path, monke
     cameras = tuple(Entry(str(i), "train", camera(position=tuple(place))) for i, place in enumerate(places))
     wall, statue = lamps(), replace(lamps(), means=lamps().means * 0.02, log_scales=lamps().log_scales - 3)
     around = lights_map(tmp_path / "wall", field_of(wall), cameras)
-    both = lights_map(tmp_path / "both", field_of(concatenated([wall, statue])), cameras)
+    both = lights_map(tmp_path / "both", field_of(join_gaussians([wall, statue])), cameras)
     np.testing.assert_allclose(both, around, rtol=1e-3, atol=1e-3)
 
 

@@ -39,7 +39,7 @@ def test_what_a_config_lacks_is_named(tmp_path):
     with pytest.raises(InputError, match="has no display 'x'"):
         ocio_view(CONFIG, "x/Raw")
     (tmp_path / "a.ocio").write_text("no config")
-    for name, problem in (("a.ocio", "is no OpenColorIO config"), ("b.ocio", "file not found")):
+    for name, problem in (("a.ocio", "is not an OpenColorIO config"), ("b.ocio", "file not found")):
         with pytest.raises(InputError, match=problem):
             ocio_view(str(tmp_path / name), "Raw")
     (tmp_path / "raw.ocio").write_text(OCIO.Config.CreateRaw().serialize())
@@ -111,5 +111,5 @@ def test_archives_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
         with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.cube", "w") as lut:
             for _ in range(5):
                 lut.write(bytes(60_000_000))
-    with pytest.raises(InputError, match="is no archive of a config|unpacks to 300000000 bytes"):
+    with pytest.raises(InputError, match="is not an archive of a config|unpacks to 300000000 bytes"):
         ocio_view(str(file), "V")

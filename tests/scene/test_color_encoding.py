@@ -12,7 +12,7 @@ from PIL import Image, ImageCms
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.color_encoding import encoding_of_profile, stated_encoding
+from sehdr_warp.scene.color_encoding import encoding_of, encoding_of_profile
 from sehdr_warp.scene.icc import xyz_to_rec709
 from sehdr_warp.scene.images import EncodedImage, open_image, read_ldr
 from sehdr_warp.scene.primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
@@ -249,7 +249,7 @@ def test_stated_light_wins_over_a_guess(tmp_path, case):
     assert scene.light_known and any(words in note and "no response is guessed" in note for note in scene.notes)
     light = light_of(scene.views[0], scene)[8, 8:48:16, 0]
     np.testing.assert_allclose(np.diff(np.log2(light)), 2, atol=0.01)
-    with pytest.raises(InputError, match="their light is known, and response gamma-2.2 is not theirs"):
+    with pytest.raises(InputError, match="their light is known, and response gamma-2.2 does not apply"):
         load_scene(tmp_path, response="gamma-2.2")
 
 
@@ -259,16 +259,16 @@ def test_gamma_and_primaries_of_png(tmp_path):
     chunks = (b"gAMA", struct.pack(">I", 55_556)), (b"cHRM", struct.pack(">8I", *np.rint(places).astype(int)))
     png16(tmp_path / "a.png", np.full((2, 2, 3), 0.5), *chunks)
     with open_image(tmp_path / "a.png") as image:
-        encoding = stated_encoding(image)
+        encoding = encoding_of(image)
     assert encoding.name == "gAMA 0.55556 and cHRM" and not encoding.light
     light, _ = encoding.to_linear(np.full((1, 1, 3), 32768, np.uint16))
     np.testing.assert_allclose(light, 0.5**1.8, rtol=2e-3)
     png16(tmp_path / "b.png", np.full((2, 2, 3), 0.5), (b"gAMA", struct.pack(">I", 45_455)))
     with open_image(tmp_path / "b.png") as image:
-        assert stated_encoding(image).is_srgb
+        assert encoding_of(image).is_srgb
     png16(tmp_path / "c.png", np.full((2, 2, 3), 0.5), chunks[1])
     with open_image(tmp_path / "c.png") as image:
-        alone = stated_encoding(image)
+        alone = encoding_of(image)
     assert alone.name == "cHRM" and not alone.curves and alone.to_rec709 is not None, "primaries without a gamma"
 
 
@@ -288,7 +288,7 @@ def test_adobe_rgb_of_exif(tmp_path, interop):
         exif.get_ifd(0x8769)[0xA005] = {1: interop["index"]}
     Image.fromarray(np.full((8, 8, 3), PATCHES[0], np.uint8)).save(tmp_path / "a.jpg", exif=exif, quality=100)
     with open_image(tmp_path / "a.jpg") as image:
-        encoding = stated_encoding(image)
+        encoding = encoding_of(image)
     light, _ = encoding.to_linear(np.array([[PATCHES[0]]], np.uint8))
     np.testing.assert_allclose(light[0, 0], rec709_of("Adobe RGB (1998)", 563 / 256, PATCHES[0]), rtol=2e-3)
 
@@ -327,7 +327,7 @@ def test_profiles_that_pillow_cannot_join_are_named(tmp_path, kind):
         file = tmp_path / "a.png"
         png16(file, np.full((2, 2, 3), 0.5), (b"iCCP", b"x\0\0no zlib"))
     with open_image(file) as image:
-        encoding = stated_encoding(image)
+        encoding = encoding_of(image)
     assert encoding.problem == "its ICC profile is damaged" and encoding.is_srgb
 
 
@@ -335,7 +335,7 @@ def test_names_of_profiles_fit_a_line(tmp_path):
     profile = icc_profile("Display P3", name="n\n" * 20_000)
     Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(tmp_path / "a.png", icc_profile=profile)
     with open_image(tmp_path / "a.png") as image:
-        encoding = stated_encoding(image)
+        encoding = encoding_of(image)
     assert len(encoding.name) < 200 and "\n" not in encoding.name
 
 
@@ -346,7 +346,7 @@ def test_bad_gamma_and_primaries_of_png_are_named(tmp_path):
                          ((b"cICP", bytes([77, 1, 0, 1])), "its cICP 77/1 is not known")):  # fmt: skip
         png16(tmp_path / "a.png", np.full((2, 2, 3), 0.5), chunk)
         with open_image(tmp_path / "a.png") as image:
-            encoding = stated_encoding(image)
+            encoding = encoding_of(image)
         assert encoding.problem == words and encoding.is_srgb
 
 
@@ -362,7 +362,7 @@ def test_narrow_range_and_unstated_code_points(tmp_path):
     for code_points in ([1, 13, 0, 0], [2, 2, 0, 1], [1, 13, 0, 1]):
         png16(tmp_path / "a.png", np.full((2, 2, 3), 0.5), (b"cICP", bytes(code_points)))
         with open_image(tmp_path / "a.png") as image:
-            encodings.append(stated_encoding(image))
+            encodings.append(encoding_of(image))
     narrow, unstated, rec709 = encodings
     light, _ = narrow.to_linear(np.array([[[16, 126, 235]]], np.uint8))
     np.testing.assert_allclose(light[0, 0], srgb_to_linear(np.array([0, 110 / 219, 1])), atol=2e-3)

@@ -215,7 +215,7 @@ def test_files_that_are_no_photos_of_a_camera(tmp_path, shared, capfd):
             read_raw(tmp_path / name, oriented=False)
     assert capfd.readouterr().err == ""
     folder = shared / "data" / "raw"
-    with pytest.raises(InputError, match="no photo through a filter of three colors"):
+    with pytest.raises(InputError, match="not a photo through a filter of three colors"):
         read_raw(folder / "Nikon_uncompressed.nef", oriented=False)
     shutil.copy(folder / "RAW_KODAK_DC50.KDC", tmp_path / "d.dng")
     with pytest.raises(InputError, match="states no color matrix"):

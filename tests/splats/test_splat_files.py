@@ -154,7 +154,7 @@ BAD = {
     "b.glb": (struct.pack("<5I", 0x46546C67, 2, 22, 2, 0x4E4F534A) + b"{}", "is damaged glTF"),
     "a.spz": (b"x", "is damaged SPZ"),
     "a.splat": (b"x", ".splat is not read or written here"),
-    "a.txt": (b"x", "a.txt: is no splat file; use one of .ply"),
+    "a.txt": (b"x", "a.txt: is not a splat file; use one of .ply"),
     "a.usda": (b"#usda 1.0\ndef Sphere \"a\" {}\n", "has 0 prims of ParticleField3DGaussianSplat"),
     "b.usda": (b"#usda 1.0\ndef {", "cannot be read as USD"),
 }  # fmt: skip

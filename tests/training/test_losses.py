@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model.radiance_field import TrainRender
+from sehdr_warp.model.renders import TrainRender
 from sehdr_warp.rasterizer.code_residual import code_tensor
 from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import response_by_name
