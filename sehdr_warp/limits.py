@@ -28,7 +28,8 @@ def memory_left(proc: Path = PROC, mount: Path = MOUNT, environment: Mapping[str
     free = [
         limit - max(0, usage - _number(group / "memory.stat", field))
         for group, names, field in _memory_groups(proc, mount)
-        if (limit := _number(group / names[0])) < _NO_LIMIT and (usage := _number(group / names[1])) < _NO_LIMIT
+        if (limit := min(_number(group / name) for name in names[:-1])) < _NO_LIMIT
+        and (usage := _number(group / names[-1])) < _NO_LIMIT
     ]
     if (job := _slurm_memory(environment)) is not None:
         free.append(job - _resident(proc))
@@ -74,7 +75,8 @@ def _groups(proc: Path, mount: Path, controller: str) -> Iterator[tuple[int, Pat
             if number == "0" and not controllers:
                 version, roots = 2, (mount, mount / "unified")
             elif controller in controllers.split(","):
-                version, roots = 1, (mount / controllers, mount / controller)
+                reverse = ",".join(reversed(controllers.split(",")))
+                version, roots = 1, (mount / controllers, mount / reverse, mount / controller)
             else:
                 continue
             below = Path(path.lstrip("/"))
@@ -87,8 +89,13 @@ def _groups(proc: Path, mount: Path, controller: str) -> Iterator[tuple[int, Pat
                         yield version, root / place
 
 
-def _memory_groups(proc: Path, mount: Path) -> Iterator[tuple[Path, tuple[str, str], str]]:
-    names = {1: ("memory.limit_in_bytes", "memory.usage_in_bytes"), 2: ("memory.max", "memory.current")}
+def _memory_groups(proc: Path, mount: Path) -> Iterator[tuple[Path, tuple[str, ...], str]]:
+    """Yield the folder of each memory cgroup, its files of limits and of usage, and the field of idle file pages."""
+    # Above memory.high, processes are slowed down until they hardly go on.
+    names = {
+        1: ("memory.limit_in_bytes", "memory.usage_in_bytes"),
+        2: ("memory.max", "memory.high", "memory.current"),
+    }
     for version, group in _groups(proc, mount, "memory"):
         yield group, names[version], "total_inactive_file" if version == 1 else "inactive_file"
 

@@ -38,8 +38,14 @@ def test_version_2_counts_all_groups_up_to_the_root(tmp_path):
     assert processor_limit(*places) == 2
 
 
-def test_version_1(tmp_path):
-    places = write(tmp_path, V1)
+def test_memory_from_which_the_kernel_slows_a_process_down(tmp_path):
+    places = write(tmp_path, V2 | {"cgroup/job/step/memory.high": 4 * GB})
+    assert memory_left(*places) == 3 * GB
+
+
+@pytest.mark.parametrize("listed", ["cpu,cpuacct", "cpuacct,cpu"])
+def test_version_1(tmp_path, listed):
+    places = write(tmp_path, V1 | {"proc/self/cgroup": V1["proc/self/cgroup"].replace("cpu,cpuacct", listed)})
     assert memory_left(*places) == 3 * GB
     assert processor_limit(*places) == 4
 

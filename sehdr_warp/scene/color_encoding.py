@@ -8,7 +8,7 @@ light, PQ, HLG and logarithmic curves are light themselves, and leave nothing to
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
@@ -243,9 +243,26 @@ def _nclx(path: Path) -> ColorEncoding | None:
         boxes = [data for kind, data in items.items[items.primary].properties if kind == "colr"]
     except (InputError, KeyError):
         return None
-    codes = [struct.unpack_from(">2H", data, 4) for data in boxes if data[:4] == b"nclx" and len(data) >= 8]
-    profile = any(data[:4] in (b"prof", b"rICC") for data in boxes)
-    return _from_cicp((*codes[0], 1), "nclx") if codes and (not profile or codes[0][1] in _LIGHT) else None
+    codes, profile = _code_points(boxes), _profile_in(boxes)
+    return _from_cicp((*codes, 1), "nclx") if codes and (profile is None or codes[1] in _LIGHT) else None
+
+
+def encoding_of_boxes(boxes: Sequence[bytes]) -> ColorEncoding | None:
+    """Return what the `colr` boxes of a picture in a HEIF or AVIF file state, the profile first; None for nothing."""
+    if profile := _profile_in(boxes):
+        return encoding_of_profile(profile)
+    codes = _code_points(boxes)
+    return None if codes is None else _from_cicp((*codes, 1), "nclx")
+
+
+def _code_points(boxes: Sequence[bytes]) -> tuple[int, int] | None:
+    """Return primaries and transfer of ITU-T H.273 in `colr` boxes, None if they hold none."""
+    return next((struct.unpack_from(">2H", box, 4) for box in boxes if box[:4] == b"nclx" and len(box) >= 8), None)
+
+
+def _profile_in(boxes: Sequence[bytes]) -> bytes | None:
+    """Return the ICC profile in `colr` boxes, None if they hold none."""
+    return next((box[4:] for box in boxes if box[:4] in (b"prof", b"rICC")), None)
 
 
 @lru_cache(maxsize=64)

@@ -24,15 +24,35 @@ _BLACK_REPEAT, _BLACK, _BLACK_DELTA_H, _BLACK_DELTA_V, _WHITE = 50713, 50714, 50
 _DEFAULT_SCALE, _CROP_ORIGIN, _CROP_SIZE, _ACTIVE_AREA = 50718, 50719, 50720, 50829
 _OPCODE_LISTS = 51008, 51009, 51022
 _CFA, _LINEAR_RAW = 32803, 34892
-_JPEG_XL = 52546
+_TILE_WIDTH, _TILE_LENGTH, _ROWS_PER_STRIP, _LINEARIZATION = 322, 323, 278, 50712
+_PLACES, _LENGTHS = (324, 273), (325, 279)  # Of tiles, or strips
+_UNCOMPRESSED, _LOSSLESS_JPEG, _LOSSY_JPEG, _JPEG_XL = 1, 7, 34892, 52546
+# Compressions of integers that LibRaw does not decode.
+_UNDECODED = {5: "LZW", 8: "Deflate", 9: "VC-5 (GoPro GPR)", 32773: "PackBits", 32946: "Deflate", _JPEG_XL: "JPEG XL"}
 _MOST_IFDS = 64
 _LARGEST_SCALE = 8.0  # Of DefaultScale; files state 1 or 2
 _FLOAT = 3  # SampleFormat
+_BIG_HEADS = b"II+\0", b"MM\0+"
 _CONVERT = "convert it with Adobe DNG Converter"
 _MAX_SIDE = 65536
 """Pixels of the longest side that is read, because a damaged size would fill the memory."""
 _MAX_REPEAT = 64
 """Rows and columns of the largest pattern of black levels that is read."""
+
+
+@dataclass(frozen=True)
+class JpegTiles:
+    """Baseline JPEG pictures that a lossy DNG's linear raw image consists of, row by row.
+
+    Attributes:
+        size: (width, height) of each; the last ones may reach beyond the image, or end with it.
+        places: (offset in the file, length) of each.
+        linearization: stored value of each code; None if codes are stored values.
+    """
+
+    size: tuple[int, int]
+    places: tuple[tuple[int, int], ...]
+    linearization: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -51,6 +71,7 @@ class DngRaw:
         crop: left, top, width, height of the picture inside the active area, in pixels before scale.
         orientation: EXIF's, 1 to 8.
         opcodes: the opcode lists 1 (stored samples), 2 (light before demosaicing) and 3 (after it), as bytes.
+        tiles: of a lossy DNG, which LibRaw decodes by a curve of its own; None otherwise.
     """
 
     size: tuple[int, int]
@@ -64,6 +85,7 @@ class DngRaw:
     crop: tuple[float, float, float, float]
     orientation: int
     opcodes: tuple[bytes, bytes, bytes]
+    tiles: JpegTiles | None = None
 
     @property
     def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -80,11 +102,15 @@ def read_dng(path: Path) -> DngRaw | None:
     """
     try:
         with path.open("rb") as file:
+            big = file.read(4) in _BIG_HEADS
+            file.seek(0)
             tables = list(_tables(file))
     except (*PILLOW_ERRORS, IndexError):
         return None  # LibRaw's message says what is wrong.
     if not tables or _DNG_VERSION not in tables[0]:
         return None
+    if big:
+        raise InputError(path, "is a DNG in the form of a BigTIFF, which LibRaw does not read", _CONVERT)
     raw = [table for table in tables if table.get(_PHOTOMETRIC) in (_CFA, _LINEAR_RAW) and not _reduce(table)]
     if not raw:
         return None
@@ -99,7 +125,7 @@ def read_dng(path: Path) -> DngRaw | None:
 def _tables(file: Any) -> Iterator[Any]:
     """Yield the image file directories of a TIFF file, those of SubIFDs included."""
     prefix = file.read(8)
-    if prefix[2:4] in (b"\x2b\x00", b"\x00\x2b"):
+    if prefix[:4] in _BIG_HEADS:
         prefix += file.read(8)  # BigTIFF
     head = TiffImagePlugin.ImageFileDirectory_v2(prefix)
     places, visited = [head.next], set()
@@ -124,10 +150,16 @@ def _reduce(table: Any) -> bool:
 
 def _check_decodable(path: Path, table: Any) -> None:
     """Raise InputError for samples that LibRaw does not decode, or not by one scale for all photos."""
-    if table.get(_COMPRESSION) == _JPEG_XL:
-        remedy = f"{_CONVERT} (lossless JPEG), or choose JPEG Lossless in the phone's RAW settings"
-        raise InputError(path, "is a DNG compressed as JPEG XL, which LibRaw does not decode", remedy)
-    if _FLOAT in _numbers(table, _SAMPLE_FORMAT, (1,)):
+    compression, is_float = table.get(_COMPRESSION, _UNCOMPRESSED), _FLOAT in _numbers(table, _SAMPLE_FORMAT, (1,))
+    other = compression not in (0, _UNCOMPRESSED, _LOSSLESS_JPEG, _LOSSY_JPEG)
+    if other and (not is_float or compression == _JPEG_XL):
+        remedy = f"{_CONVERT} (lossless JPEG)"
+        remedy += ", or choose JPEG Lossless in the phone's RAW settings" * (compression == _JPEG_XL)
+        name = _UNDECODED.get(compression, f"compression {compression}")
+        raise InputError(path, f"is a DNG compressed as {name}, which LibRaw does not decode", remedy)
+    if compression == _LOSSY_JPEG and table.get(_PHOTOMETRIC) != _LINEAR_RAW:
+        raise InputError(path, "is a DNG whose color filter's samples are compressed with loss", _CONVERT)
+    if is_float:
         problem = "is a DNG of floating-point samples (an HDR merge), which LibRaw scales differently in each file"
         raise InputError(path, problem, "export it as OpenEXR, or use the photos that it was merged from")
     if _samples(table) == 1 and table.get(_PHOTOMETRIC) == _LINEAR_RAW:
@@ -210,4 +242,19 @@ def _raw_of(table: Any, first: Any) -> DngRaw:
         crop=(crop_left, crop_top, crop_width, crop_height),
         orientation=orientation if orientation in range(1, 9) else 1,
         opcodes=tuple(bytes(table.get(tag, b"")) for tag in _OPCODE_LISTS),  # type: ignore[arg-type]
+        tiles=_jpeg_tiles(table, width, height) if table.get(_COMPRESSION) == _LOSSY_JPEG else None,
     )
+
+
+def _jpeg_tiles(table: Any, width: int, height: int) -> JpegTiles:
+    """Return where a lossy DNG's pictures lie. Raises ValueError for a number of them that does not fill the image."""
+    places, lengths = (next(_numbers(table, tag, ()) for tag in tags if tag in table) for tags in (_PLACES, _LENGTHS))
+    size = int(table.get(_TILE_WIDTH, width)), int(table.get(_TILE_LENGTH, table.get(_ROWS_PER_STRIP, height)))
+    if min(size) < 1 or max(size) > _MAX_SIDE:
+        raise ValueError(f"tiles of {size[0]} x {size[1]} pixels")
+    count = -(-width // size[0]) * -(-height // size[1])
+    if not len(places) == len(lengths) == count:
+        raise ValueError(f"{len(places)} tiles, not {count}")
+    values = np.array(_numbers(table, _LINEARIZATION, 0.0), np.float32) if _LINEARIZATION in table else None
+    parts = tuple((int(place), int(length)) for place, length in zip(places, lengths, strict=True))
+    return JpegTiles(size, parts, values)

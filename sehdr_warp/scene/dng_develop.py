@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from ..errors import InputError
-from .dng import DngRaw
+from .dng import DngRaw, JpegTiles
 from .dng_opcodes import apply_opcodes
-from .images import DAMAGED, turn_upright
+from .images import DAMAGED, PILLOW_ERRORS, turn_upright
 
 CLIPPED = 0.99
 """Part of the clipping level from which a sample is clipped: a sensor reads it with noise, and demosaicing mixes it."""
@@ -53,16 +54,7 @@ def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorL
         InputError: if the samples do not fit the tags, or an opcode list is damaged.
     """
     pattern = dng.pattern
-    samples = 3 if pattern is None else 1
-    sensor = np.asarray(raw.raw_image)
-    sensor = sensor.reshape(*sensor.shape[:2], -1)[:, :, :samples]
-    height, width, channels = sensor.shape
-    sensor = sensor[: dng.size[1], : dng.size[0]]  # LibRaw may pad to whole tiles.
-    if sensor.shape != (dng.size[1], dng.size[0], samples):
-        problem = (
-            f"its tags state {dng.size[0]} x {dng.size[1]} pixels, LibRaw decodes {width} x {height} of {channels}"
-        )
-        raise InputError(path, problem, DAMAGED)
+    sensor = _decoded_by_libraw(path, dng, raw) if dng.tiles is None else _decoded_tiles(path, dng, dng.tiles)
     cell = 1 if pattern is None else len(pattern)
     if dng.opcodes[0]:
         sensor = apply_opcodes(dng.opcodes[0], sensor.astype(np.float32) / 65535, path, cell=cell) * 65535
@@ -86,6 +78,44 @@ def develop_dng(path: Path, dng: DngRaw, raw: Any, *, oriented: bool) -> SensorL
     if oriented:
         light, clipped = (turn_upright(each, dng.orientation) for each in (light, clipped))
     return SensorLight(light, clipped)
+
+
+def _decoded_by_libraw(path: Path, dng: DngRaw, raw: Any) -> np.ndarray:
+    """Return the stored samples [H, W, 1 or 3]. Raises InputError if there are not as many as the tags state."""
+    samples = 3 if dng.pattern is None else 1
+    sensor = np.asarray(raw.raw_image)
+    sensor = sensor.reshape(*sensor.shape[:2], -1)[:, :, :samples]
+    height, width, channels = sensor.shape
+    sensor = sensor[: dng.size[1], : dng.size[0]]  # LibRaw may pad to whole tiles.
+    if sensor.shape != (dng.size[1], dng.size[0], samples):
+        problem = (
+            f"its tags state {dng.size[0]} x {dng.size[1]} pixels, LibRaw decodes {width} x {height} of {channels}"
+        )
+        raise InputError(path, problem, DAMAGED)
+    return sensor
+
+
+def _decoded_tiles(path: Path, dng: DngRaw, tiles: JpegTiles) -> np.ndarray:
+    """Return the stored samples [H, W, 3] of a lossy DNG. Raises InputError if a picture is damaged."""
+    (width, height), (across, down) = dng.size, tiles.size
+    sensor = np.empty((height, width, 3), np.uint8 if tiles.linearization is None else np.float32)
+    corners = ((top, left) for top in range(0, height, down) for left in range(0, width, across))
+    with path.open("rb") as file:
+        for (top, left), (place, length) in zip(corners, tiles.places, strict=True):
+            part = sensor[top : top + down, left : left + across]
+            try:
+                file.seek(place)
+                with Image.open(io.BytesIO(file.read(length)), formats=("JPEG", "MPO")) as picture:
+                    if picture.width > across or picture.height > down:
+                        raise ValueError(f"{picture.width} x {picture.height} pixels")
+                    codes = np.asarray(picture)[: part.shape[0], : part.shape[1]]
+            except PILLOW_ERRORS as error:
+                raise InputError(path, f"a JPEG picture in it is damaged ({error!s:.80})", DAMAGED) from None
+            if codes.shape != part.shape:
+                raise InputError(path, f"a JPEG picture in it has the shape {codes.shape}, not {part.shape}", DAMAGED)
+            table = tiles.linearization
+            part[:] = codes if table is None else table[np.minimum(codes, len(table) - 1)]
+    return sensor
 
 
 def _places(shape: tuple[int, ...], pattern: np.ndarray, channel: int) -> np.ndarray:

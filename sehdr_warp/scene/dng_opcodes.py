@@ -254,13 +254,34 @@ def _warp_rectilinear(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarr
     polar = _Polar.of(*reader.take("2d"), image.shape)  # pyright: ignore[reportCallIssue]
 
     def moved(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        squared, right, down = polar.squared, polar.right, polar.down
-        factor = np.polynomial.polynomial.polyval(squared, k[:4])
-        x = factor * right + k[4] * 2 * right * down + k[5] * (squared + 2 * right**2)
-        y = factor * down + k[5] * 2 * right * down + k[4] * (squared + 2 * down**2)
-        return x, y
+        return _bent(polar, np.polynomial.polynomial.polyval(polar.squared, k[:4]), k[4:])
 
     return _warp(image, polar, terms, moved)
+
+
+def _warp_rectilinear_2(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+    """Move pixels by a polynomial of the radius itself, within a range of radii, or by its reciprocal (DNG 1.6)."""
+    (planes,) = reader.take("I")
+    terms = reader.array("f8", 19 * planes).reshape(-1, 19)
+    polar = _Polar.of(*reader.take("2d"), image.shape)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    (reciprocal,) = reader.take("I")
+
+    def moved(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        radius = np.sqrt(np.clip(polar.squared, k[17] ** 2, k[18] ** 2))
+        factor = np.polynomial.polynomial.polyval(radius, k[:15])
+        if reciprocal and not np.abs(factor).min() > 0:
+            raise ValueError("a polynomial of 0")
+        return _bent(polar, 1 / factor if reciprocal else factor, k[15:17])
+
+    return _warp(image, polar, terms, moved)
+
+
+def _bent(polar: _Polar, factor: np.ndarray, tangential: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return [H, W] places to the right and down: multiplied by a factor and moved by two tangential coefficients."""
+    squared, right, down = polar.squared, polar.right, polar.down
+    x = factor * right + tangential[0] * 2 * right * down + tangential[1] * (squared + 2 * right**2)
+    y = factor * down + tangential[1] * 2 * right * down + tangential[0] * (squared + 2 * down**2)
+    return x, y
 
 
 def _warp_fisheye(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
@@ -305,4 +326,5 @@ _FUNCTIONS: dict[int, Callable[[_Reader, np.ndarray, int], np.ndarray]] = {
     11: _along(1, np.add),
     12: _along(0, np.multiply),
     13: _along(1, np.multiply),
+    14: _warp_rectilinear_2,
 }

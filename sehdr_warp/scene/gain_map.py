@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image, TiffImagePlugin
 
 from ..errors import InputError
+from .color_encoding import ColorEncoding, encoding_of, encoding_of_boxes, encoding_of_profile
 from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, with_primary
 from .images import PILLOW_ERRORS, EncodedImage, exif_of, open_image, orientation_of, turn_upright
 from .linear_photos import linear_codes
@@ -49,6 +50,7 @@ class GainMap:
         base_offset: added to the photo's light before it is multiplied.
         alternate_offset: subtracted afterwards.
         headroom: log2 of the brightest light that the file means, as a multiple of white.
+        to_alternate: [3, 3] from the photo's primaries to those in which the gains apply; None if they are the photo's.
     """
 
     encoded: np.ndarray
@@ -58,10 +60,13 @@ class GainMap:
     base_offset: np.ndarray
     alternate_offset: np.ndarray
     headroom: float
+    to_alternate: np.ndarray | None = None
 
     def light(self, base: np.ndarray) -> np.ndarray:
         """Return the light [H, W, 3] float32 of a photo whose own light [H, W, 3] is in [0, 1], 1 at white."""
         height, width = base.shape[:2]
+        if self.to_alternate is not None:
+            base = base @ self.to_alternate.T.astype(np.float32)
         result = np.empty(base.shape, np.float32)
         for channel in range(3):
             plane = self.encoded[..., min(channel, self.encoded.shape[2] - 1)]
@@ -71,6 +76,8 @@ class GainMap:
             gain = np.exp2(np.float32(self.minimum[channel]) + np.float32(span) * share)
             light = (base[..., channel] + np.float32(self.base_offset[channel])) * gain
             result[..., channel] = light - np.float32(self.alternate_offset[channel])
+        if self.to_alternate is not None:
+            result = result @ np.linalg.inv(self.to_alternate).T.astype(np.float32)
         return np.maximum(result, 0)
 
 
@@ -145,7 +152,7 @@ def _is_jpeg(path: Path) -> bool:
 
 def _of_jpeg(path: Path) -> GainMap | None:
     with open_image(path) as image:
-        photo, exif = image.size, exif_of(image)
+        photo, exif, own = image.size, exif_of(image), encoding_of(image)
         for second in _further_pictures(image, path):
             iso = next((data for _, data in getattr(second, "applist", ()) if data.startswith(_ISO_JPEG)), None)
             xmp = _with_usual_prefix(_text(second.info.get("xmp", b"")))
@@ -157,7 +164,9 @@ def _of_jpeg(path: Path) -> GainMap | None:
                 make = _of_apple(xmp, exif)
             else:
                 continue
-            return _gain_map_of(make, _pixels(second, photo))
+            profile = second.info.get("icc_profile")
+            alternate = encoding_of_profile(bytes(profile)) if profile else None
+            return _gain_map_of(make, _pixels(second, photo), _between(own, alternate))
     return None
 
 
@@ -193,13 +202,14 @@ def _of_items(path: Path) -> GainMap | None:
         if file.read(12)[4:8] != b"ftyp":
             return None
     with open_image(path) as image:
-        photo, exif = image.size, exif_of(image)
+        photo, exif, own = image.size, exif_of(image), encoding_of(image)
     items = read_items(path)
     inputs = {number: to for kind, number, to in items.references if kind == "dimg"}
     for number, item in items.items.items():
         if item.kind == "tmap" and len(to := inputs.get(number, ())) >= 2 and to[0] == items.primary:
             make = _of_iso(item_bytes(path, item)[1:])
-            return _gain_map_of(make, _item_pixels(path, items, to[1], photo))
+            alternate = encoding_of_boxes([data for name, data in item.properties if name == "colr"])
+            return _gain_map_of(make, _item_pixels(path, items, to[1], photo), _between(own, alternate))
     for number, item in items.items.items():
         kinds = [data[4:].split(b"\0")[0].decode("latin-1") for name, data in item.properties if name == "auxC"]
         if _APPLE_AUX in kinds:
@@ -267,12 +277,26 @@ class _Parameters:
     alternate_offset: tuple[float, ...] = (1 / 64,)
     headroom: float = 1.0
     base_is_hdr: bool = False
+    in_alternate_colors: bool = False
     apple_headroom: float | None = None
 
 
-def _gain_map_of(parameters: _Parameters, encoded: np.ndarray) -> GainMap | None:
+def _between(own: ColorEncoding | None, alternate: ColorEncoding | None) -> np.ndarray | None:
+    """Return [3, 3] from the primaries of a photo to those of its alternate rendition; None if they do not differ.
+
+    An alternate rendition that states no primaries has the photo's.
+    """
+    if alternate is None or alternate.problem or alternate.table or (own is not None and own.table is not None):
+        return None
+    to_rec709 = [np.eye(3) if each is None or each.to_rec709 is None else each.to_rec709 for each in (own, alternate)]
+    matrix = np.linalg.solve(to_rec709[1], to_rec709[0])
+    return None if np.allclose(matrix, np.eye(3), atol=1e-3) else matrix
+
+
+def _gain_map_of(parameters: _Parameters, encoded: np.ndarray, between: np.ndarray | None = None) -> GainMap | None:
     """Return the gain map of parameters and pixels; None if the photo itself is the HDR rendition.
 
+    `between` leads from the photo's primaries to those of the alternate rendition, where the metadata may apply gains.
     Raises ValueError for parameters that cannot be.
     """
     if parameters.base_is_hdr:
@@ -294,7 +318,8 @@ def _gain_map_of(parameters: _Parameters, encoded: np.ndarray) -> GainMap | None
         raise ValueError(f"gains from {low.tolist()} to {high.tolist()} stops")
     if not max(np.abs(numbers["base_offset"]).max(), np.abs(numbers["alternate_offset"]).max()) <= 1:
         raise ValueError("offsets above the light of white")
-    return GainMap(encoded=encoded, headroom=float(high.max()), **numbers)
+    to_alternate = between if parameters.in_alternate_colors else None
+    return GainMap(encoded=encoded, headroom=float(high.max()), to_alternate=to_alternate, **numbers)
 
 
 def _of_xmp(xmp: str) -> _Parameters:
@@ -357,7 +382,8 @@ def _of_iso(data: bytes) -> _Parameters:
     base, alternate = take(False), take(False)
     rows = [(take(True), take(True), take(False), take(True), take(True)) for _ in range(channels)]
     minimum, maximum, gamma, base_offset, alternate_offset = zip(*rows, strict=True)
-    return _Parameters(minimum, maximum, gamma, base_offset, alternate_offset, alternate, base_is_hdr=base > alternate)
+    colors, is_hdr = not flags & 0x40, base > alternate
+    return _Parameters(minimum, maximum, gamma, base_offset, alternate_offset, alternate, is_hdr, colors)
 
 
 def _of_apple(xmp: str, exif: Any) -> _Parameters:

@@ -94,14 +94,28 @@ def unusable_notes(problems: Sequence[InputError], count: int) -> list[str]:
     Raises:
         InputError: the first problem, if more than half of the photos or all but two have one.
     """
+    if problems and count - len(problems) < min(FEWEST_PHOTOS, count):
+        raise problems[0]
+    return _left_out_note(problems, count, "photos")
+
+
+def truth_notes(problems: Sequence[InputError], count: int) -> list[str]:
+    """Return a note on the truth files, of `count`, that have a problem: their photos are used without truth.
+
+    Raises:
+        InputError: the first problem, if more than half of the files have one.
+    """
+    return _left_out_note(problems, count, "files of truth")
+
+
+def _left_out_note(problems: Sequence[InputError], count: int, files: str) -> list[str]:
     if not problems:
         return []
-    rest = count - len(problems)
-    if 2 * len(problems) > count or rest < min(FEWEST_PHOTOS, count):
+    if 2 * len(problems) > count:
         raise problems[0]
     reasons = "; ".join(f"{_short_name(Path(error.path))}: {error.problem}" for error in problems[:_MOST_NAMED])
     more = " ..." if len(problems) > _MOST_NAMED else ""
-    return [f"{len(problems)} of {count} photos cannot be used and were left out ({reasons}{more})"]
+    return [f"{len(problems)} of {count} {files} cannot be used and were left out ({reasons}{more})"]
 
 
 def _short_name(path: Path) -> str:

@@ -25,7 +25,7 @@ from .linear_photos import float_codes, kind_of, linear_codes
 from .masks import mask_note, read_mask
 from .names import unique_names
 from .photo_file import PhotoKeeper
-from .photos import fitted_lens, read_photo, unusable_notes
+from .photos import fitted_lens, read_photo, truth_notes, unusable_notes
 from .primaries import linear_to_srgb
 from .srgb_codes import bands_of
 from .types import Scene, View, codes_of
@@ -75,7 +75,8 @@ def preprocess(
             problems.append(view)
         else:
             views.append(keeper.store(view))
-    damaged = unusable_notes(problems, len(names))
+    truth_count = sum(record.hdr is not None for record in dataset.records)
+    damaged = unusable_notes(problems, len(names)) + truth_notes(preprocessor.unusable_truth, truth_count)
     content = ContentCheck()
     for view in [view for view in views if view.split == "train"] or views:
         content.add(view.codes, view.mask)
@@ -198,6 +199,7 @@ class _Preprocessor:
         self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
         self.labeled_masks: set[Path] = set()
         self.transparent: set[str] = set()  # Views whose photos have transparent pixels
+        self.unusable_truth: list[InputError] = []
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
 
     def view_or_error(self, record: ImageRecord, name: str) -> View | InputError:
@@ -215,11 +217,9 @@ class _Preprocessor:
         lens, oriented = (record.lens, False) if record.derived else fitted_lens(record)
         resample = self._resampler(record, lens)
         camera = resample.camera
-        hdr = None
-        if record.hdr is not None:
-            hdr = resample(_read_truth(record.hdr, lens, camera, resample.undistortion is not None))
-            if record.hdr == record.image:
-                hdr *= np.float32(record.light_scale)
+        hdr = self._truth(record, lens, resample)
+        if hdr is not None and record.hdr == record.image:
+            hdr *= np.float32(record.light_scale)
         time, split = record.seconds, record.split or "train"
         stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented, self.labeled_masks)
         self.mask_shares[name] = None if stored is None else float(stored.mean())
@@ -252,6 +252,18 @@ class _Preprocessor:
             light_above_white=photo.above_white,
             light_above_white_deviation=photo.above_white_deviation,
         )
+
+    def _truth(self, record: ImageRecord, lens: Lens, resample: _Resampler) -> np.ndarray | None:
+        """Return the truth of a photo at the size of its view; None without a file, or with one that cannot be used."""
+        if record.hdr is None:
+            return None
+        try:
+            return resample(_read_truth(record.hdr, lens, resample.camera, resample.undistortion is not None))
+        except InputError as error:
+            if record.derived or record.hdr == record.image:
+                raise
+            self.unusable_truth.append(error)
+            return None
 
     def _resampler(self, record: ImageRecord, lens: Lens) -> _Resampler:
         """Return the resampler of a photo; photos of one lens in a row share its map, which is as large as an image."""

@@ -45,16 +45,20 @@ def gain_map(
     return 9, area(size, top, left, pitch) + grid
 
 
-def write_tagged_dng(path: Path, stored: np.ndarray, tags: dict[int, Tag] | None = None, pattern=BAYER) -> None:
+def write_tagged_dng(
+    path: Path, stored: np.ndarray, tags: dict[int, Tag] | None = None, pattern=BAYER, pieces: list[bytes] | None = None
+) -> None:
     """stored: [H, W] of a color filter or [H, W, 3] of linear raw; uint16 or float32. tags: beside or in place of the
-    usual ones: black level 0, white level 65535, the top left pixel first."""
+    usual ones: black level 0, white level 65535, the top left pixel first. pieces: compressed strips or tiles, in place
+    of the samples."""
     height, width = stored.shape[:2]
     samples = 1 if stored.ndim == 2 else stored.shape[2]
-    data = stored.astype(stored.dtype.newbyteorder("<")).tobytes()
+    pieces = [stored.astype(stored.dtype.newbyteorder("<")).tobytes()] if pieces is None else pieces
+    lengths = [len(piece) for piece in pieces]
     all_tags = {
         254: longs(0), 256: longs(width), 257: longs(height), 258: shorts(*[8 * stored.dtype.itemsize] * samples),
         259: shorts(1), 262: shorts(32803 if samples == 1 else 34892), 271: (2, 5, b"Test\0"), 272: (2, 7, b"Sensor\0"),
-        273: longs(0), 274: shorts(1), 277: shorts(samples), 278: longs(height), 279: longs(len(data)), 284: shorts(1),
+        274: shorts(1), 277: shorts(samples), 278: longs(height), 284: shorts(1),
         33434: rationals(0.01), 34855: shorts(100), 50706: (1, 4, bytes([1, 4, 0, 0])), 50708: (2, 5, b"Test\0"),
         50714: longs(0), 50717: longs(*[65535] * samples), 50721: rationals(*TO_CAMERA.ravel()),
         50728: rationals(0.5, 1.0, 0.7), 50778: shorts(21),
@@ -65,16 +69,17 @@ def write_tagged_dng(path: Path, stored: np.ndarray, tags: dict[int, Tag] | None
     if stored.dtype.kind == "f":
         all_tags[339] = shorts(*[3] * samples)
     all_tags |= tags or {}
+    place_tag, length_tag = (324, 325) if 322 in all_tags else (273, 279)
+    all_tags |= {place_tag: longs(*[0] * len(pieces)), length_tag: longs(*lengths)}
     start, blobs, entries = 8 + 2 + 12 * len(all_tags) + 4, b"", b""
     room = sum(len(value) + len(value) % 2 for _, _, value in all_tags.values() if len(value) > 4)
+    all_tags[place_tag] = longs(*(start + room + sum(lengths[:i]) for i in range(len(pieces))))
     for tag, (kind, count, value) in sorted(all_tags.items()):
-        if tag == 273:
-            value = struct.pack("<I", start + room)
-        elif len(value) > 4:
+        if len(value) > 4:
             place, blobs = start + len(blobs), blobs + value + b"\0" * (len(value) % 2)
             value = struct.pack("<I", place)
         entries += struct.pack("<HHI", tag, kind, count) + value.ljust(4, b"\0")
-    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(all_tags)) + entries + bytes(4) + blobs + data)
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(all_tags)) + entries + bytes(4) + blobs + b"".join(pieces))
 
 
 def mosaic(light: np.ndarray, pattern=BAYER) -> np.ndarray:

@@ -13,14 +13,17 @@ from sehdr_warp.scene.heif import item_bytes, read_items
 BASE_LIGHT = "srgb"
 
 
-def iso_metadata(maximum, minimum=0.0, gamma=1.0, offset=1 / 64, headroom=None, base_headroom=0.0, channels=1) -> bytes:
-    """ISO 21496-1's binary metadata without the version byte that HEIF has before it."""
+def iso_metadata(
+    maximum, minimum=0.0, gamma=1.0, offset=1 / 64, headroom=None, base_headroom=0.0, channels=1, base_colors=True
+) -> bytes:
+    """ISO 21496-1's binary metadata without the version byte that HEIF has before it. base_colors: whether the gains
+    apply in the photo's primaries."""
 
     def fraction(value, layout):
         parts = Fraction(value).limit_denominator(1 << 16)
         return struct.pack(f">{layout}I", parts.numerator, parts.denominator)
 
-    head = struct.pack(">HHB", 0, 0, 0x40 | (0x80 if channels == 3 else 0))
+    head = struct.pack(">HHB", 0, 0, (0x40 if base_colors else 0) | (0x80 if channels == 3 else 0))
     head += fraction(base_headroom, "I") + fraction(maximum if headroom is None else headroom, "I")
     row = (minimum, "i"), (maximum, "i"), (gamma, "I"), (offset, "i"), (offset, "i")
     return head + b"".join(fraction(*each) for each in row) * channels
@@ -71,10 +74,10 @@ def _full(kind: str, payload: bytes, version=0, flags=0) -> bytes:
 
 
 def write_heif_pair(
-    path: Path, base: Path, gain: Path, *, iso: bytes | None = None, apple_xmp: bytes | None = None
+    path: Path, base: Path, gain: Path, *, iso: bytes | None = None, colr=b"", apple_xmp: bytes | None = None
 ) -> None:
-    """One file of two: the photo of `base`, and `gain` as its gain map by a derived item (iso: its metadata) or as
-    Apple's auxiliary picture (apple_xmp: the metadata that describe it)."""
+    """One file of two: the photo of `base`, and `gain` as its gain map by a derived item (iso: its metadata, colr: what
+    it states of its colors) or as Apple's auxiliary picture (apple_xmp: the metadata that describe it)."""
     items, properties, associated, payloads = [], [], {}, {}
     for number, source in ((1, base), (2, gain)):
         stored = read_items(source)
@@ -96,6 +99,9 @@ def write_heif_pair(
         items.append((3, "tmap"))
         payloads[3] = b"\0" + iso
         references += _box("dimg", struct.pack(">4H", 3, 2, 1, 2))
+        if colr:
+            properties.append(_box("colr", colr))
+            associated[3] = [len(properties)]
     if apple_xmp is not None:
         properties.append(_full("auxC", b"urn:com:apple:photo:2020:aux:hdrgainmap\0"))
         associated[2].append(len(properties))

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import struct
 import time
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
 from sehdr_warp.scene.images import read_ldr
+from sehdr_warp.scene.primaries import matrix_to_rec709
 
 from .gain_map_files import iso_metadata, jpeg_bytes, write_heif_pair, write_jpeg_pair, xmp_segment
 from .test_color_encoding import icc_profile
@@ -90,6 +92,35 @@ def test_a_gain_map_of_three_channels(tmp_path):
     light, base, gain = pair(channels=3)
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [iso_segment(channels=3)])
     assert_light(decoded(tmp_path / "a.jpg"), light, channels=3)
+
+
+def colorful_pair():
+    """Light of strong colors in Rec.709, the photo of it, and gains of three channels between them in Display P3."""
+    light = scene() * [1.0, 0.3, 0.05]
+    base = np.rint(255 * encoded(light)).astype(np.uint8)
+    to_p3 = np.linalg.inv(matrix_to_rec709((0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.3290)))
+    ratio = (light @ to_p3.T + 1 / 64) / (linear(base) @ to_p3.T + 1 / 64)
+    return light, base, np.rint(255 * np.clip((np.log2(ratio) + 1) / (STOPS + 1), 0, 1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".heic"])
+def test_gains_in_the_colors_of_the_alternate_rendition(tmp_path, suffix):
+    light, base, gain = colorful_pair()
+
+    def error(base_colors):
+        options = {"minimum": -1.0, "channels": 3, "base_colors": base_colors}
+        path = tmp_path / f"a{suffix}"
+        if suffix == ".jpg":
+            segments = [iso_segment(**options), (0xFFE2, b"ICC_PROFILE\0\1\1" + icc_profile("Display P3", 2.2))]
+            write_jpeg_pair(path, base, gain, segments)
+        else:
+            files = saved(tmp_path / "b.heic", base), saved(tmp_path / "g.heic", gain)
+            nclx = b"nclx" + struct.pack(">3HB", 12, 13, 0, 0x80)
+            write_heif_pair(path, *files, iso=iso_metadata(STOPS, **options), colr=nclx)
+        return np.abs(decoded(path) / light - 1)[8:-8, 8:-8, 0]
+
+    assert np.percentile(error(base_colors=False), 95) < 0.03
+    assert np.percentile(error(base_colors=True), 95) > 0.1
 
 
 def test_libultrahdr_writes_what_is_read(tmp_path):

@@ -37,6 +37,37 @@ def test_truth_of_no_photo_is_named(tmp_path):
     assert "hdr/ holds 1 file that is the truth of no photo: probe.exr" in scene.notes
 
 
+@pytest.mark.parametrize("fault", ["not finite", "cannot be read as OpenEXR", "HDR truth is 32 x 24", "negative"])
+def test_truth_that_cannot_be_used_is_left_out_and_named(tmp_path, fault):
+    write_colmap(tmp_path)
+    for i in range(6):
+        write_truth(tmp_path / "hdr" / f"{i:03d}.exr")
+    odd = tmp_path / "hdr" / "003.exr"
+    match fault:
+        case "not finite":
+            write_truth(odd, light=np.nan)
+        case "cannot be read as OpenEXR":
+            odd.write_bytes(odd.read_bytes()[:60])
+        case "HDR truth is 32 x 24":
+            write_truth(odd, (32, 24))
+        case _:
+            write_truth(odd, light=-1)
+    scene = load(tmp_path, holdout=0)
+    with_truth = [view.hdr is not None for view in scene.views]
+    assert with_truth == [True] * 3 + [fault == "negative"] + [True] * 2
+    notes = [note for note in scene.notes if "truth cannot be used" in note]
+    assert len(notes) == (fault != "negative")
+    assert all(note.startswith("1 of 6 files of truth cannot be used") and fault in note for note in notes)
+
+
+def test_truth_of_another_size_than_all_photos_is_refused(tmp_path):
+    write_colmap(tmp_path)
+    for i in range(6):
+        write_truth(tmp_path / "hdr" / f"{i:03d}.exr", (32, 24))
+    with pytest.raises(InputError, match="HDR truth is 32 x 24, the photo 64 x 48"):
+        load(tmp_path, holdout=0)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="links need rights")
 def test_truth_that_leads_out_of_its_folder_is_refused(tmp_path):
     write_colmap(tmp_path / "set")
