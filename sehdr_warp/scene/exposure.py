@@ -73,10 +73,7 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
     Raises:
         InputError: if exposures.json is damaged or states an impossible time.
     """
-    times, notes = [record.exposure_time for record in records], []
-    if None in times:
-        table, notes = _listed_times(records, source)
-        times = [table.get(record.image) if time is None else time for time, record in zip(times, records, strict=True)]
+    times, notes = stated_times(records, source)
     if None in times:
         unlisted = [record for record, time in zip(records, times, strict=True) if time is None]
         by_exif, more = _exif_times(unlisted)
@@ -104,6 +101,21 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
     return timed, True, notes
 
 
+def stated_times(records: Sequence[ImageRecord], source: Path) -> tuple[list[float | None], list[str]]:
+    """Return the seconds of each photo by the set's own files, then by exposures.json, None without; and notes.
+
+    Raises:
+        InputError: if exposures.json is damaged or states an impossible time.
+    """
+    times = [record.exposure_time for record in records]
+    if None not in times:
+        return times, []
+    table, notes = _listed_times(records, source)
+    return [
+        table.get(record.image) if time is None else time for time, record in zip(times, records, strict=True)
+    ], notes
+
+
 def shutter(time: float) -> str:
     """Return an exposure time as photographers write it: `1/640 s`, `0.4 s`, `2 s`."""
     parts = round(1 / time)
@@ -123,7 +135,7 @@ def parse_seconds(value, source: Path, field: str) -> float:
     return seconds
 
 
-def _listed_times(records: list[ImageRecord], source: Path) -> tuple[dict[Path, float], list[str]]:
+def _listed_times(records: Sequence[ImageRecord], source: Path) -> tuple[dict[Path, float], list[str]]:
     """Return the seconds of photos by exposures.json, and notes on names that it could not be matched with.
 
     The file is {"path": seconds} or a list of {"file": path, "exposure_time": seconds}. Paths are relative to the data

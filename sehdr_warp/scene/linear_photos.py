@@ -6,7 +6,7 @@ matrix (Scene.color_matrix) leads from there to Rec.709, with the white balance 
 """
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,21 +45,35 @@ def float_codes(radiance: np.ndarray, time: float) -> np.ndarray:
     return codes_of(reinhard_gamma(radiance * time), 16)
 
 
-def float_time(photos: Sequence[Path]) -> float:
-    """Return the exposure time at which the log-average of a set of float images is middle grey.
+def log_averages(photos: Sequence[Path]) -> dict[int, float]:
+    """Return the logarithm of the log-average of each float image of an even sample, by its index.
 
     Raises:
         InputError: if none of those that are sampled can be read; others are left out.
     """
-    averages, problems = [], []
-    for photo in every_nth(photos, _MOST_JUDGED):
+    averages, problems = {}, []
+    for index in every_nth(range(len(photos)), _MOST_JUDGED):
         try:
-            averages.append(np.log(_log_average(read_hdr(photo))))
+            averages[index] = float(np.log(_log_average(read_hdr(photos[index]))))
         except InputError as error:
             problems.append(error)
     if not averages:
         raise problems[0]
-    return _MIDDLE_GREY / float(np.exp(np.mean(averages)))
+    return averages
+
+
+def middle_grey_time(averages: Collection[float]) -> float:
+    """Return the exposure time at which images of these log_averages() are middle grey."""
+    return _MIDDLE_GREY / float(np.exp(np.mean(list(averages))))
+
+
+def follow_times(averages: Mapping[int, float], times: Sequence[float]) -> bool:
+    """Return whether images become more alike if their values are divided by their exposure times.
+
+    `averages` are log_averages(), `times` those of all images.
+    """
+    values = np.array(list(averages.values()))
+    return bool(np.std(values - np.log([times[index] for index in averages])) <= np.std(values))
 
 
 def tone_mapped(path: Path) -> np.ndarray:

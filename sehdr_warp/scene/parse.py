@@ -1,19 +1,20 @@
 """Parse a data folder of any layout: cameras, files, exposure times and splits, before pixels are decoded."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
+from typing import NamedTuple
 
 from ..errors import InputError, did_you_mean
 from ..files import has_file
 from ..subsets import first_names
 from .colmap_model import find_model
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
-from .exposure import choose_exposure, with_exposure_times
+from .exposure import choose_exposure, stated_times, with_exposure_times
 from .hdr_files import exr_exposure_time
-from .linear_photos import float_time
+from .linear_photos import follow_times, log_averages, middle_grey_time
 from .masks import assign_masks
 from .names import unique_names
 from .photos import usable_photos
@@ -88,22 +89,42 @@ def parse_dataset(
 
 def _with_times(records: list[ImageRecord], kind: str, folder: Path) -> tuple[list[ImageRecord], bool, list[str]]:
     """Return the photos with an exposure time each, whether times are known, and notes."""
-    if kind != "float" or any(record.exposure_time is not None for record in records):
+    if kind != "float":
         return with_exposure_times(records, folder)
-    time = float_time([record.image for record in records])
-    header_times = [exr_exposure_time(record.image) for record in records]
-    times = [each for each in header_times if each is not None]
-    if len(times) < len(header_times) or max(times) < min(times) * 1.001:
-        note = "float images: their values are taken as light, at no exposure"
-        timed = [replace(record, exposure_time=time, hdr=record.hdr or record.image) for record in records]
-        return timed, True, [note]
+    averages = log_averages([record.image for record in records])
+    time, exposures = middle_grey_time(averages.values()), _float_exposures(records, averages, folder)
     timed = []
-    for record, each in zip(records, times, strict=True):
-        factor = each / times[0]
+    for index, record in enumerate(records):
+        factor = exposures.times[index] / exposures.times[0] if exposures.times else 1.0
         truth = record.hdr or record.image
         timed.append(replace(record, exposure_time=time * factor, hdr=truth, light_scale=1 / factor))
-    note = f"float images: their values are light times expTime, {min(times):g} to {max(times):g} s"
-    return timed, True, [note]
+    return timed, True, exposures.notes
+
+
+class _FloatExposures(NamedTuple):
+    """Exposure times by which the values of float images are divided; none if the values are light."""
+
+    times: list[float]
+    notes: list[str]
+
+
+def _float_exposures(records: list[ImageRecord], averages: Mapping[int, float], folder: Path) -> _FloatExposures:
+    """Return the times of float images: those of the set or exposures.json, else expTime of the headers.
+
+    Times that the user states count if the images' brightness follows them: a set of light may list those of photos.
+    """
+    stated, notes = stated_times(records, folder)
+    times = [exr_exposure_time(record.image) if time is None else time for record, time in zip(records, stated)]
+    known = [time for time in times if time is not None]
+    if len(known) < len(times) or max(known) < min(known) * 1.001:
+        return _FloatExposures([], [*notes, "float images: their values are taken as light, at no exposure"])
+    span = f"{min(known):g} to {max(known):g} s"
+    if None in stated:
+        return _FloatExposures(known, [*notes, f"float images: their values are light times expTime, {span}"])
+    if follow_times(averages, known):
+        return _FloatExposures(known, [*notes, f"float images: their values are light times the stated times, {span}"])
+    note = f"float images: their values are taken as light, because they do not follow the stated times, {span}"
+    return _FloatExposures([], [*notes, note])
 
 
 def _folder(path: Path | str) -> Path:

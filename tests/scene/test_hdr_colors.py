@@ -169,6 +169,34 @@ def test_exposure_times_of_openexr(tmp_path):
     assert exr_exposure_time(tmp_path / "c" / "images" / "r_0.exr") is None
 
 
+@pytest.mark.parametrize("place", ["exposures.json", "transforms.json"])
+def test_exposure_times_that_the_user_states_for_openexr(tmp_path, place):
+    """They replace expTime; and a set of light that lists the times of photos stays light."""
+    light, times = 0.1 + pattern(40, 30) / 255, [0.01, 0.02, 0.04, 0.01, 0.02, 0.04]
+
+    def load_with(folder, factors):
+        float_set(folder, light, factors, stated=False)
+        values = json.loads((folder / "transforms.json").read_text())
+        for frame, time in zip(values["frames"], times):
+            frame.pop("exposure_time", None)
+            if place == "transforms.json":
+                frame["exposure_time"] = time
+        (folder / "transforms.json").write_text(json.dumps(values))
+        if place == "exposures.json":
+            (folder / place).write_text(json.dumps({f"r_{i}.exr": time for i, time in enumerate(times)}))
+        return load_scene(folder, holdout=0)
+
+    exposed, lit = load_with(tmp_path / "a", times), load_with(tmp_path / "b", [0.5] * 6)
+    assert "float images: their values are light times the stated times, 0.01 to 0.04 s" in exposed.notes
+    for view, time in zip(exposed.views, times, strict=True):
+        np.testing.assert_allclose(view.hdr, light * times[0], rtol=2e-3)
+        assert view.exposure_time / exposed.views[0].exposure_time == pytest.approx(time / times[0])
+    assert any("do not follow the stated times" in note for note in lit.notes)
+    for view in lit.views:
+        np.testing.assert_allclose(view.hdr, light * 0.5, rtol=2e-3)
+        assert view.exposure_time == lit.views[0].exposure_time
+
+
 @pytest.mark.parametrize("layers, picture", [
     (["ViewLayer.Combined", "ViewLayer.Normal"], "ViewLayer.Combined"), (["beauty"], "beauty"),
     (["diffuse", "rgba", "specular"], "rgba"), (["left.main"], "left.main"),
