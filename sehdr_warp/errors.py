@@ -73,11 +73,12 @@ class InputError(SehdrError):
 
     Attributes:
         path: the file, folder, flag or value.
-        problem: what is wrong with it.
+        problem: what is wrong with it, on one line.
     """
 
     def __init__(self, path: Path | str, problem: str, remedy: str):
         """Compose the message; remedy says what to do."""
+        problem = " ".join(problem.split())  # Libraries' messages may have several lines.
         self.path, self.problem = str(path), problem
         parts = [_shorten(self.path), _shorten(problem)]
         super().__init__(" ".join(f"{parts[0]}: {parts[1]}; {remedy}".split()))
