@@ -1,11 +1,12 @@
-"""gsplat's examples/simple_trainer.py (1.5.3) with its rasterizer and strategies replaced, on the embedded scene.
+"""gsplat's examples/simple_trainer.py (1.5.3) with its rasterizer and strategies replaced.
 
-python -m tests.compat.gsplat.simple_trainer EXAMPLES STRATEGY STEPS [--device cuda] [--engine gsplat] [--seeds 0 1 2]
+python -m tests.compat.gsplat.simple_trainer EXAMPLES STRATEGY STEPS [--scene FOLDER] [--device cuda]
+    [--engine gsplat] [--seeds 0 1 2]
 
-EXAMPLES is the folder `examples` of a checkout of gsplat. Its file is read as it is; only the name of its device is
-another on the CPU. What it imports beside gsplat (a viewer, TensorBoard, metrics, the reader of COLMAP sets) is small
-here. The output has a line of JSON for each seed: PSNR of the held-out views and, as psnr_train, of the other views,
-and how many Gaussians there are.
+FOLDER is a set of photos, by default the embedded room. EXAMPLES is the folder `examples` of a checkout of gsplat. Its
+file is read as it is; only the name of its device is another on the CPU. What it imports beside gsplat (a viewer,
+TensorBoard, metrics, the reader of COLMAP sets) is small here. The output has a line of JSON for each seed: PSNR of the
+held-out views and, as psnr_train, of the other views, and how many Gaussians there are.
 """
 
 import argparse
@@ -106,7 +107,10 @@ def camera_to_world(view: sw.View) -> np.ndarray:
 
 
 def make_parser(scene: sw.Scene):
-    """The class Parser of gsplat's datasets.colmap, for a scene: points along random rays of its photos."""
+    """Return the class Parser of gsplat's datasets.colmap, for a scene.
+
+    Its points are those of the scene, or lie along random rays of the photos of a scene without points.
+    """
     generator = np.random.default_rng(0)
 
     class Parser:
@@ -114,9 +118,10 @@ def make_parser(scene: sw.Scene):
             self.views, self.camtoworlds = scene.views, np.stack([camera_to_world(view) for view in scene.views])
             centers = self.camtoworlds[:, :3, 3]
             self.scene_scale = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
-            points, colors = zip(*map(self._rays, scene.views), strict=True)
-            self.points = np.concatenate(points).astype(np.float32)
-            self.points_rgb = np.concatenate(colors).astype(np.uint8)
+            points, colors = scene.points, scene.point_colors * 255
+            if not len(points):
+                points, colors = map(np.concatenate, zip(*map(self._rays, scene.views), strict=True))
+            self.points, self.points_rgb = points.astype(np.float32), colors.astype(np.uint8)
 
         def _rays(self, view: sw.View) -> tuple[np.ndarray, np.ndarray]:
             camera, pose = view.camera, camera_to_world(view)
@@ -210,10 +215,11 @@ def main() -> None:
     parser.add_argument("steps", type=int)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", default="sehdr", choices=["sehdr", "gsplat"])
+    parser.add_argument("--scene", default="embedded")
     parser.add_argument("--max-size", type=int, default=200)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     args = parser.parse_args()
-    put_modules(sw.load_scene("embedded", max_size=args.max_size), args.engine)
+    put_modules(sw.load_scene(args.scene, max_size=args.max_size), args.engine)
     names, steps = read_trainer(args.examples, args.device), args.steps
     kinds = {"default": names["DefaultStrategy"], "mcmc": names["MCMCStrategy"]}
     refine = {"refine_start_iter": steps // 10, "refine_every": steps // 12, "refine_stop_iter": steps * 7 // 10}
