@@ -149,8 +149,8 @@ def warn_of_compensation(path: Path, compensated: bool, statement: str) -> None:
     """Warn of Gaussians that were trained with opacity compensation, as a file states it."""
     if compensated:
         log.warning(
-            "%s: was trained with opacity compensation (%s): renderers without it, such as this one and most viewers, "
-            "show its small Gaussians too bright; PLY, SPZ and SOG keep the mark, other formats cannot",
+            "%s: was trained with opacity compensation (%s), and is rendered with it; programs without it, such as most "
+            "viewers, show its small Gaussians too bright; PLY, SPZ and SOG keep the mark, other formats cannot",
             *(path, statement),
         )
 

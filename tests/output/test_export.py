@@ -11,6 +11,7 @@ from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras
 from sehdr_warp.splats import LOSSY_SUFFIXES, read_gaussians, write_gaussians
 
+from ..splats.test_other_tools import write_ply
 from ..splats.test_splat_files import gaussians
 from .helpers import Entry, camera
 
@@ -93,3 +94,12 @@ def test_what_a_small_file_loses_is_measured_on_the_file(tmp_path, run, logged, 
     size = (tmp_path / f"a{suffix}").stat().st_size
     assert "beside the scene (" in line and line.endswith(f"{size / 1e6:.2f} MB")
     assert float(line.split()[1]) > 25
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
+def test_the_mark_of_opacity_compensation_passes_through_a_conversion(tmp_path, suffix):
+    for name, mode in (("mip", "mip"), ("common", "default")):
+        scene = load_splats(write_ply(tmp_path / f"{name}.ply", [f"SplatRenderMode: {mode}"]))
+        assert scene.field.antialiased == (mode == "mip")
+        file = export(scene, tmp_path / f"{name}_new{suffix}")
+        assert read_gaussians(file).compensated == (mode == "mip")

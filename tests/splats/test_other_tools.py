@@ -64,6 +64,7 @@ def test_the_mark_of_opacity_compensation_is_kept_and_warned_of(tmp_path, caplog
     assert b"SplatRenderMode" not in (tmp_path / "d.ply").read_bytes()
 
 
+
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply"])
 def test_the_mark_of_opacity_compensation_in_compressed_files(tmp_path, caplog, suffix):
     """Brush issue 466: SPZ has a flag of it, SOG a field of meta.json; both were passed over."""
