@@ -149,7 +149,7 @@ def warn_of_compensation(path: Path, compensated: bool, statement: str) -> None:
     """Warn of Gaussians that were trained with opacity compensation, as a file states it."""
     if compensated:
         log.warning(
-            "%s: was trained with opacity compensation (%s), and is rendered with it; programs without it, such as most "
+            "%s: was trained with opacity compensation (%s), and is rendered with it; programs without it, like most "
             "viewers, show its small Gaussians too bright; PLY, SPZ and SOG keep the mark, other formats cannot",
             *(path, statement),
         )

@@ -142,10 +142,11 @@ def usd_arrays(path: Path) -> dict[str, Any]:
     if len(prims) != 1:
         return {"count": len(prims)}
     prim, splat = prims[0], UsdVol.ParticleField3DGaussianSplat(prims[0])
+    to_world = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.EarliestTime())
     arrays = {
         "count": 1,
         "space": str(Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) or ""),
-        "matrix": np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())),
+        "matrix": np.array(to_world),
         "degree": int(_value(splat.GetRadianceSphericalHarmonicsDegreeAttr()) or 0),
         "world_matrix": np.array(world.Get()).T if (world := prim.GetAttribute(_WORLD_MATRIX)) else np.eye(4),
         "base_time": float(prim.GetAttribute(_BASE_TIME).Get()) if prim.HasAttribute(_BASE_TIME) else 1.0,

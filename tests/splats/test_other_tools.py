@@ -64,7 +64,6 @@ def test_the_mark_of_opacity_compensation_is_kept_and_warned_of(tmp_path, caplog
     assert b"SplatRenderMode" not in (tmp_path / "d.ply").read_bytes()
 
 
-
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply"])
 def test_the_mark_of_opacity_compensation_in_compressed_files(tmp_path, caplog, suffix):
     """Brush issue 466: SPZ has a flag of it, SOG a field of meta.json; both were passed over."""
@@ -200,6 +199,19 @@ def test_values_of_openusd_at_times_alone(tmp_path):
     assert sampled != text
     (tmp_path / "b.usda").write_text(sampled)
     np.testing.assert_allclose(read_gaussians(tmp_path / "b.usda").means, read_gaussians(tmp_path / "a.usda").means)
+
+
+@pytest.mark.parametrize("value", [" = (1, 2, 3)", ".timeSamples = { 1: (1, 2, 3), 5: (0, 0, 0) }"])
+def test_transforms_of_openusd_are_named(tmp_path, value):
+    pytest.importorskip("pxr")
+    write_gaussians(tmp_path / "a.usda", arrays(color_model="linear"))
+    text = (tmp_path / "a.usda").read_text()
+    moved = (
+        f'double3 xformOp:translate{value}\nuniform token[] xformOpOrder = ["xformOp:translate"]\npoint3f[] positions'
+    )
+    (tmp_path / "b.usda").write_text(text.replace("point3f[] positions", moved, 1))
+    with pytest.raises(InputError, match="moved by a transform"):
+        read_gaussians(tmp_path / "b.usda")
 
 
 def test_the_filter_is_told(tmp_path, caplog):
