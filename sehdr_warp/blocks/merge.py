@@ -1,8 +1,9 @@
 """Merge the trained blocks of a plan into one run.
 
 Inside a block's core, its Gaussians are those of the merged run; those beyond, which its photos show too, are dropped,
-because another block has them. Rows are in an order in which neighbours in space are neighbours in memory, so that a
-part of the scene is a few ranges of rows.
+because another block has them. Of those inside, the ones that reach far into other blocks are dropped, too: photos
+there were not trained on, and a few Gaussians as large as a block can hide all of it. Rows are in an order in which
+neighbours in space are neighbours in memory, so that a part of the scene is a few ranges of rows.
 """
 
 import logging
@@ -27,6 +28,10 @@ from .block_plan import BlockPlan
 from .job import folder_of
 
 log = logging.getLogger(__name__)
+
+SIGMAS = 3.0  # Radius of a Gaussian, in its largest standard deviations
+REACH = 2.0  # Margins of a block within which Gaussians of others may reach into it
+MIDDLE = 0.02, 0.98  # Quantiles of the Gaussians in a core between which most of it is
 
 
 class TrainedBlock(NamedTuple):
@@ -59,7 +64,7 @@ def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
     Raises:
         InputError: If a block is damaged or was trained with other options, or if no Gaussian is in any core.
     """
-    blocks = [_trained_block(out, plan, index) for index in range(len(plan.blocks))]
+    blocks = _without_far_reaching([_trained_block(out, plan, index) for index in range(len(plan.blocks))], plan)
     empty = [plan.blocks[index].name for index, block in enumerate(blocks) if not len(block.evidence.weight_sum)]
     if empty:
         log.warning("%s: no Gaussian is in its core; the merged run has nothing there", ", ".join(empty))
@@ -124,6 +129,34 @@ def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:
     views = folder.read_scene()["views"]
     evidence = folder.read_evidence(checkpoint).rows(rows)
     return TrainedBlock(gaussians, evidence, checkpoint.values, info, views, folder.read_summary())
+
+
+def _without_far_reaching(blocks: list[TrainedBlock], plan: BlockPlan) -> list[TrainedBlock]:
+    """Leave out Gaussians that reach farther into the middle of another block than REACH of its margins."""
+    places, radii = [], []
+    for block in blocks:
+        points = plan.normalization.scene_points(block.gaussians["means"].numpy())
+        places.append(points @ plan.axes.T)
+        radii.append(SIGMAS * plan.normalization.unit * block.gaussians["log_scales"].amax(1).exp().numpy())
+    allowed = REACH * plan.division.margins.max(1)
+    boxes = [np.quantile(own, MIDDLE, axis=0) if len(own) else None for own in places]
+    remaining, dropped = [], 0
+    for index, block in enumerate(blocks):
+        reaches = np.zeros(len(places[index]), bool)
+        large = np.flatnonzero(radii[index] > allowed.min())
+        for other, box in enumerate(boxes):
+            if other == index or box is None:
+                continue
+            own = places[index][large]
+            distance = np.linalg.norm(np.maximum(np.maximum(box[0] - own, own - box[1]), 0), axis=1)
+            reaches[large] |= radii[index][large] - distance > allowed[other]
+        dropped += int(reaches.sum())
+        rows = torch.from_numpy(np.flatnonzero(~reaches))
+        gaussians = {name: tensor[rows] for name, tensor in block.gaussians.items()}
+        remaining.append(block._replace(gaussians=gaussians, evidence=block.evidence.rows(rows)))
+    if dropped:
+        log.info("left out %d Gaussians that reach far into blocks that were trained without them", dropped)
+    return remaining
 
 
 def _summary(blocks: list[TrainedBlock], iterations: int, seconds: float, gaussians: int) -> dict[str, Any]:

@@ -88,11 +88,17 @@ def test_jobs_exchange_values_in_a_new_folder(merged):
 
 
 def test_the_merged_run_is_as_good_as_one_training(merged, survey, tmp_path):
-    """Blocks train as many steps on each photo as the whole."""
+    """Blocks train as many steps on each photo as the whole; merging them costs next to nothing."""
     assert call("train", survey, "--out", tmp_path / "whole", *FLAGS, "--iterations", "340") == 0
     whole, blocks = (load_run(path).metrics()[-1]["psnr_ldr"] for path in (tmp_path / "whole", merged))
     # So short a training of small photos depends on the seed: blocks were 0.2, 1.2 and 2.7 dB below the whole.
     assert blocks > whole - 1
+    plan = BlockPlan.read(merged)
+    each = [load_run(folder_of(merged, plan, index)) for index in (0, 1)]
+    held_out = [sum(entry.split == "test" for entry in run.cameras) for run in each]
+    own = np.average([run.metrics()[-1]["psnr_ldr"] for run in each], weights=held_out)
+    # Before Gaussians that reach far into other blocks were left out, three seeds lost 0, 0 and 3.3 dB.
+    assert blocks > own - 0.3
     borders = json.loads((merged / "summary.json").read_text())["borders"]
     # Borders are some 150 pixels here, so chance decides: with three seeds they were 1.5 to 3.2 dB below the rest, with
     # one thread 1.7 dB above it to 0.4 below. In two runs with 400 photos they were 2.8 dB above it and 0.3 below.
@@ -110,12 +116,13 @@ def test_each_place_has_the_gaussians_of_one_block(merged):
         inside = plan.division.block_of(own) == index
         mine = owner == index
         assert 0 < inside.sum() < len(own), "Gaussians beyond the border are dropped"
-        assert abs(int(mine.sum()) - int(inside.sum())) <= 2 and np.allclose(mine.nonzero()[0].min(), start, atol=2)
+        left_out = int(inside.sum()) - int(mine.sum())  # Those that reach far into the other block
+        assert -2 <= left_out <= 0.02 * inside.sum() and np.allclose(mine.nonzero()[0].min(), start, atol=2)
         sizes, merged_sizes = (
             np.sort((each.gaussians.log_scales.numpy()[rows] + np.log(each.normalization.unit)).ravel())
             for each, rows in ((block.field, inside), (run.field, mine))
         )
-        assert np.quantile(sizes, 0.5) == pytest.approx(np.quantile(merged_sizes, 0.5), abs=1e-3)
+        assert np.quantile(sizes, 0.5) == pytest.approx(np.quantile(merged_sizes, 0.5), abs=0.02)
         start += int(mine.sum())
     assert run.field.confidence is not None and len(run.field.confidence) == run.gaussian_count
     assert torch.equal(run.clipped_share() >= 0, torch.ones(run.gaussian_count, dtype=torch.bool))

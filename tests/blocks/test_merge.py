@@ -1,0 +1,62 @@
+"""Merging: which Gaussians of a trained block go into the merged run."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.survey import write_survey
+from sehdr_warp.blocks.block_plan import make_block_plan
+from sehdr_warp.blocks.job import folder_of, train_block
+from sehdr_warp.blocks.merge import merge_blocks
+from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.runs.run import load_run
+from sehdr_warp.runs.run_writer import RunWriter, write_confidence
+from sehdr_warp.training.launch import installed_versions
+
+LITTLE = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_prior": False}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The folder of two trained blocks, and their plan."""
+    folder = tmp_path_factory.mktemp("trained")
+    write_survey(folder / "town", views=32, size=48, gaussians=6000)
+    data = {"path": str(folder / "town"), "exposure_index": None, "max_size": None, "holdout": None}
+    config = override_config(Config(), {"response.name": "srgb", "schedule.iterations": 20} | LITTLE)
+    plan = make_block_plan(data, config, torch.device("cpu"), 2)
+    assert plan is not None
+    (folder / "run").mkdir()
+    plan.write(folder / "run")
+    for index in (0, 1):
+        assert train_block(folder / "run", index, "cpu", "auto", installed_versions()).error is None
+    return folder / "run", plan
+
+
+@pytest.mark.parametrize(("margins", "fewer"), [(0.5, 0), (40, 1)])
+def test_a_gaussian_that_reaches_far_into_another_block_is_left_out(trained, margins, fewer):
+    """Its center is in its core, far from the border."""
+    out, plan = trained
+    merge_blocks(out, plan)
+    before = load_run(out)
+    places = before.field.normalization.scene_points(before.field.gaussians.means.detach().numpy())
+    far = places[np.where(plan.division.block_of(places) == 1, plan.division.border_distance(places), 0).argmax()]
+
+    folder = RunWriter(folder_of(out, plan, 1))
+    run, checkpoint = load_run(folder.path), folder.newest_checkpoint()
+    assert checkpoint is not None
+    own = run.field.normalization.scene_points(run.field.gaussians.means.detach().numpy())
+    row = np.linalg.norm(own - far, axis=1).argmin()
+    changed = {name: tensor.clone() for name, tensor in checkpoint.tensors.items()}
+    changed["gaussians.log_scales"][row] = np.log(margins * plan.division.margins.max() / run.field.normalization.unit)
+    evidence = folder.read_evidence(checkpoint)
+    folder.lock()
+    folder.write_checkpoint(changed, checkpoint.values | {"iteration": checkpoint.values["iteration"] + 1}, keep=9)
+    write_confidence(folder, evidence, folder.checkpoint_hash)
+    try:
+        merge_blocks(out, plan)
+        assert load_run(out).gaussian_count == before.gaussian_count - fewer
+    finally:
+        folder.write_checkpoint(checkpoint.tensors, checkpoint.values, keep=1)
+        write_confidence(folder, evidence, folder.checkpoint_hash)
+        folder.unlock()
