@@ -51,7 +51,8 @@ def run_synth(args: Synth) -> None:
         noise = SensorNoise(*figures)
     times = args.exposures and [exposure.time for exposure in read_exposures(args.exposures, None, "--exposures")]
     check_absent(args.out, args.overwrite, folder=True)
-    scene = load_scene(args.truth, response="srgb")
+    # Only truth is used of the set. A response as an object also stands beside photos whose light is known.
+    scene = load_scene(args.truth, response=response_by_name("srgb"))
     times = times or exposure_ladder(scene, response)
     write_photo_set(scene, args.out, response, times, noise=noise, seed=args.seed, overwrite=args.overwrite)
     times_text = ", ".join(f"{time:.4g}" for time in times)

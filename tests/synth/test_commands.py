@@ -1,14 +1,20 @@
 """`sehdr-warp synth`, as typed."""
 
+import json
+
 import numpy as np
+import OpenEXR
 import pytest
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.primaries import matrix_to_rec709
 from sehdr_warp.synth.expose import RadianceView, expose
 from tests import refusals
-from tests.make_scenes import arc_poses, load, write_reinhard
+from tests.make_scenes import arc_poses, load, write_blender, write_reinhard
 from tests.refusals import call
+
+ACESCG = 0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767
 
 
 @pytest.fixture
@@ -31,6 +37,42 @@ def truth(tmp_path):
 
 def refused(capfd, *arguments):
     return refusals.refused(capfd, "synth", *arguments)
+
+
+@pytest.mark.parametrize("place", ["photos", "truth beside photos"])
+def test_openexr_pictures_of_any_primaries_are_truth(tmp_path, place, capfd):
+    """Light that is stored in ACEScg gives the photos of the same light in Rec.709."""
+    matrix = matrix_to_rec709(ACESCG)
+    rng, photos = np.random.default_rng(4), {}
+    light = [rng.uniform(0.05, 0.8, (30, 40, 3)) for _ in range(6)]
+    for name, to_file, places in (("rec709", np.eye(3), None), ("acescg", np.linalg.inv(matrix), ACESCG)):
+        folder = tmp_path / name
+        write_blender(folder, 6, size=(40, 30))
+        if place == "photos":
+            set_frames(folder, ".exr")
+        for i in range(6):
+            write_light(folder / "images" / f"r_{i}.exr", light[i] @ to_file.T, places)
+        out = tmp_path / f"{name}_out"
+        assert call("synth", folder, "--out", out, "--response", "srgb", "--exposures", "0.5") == 0, capfd.readouterr()
+        assert call("eval", folder / "images", "--truth", folder) == 0, capfd.readouterr()
+        photos[name] = [view.codes for view in load(out, exposure_index=0, response="srgb").views]
+    for first, second in zip(photos["rec709"], photos["acescg"], strict=True):
+        assert np.abs(first.astype(int) - second.astype(int)).max() <= 1
+
+
+def set_frames(folder, suffix):
+    values = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(values["frames"]):
+        (folder / "images" / f"r_{i}.png").unlink()
+        frame["file_path"] = f"images/r_{i}{suffix}"
+        frame.pop("exposure_time", None)
+    (folder / "transforms.json").write_text(json.dumps(values))
+
+
+def write_light(path, light, chromaticities):
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    header |= {} if chromaticities is None else {"chromaticities": chromaticities}
+    OpenEXR.File(header, {"RGB": light.astype(np.float32)}).write(str(path))
 
 
 def test_expose_writes_a_set_of_five_exposures(truth, tmp_path, capfd):
