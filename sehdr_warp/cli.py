@@ -144,7 +144,8 @@ def parse_command(words: list[str]) -> tuple[Callable, Any]:
     if name in _RENAMED:
         raise UsageError(f"no command {name}: {_RENAMED[name]}")
     if name not in _COMMANDS:
-        raise UsageError(f"no command {name}{did_you_mean(name, _COMMANDS)}; {PROGRAM} --help lists them")
+        hint = did_you_mean(name, {*_COMMANDS, "--help", "--version"})
+        raise UsageError(f"no command {name}{hint}; {PROGRAM} --help lists them")
     options, run = _load(_COMMANDS[name])
     return run, parse(options, rest, f"{PROGRAM} {name}")
 
@@ -172,6 +173,11 @@ def _run(argv: list[str]) -> None:
     if words[0] == "--version":
         print(f"{PROGRAM} {__version__}")
         return
+    if words[0] == "help":
+        words = [*words[1:2], "--help"]
+        if len(words) == 1:
+            print(_help())
+            return
     run, options = parse_command(words)
     with stages_on_terminal():
         if "argv" in inspect.signature(run).parameters:

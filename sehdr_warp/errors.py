@@ -4,13 +4,17 @@ import difflib
 import os
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 MAX_MESSAGE_PART = 400
 """Characters of a path and of a problem that a message shows; both may come from a damaged file."""
+
+MOST_LISTED = 2000
+"""Names beside a missing path among which the one that was meant is looked for."""
 
 NOT_FINITE_REMEDY = "it is not written; train again from an earlier checkpoint or with another seed"
 
@@ -109,6 +113,21 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return `, did you mean X?` for the most similar known word, or "" if none is similar."""
     suggestion = nearest(word, known)
     return f", did you mean {suggestion}?" if suggestion else ""
+
+
+def missing(path: Path | str, problem: str, remedy: str) -> InputError:
+    """Return the error of a path that does not exist; the remedy is what it may be a misspelling of, if there is one.
+
+    Args:
+        path: What is not there.
+        problem: What is wrong, such as "not found".
+        remedy: What to do if nothing beside it has a similar name.
+    """
+    path, names = Path(path), list[str]()
+    with suppress(OSError):
+        names = [entry.name for entry in islice(path.parent.iterdir(), MOST_LISTED)]
+    similar = nearest(path.name, names)
+    return InputError(path, problem, f"did you mean {path.with_name(similar)}?" if similar else remedy)
 
 
 # Control characters but line ends and tabs, and those that change the direction of text.

@@ -70,6 +70,39 @@ def test_every_field_of_the_config_is_a_flag_with_help(capsys, monkeypatch):
         assert path == "seed" or " ".join(item.description.split())[:40] in text
 
 
+def test_help_is_a_word_too(capsys):
+    assert call("help") == 0
+    assert capsys.readouterr().out.startswith("usage: sehdr-warp COMMAND")
+    assert call("help", "export") == 0
+    assert "sehdr-warp export" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("train prak --out runs/x", "prak: not found; did you mean park?"),
+        ("train elsewhere --out runs/x", "elsewhere: not found; give a folder of photos, or 'embedded'"),
+        ("render runs/caslte --out views", "runs/caslte: no such folder; did you mean runs/castle?"),
+        ("view prk", "prk: no such folder; did you mean park?"),
+    ],
+)
+def test_a_misspelled_folder_is_told_the_one_beside_it(line, message, tmp_path, monkeypatch, capsys):
+    for name in ("park", "runs/castle"):
+        (tmp_path / name).mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert call(*line.split()) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_missing_folder_is_told_without_torch(tmp_path):
+    code = (
+        "import sys\nfrom sehdr_warp.cli import main\ntry: main(sys.argv[1:])\nfinally: print('torch' in sys.modules)"
+    )
+    words = [sys.executable, "-c", code, "train", "gone", "--out", "x"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stdout == "False\n", done.stderr
+
+
 @pytest.mark.parametrize("name", [name for group in cli.COMMANDS.values() for name in group])
 def test_every_command_explains_itself(name, capsys):
     assert call(name, "--help") == 0
@@ -106,8 +139,9 @@ def test_what_cannot_be_written_is_said_before_the_work(line, tmp_path, capsys):
         ("trian", "no command trian, did you mean train?"),
         ("fly", "no command fly; sehdr-warp --help"),
         ("--out x", "no command --out"),
-        ("train", "train needs --out"),
+        ("train", "train needs SCENE"),
         ("train --out y", "train needs SCENE"),
+        ("--versoin", "no command --versoin, did you mean --version?"),
         ("train x y --out z", "y: unexpected argument"),
         ("train x --out", "--out needs a value"),
         ("eval --run x", "eval takes RUN without --run"),

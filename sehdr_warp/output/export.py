@@ -116,8 +116,8 @@ def export(
     count, harmonics = file_gaussians.count, max(file_gaussians.degree, degree or 0)
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, count, harmonics, meaning)
     if not merge:
-        reference = gaussians if edits.changes_pictures else None
-        _log_loss(path, run, whole[0] if edits.changes_pictures else gaussians, kind, time)
+        reference = gaussians if edits.shows_part else None
+        _log_loss(run, whole[0] if edits.shows_part else gaussians, kind, time, is_part=edits.shows_part)
         if path_is_lossy(path):
             _log_file_loss(path, run, reference, to_file, kind, time)
     return path
@@ -196,10 +196,13 @@ def loss_in_words(decibels: float) -> str:
     return "visible loss"
 
 
-def _log_loss(path: Path, run: "RenderableScene", gaussians: GaussianArrays, kind: str, time: float) -> None:
-    """Measure and log how well Gaussians in the scene's own coordinates show the scene."""
+def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, time: float, *, is_part: bool) -> None:
+    """Measure and log how well Gaussians in the scene's own coordinates show the scene.
+
+    is_part: The file holds a part of the scene, so these are all of its Gaussians.
+    """
     views = _cameras_to_compare(run)
-    where = f"{len(views)} view{'s' * (len(views) != 1)}"
+    where = f"{len(views)} view{'s' * (len(views) != 1)}" + ", before the cut" * is_part
     if not views:
         log.info("it is not compared with the scene, which has no cameras of its own")
     elif kind == "ldr":

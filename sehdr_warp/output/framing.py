@@ -4,14 +4,14 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..scene import Camera
 from .camera_paths import common_focus, evenly, look_at_pose, orbit, surround, training_cameras, walk, walk_path
 from .images import as_array
-from .world_transform import scene_up
+from .world_transform import scene_up, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -27,6 +27,9 @@ _REACH = 0.7  # Surfaces within this part of the cameras' distance from the focu
 _EXTENT = 90  # Percentile of their distances from the focus that the picture holds
 _OPENINGS, _WITNESSES = 16, 32  # Photos among which an opening view is chosen, and those that may show what it shows
 _SEVERAL = 3  # Photos that show a point which an opening view should show
+# Distances of a view of Gaussians without cameras, over the radius that holds half of them, and its height over these.
+_OUTSIDE, _ABOVE, _OUTSIDE_FOV = (2.8, 2.0, 1.3, 0.8, 0.5), 0.15, math.radians(50)
+_FRAMED = 0.6  # Part of half a photo's field of view within which the focus lies in a photo that framed its subject
 _CLOSER = 0.6  # Tangent of the field of view of an opening view, at least this part of its photo's
 # Parts of the picture that an opening view may show less if it is nearer to the middle of the photos by their extent,
 # if it looks as most of them do by a right angle, and if it holds the whole subject instead of nothing of it.
@@ -85,13 +88,16 @@ def default_path(run: "RenderableScene", count: int, up: str | Sequence[float] |
 
 
 def opening_view(run: "RenderableScene") -> Camera | None:
-    """Return the camera that pages and the viewer open with; None without pinhole cameras.
+    """Return the camera that pages and the viewer open with; None if all photos are wider than pinholes.
 
-    It stands where a photo was taken, in 16:9 and level, and looks at the middle of what the photos look at, with a
-    lens that holds the subject: wider than of a close-up, narrower than of a photo from afar. Of several photos that is
-    taken whose picture shows most of what at least three photos show. A walk ahead is opened at its start.
+    It stands where a photo was taken, in 16:9 and level, and looks where the photo looks or at the middle of what the
+    photos look at, with a lens that holds the subject: wider than of a close-up, narrower than of a photo from afar. Of
+    several photos that is taken whose picture shows most of what at least three photos show. A walk ahead is opened at
+    its start. Gaussians without cameras are looked at from outside.
     """
     photos = training_cameras(run) or [entry.camera for entry in run.cameras]
+    if not photos:
+        return _view_from_outside(run)
     photos = [camera for camera in photos if camera.is_pinhole]
     if not photos:
         return None
@@ -116,13 +122,67 @@ def opening_view(run: "RenderableScene") -> Camera | None:
     return max((_opening_of(camera, photos, up, focus, radius) for camera in evenly(photos, _OPENINGS)), key=score)
 
 
+def opening_facts(run: "RenderableScene") -> dict[str, Any]:
+    """Return the opening view as a page needs it: `opening`, and for Gaussians without cameras `focus` and `size`."""
+    camera = opening_view(run)
+    facts: dict[str, Any] = {"opening": None if camera is None else camera.to_dict()}
+    if camera is not None and not run.cameras:
+        focus = _focus_without_cameras(run)
+        facts |= {"focus": focus.tolist(), "size": float(np.linalg.norm(focus - camera.position))}
+    return facts
+
+
+def _focus_without_cameras(run: "RenderableScene") -> np.ndarray:
+    """Return the point [3] that most photos looked at if the file tells it, or else the middle of the Gaussians."""
+    if run.world_matrix is not None:
+        return np.zeros(3)  # Upright files have it as their origin.
+    return np.median(_means(run), axis=0)
+
+
+def _means(run: "RenderableScene") -> np.ndarray:
+    return run.field.normalization.scene_points(run.field.gaussians.means.detach().cpu().numpy())
+
+
+def _view_from_outside(run: "RenderableScene") -> Camera:
+    """Return a camera for Gaussians without cameras, from as far away as nothing stands before their middle.
+
+    It looks ahead as upright files do, where the photos' middle camera looks along +Z.
+    """
+    focus = _focus_without_cameras(run)
+    radius = max(float(np.median(np.linalg.norm(_means(run) - focus, axis=1))), 1e-6)
+    _, up, forward = world_transform(run).rotation
+    width, height = FILM_SIZES[1]
+    focal = height / 2 / math.tan(_OUTSIDE_FOV / 2)
+    for part in _OUTSIDE:
+        position = focus + radius * (-part * forward + _ABOVE * part * up)
+        pose = np.linalg.inv(look_at_pose(position, focus, up))
+        camera = Camera(width, height, focal, focal, width / 2, height / 2, pose)
+        if _nearest_depth(run, camera) >= _NEAR * part * radius:
+            break
+    return camera
+
+
+def _nearest_depth(run: "RenderableScene", camera: Camera) -> float:
+    """Return the depth than which a tenth of the middle of a camera's picture is nearer; infinity if it is empty."""
+    small = camera.within(_SIZE)
+    rendered = run.render(small)
+    rows, columns = (slice(side // 5, side - side // 5) for side in (small.height, small.width))
+    depth = as_array(rendered.depth)[rows, columns]
+    depth = depth[(depth > 0) & (as_array(rendered.alpha)[rows, columns] > 0.5)]
+    return float(np.percentile(depth, _BLOCKED)) if depth.size else math.inf
+
+
 def _opening_of(
     photo: Camera, photos: Sequence[Camera], up: np.ndarray, focus: np.ndarray | None, radius: float | None
 ) -> Camera:
     """Return the opening view from a photo's place; see opening_view."""
     camera = film_camera(photo, photos)
-    ahead = photo.world_to_camera[2, :3] if focus is None else focus - photo.position
+    around = focus is not None and surround(photos, focus, up)
+    own = photo.world_to_camera[2, :3]
+    ahead = own if focus is None else focus - photo.position
     distance = float(np.linalg.norm(ahead))
+    if not around and own @ ahead > distance * math.cos(_FRAMED * math.atan(photo.height / 2 / photo.fy)):
+        ahead = own * distance
     if abs(ahead @ up) < _STEEP * distance:
         pose = look_at_pose(photo.position, photo.position + ahead, up)
         camera = replace(camera, world_to_camera=np.linalg.inv(pose))
@@ -130,7 +190,7 @@ def _opening_of(
         return camera
     present = camera.height / 2 / camera.fy
     needed = math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
-    most = _MOST_ZOOM * present if surround(photos, focus, up) else max(photo.height / 2 / photo.fy, present)
+    most = _MOST_ZOOM * present if around else max(photo.height / 2 / photo.fy, present)
     zoom = present / max(min(needed, most), _CLOSER * present)
     return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
 
@@ -193,13 +253,8 @@ def _in_front_of_obstacles(
     checked = [path[i] for i in sorted({round(i) for i in np.linspace(0, len(path) - 1, min(len(path), 60))})]
     advance = []
     for camera in checked:
-        small = camera.within(_SIZE)
-        rendered = run.render(small)
-        rows, columns = (slice(side // 5, side - side // 5) for side in (small.height, small.width))
-        depth = as_array(rendered.depth)[rows, columns]
-        depth = depth[(depth > 0) & (as_array(rendered.alpha)[rows, columns] > 0.5)]
         distance = float(np.linalg.norm(camera.position - focus))
-        near = float(np.percentile(depth, _BLOCKED)) if depth.size else distance
+        near = min(_nearest_depth(run, camera), distance)
         room = max(distance - 1.2 * radius, 0.0)  # It stays in front of the subject.
         advance.append(min(1.2 * near, room) / distance if near < _NEAR * distance else 0.0)
     if not any(advance):

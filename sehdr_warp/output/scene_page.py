@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError
 from ..files import atomic_path, check_absent
 from ..model.baking import gaussians_of
+from ..scene import Camera
 from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras, training_cameras
-from .framing import opening_view
+from .framing import opening_facts
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
 from .light_pictures import curve_table
 from .splat_edits import SplatEdits, most_visible, without_strays
@@ -45,17 +45,14 @@ def write_scene_page(
         overwrite: Replace a file that exists.
 
     Raises:
-        InputError: If the file exists (unless overwrite), a value is not finite or the scene has no cameras to look
-            from.
+        InputError: If the file exists (unless overwrite), or a value is not finite.
     """
     path = Path(path)
     check_absent(path, overwrite)
-    if not run.cameras:
-        raise InputError(path, "the scene has no cameras to look from", "export the run, or put cameras.json beside it")
+    opening = opening_facts(run)
     cameras = training_cameras(run) or [e.camera for e in run.cameras]
-    gaussians = gaussians_of(
-        run.field, "linear", np.array([camera.position for camera in cameras]), color_matrix=run.color_matrix
-    )
+    places = [camera.position for camera in cameras or [Camera.from_dict(opening["opening"])]]
+    gaussians = gaussians_of(run.field, "linear", np.array(places), color_matrix=run.color_matrix)
     transform = world_transform(run)
     edits = edits or SplatEdits()
     mask = edits.mask(gaussians.opacities, transform.points(gaussians.means), run)
@@ -74,8 +71,8 @@ def write_scene_page(
     columns |= {f"rot_{i}": column for i, column in enumerate(gaussians.unit_quaternions.T)}
     values = np.stack(list(columns.values()))
     facts = facts_of_cameras(run.cameras) | {
+        **opening,
         "up": transform.rotation[1].tolist(),
-        "opening": None if (opening := opening_view(run)) is None else opening.to_dict(),
         "columns": list(columns),
         "base_time": run.base_time,
         "grey": display_gain(run.response),

@@ -179,6 +179,7 @@ def run_convert(args: Convert) -> None:
             f"{args.source}: is a folder; runs are written by sehdr-warp export {args.source} --out {args.out}"
         )
     check_suffix(args.source)
+    check_suffix(args.out)
     _export(args.source, args.out, args.file, args.device, overwrite=args.overwrite)
 
 

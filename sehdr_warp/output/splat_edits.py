@@ -106,10 +106,14 @@ class SplatEdits:
             raise SehdrError(f"no photo has a mask that leaves out pixels; {remedy}")
 
     @property
+    def shows_part(self) -> bool:
+        """True if the file is meant to show a part of the scene."""
+        return bool(self.crop or self.cut or self.mask_views is not None)
+
+    @property
     def changes_pictures(self) -> bool:
         """True if the file is meant to show something else than the scene."""
-        regions = self.crop or self.cut or self.mask_views is not None
-        return bool(regions or self.min_views or self.min_opacity > LEAST_OPACITY)
+        return bool(self.shows_part or self.min_views or self.min_opacity > LEAST_OPACITY)
 
     def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: "RenderableScene") -> np.ndarray:
         """Return [N], which Gaussians stay.
@@ -122,7 +126,9 @@ class SplatEdits:
         Raises:
             SehdrError: If none stays, or views are to be counted and the scene has no cameras.
         """
-        steps = {"fainter than min_opacity": opacities < self.min_opacity} | self._outside(upright_means)
+        too_faint = self.min_opacity <= LEAST_OPACITY
+        faint = "too faint for any program to draw" if too_faint else f"of opacity below {self.min_opacity:g}"
+        steps = {faint: opacities < self.min_opacity} | self._outside(upright_means)
         if self.min_views:
             cameras = training_cameras(run)
             if not cameras:

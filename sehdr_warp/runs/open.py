@@ -6,11 +6,12 @@ torch is imported when a function is called, so that the command line can import
 from __future__ import annotations
 
 import logging
+import os
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, SehdrError, missing
 from .device import pick_device
 from .load_arguments import LOAD_OPTIONS, LoadArguments
 
@@ -33,6 +34,7 @@ def open_run(path: Path, device: str | None) -> Run:
     Raises:
         InputError: If the folder is not a run, or the device is missing.
     """
+    _require(path)
     from .run import load_run
 
     return load_run(path, device=pick_device(device))
@@ -40,12 +42,19 @@ def open_run(path: Path, device: str | None) -> Run:
 
 def open_scene(path: Path, device: str | None) -> Run | Splats:
     """Load the run in a folder, or the Gaussians in a file of one of splats.SUFFIXES; arguments as of open_run."""
+    _require(path)
     from ..splats import SUFFIXES
     from .run import load_splats
 
     if path.is_file() or path.suffix.lower() in SUFFIXES:
         return load_splats(path, device=pick_device(device))
     return open_run(path, device)
+
+
+def _require(path: Path) -> None:
+    """Raise InputError for a path that is not there, before torch is imported, which takes seconds."""
+    if not os.path.lexists(path):
+        raise missing(path, "no such folder", "give the folder that a training wrote")
 
 
 def load_saved_scene(data: LoadArguments, **options: Any) -> Scene:

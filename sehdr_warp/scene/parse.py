@@ -7,7 +7,7 @@ from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
-from ..errors import InputError, did_you_mean
+from ..errors import InputError, did_you_mean, missing
 from ..files import has_file
 from ..subsets import first_names
 from .colmap_model import find_model
@@ -136,7 +136,7 @@ def _folder(path: Path | str) -> Path:
     try:
         empty = not any(folder.iterdir())
     except FileNotFoundError:
-        raise InputError(folder, "not found", "give a folder of photos, or 'embedded'") from None
+        raise missing(folder, "not found", "give a folder of photos, or 'embedded'") from None
     except NotADirectoryError:
         problem, remedy = "is not a folder", "give the folder that holds the photos"
         if folder.suffix.lower() in UNSTITCHED_SUFFIXES:

@@ -37,7 +37,9 @@ def best_if_overfitted(points: Sequence[Evaluation]) -> Evaluation | None:
     return best if best is not None and best.psnr - points[-1].psnr > FALLING else None
 
 
-def advice(path: Path, summary: Mapping[str, Any], train_photos: int, scene: str = "SCENE") -> list[str]:
+def advice(
+    path: Path, summary: Mapping[str, Any], train_photos: int, scene: str = "SCENE", options: Sequence[str] = ()
+) -> list[str]:
     """Return lines of advice on a finished training; none if nothing stands out.
 
     Args:
@@ -45,9 +47,10 @@ def advice(path: Path, summary: Mapping[str, Any], train_photos: int, scene: str
         summary: Run.summary() with the list of evaluations as "metrics".
         train_photos: Number of photos that were trained on.
         scene: Where the photos are, for the commands.
+        options: Words of the command line that the training had, such as --max-size 240, for the commands.
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
-    again = f"sehdr-warp train {shlex.quote(scene)} --out {run} --overwrite"
+    again = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
     points, lines, gain = evaluations(summary["metrics"]), [], 0.0
     if len(points) >= 3:
         earlier = [point.psnr for point in points if point.iteration <= iterations * 2 / 3 + 1]
@@ -73,6 +76,12 @@ def advice(path: Path, summary: Mapping[str, Any], train_photos: int, scene: str
     return lines
 
 
+def option_words(options: Mapping[str, Any]) -> list[str]:
+    """Return the words of a command line that state options, by their names, but for the number of steps."""
+    stated = {name: value for name, value in options.items() if value is not None and name != "schedule.iterations"}
+    return [word for name, value in stated.items() for word in ("--" + name.replace("_", "-"), str(value))]
+
+
 def _exposure_jump(offsets: Mapping[str, float], again: str) -> str | None:
     """Return advice on photos whose brightness differs from the scene's as a whole."""
     jumps = sorted((name for name in offsets if abs(offsets[name]) >= EXPOSURE_JUMP), key=lambda n: -abs(offsets[n]))
@@ -80,7 +89,7 @@ def _exposure_jump(offsets: Mapping[str, float], again: str) -> str | None:
         return None
     names = first_names([f"{name} {offsets[name]:+.1f}" for name in jumps])
     what = f"{len(jumps)} photo{'s are' if len(jumps) > 1 else ' is'} brighter or darker than the scene as a whole"
-    remedy = f"state their exposure times in exposures.json beside the photos, or leave them out: {again}"
+    remedy = f"state their exposure times in exposures.json beside the photos, or move them elsewhere: {again}"
     return f"{what} (stops: {names}), as where exposure or sun changed: {remedy}"
 
 

@@ -5,6 +5,7 @@ torch is imported when it runs.
 
 import json
 import logging
+import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 from tyro.conf import Positional
 
-from ..errors import InputError, SehdrError, UsageError
+from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
@@ -115,6 +116,7 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
 
     `argv` are the words of the command line, with which --gpus starts the other ranks.
     """
+    _require_scene(args)
     from .launch import device_of_rank, rank_from_environment
 
     gpus, rank_info = args.machine.gpus, rank_from_environment()
@@ -177,12 +179,12 @@ def _train(args: Train, ranks=None) -> None:
 
             ranks.request_photos(PhotoRequest(data, {"response": options.name, **selection}))
         scene = load_saved_scene(data, response=options.name, **selection)
-        if plan_only:
+        if plan_only or output.out is None:
             _print_plan(args, scene, config, device)
             return
         from ..console import run_with_progress
         from ..viewer.live import serve_training
-        from .advice import advice
+        from .advice import advice, option_words
         from .train import create_trainer
 
         trainer = create_trainer(
@@ -201,7 +203,10 @@ def _train(args: Train, ranks=None) -> None:
         with serve_training(trainer, str(output.out)) if output.view else nullcontext(trainer) as steps:
             run_with_progress(steps, trainer.total)
     photos = len(trainer.scene.train_views)
-    _print_result(args, trainer.run, partial(advice, train_photos=photos, scene=data.get("path") or "SCENE"))
+    options = {name: data.get(name) for name in LOAD_OPTIONS} | configs.named_fields(args.fields)
+    words = option_words(options | {"response": args.scene.response, "preset": args.training.preset})
+    hints = partial(advice, train_photos=photos, scene=data.get("path") or "SCENE", options=words)
+    _print_result(args, trainer.run, hints)
 
 
 def _run_to_resume(output: OutputOptions) -> "RunWriter | None":
@@ -330,6 +335,16 @@ def _refuse_run(args: Train) -> None:
     raise UsageError(f"{args.data}: is a run, not photos; {command} continues it")
 
 
+def _require_scene(args: Train) -> None:
+    """Raise an error for a missing SCENE, before torch is imported, which takes seconds."""
+    from ..scene import is_embedded
+
+    if args.data is None and not args.output.resume:
+        raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
+    if args.data is not None and not is_embedded(args.data) and not os.path.lexists(args.data):
+        raise missing(Path(args.data), "not found", "give a folder of photos, or 'embedded'")
+
+
 def _path_of(args: Train) -> str | None:
     """Return where the command line says that the photos are, as an absolute path or a name; None if it does not."""
     from ..scene import is_embedded
@@ -347,10 +362,8 @@ def _load_arguments(args: Train, saved: LoadArguments | None) -> LoadArguments:
     if saved is not None:
         options = {name: saved.get(name) if value is None else value for name, value in options.items()}
         options |= {"views": views} if (views := saved.get("views")) else {}
-    if options["path"] is None and args.output.resume:
-        raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
     if options["path"] is None:
-        raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
+        raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
     return LoadArguments(**options)
 
 

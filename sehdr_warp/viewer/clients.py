@@ -1,5 +1,6 @@
 """Clients of requests, the paths that they ask for, and the answer to a request that is refused."""
 
+import ipaddress
 import re
 from contextlib import AbstractContextManager
 
@@ -39,3 +40,11 @@ def own_path(path: str) -> str:
     """Return the path of a request without its query, and without the prefix that some proxies leave there."""
     match = re.search(r"/(photo/[^/]+/[^/]+|[^/]*)$", path.partition("?")[0])
     return match[0] if match else path
+
+
+def is_local(host: str) -> bool:
+    """Return whether only this machine reaches a host's name or address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost" or host.endswith(".localhost")

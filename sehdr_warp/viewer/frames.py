@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..model.lights import Light
 from ..output.camera_paths import facts_of_cameras
-from ..output.framing import opening_view
+from ..output.framing import opening_facts
 from ..output.light_pictures import curve_table
 from ..output.light_unit import luminance_of_one
 from ..output.splat_edits import SplatEdits
@@ -40,7 +40,7 @@ class ViewerScene:
         self.run, self.name, self.clipped = run, name, clipped
         self.lock, self.version = SceneLock(), 0
         self.opacities, self.visible_count = EditedOpacities(), None
-        self._opened: list[dict[str, Any] | None] = []
+        self._opened: list[dict[str, Any]] = []
         self._start_lights()
 
     def _start_lights(self) -> None:
@@ -155,11 +155,10 @@ class ViewerScene:
             frame = torch.empty(frame.shape, dtype=frame.dtype, pin_memory=True).copy_(frame)
         yield frame.numpy().data.cast("B")
 
-    def _opening(self) -> dict[str, Any] | None:
-        """Return the camera that the page opens with, found at the first call; see opening_view."""
+    def _opening(self) -> dict[str, Any]:
+        """Return what the page opens with, found at the first call; see opening_facts."""
         if not self._opened:
-            camera = opening_view(cast(Any, self))
-            self._opened = [None if camera is None else camera.to_dict()]
+            self._opened = [opening_facts(cast(Any, self))]
         return self._opened[0]
 
     def facts(self) -> dict[str, Any]:
@@ -170,7 +169,7 @@ class ViewerScene:
             own = {
                 "up": transform.rotation[1].tolist(),
                 "upright": transform.matrix.tolist(),
-                "opening": self._opening(),
+                **self._opening(),
             }
         facts = {
             "name": self.name,

@@ -5,7 +5,6 @@ Nothing that comes in is trusted: a fixed set of paths, bounded bodies and sizes
 
 import errno
 import io
-import ipaddress
 import json
 import logging
 import re
@@ -29,7 +28,7 @@ from ..output.images import quantize
 from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
-from .clients import Client, Refusal, own_path
+from .clients import Client, Refusal, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, orient
 from .frames import ViewerScene, camera_file, camera_of, frame_bytes
@@ -307,16 +306,8 @@ class Server(ThreadingHTTPServer):
         name = re.sub(r":[0-9]*$", "", host)
         own = f"[{self.host}]" if ":" in self.host else self.host
         proxies = [each.partition("://")[2] for each in self.origins]
-        reached = not _is_local(self.host) or name in (*_LOCAL, own) or host in proxies
+        reached = not is_local(self.host) or name in (*_LOCAL, own) or host in proxies
         return reached and origin in (None, f"http://{host}", f"https://{host}", *self.origins)
-
-
-def _is_local(host: str) -> bool:
-    """Return whether only this machine reaches a host's name or address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost" or host.endswith(".localhost")
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -7,6 +7,7 @@ from sehdr_warp.output.framing import (
     film_camera,
     film_size,
     frame_subject,
+    opening_facts,
     opening_view,
     subject_radius,
 )
@@ -33,7 +34,7 @@ def ball(tmp_path, extra=()):
     means, scales = np.concatenate([points, *([place] for place, _ in extra)]), [0.05] * 1500
     gaussians = splats(means, [0.95] * len(means))
     gaussians.log_scales[:] = np.log(scales + [size for _, size in extra])[:, None]
-    write_gaussians(tmp_path / "ball.ply", gaussians)
+    write_gaussians(tmp_path / "ball.ply", gaussians, overwrite=True)
     return load_splats(tmp_path / "ball.ply")
 
 
@@ -151,5 +152,15 @@ def test_a_page_opens_nearer_than_photos_from_afar_and_farther_than_close_ups(tm
     film = film_camera(photos[0], photos)
     assert film.fx / opening.fx == pytest.approx(change, rel=0.02)
     assert opening.world_to_camera[0, 1] == pytest.approx(0, abs=1e-9)
-    run.cameras = ()
-    assert opening_view(run) is None
+
+
+def test_gaussians_without_cameras_are_looked_at_from_outside_and_not_through_a_wall(tmp_path):
+    run = ball(tmp_path)
+    facts = opening_facts(run)
+    opening = Camera.from_dict(facts["opening"])
+    assert np.linalg.norm(opening.position - facts["focus"]) == pytest.approx(facts["size"])
+    assert facts["size"] == pytest.approx(2.8, rel=0.05)
+    alpha = np.asarray(run.render(opening.within(96)).alpha)
+    assert alpha[0].max() < 0.5 and alpha.mean() > 0.2
+    wall = [((x, y, 2.0 * np.sign(opening.position[2])), 0.3) for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)]
+    assert np.linalg.norm(opening_view(ball(tmp_path, wall)).position) < 2.2

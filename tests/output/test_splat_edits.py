@@ -52,7 +52,7 @@ def export_means(run, path, **edits):
 
 def test_what_no_program_draws_is_left_out(tmp_path, run, logged):
     assert len(export_means(run, tmp_path / "a.ply")) == 3
-    assert "left out: 1 Gaussians (25 %) fainter than min_opacity" in logged
+    assert "left out: 1 Gaussians (25 %) too faint for any program to draw" in logged
     assert len(export_means(run, tmp_path / "b.ply", min_opacity=0)) == 4
 
 

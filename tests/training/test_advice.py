@@ -1,7 +1,7 @@
 from pathlib import Path
 
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.training.advice import advice
+from sehdr_warp.training.advice import advice, option_words
 from sehdr_warp.training.train import train
 
 from .toy import toy_scene
@@ -29,7 +29,14 @@ def test_photos_of_another_exposure_are_named_with_the_command():
     figures = summary([28, 28, 28], regions=100) | {"brightness_offsets": {"a": 0.1, "b": -0.9, "c": 0.5}}
     [line] = advice(Path("r"), figures, 10, "my photos")
     assert line.startswith("2 photos are brighter or darker") and "b -0.9, c +0.5" in line
-    assert line.endswith("or leave them out: sehdr-warp train 'my photos' --out r --overwrite")
+    assert line.endswith("or move them elsewhere: sehdr-warp train 'my photos' --out r --overwrite")
+
+
+def test_commands_keep_the_options_of_the_training():
+    options = ["--max-size", "240", "--preset", "fast"]
+    [line] = advice(Path("r"), summary([20, 26, 25, 24]), 12, "park", options)
+    assert line.endswith("sehdr-warp train park --out r --max-size 240 --preset fast --overwrite --iterations 44")
+    assert option_words({"max_size": 240, "holdout": None, "schedule.iterations": 9, "preset": "fast"}) == options
 
 
 def test_a_training_that_is_too_short_blames_nothing_that_moved():
@@ -40,7 +47,7 @@ def test_a_training_that_is_too_short_blames_nothing_that_moved():
 def test_few_photos_and_movement():
     assert "photos are few" in advice(Path("r"), summary([20, 21, 21.05]), 8)[0]
     [line] = advice(Path("r"), summary([28, 28, 28], regions=100), 10)
-    assert "masks/PHOTO.png" in line and "p0, p1, p2, ..." in line
+    assert "masks/PHOTO.png" in line and "p0, p1, p2 ..." in line
     assert advice(Path("r"), summary([28, 28, 28], regions=100, stops=-1.1), 10) == []  # Blur
     assert advice(Path("r"), summary([28, 28, 28]), 100) == []
     assert advice(Path("r"), {"iteration": 9, "metrics": []}, 3) == []

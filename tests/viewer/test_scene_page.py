@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError, UsageError
+from sehdr_warp.output.export import export
 from sehdr_warp.output.images import as_array
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.splat_commands import Export, run_export
 from sehdr_warp.output.tonemap import display_gain, encode_srgb
+from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera
 from sehdr_warp.training.train import train
 
@@ -61,8 +63,22 @@ def test_refusals(run, tmp_path):
         write_scene_page(run, tmp_path / "mine.html")
     with pytest.raises(UsageError, match="without effect on a page"):
         run_export(Export(run=run.path, out=tmp_path / "new.html", cameras=True))
-    cameras, run.cameras = run.cameras, ()
-    with pytest.raises(InputError, match="no cameras"):
-        write_scene_page(run, tmp_path / "new.html")
-    run.cameras = cameras
     assert [file.name for file in tmp_path.iterdir()] == ["mine.html"]
+
+
+def test_a_file_without_cameras_is_a_page_that_shows_it(run, tmp_path):
+    export(run, tmp_path / "s.ply")
+    file = write_scene_page(load_splats(tmp_path / "s.ply"), tmp_path / "s.html")
+    with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
+        page.wait_for_selector(FULL)
+        assert (pixels(page, "#picture").max(axis=2) > 0.05).mean() > 0.1
+        seen = page.evaluate("document.getElementById('stage').seen.world_to_camera")
+        page.locator("#stage").evaluate("stage => delete stage.dataset.frame")
+        page.keyboard.press("d")  # Before any click
+        page.wait_for_selector(FULL)
+        assert page.evaluate("document.getElementById('stage').seen.world_to_camera") != seen
+        page.keyboard.press("Home")
+        page.wait_for_function("seen => JSON.stringify(stage.seen.world_to_camera) === JSON.stringify(seen)", arg=seen)
+        for _ in range(3):
+            page.keyboard.press("[")
+        assert "1.0" in page.text_content("#stopsTold")

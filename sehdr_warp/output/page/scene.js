@@ -36,10 +36,11 @@ async function start() {
   app.root.addChild(eye);
   app.start();
   splat.gsplat.instance.sorter.on("updated", () => { sorted++; request(timer !== 0); });
-  facts.views.forEach((view, i) => $("view").add(new Option(view.name, i)));
+  facts.views.forEach((view, i) => $("view").add(new Option("photo " + view.name, i)));
   new ResizeObserver(moved).observe(stage);
-  jump(facts.opening || facts.views[facts.first].camera);
+  jump(opening());
 }
+const opening = () => facts.opening || facts.views[facts.first].camera;
 
 // The engine's Gaussians end early, are lifted to make up for it, and left out where small; ours end at the same opacity alone.
 function asOurs(material, chunks) {
@@ -119,7 +120,7 @@ function jump(view) {
 
 $("stops").addEventListener("input", paint);
 $("tone").addEventListener("change", paint);
-$("view").addEventListener("change", () => $("view").value && jump(facts.views[$("view").value].camera));
+$("view").addEventListener("change", () => jump($("view").value ? facts.views[$("view").value].camera : opening()));
 $("panel").addEventListener("submit", event => event.preventDefault());
 let drag = null;
 stage.addEventListener("pointerdown", event => { stage.setPointerCapture(event.pointerId); drag = [event.clientX, event.clientY]; });
@@ -134,9 +135,11 @@ stage.addEventListener("pointermove", event => {
 });
 stage.addEventListener("contextmenu", event => event.preventDefault());
 stage.addEventListener("wheel", event => { event.preventDefault(); camera.dolly(Math.exp(Math.sign(event.deltaY) * Math.min(60, Math.abs(event.deltaY)) / 500)); moved(); }, {passive: false});
-stage.addEventListener("keydown", event => {
+document.addEventListener("keydown", event => {
+  if (event.target.matches("input, select") || event.ctrlKey || event.metaKey) return;
   const pace = facts.size * 0.03, step = {w: [0, 0, pace], s: [0, 0, -pace], a: [-pace, 0, 0], d: [pace, 0, 0], e: [0, pace, 0], q: [0, -pace, 0]}[event.key.toLowerCase()];
   if (step) camera.fly(...step), moved();
-  if (event.key === "[" || event.key === "]") { $("stops").value = Number($("stops").value) + (event.key === "]" ? 1 : -1) / 3; paint(); }
+  if (event.key === "[" || event.key === "]") { $("stops").value = (Math.round(3 * Number($("stops").value)) + (event.key === "]" ? 1 : -1)) / 3; paint(); }
+  if (event.key === "Home") { $("view").value = ""; jump(opening()); }
 });
 start().catch(error => { $("told").textContent = error.message; });

@@ -36,7 +36,15 @@ async function start() {
   else setInterval(renew, 2000);
   useRun(0);
   new ResizeObserver(resize).observe(stage);
-  jump(facts.first, facts.opening);
+  home();
+}
+const home = () => jump(facts.opening && facts.views.length ? nearestView(facts.opening) : facts.first, facts.opening);
+// The photo that was taken nearest to a camera, in about its direction.
+function nearestView(seen) {
+  const center = centerOf(seen), forward = seen.world_to_camera[2].slice(0, 3);
+  const distances = facts.views.map(view => Math.hypot(...add(centerOf(view.camera), center, -1)) / facts.size
+    + 1 - dot(view.camera.world_to_camera[2].slice(0, 3), forward));
+  return distances.indexOf(Math.min(...distances));
 }
 
 // Shows what a training of another process has written meanwhile.
@@ -76,11 +84,12 @@ function resize() {
 // Takes the place of a photo, or another one near it.
 function jump(index, place) {
   const view = facts.views[index];
-  if (!view) { camera.jump({width: 4, height: 3, fx: 3, fy: 3, cx: 2, cy: 1.5, world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, 1); return moved(); }
-  $("view").value = index, $("zoom").value = 0;
+  if (!view && !place) { camera.jump({width: 4, height: 3, fx: 3, fy: 3, cx: 2, cy: 1.5, world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, 1); return moved(); }
+  $("zoom").value = 0;
+  if (view) $("view").value = index;
   const seen = place || view.camera, ahead = facts.focus ? dot(add(facts.focus, centerOf(seen), -1), seen.world_to_camera[2].slice(0, 3)) : 0;
   camera.jump(seen, ahead > 0 ? ahead : facts.size / 2);
-  loadPhoto(index);
+  if (view) loadPhoto(index);
   moved();
 }
 
@@ -101,9 +110,7 @@ async function loadPhoto(index) {
 const usesPhoto = () => $("left").value === "photo" || $("overlay").value === "error";
 function nearestPhoto() {
   if (!usesPhoto() || !facts.views.length) return;
-  const distances = facts.views.map(view => Math.hypot(...add(centerOf(view.camera), camera.position, -1)) / facts.size
-    + 1 - dot(view.camera.world_to_camera[2].slice(0, 3), camera.forward));
-  const nearest = distances.indexOf(Math.min(...distances));
+  const nearest = nearestView(drawn.camera);
   if (nearest !== state.photo || state.photoReady !== nearest) loadPhoto(nearest);
 }
 
@@ -353,6 +360,7 @@ document.addEventListener("keydown", event => {
   const key = event.key.toLowerCase(), count = facts.views.length;
   if ("wasdqe".includes(key)) { if (!state.keys.size) requestAnimationFrame(fly); state.keys.add(key); }
   if (key === "[" || key === "]") { state.stops = bounded(Math.round(3 * state.stops + (key === "]" ? 1 : -1)) / 3); expose(); }
+  if (key === "home") home();
   if (count && (key === "arrowleft" || key === "arrowright")) jump((Number($("view").value) + (key === "arrowright" ? 1 : count - 1)) % count);
 });
 document.addEventListener("keyup", event => state.keys.delete(event.key.toLowerCase()));
@@ -366,7 +374,7 @@ function pointAt([u, v]) {
 }
 let flown = 0;
 function fly(now) {
-  const pace = facts.size * 0.5 * Math.min(0.1, flown ? (now - flown) / 1000 : 0.016), on = key => state.keys.has(key) ? pace : 0;
+  const pace = facts.size * 0.25 * Math.min(0.1, flown ? (now - flown) / 1000 : 0.016), on = key => state.keys.has(key) ? pace : 0;
   flown = state.keys.size ? now : 0;
   if (!state.keys.size) return;
   camera.fly(on("d") - on("a"), on("e") - on("q"), on("w") - on("s"));
@@ -468,7 +476,7 @@ function listLights(told) {
   const unit = told && told.unit, value = x => unit ? `${figure(unit * x)} cd/m\u00b2` : figure(x);
   $("lightList").replaceChildren(...(told ? told.lights : []).map((lamp, i) => {
     const make = (kind, values = {}) => Object.assign(document.createElement(kind), values), row = make("div", {className: "light"});
-    const name = `${lamp.shape === "rect" ? "panel" : "lamp"} ${i + 1}: ${(100 * lamp.share).toFixed(lamp.share < 0.1 ? 1 : 0)} % of the light`;
+    const name = `${lamp.shape === "rect" ? "area" : "lamp"} ${i + 1}: ${(100 * lamp.share).toFixed(lamp.share < 0.1 ? 1 : 0)} % of the light`;
     const sure = lamp.deviation === null ? "" : ` \u00b1 ${lamp.deviation.toFixed(1)} stops`, button = make("button", {textContent: name, title: "fly there"});
     const range = make("input", {type: "range", min: -6, max: 6, step: 0.1, value: lamp.stops, ariaLabel: `gain of light ${i + 1}, stops`});
     const stops = make("output", {textContent: stopsText(lamp.stops)});
