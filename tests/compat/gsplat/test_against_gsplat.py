@@ -7,7 +7,7 @@ import torch
 
 from sehdr_warp.compat import gsplat as ours
 
-from .test_rendering import COUNT, HEIGHT, WIDTH, gradients, scene
+from .scenes import COUNT, HEIGHT, WIDTH, gradients, scene
 
 gsplat = pytest.importorskip("gsplat")
 reference = pytest.importorskip("gsplat.cuda._torch_impl")

@@ -8,7 +8,8 @@ import torch
 from sehdr_warp.compat.gsplat import DefaultStrategy, MCMCStrategy, compute_relocation, rasterization
 from sehdr_warp.compat.gsplat.parameter_rows import change_rows, write_rows
 
-from .test_rendering import COUNT, scene
+from .reference_state import reference_state
+from .scenes import COUNT, scene
 
 
 def model(device="cpu", count=COUNT):
@@ -151,3 +152,30 @@ def test_parameters_that_do_not_fit_are_named(strategy):
     optimizers["means"].add_param_group({"params": [torch.nn.Parameter(torch.zeros(1))]})
     with pytest.raises(ValueError, match="optimizer of means has 2 groups"):
         strategy.check_sanity(params, optimizers)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("absgrad", [True, False])
+def test_signals_of_densification_are_those_of_a_dense_render(absgrad, packed, device):
+    """Two steps of both cameras, many Gaussians beyond the border, beside autograd over every pixel and Gaussian."""
+    leaves, place = scene(device, count=120)
+    means, quats, scales, opacities, colors = (leaf.detach().double() for leaf in leaves)
+    place = place._replace(viewmats=place.viewmats.double(), Ks=place.Ks.double())
+    values = {"means": 1.7 * means, "quats": quats, "scales": scales.log(), "opacities": opacities.logit()}
+    params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
+    strategy = DefaultStrategy(absgrad=absgrad, refine_scale2d_stop_iter=10)
+    state, truth = strategy.initialize_state(), None
+    for step in range(2):
+        shapes = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid()
+        image, _, info = rasterization(*shapes, colors, **place._asdict(), packed=packed, absgrad=absgrad)
+        strategy.step_pre_backward(params, {}, state, step, info)
+        (image - 0.5).abs().mean().backward()
+        strategy.step_post_backward(params, {}, state, step, info, packed=packed)
+        own = reference_state([shape.detach() for shape in shapes], colors, place, absgrad=absgrad)
+        truth = own if truth is None else own.after(truth)
+        with torch.no_grad():
+            params["means"][:, 0] += 0.05
+    assert truth is not None and 0 < int((truth.count < 4).sum()) < 120 and int((truth.count == 0).sum()) > 0
+    assert torch.equal(state["count"], truth.count)
+    torch.testing.assert_close(state["grad2d"], truth.grad2d, rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(state["radii"], truth.radii, rtol=1e-6, atol=1e-9)
