@@ -1,8 +1,8 @@
 """Cost of a training: time, memory, network and disk as functions of photos, pixels, Gaussians, GPUs and nodes.
 
-The constants are fitted to the measurements in docs/reports (step, gpus, large) on one and two H100 and H200. Estimates
-within their range are marked as such, and all others as predictions: more than two GPUs, several nodes, or more
-Gaussians than were measured.
+The constants are fitted to the measurements in docs/reports (step, gpus, large, captures, blocks) on one and two H100
+and H200. Estimates within their range are marked as such, and all others as predictions: more than two GPUs, several
+nodes, or more Gaussians than were measured.
 """
 
 import math
@@ -15,12 +15,17 @@ NUMBERS, RANK_NUMBERS = 11, 3  # Floats per Gaussian in the all-reduce: 11, plus
 EXCHANGE_SECONDS, NUMBER_SECONDS = 1.5e-4, 2.3e-11
 """Additional duration on two GPUs of one node: to start the all-reduce, and per float of the gradients."""
 NETWORK = 12.5e9  # Bytes a second between nodes, of 100 Gb/s; not measured
-GAUSSIAN_BYTES, PIXEL_BYTES = 920, 177
-"""Memory on the GPU: of a Gaussian with gradients and optimizer state, and of a pixel of one photo in a step."""
+GAUSSIAN_BYTES, PIXEL_BYTES = 1700, 177
+"""Memory on the GPU: of a Gaussian with gradients, optimizer state and its part of the tile lists, and of a pixel of a
+photo in a step. Fitted to trainings on ten captures (480 to 864 pixels); where Gaussians are small in the photo, as in
+large photos of synthetic scenes, 920 for each are enough."""
 STATE_BYTES = 940  # Of a Gaussian in a checkpoint: parameters, moments, moving average
 CPU_PIXEL, CPU_GAUSSIAN = 1.0e-6, 1.5e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
 GROWTH = 1.5  # Final number of Gaussians relative to the mean over a training that grows for half of its steps
-START_SECONDS = 10.0  # Approximate duration to start a process
+START_SECONDS = 10.0  # To start a process with torch and to prepare a training
+PHOTO_SECONDS = 0.026  # To read a photo, to match it before the training, and to measure confidence on it after
+SAVE_SECONDS = 2.5e-6  # Of a Gaussian in a checkpoint: copied, hashed and written
+SAVES_APART, MOST_SAVES = 10.0, 6  # Seconds between checkpoints, and their number with the default interval
 OVERLAP = 1.3  # Photos and Gaussians of all blocks together, relative to the whole set
 MOST_GPUS, MOST_GAUSSIANS = 2, 5_000_000  # Range of the measurements
 SAVES = 1.2  # Blocks or more GPUs are recommended if they need this many times less
@@ -50,7 +55,7 @@ class Cost:
     """Cost of a training.
 
     Attributes:
-        seconds: Duration of its steps, with the start of processes.
+        seconds: Duration from the start of its process to its end.
         gpu_bytes: Peak memory of each GPU, with the photos if `photos_on_gpu`.
         network_bytes: Bytes that each node sends and receives.
         disk_bytes: Of the run folder.
@@ -89,9 +94,11 @@ def training_cost(work: Workload, gpus: int = 1, nodes: int = 1) -> Cost:
     mean = work.gaussians / GROWTH
     steps = math.ceil(work.iterations / gpus)
     seconds = steps * (step_seconds(work.pixels, mean) + exchange_seconds(mean, gpus, nodes))
+    saves = 1 + min(MOST_SAVES - 1, int(seconds / SAVES_APART))
+    around = START_SECONDS + PHOTO_SECONDS * work.photos + saves * SAVE_SECONDS * work.gaussians
     photos = work.photos * work.pixels * work.code_bytes
     return Cost(
-        seconds + (START_SECONDS if gpus > 1 else 0.0),
+        seconds + around,
         GAUSSIAN_BYTES * work.gaussians + PIXEL_BYTES * work.pixels,
         steps * exchange_bytes(mean, gpus) if nodes > 1 else 0.0,
         STATE_BYTES * work.gaussians,
@@ -114,7 +121,7 @@ def block_cost(work: Workload, blocks: int, gpus: int = 1) -> Cost:
     merged = STATE_BYTES / 4 * work.gaussians
     return replace(
         one,
-        seconds=rounds * (one.seconds + START_SECONDS),
+        seconds=rounds * one.seconds,
         disk_bytes=blocks * one.disk_bytes + merged,
         photo_bytes=one.photo_bytes * min(gpus, blocks),
         predicted=one.predicted or gpus > MOST_GPUS,

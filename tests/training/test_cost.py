@@ -51,13 +51,25 @@ def test_two_gpus_take_as_long_as_measured():
 
 
 def test_memory_is_as_measured():
+    """On captures, to which it was fitted; synthetic scenes, whose Gaussians are small in the photos, need less."""
+    for row in rows("captures", method="sehdr-warp"):
+        if row.get("memory"):
+            photos, pixels = int(row["photos"].split()[0]), 0.75 * row["size"] ** 2
+            estimate = GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels + 3 * photos * pixels
+            assert error(estimate, row["memory"]) < 0.2
     for row in rows("large", method="sehdr-warp"):
         pixels = row["width"] * row["height"]
         estimate = GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels + 3 * 24 * pixels
-        assert error(estimate, row["memory"]) < 0.1
-    for row in rows("step", preset="default", implementation="sehdr-warp"):
-        pixels = row["width"] * row["height"]
-        assert error(GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels, row["peak_memory_bytes"]) < 0.25
+        assert 1 < estimate / row["memory"] < 1.7
+
+
+def test_blocks_take_as_long_and_as_much_memory_as_measured():
+    """Of a town of 400 photos of 560 x 420 pixels; its memory was not used for the fit."""
+    for row in rows("blocks"):
+        if row["what"].startswith("block_") and row.get("steps"):
+            cost = training_cost(Workload(row["photos"], 560 * 420, row["gaussians"], row["steps"]))
+            assert error(cost.seconds, row["seconds"]) < 0.25
+            assert error(cost.gpu_bytes + cost.photo_bytes, row["peak_memory_bytes"]) < 0.3
 
 
 def test_only_what_was_measured_is_no_prediction():
@@ -83,7 +95,7 @@ def test_recommendations():
     assert recommend(small, 1, 80e9) == "one GPU: the set is one training"
     assert recommend(small, 1, 80e9, 2).startswith("--gpus 2: 1.")
     assert recommend(SURVEY, 65, 80e9, 2).startswith("--blocks 65: the set fills 65 trainings")
-    assert recommend(replace(small, gaussians=2e8), 1, 80e9).startswith("--blocks 4: 185 GB are more than the 80 GB")
+    assert recommend(replace(small, gaussians=2e8), 1, 80e9).startswith("--blocks 6: 341 GB are more than the 80 GB")
     fits = {choice.name: choice.fits for choice in choices(replace(small, gaussians=2e8), SURVEY, 65, 80e9)}
     assert not fits["1 GPU"] and fits["65 blocks on 1 GPU"]
 
