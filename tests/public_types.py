@@ -113,6 +113,14 @@ assert_type(result, tuple[torch.Tensor, torch.Tensor, dict[str, Any]])
 strategy = gsplat.DefaultStrategy(absgrad=True)
 assert_type(strategy.initialize_state(scene_scale=1.0), dict[str, Any])
 strategies: list[gsplat.Strategy] = [strategy, gsplat.MCMCStrategy(cap_max=1000)]
+parameters = {"means": torch.nn.Parameter(image)}
+optimizers = {name: torch.optim.Adam([value]) for name, value in parameters.items()}
+strategy.check_sanity(parameters, optimizers)
+state = strategy.initialize_state(scene_scale=1.0)
+assert_type(state, dict[str, Any])
+strategy.step_pre_backward(torch.nn.ParameterDict(parameters), optimizers, state, 0, result[2])
+strategy.step_post_backward(parameters, optimizers, state, 0, result[2], packed=True)
+gsplat.MCMCStrategy().step_post_backward(parameters, optimizers, {}, 0, result[2], lr=1e-4)
 assert_type(gsplat.spherical_harmonics(0, image, image), torch.Tensor)
 assert_type(gsplat.compute_relocation(image[0], image, image[0]), tuple[torch.Tensor, torch.Tensor])
 assert_type(gsplat.isect_offset_encode(image[0], 1, 4, 3), torch.Tensor)

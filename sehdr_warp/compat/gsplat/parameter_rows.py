@@ -1,13 +1,13 @@
 """Change rows of parameters and of their optimizers' state together."""
 
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 Parameters = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
-Optimizers = MutableMapping[str, torch.optim.Optimizer]
+Optimizers = Mapping[str, torch.optim.Optimizer]
 
 
 def change_rows(
