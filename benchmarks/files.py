@@ -91,7 +91,8 @@ def judge(run: "sw.Run", path: Path, transform: WorldTransform) -> dict[str, Any
                     encode(scene.render(each).hdr * run.base_time) for scene, each in ((back, moved), (run, camera))
                 ]
             else:
-                pair = [back.field.render_ldr(moved, run.base_time), run.render_ldr(camera, run.base_time)]
+                # At the file's own exposure, which SPZ does not state.
+                pair = [back.field.render_ldr(moved, back.base_time), run.render_ldr(camera, run.base_time)]
         errors.append(float((pair[0].clamp(0, 1) - pair[1].clamp(0, 1)).square().mean()))
     return {"psnr": -10 * float(np.log10(max(np.mean(errors), 1e-12)))} | spread(read_gaussians(path), run, transform)
 

@@ -175,6 +175,8 @@ class Lights:
     """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
     unseen: Literal["inpaint", "black"] = "inpaint"
     """inpaint: directions of the map that no photo covers get the light around them; alpha still tells them."""
+    reference_white: float | None = None
+    """The one that the plates were rendered with, if any: lights and map then have their units."""
     overwrite: bool = False
     """Replace files that exist."""
     device: str | None = None
@@ -231,6 +233,8 @@ def run_lights(args: Lights) -> None:
 
     run = open_run(args.run, args.device)
     if args.out is None:
+        if args.reference_white is not None:
+            raise UsageError("--reference-white: set for a file, which --out names")
         transform = world_transform(run, args.axes, up=args.up, scale=args.scale)
         print(lights_table(run.find_lights(), luminance_of_one(run), transform))
         return

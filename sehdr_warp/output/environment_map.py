@@ -2,7 +2,7 @@
 
 import json
 import logging
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,7 +131,7 @@ def write_environment_map(
     place = transform.points(center.position)
     beyond = center.beyond * transform.scale if beyond is None else beyond
     facts = {**provenance(run), "position": json.dumps(place.tolist()), "axes": axes}
-    facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(asdict(shares))}
+    facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(shares.to_dict())}
     facts |= {"worldMatrix": describe(transform)}
     white_luminance = None if luminance is None else luminance / exposure
     header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)

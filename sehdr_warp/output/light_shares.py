@@ -1,6 +1,6 @@
 """Shares of an environment map's light: measured by photos, a lower bound, an estimate, or filled in."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -22,6 +22,13 @@ class LightShares:
     estimated: float
     inpainted: float
     clipped_known: bool
+
+    def to_dict(self) -> dict[str, float | bool | None]:
+        """Return plain values; None for what is not known, and then `shown` for what photos or the file show."""
+        values = asdict(self)
+        if not self.clipped_known:
+            values |= {"shown": self.measured, "measured": None, "bound": None, "estimated": None}
+        return values
 
     def table(self) -> str:
         """Return the shares as lines of text."""

@@ -18,6 +18,7 @@ from .images import as_array
 from .light_unit import luminance_of_one
 from .map_center import map_center
 from .render_views import provenance
+from .tonemap import exposure_of_white
 from .world_transform import WorldTransform, world_transform
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ def write_lights(
     up: str | None = None,
     scale: float | None = None,
     unseen: str = "inpaint",
+    reference_white: float | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
     """Write the lights of a scene; return the files.
@@ -86,6 +88,8 @@ def write_lights(
         scale: As in world_transform.
         unseen: "inpaint": directions of the dome that no photo covers get the light around them, so that they do not
             darken what the dome lights. "black": they are black.
+        reference_white: Value of the photos' white in the plates that the lights go with, as in render_views; lights
+            and dome are then in the units of these plates, also if the unit of light is known.
         overwrite: Replace files that exist.
 
     Raises:
@@ -103,18 +107,21 @@ def write_lights(
     for file in files:
         check_absent(file, overwrite)
     transform = world_transform(run, axes, up=up, scale=scale)
+    exposure_of_white(run, reference_white)  # Before minutes of looking for lights
     lights = run.find_lights()
     if not lights:
         log.warning(
             "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest", run.path
         )
-    unit = luminance_of_one(run)
-    rows = [_describe(f"light_{index}", light, transform, unit or 1.0) for index, light in enumerate(lights)]
+    unit = luminance_of_one(run) if reference_white is None else None
+    factor = unit or exposure_of_white(run, reference_white)
+    rows = [_describe(f"light_{index}", light, transform, factor) for index, light in enumerate(lights)]
     if suffix == ".usda":
         _write_rest(run, rest, lights, transform, unseen, overwrite)
-        text = usd_lights(rows, run.scene_name, rest.name, unit or 1.0)
+        text = usd_lights(rows, run.scene_name, rest.name, factor)
     else:
-        units = f"{'relative radiance' if unit is None else 'cd/m^2'}, linear Rec.709"
+        relative = "relative radiance" if reference_white is None else f"white is {reference_white:g}"
+        units = f"{relative if unit is None else 'cd/m^2'}, linear Rec.709"
         facts = {**provenance(run), "units": units, "axes": axes}
         text = json.dumps({**facts, "lights": rows}, indent=1)
     with atomic_path(path, overwrite) as temporary:

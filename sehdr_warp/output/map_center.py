@@ -80,7 +80,7 @@ def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], tra
     except (ValueError, TypeError):
         position = np.array([])
     if position.shape != (3,) or not np.isfinite(position).all():
-        raise SehdrError(f"point {at!r} is neither x,y,z nor camera:NAME nor center")
+        raise SehdrError(f"point {at!r} is neither x,y,z nor camera:NAME nor center; set --at, for example to 0,0,1.5")
     return transform.inverse().points(position)
 
 

@@ -1,5 +1,6 @@
 """Exposure times of photos that state none, from the light that they share with photos that do."""
 
+import warnings
 from collections.abc import Collection
 from dataclasses import replace
 
@@ -55,7 +56,10 @@ def _factor(view: View, timed: list[View], points: np.ndarray, response: Respons
         shared = np.isfinite(light[0]) & several
         count = int(shared.any(1).sum())
         if count >= _FEWEST:
-            others = np.nanmedian(np.where(shared, light[1:], np.nan)[:, shared.any(1)], axis=0)
+            with warnings.catch_warnings():
+                # A channel of a point that is clipped in all other photos is NaN, and left out below.
+                warnings.simplefilter("ignore", RuntimeWarning)
+                others = np.nanmedian(np.where(shared, light[1:], np.nan)[:, shared.any(1)], axis=0)
             difference = light[0][shared.any(1)] - others
             return float(np.exp(np.nanmedian(difference))), count
     gains = initial_gains([view, *timed], response).gains

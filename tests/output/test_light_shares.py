@@ -22,6 +22,7 @@ def test_shares_are_of_measured_clipped_and_filled_in_light():
 def test_without_knowledge_of_clipping_the_table_does_not_claim_a_measurement():
     shares = light_shares(np.ones((2, 4, 3)), np.zeros((2, 4, 3)), None, np.ones((2, 4)), white=0.1)
     assert shares.measured == 1 and not shares.clipped_known
+    assert shares.to_dict()["measured"] is None and shares.to_dict()["shown"] == 1
     assert "measured" not in shares.table() and "does not state" in shares.table()
 
 

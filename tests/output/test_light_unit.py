@@ -14,7 +14,7 @@ from sehdr_warp.output.environment_map import write_environment_map
 from sehdr_warp.output.light_unit import EFFICACY, UNIT_FILE, meter, read_light_unit
 from sehdr_warp.output.lights import lights_table, write_lights
 from sehdr_warp.output.render_views import render_views
-from sehdr_warp.output.tonemap import LUMINANCE
+from sehdr_warp.output.tonemap import LUMINANCE, exposure_of_white
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
 
@@ -97,6 +97,21 @@ def test_lights_are_in_candelas(lit, tmp_path):
     assert "cd / m^2" in lights_table(LIGHTS, unit) and "radiance" in lights_table(LIGHTS)
     write_lights(lit, tmp_path / "lights.usda", axes="scene")
     assert f"float inputs:intensity = {unit!r}\n        asset inputs:texture" in (tmp_path / "lights.usda").read_text()
+
+
+def test_lights_are_in_the_units_of_plates_with_a_reference_white(lit, tmp_path):
+    meter(lit, "r_0", (16, 12), luminance=250.0)
+    factor = exposure_of_white(lit, 2.0)
+    write_lights(lit, tmp_path / "lights.json", axes="scene", reference_white=2.0)
+    lights_file = json.loads((tmp_path / "lights.json").read_text())
+    assert lights_file["units"] == "white is 2, linear Rec.709"
+    assert lights_file["lights"][0]["radiance"] == pytest.approx([8 * factor, 4 * factor, 2 * factor])
+    write_lights(lit, tmp_path / "lights.usda", axes="scene", reference_white=2.0)
+    assert (
+        f"float inputs:intensity = {factor!r}\n        asset inputs:texture" in (tmp_path / "lights.usda").read_text()
+    )
+    with pytest.raises(SehdrError, match="white 0.0 is not between"):
+        write_lights(lit, tmp_path / "none.json", reference_white=0.0)
 
 
 def test_a_clipped_place_is_named(run, caplog):

@@ -63,5 +63,6 @@ def _lines(cache: Path) -> set[bytes]:
 
 
 def _keep(cache: Path) -> None:
-    with suppress(OSError, SehdrError), atomic_path(cache / LIST, internal=True) as beside:
+    # A signal that ends the process meanwhile raises SystemExit, which Python would print as a traceback here.
+    with suppress(OSError, SehdrError, SystemExit), atomic_path(cache / LIST, internal=True) as beside:
         beside.write_bytes(b"".join(line + b"\n" for line in sorted(_lines(cache))))
