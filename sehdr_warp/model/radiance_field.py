@@ -106,7 +106,8 @@ class RadianceField(nn.Module):
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
                 harmonics have in this direction; the harmonics themselves then get no gradient.
             opacity_weight: Weight of the mean opacity in opacity_penalty.
-            opacity_moments: [N] Adam's second moments of the opacities, see opacity_penalty().
+            opacity_moments: [N] Adam's second moments of the opacities, by which opacity_penalty() spares Gaussians
+                that no photo has shown yet; None if the penalty counts all Gaussians.
         """
         opacities = self.gaussians.opacities()
         ratio = exposure_time / self.base_time
@@ -120,7 +121,8 @@ class RadianceField(nn.Module):
             render = self._render_color_sets(camera, color_sets, opacities, ratio, max_intersections, encode=encode)
         if not opacity_weight:
             return render
-        extents = render.rendering.extents if camera.directions is None else None  # Of wide cameras all count.
+        spares_unseen = opacity_moments is not None and camera.directions is None  # Of wide cameras all count.
+        extents = render.rendering.extents if spares_unseen else None
         penalty = opacity_penalty(opacities, extents, opacity_moments, opacity_weight, self.gaussians.active_count)
         return replace(render, opacity_penalty=penalty)
 

@@ -120,7 +120,8 @@ class LossConfig(_Table):
     """learned response: weight of (f(1) - 1/2)^2, which fixes the scale of exposure (HDR-NeRF: 0.5)"""
     opacity_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.003
     """weight of the mean opacity, which lets unneeded Gaussians fade for mcmc to relocate (3DGS-MCMC: 0.01); it is 0
-    for new Gaussians until a photo shows them, and from the last relocation on; more leaves surfaces transparent"""
+    from the last relocation on and, where a photo shows less than a tenth of the scene, for new Gaussians until a
+    photo shows them; more leaves surfaces transparent"""
 
     @property
     def uses_hdr(self) -> bool:

@@ -20,9 +20,14 @@ from ..scene import Scene
 from .losses import compares_exposures, data_loss, extra_images, largest_hdr_truth
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
+from .scene_facts import share_in_view
 from .step_graphs import GraphCapacity
 from .strategies import Strategy
 from .targets import TrainingView
+
+LARGE_SCENE = 0.1
+"""If a photo shows less than this fraction of the scene's points, Gaussians that no photo has shown yet are spared from
+the opacity penalty: they would fade before one does. Elsewhere the penalty removes copies that are not needed."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,7 @@ class GradientStep:
         self.needs_encoded = not compares_exposures(config.loss, field)
         self.defer_sh_gradients = field.gaussians.means.device.type == "cuda"
         self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
+        self._spares_unseen = share_in_view(scene) < LARGE_SCENE
         self._flat: FlatGradients | None = None
 
     def run(self, compute: Callable[[], Gradients], apply: Callable[[Gradients], Tensor]) -> StepResult:
@@ -138,7 +144,7 @@ class GradientStep:
             encode=self.needs_encoded,
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
             opacity_weight=options.opacity_weight,
-            opacity_moments=opacity_moments,
+            opacity_moments=opacity_moments if self._spares_unseen else None,
         )
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in the step.
         needs_means2d_grad = options.needs_means2d_grad

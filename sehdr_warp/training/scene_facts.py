@@ -75,14 +75,8 @@ class SceneFacts:
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     """Measure a scene with at least one training view; `seed` is that of the probes."""
     photos, views = scene.train_views, perspective_views(scene.train_views)
-    rng = np.random.default_rng(seed)
-    probes = ray_points = points_on_rays(views, PROBES, focus_distance(views), rng)
-    if len(scene.points) >= FEWEST_POINTS:
-        count = min(PROBES, len(scene.points))
-        probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
-    visible, on_rays = (
-        np.array([view.camera.project(points).inside for view in views]).sum(0) for points in (probes, ray_points)
-    )
+    probes, ray_points = _probes(scene, views, seed)
+    visible, on_rays = (_in_view(views, points).sum(0) for points in (probes, ray_points))
     read_views = every_nth(views, MOST_VIEWS)
     figures = np.array([_codes(view) for view in read_views])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
@@ -105,6 +99,30 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         unclipped=scene.light_known and all(view.source and kind_of(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
     )
+
+
+def share_in_view(scene: Scene, seed: int = 0) -> float:
+    """Return the mean fraction of a scene's sparse points that a training photo contains, occlusion not considered.
+
+    With fewer than FEWEST_POINTS points, places along the cameras' rays count. `seed` is that of the sample.
+    """
+    views = perspective_views(scene.train_views)
+    return float(_in_view(views, _probes(scene, views, seed)[0]).mean())
+
+
+def _probes(scene: Scene, views: tuple[View, ...], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a sample [P, 3] of the sparse points, if there are enough, and places [Q, 3] along the cameras' rays."""
+    rng = np.random.default_rng(seed)
+    probes = ray_points = points_on_rays(views, PROBES, focus_distance(views), rng)
+    if len(scene.points) >= FEWEST_POINTS:
+        count = min(PROBES, len(scene.points))
+        probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
+    return probes, ray_points
+
+
+def _in_view(views: Sequence[View], points: np.ndarray) -> np.ndarray:
+    """Return which views [V, P] contain which points [P, 3]."""
+    return np.array([view.camera.project(points).inside for view in views])
 
 
 def _codes(view: View) -> tuple[float, float, float, float, float]:
