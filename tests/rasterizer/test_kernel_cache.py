@@ -1,5 +1,7 @@
 """Warp's cache: what is damaged is found and goes, what is sound stays, and a place that cannot be used is no end."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -45,3 +47,32 @@ def test_a_place_that_cannot_be_used_is_done_without(monkeypatch, caplog, place)
     kernel_cache.select_folder()
     assert folders == [wp.config.kernel_cache_dir] and "for this process alone" in caplog.text
     Path(folders[0]).rmdir()
+
+
+END = """
+import atexit, os, signal, sys
+import warp as wp
+from pathlib import Path
+from sehdr_warp.process import prepare
+from sehdr_warp.rasterizer.warp_launch import kernel_cache
+
+wp.config.kernel_cache_dir = sys.argv[1]
+prepare()
+kernel_cache.discard_damaged()
+hash_line = kernel_cache.hash_line
+
+def hashed(file, name):
+    print("hashed", flush=True)
+    os.kill(os.getpid(), signal.SIGTERM)
+    return hash_line(file, name)
+
+kernel_cache.hash_line = hashed
+if sys.argv[2] == "compiles":
+    (Path(sys.argv[1]) / "wp_blend_0a1b2c3" / "new.o").write_text("new")
+"""
+
+
+@pytest.mark.parametrize("work", ["compiles", "nothing"])
+def test_a_signal_at_the_end_prints_nothing(cache, work):
+    done = subprocess.run([sys.executable, "-c", END, cache, work], capture_output=True, text=True, timeout=120)
+    assert done.stderr == "" and ("hashed" in done.stdout) == (work == "compiles")

@@ -11,6 +11,7 @@ import re
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -50,16 +51,39 @@ def discard_damaged() -> None:
         _log.warning("%d damaged modules of the kernel cache are compiled again", len(damaged))
     if damaged or now != before:
         _keep(cache)
-    atexit.register(_keep, cache)
+    atexit.register(_keep_changes, cache, _states(cache))
+
+
+def _files(cache: Path) -> Iterator[Path]:
+    """Yield the files of the modules, while other processes may be at work there."""
+    for module in (path for path in cache.glob("wp_*") if _MODULE.fullmatch(path.name)):
+        with suppress(OSError):
+            yield from module.iterdir()
+
+
+def _states(cache: Path) -> set[tuple[Path, int, int]]:
+    """Return size and time of each file, by which a change shows without reading what it holds."""
+    states = set()
+    for file in _files(cache):
+        with suppress(OSError):
+            state = file.stat()
+            states.add((file, state.st_size, state.st_mtime_ns))
+    return states
 
 
 def _lines(cache: Path) -> set[bytes]:
     lines = set()
-    for module in (path for path in cache.glob("wp_*") if _MODULE.fullmatch(path.name)):
-        for file in module.iterdir():
-            with suppress(OSError):  # Another process may be at work here.
-                lines.add(hash_line(file, f"{module.name}/{file.name}"))
+    for file in _files(cache):
+        with suppress(OSError):
+            lines.add(hash_line(file, f"{file.parent.name}/{file.name}"))
     return lines
+
+
+def _keep_changes(cache: Path, before: set[tuple[Path, int, int]]) -> None:
+    """Keep the hashes at the end of a process that compiled something; a signal leaves them as they were."""
+    with suppress(SystemExit, KeyboardInterrupt):
+        if _states(cache) != before:
+            _keep(cache)
 
 
 def _keep(cache: Path) -> None:
