@@ -1,6 +1,5 @@
 """Exposure times of photos that state none, from the light that they share with photos that do."""
 
-import warnings
 from collections.abc import Collection
 from dataclasses import replace
 
@@ -52,16 +51,11 @@ def _factor(view: View, timed: list[View], points: np.ndarray, response: Respons
     if len(points):
         visible = np.ones((1 + len(timed), len(points)), bool)
         light, _ = point_light([view, *timed], points, visible, response)
-        several = np.isfinite(light[1:]).sum(0) > 0
-        shared = np.isfinite(light[0]) & several
+        shared = np.isfinite(light[0]) & np.isfinite(light[1:]).any(0)  # [P, 3]
         count = int(shared.any(1).sum())
         if count >= _FEWEST:
-            with warnings.catch_warnings():
-                # A channel of a point that is clipped in all other photos is NaN, and left out below.
-                warnings.simplefilter("ignore", RuntimeWarning)
-                others = np.nanmedian(np.where(shared, light[1:], np.nan)[:, shared.any(1)], axis=0)
-            difference = light[0][shared.any(1)] - others
-            return float(np.exp(np.nanmedian(difference))), count
+            others = np.nanmedian(light[1:][:, shared], axis=0)
+            return float(np.exp(np.median(light[0][shared] - others))), count
     gains = initial_gains([view, *timed], response).gains
     log_gains = np.log(gains[view.name])
     return float(np.exp(np.median(log_gains) - np.median([np.log(gains[other.name]) for other in timed]))), 0

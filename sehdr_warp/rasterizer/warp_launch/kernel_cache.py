@@ -80,13 +80,15 @@ def _lines(cache: Path) -> set[bytes]:
 
 
 def _keep_changes(cache: Path, before: set[tuple[Path, int, int]]) -> None:
-    """Keep the hashes at the end of a process that compiled something; a signal leaves them as they were."""
+    """Keep the hashes at the end of a process that compiled something; a signal leaves them as they were.
+
+    What an exit hook raises would be printed as a traceback.
+    """
     with suppress(SystemExit, KeyboardInterrupt):
         if _states(cache) != before:
             _keep(cache)
 
 
 def _keep(cache: Path) -> None:
-    # A signal that ends the process meanwhile raises SystemExit, which Python would print as a traceback here.
-    with suppress(OSError, SehdrError, SystemExit), atomic_path(cache / LIST, internal=True) as beside:
+    with suppress(OSError, SehdrError), atomic_path(cache / LIST, internal=True) as beside:
         beside.write_bytes(b"".join(line + b"\n" for line in sorted(_lines(cache))))
