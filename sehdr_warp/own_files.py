@@ -1,4 +1,4 @@
-"""The list of files that this program has written to a folder, by which --overwrite tells them from a user's.
+"""The list of files that this program has written to a folder, by which --overwrite knows them from a user's.
 
 Each folder has its list in the file LIST: a line `SHA-256  name` for each file. A file that was changed since is the
 user's, because the list no longer has its hash.

@@ -47,7 +47,7 @@ def folder_of(out: Path, plan: BlockPlan, index: int) -> Path:
 def is_finished(folder: Path) -> bool:
     """Return whether the run of a block has been trained to its end, and its confidence measured."""
     run = RunFolder(folder)
-    return run.info.is_file() and run.confidence.is_file() and bool(run.read_summary().get("finished"))
+    return run.info_file.is_file() and run.confidence.is_file() and bool(run.read_summary().get("finished"))
 
 
 class StoppedTraining(RuntimeError):
@@ -73,7 +73,7 @@ def train_block(
         is_over: Set when the job has to end soon; its training then stops and saves.
 
     Returns:
-        The result. Errors that a user can act on are returned, so that a job that ran is told from one that died.
+        The result. Errors that a user can act on are returned, so that a job that ran differs from one that died.
 
     Raises:
         StoppedTraining: If the training was stopped by is_over or SIGTERM.

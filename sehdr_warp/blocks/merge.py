@@ -115,7 +115,7 @@ def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:
     info = folder.read_info()
     if info["base_time"] != plan.shared.base_time:
         problem = f"base_time = {info['base_time']}, and the blocks share {plan.shared.base_time}"
-        raise InputError(folder.info, problem, "remove the folder of this block, and continue with --resume")
+        raise InputError(folder.info_file, problem, "remove the folder of this block, and continue with --resume")
     own = Normalization.from_dict(info["normalization"])
     gaussians = {name: checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES}
     points = own.scene_points(gaussians["means"].numpy())

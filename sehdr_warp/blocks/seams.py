@@ -38,7 +38,7 @@ def measure_seams(run: Run, views: tuple[View, ...], division: Division, depths:
         run: A trained run.
         views: Views with their photos, with the exposure compensation of the run.
         division: Division into blocks, in scene coordinates.
-        depths: Run whose depths tell which pixels are near a border; by default `run`. Comparing two runs needs one.
+        depths: Run whose depths show which pixels are near a border; by default `run`. Comparing two runs needs one.
     """
     near = NEAR * float(division.margins.max(1).mean())
     sums, each = np.zeros((2, 2)), []

@@ -40,7 +40,7 @@ class QueueWatcher(SlurmInfoWatcher):
 
 
 def job_watcher() -> SlurmInfoWatcher:
-    """Return what tells the states of jobs on this cluster."""
+    """Return a watcher of the states of jobs on this cluster."""
     with suppress(OSError, subprocess.SubprocessError):
         query = subprocess.run(["sacct", "--noheader", "--starttime=now"], capture_output=True, timeout=_ASKS)
         if query.returncode == 0:

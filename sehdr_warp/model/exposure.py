@@ -73,7 +73,7 @@ def exposure_times(base_time: float, items: Items = PAPER_BRACKETS) -> tuple[flo
 
 
 def seconds(items: Items, field: str = "exposures") -> tuple[float, ...]:
-    """Return times in the given order; raises SehdrError for an item that is not in seconds."""
+    """Return times in the order of the items; raises SehdrError for an item that is not in seconds."""
     return tuple(exposure.time for exposure in _exposures(items, None, field))
 
 

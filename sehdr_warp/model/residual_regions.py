@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 MIN_STOPS, MIN_CODE_DIFFERENCE = 1.0, 0.1
 MIN_PIXELS = 6
 MAX_LISTED = 20
-_EXPOSED = 0.1, 0.95  # Codes of pixels whose brightness a photo tells well
+_EXPOSED = 0.1, 0.95  # Codes of pixels whose brightness a photo shows well
 _LEAST_EXPOSED = 0.05  # Part of such pixels, from which the brightness of a photo is compared
 MAX_VIEWS = 200  # Training views that are compared, evenly chosen; more change the means little
 

@@ -39,7 +39,7 @@ def bracket_exposures(
         exposures: Seconds, stops or multiples of the base time, such as "1/125, -2ev, 8x"; numbers are seconds.
 
     Raises:
-        SehdrError: With the value, if both or none are given, an item cannot be read or appears twice, or a time is
+        SehdrError: With the value, if both or none are set, an item cannot be read or appears twice, or a time is
             outside 1e-6 to 1e6 seconds.
     """
     if evs is not None and exposures is None:

@@ -131,18 +131,13 @@ class EnvironmentMap:
     """Pixels across; for a cube those of one face."""
     layout: Literal["latlong", "cube"] = "latlong"
     """Latitude and longitude, twice as wide as high; or OpenEXR's six faces, one above the other."""
-    axes: Literal["upright", "scene"] = "upright"
-    """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
-    up: str | None = None
-    """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
-    scale: float | None = None
-    """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
+    world: WorldOptions = field(default_factory=WorldOptions)
     beyond: float | None = None
     """Leave out what is nearer than this distance, in the units of --at: a CG object then stands in the place of the
     photographed one. By default 0, or, for the center of a walk around something, half the distance of the nearest
     photo."""
     inpaint: bool = False
-    """Fill directions that no photo covers with the light around them; alpha still tells them."""
+    """Fill directions that no photo covers with the light around them; alpha still marks them."""
     colorspace: str = "rec709"
     """Primaries, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
     reference_white: float | None = None
@@ -167,14 +162,9 @@ class Lights:
     """Folder of a run."""
     out: Path | None = None
     """The file: .json, or .usda, with a map of the rest beside it. Without it the lights are only listed."""
-    axes: Literal["upright", "scene"] = "upright"
-    """upright: turned as render and export turn the scene; +Y is up. scene: the scene's own coordinates."""
-    up: str | None = None
-    """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
-    scale: float | None = None
-    """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
+    world: WorldOptions = field(default_factory=WorldOptions)
     unseen: Literal["inpaint", "black"] = "inpaint"
-    """inpaint: directions of the map that no photo covers get the light around them; alpha still tells them."""
+    """inpaint: directions of the map that no photo covers get the light around them; alpha still marks them."""
     reference_white: float | None = None
     """The one that the plates were rendered with, if any: lights and map then have their units."""
     overwrite: bool = False
@@ -235,11 +225,11 @@ def run_lights(args: Lights) -> None:
     if args.out is None:
         if args.reference_white is not None:
             raise UsageError("--reference-white: set for a file, which --out names")
-        transform = world_transform(run, args.axes, up=args.up, scale=args.scale)
+        transform = world_transform(run, **vars(args.world))
         print(lights_table(run.find_lights(), luminance_of_one(run), transform))
         return
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device")}
-    for path in write_lights(run, args.out, **options):
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
+    for path in write_lights(run, args.out, **options, **vars(args.world)):
         print(path)
 
 
@@ -247,8 +237,8 @@ def run_environment_map(args: EnvironmentMap) -> None:
     """Run `sehdr-warp envmap`."""
     from .environment_map import write_environment_map
 
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device")}
-    print(write_environment_map(open_scene(args.run, args.device), args.out, **options))
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
+    print(write_environment_map(open_scene(args.run, args.device), args.out, **options, **vars(args.world)))
 
 
 def run_render(args: Render) -> None:

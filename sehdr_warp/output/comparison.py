@@ -41,7 +41,7 @@ class Comparison:
 
 
 def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: float = 1.0) -> int:
-    """Return the stops, from -8 to -1, at which pictures tell best what photo and scene hold above white.
+    """Return the stops, from -8 to -1, at which pictures show best what photo and scene hold above white.
 
     The brightest light that a photo can hold is then a middle grey, and brighter light of the scene stands out from it.
     Exposures of exposure_time seconds are at 0 EV; for `gain` see display_gain().

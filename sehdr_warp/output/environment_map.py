@@ -86,7 +86,7 @@ def write_environment_map(
         beyond: Leave out what is nearer than this distance, in the units of `at`, so that a CG object can stand in the
             place of a photographed one. None: 0, or for the center of a walk around something half the distance of the
             nearest camera.
-        inpaint: Fill directions that no photo covers with the light around them, as far as A is below 1; A still tells
+        inpaint: Fill directions that no photo covers with the light around them, as far as A is below 1; A still marks
             them.
         colorspace: Primaries of the file.
         reference_white: Value of the photos' white in the file; `expTime` (.hdr: EXPOSURE) states the exposure. None

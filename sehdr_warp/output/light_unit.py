@@ -1,6 +1,6 @@
 """The unit of a scene's light: how many cd/m^2 a radiance of 1 is, from one reading of a meter or a grey card.
 
-Photos tell radiance up to a factor, so one reading at one place makes the light of the whole scene absolute. It is
+Photos determine radiance up to a factor, so one reading at one place makes the light of the whole scene absolute. It is
 kept with the run; files then state it, and lights are written in cd/m^2.
 """
 

@@ -135,7 +135,7 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
     Args:
         lights: As from find_lights().
         unit: cd/m^2 of a radiance of 1; None if it is not known.
-        transform: To the coordinates that places and sizes are given in; None for those of the scene.
+        transform: To the coordinates of places and sizes; None for those of the scene.
     """
     transform = transform or WorldTransform.identity()
     lines = [f"  share  shape  {'radiance' if unit is None else 'cd / m^2':>10}  at least  stops   place, size"]

@@ -168,7 +168,7 @@ def _pictures(run: "Run", comparisons: Sequence[Comparison], times: Mapping[str,
 
 
 def _opening(comparison: Comparison, time: float, gain: float) -> Markup:
-    """Return the picture that a reader sees first: photo and scene side by side, as dark as tells them apart."""
+    """Return the picture that a reader sees first: photo and scene side by side, as dark as shows their difference."""
     stops = darker_stops([comparison], time, gain)
     figures = []
     for name, light in (("Photo", comparison.from_photo), ("Scene", comparison.hdr)):

@@ -181,7 +181,7 @@ def most_visible(mask: np.ndarray, count: int, run: "RenderableScene") -> np.nda
         return mask
     cameras = training_cameras(run)
     if not cameras:
-        raise SehdrError(f"{run.path}: has no training cameras that tell what contributes; leave max_gaussians out")
+        raise SehdrError(f"{run.path}: has no training cameras to measure contributions with; leave max_gaussians out")
     share = np.where(mask, contributions(run.field, cameras).cpu().numpy(), -1)
     largest = np.zeros(len(mask), bool)
     largest[np.argsort(-share, kind="stable")[:count]] = True

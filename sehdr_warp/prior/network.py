@@ -16,7 +16,7 @@ class LightNetwork(nn.Module):
     """Estimate the log2 excess of clipped pixels over white, with a deviation, by a small U-Net.
 
     The input is what `network_input` returns. The mean over the whole picture is added at the coarsest level, because
-    the exposure of a picture tells about its lights.
+    the exposure of a picture is correlated with its lights.
     """
 
     def __init__(self, width: int = WIDTH):

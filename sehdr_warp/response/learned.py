@@ -25,7 +25,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
 
     Source: HDR-GS (Cai et al., NeurIPS 2024): a hidden layer of 128 with ReLU, weights as torch.nn.Linear starts them,
     here turned so that the function rises at first but for a few bends. Nothing keeps it rising, and nothing in photos
-    of one exposure tells its scale.
+    of one exposure determines its scale.
 
     A Response whose tensors end in a dimension of three channels. encode and encode_extended are the same and
     differentiable in exposure and weights; decode searches a table of the weights as they are, on values made to

@@ -1,6 +1,6 @@
 """A response from photos: by color mixtures at edges, the histogram and a prior; or by the paper's score.
 
-selection_evidence.py collects what photos tell, selection_scores.py scores the candidates by it, and select_response()
+selection_evidence.py collects evidence from photos, selection_scores.py scores candidates by it, and select_response()
 chooses.
 """
 
@@ -52,7 +52,7 @@ class ResponseSelection:
 
     @property
     def note(self) -> str | None:
-        """A line that says how uncertain the response is; None if it is sure, or if nothing tells."""
+        """A line that says how uncertain the response is; None if it is sure, or if it is not known."""
         if not self.uncertainty > UNSURE:
             return None
         return (
@@ -74,7 +74,7 @@ def select_response(
 
     Args:
         image: [H, W, 3] codes of a photo, uint8 or uint16, or encoded values in [0, 1]; or several such photos
-            of one camera, taken one by one. Resampling in encoded values mixes colors, which edges then tell of.
+            of one camera, taken one by one. Resampling in encoded values mixes colors, which shows at edges.
         candidates: by default the responses with a formula.
         method: "posterior" judges edges (Lin et al. 2004), clipped pixels, the spread and smoothness of light, and
             a prior; it needs none of them. Without `candidates`, and for photos that are not a camera's own, a smooth

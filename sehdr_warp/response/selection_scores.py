@@ -17,7 +17,7 @@ from .curve import Response
 from .names import DESCRIPTIONS
 from .selection_evidence import CODE, LEAST_SHARE, MOST_SHARE, Band, PhotoEvidence
 
-MIN_EDGES = 50  # Fewer edges tell nothing
+MIN_EDGES = 50  # Fewer edges are no evidence
 # Variance of a stored value in codes^2: rounding, and a little for what two evenly colored sides still hide.
 CODE_VARIANCE = 1 / 12 + 0.05
 # Student's t: an edge that no mixture explains (a third surface, a highlight) costs a logarithm, not a square.

@@ -41,7 +41,7 @@ def run_config(args: ShowConfig) -> None:
     from .run_folder import RunFolder
 
     folder = RunFolder(args.which)
-    config = folder.read_config() if folder.config.is_file() else configs.load_config(args.which)
+    config = folder.read_config() if folder.config_file.is_file() else configs.load_config(args.which)
     print(json.dumps(config.model_dump()) if args.json else configs.config_as_toml(config, args.diff))
 
 

@@ -111,7 +111,7 @@ def enclosing_run_response(folder: Path) -> Response | str | None:
     from .run_folder import RunFolder
 
     for place in map(RunFolder, folder.resolve().parents):
-        if place.info.is_file() and place.checkpoints.is_dir():
+        if place.info_file.is_file() and place.checkpoints.is_dir():
             with suppress(InputError):  # A run.json of another program.
                 return response_for_loading(place.read_config(), Response.from_dict(place.read_info()["response"]))
     return None

@@ -79,7 +79,7 @@ class RunFolder:
     def __init__(self, path: Path | str):
         """Name the files of a run; nothing is read or written."""
         self.path = Path(path)
-        self.config, self.scene, self.info, self.plan, self.summary = (
+        self.config_file, self.scene_file, self.info_file, self.plan_file, self.summary_file = (
             self.path / f"{name}.json" for name in ("config", "scene", "run", "plan", "summary")
         )
         # Set after the training began: more iterations, up and scale for its files, and the unit of light.
@@ -95,7 +95,7 @@ class RunFolder:
     def require(self, remedy: str = _GIVE_RUN) -> None:
         """Raise InputError if this is not the folder of a run, or if one of its files is a link."""
         self.refuse_links()
-        for file in (self.config, self.info):
+        for file in (self.config_file, self.info_file):
             if not file.is_file():
                 if self.path.is_dir() and any((self.path / name).is_dir() for name in (NEW, READY)):
                     problem = "holds a run that is being replaced, or whose beginning was interrupted"
@@ -109,7 +109,15 @@ class RunFolder:
 
         What has the name of one of its files must be a plain file: a pipe or a device would be taken for a missing one.
         """
-        files = (self.config, self.scene, self.info, self.plan, self.summary, self.metrics, self.confidence)
+        files = (
+            self.config_file,
+            self.scene_file,
+            self.info_file,
+            self.plan_file,
+            self.summary_file,
+            self.metrics,
+            self.confidence,
+        )
         files += (self.extension, self.orientation, self.light_unit, self.blocks)
         for path in files:
             refuse_links(path, self.path)
@@ -142,9 +150,9 @@ class RunFolder:
 
         The place of the photos in run.json does not count.
         """
-        files = (file for file in (self.config, self.scene, self.info) if file.is_file())
+        files = (file for file in (self.config_file, self.scene_file, self.info_file) if file.is_file())
         values = {file.name: self._read(file, read_object) for file in files}
-        values.get(self.info.name, {}).pop("data", None)
+        values.get(self.info_file.name, {}).pop("data", None)
         return {
             name: hashlib.sha256(json.dumps(each, sort_keys=True).encode()).hexdigest() for name, each in values.items()
         }
@@ -152,7 +160,7 @@ class RunFolder:
     def read_config(self) -> Config:
         """Return the config of the training, with the iterations that it was extended to."""
         self.read_info()
-        config = config_from_dict(self._read(self.config, read_object), self.config)
+        config = config_from_dict(self._read(self.config_file, read_object), self.config_file)
         if not self.extension.is_file():
             return config
         iterations = self._read(self.extension, read_object).get("iterations")
@@ -162,16 +170,16 @@ class RunFolder:
 
     def read_info(self) -> dict:
         """Return the values of run.json; see RunValues."""
-        info = self._read(self.info, lambda path: read_values(path, RunValues))
+        info = self._read(self.info_file, lambda path: read_values(path, RunValues))
         try:
             Response.from_dict(info["response"])
         except SehdrError as error:
-            raise InputError(self.info, str(error), REMEDY) from None
+            raise InputError(self.info_file, str(error), REMEDY) from None
         return info
 
     def read_scene(self) -> dict:
         """Return the values of scene.json, see describe_scene()."""
-        values = self._read(self.scene, lambda path: read_values(path, SceneValues))
+        values = self._read(self.scene_file, lambda path: read_values(path, SceneValues))
         return {"notes": []} | values
 
     def read_cameras(self) -> tuple[CameraEntry, ...]:
@@ -180,7 +188,7 @@ class RunFolder:
         try:
             return tuple(_camera_entry(view) for view in views)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(self.scene, f"a view is damaged ({error!r:.200})", REMEDY) from None
+            raise InputError(self.scene_file, f"a view is damaged ({error!r:.200})", REMEDY) from None
 
     def check_same_scene(self, scene: Scene) -> None:
         """Raise InputError if the run was trained on other views, cameras or photos than a scene's."""
@@ -189,21 +197,21 @@ class RunFolder:
             return
         if difference.photos:
             problem = f"photos or masks were changed since the training began: {difference}"
-            raise InputError(self.scene, problem, "put them back as they were, or train anew with --overwrite")
+            raise InputError(self.scene_file, problem, "put them back as they were, or train anew with --overwrite")
         problem = f"its {difference} differ from those of {scene.name}"
-        raise InputError(self.scene, problem, "resume with the same data, --max-size and --holdout")
+        raise InputError(self.scene_file, problem, "resume with the same data, --max-size and --holdout")
 
     def read_decisions(self) -> list[dict]:
         """Return the decisions of the run's plan, see DecisionValues; none without a plan."""
-        if not self.plan.exists():
+        if not self.plan_file.exists():
             return []
-        return self._read(self.plan, lambda path: read_values(path, PlanValues, _REMOVE_FILE))["decisions"]
+        return self._read(self.plan_file, lambda path: read_values(path, PlanValues, _REMOVE_FILE))["decisions"]
 
     def read_summary(self) -> dict:
         """Return times, memory and counts of the training, see SummaryValues; empty if it has not ended."""
-        if not self.summary.exists():
+        if not self.summary_file.exists():
             return {}
-        return self._read(self.summary, lambda path: read_values(path, SummaryValues, _REMOVE_FILE))
+        return self._read(self.summary_file, lambda path: read_values(path, SummaryValues, _REMOVE_FILE))
 
     def read_metrics(self) -> list[dict]:
         """Return the evaluations during the training, see MetricsValues; lines that a kill cut are left out."""

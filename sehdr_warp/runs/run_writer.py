@@ -91,7 +91,7 @@ class RunWriter(RunFolder):
             raise InputError(self.path, "is a file", "choose another folder for the run")
         require_text(self.path)
         self.refuse_links()
-        remove_stale(self.config)
+        remove_stale(self.config_file)
         if not self.path.exists() or self._is_empty():
             return False
         if not resume and not overwrite:
@@ -103,8 +103,8 @@ class RunWriter(RunFolder):
             self.require()
         else:
             self.require("choose another folder for the run; --overwrite replaces runs alone")
-        if not {"format", "base_time", "response"} <= self._read(self.info, _read_own).keys():
-            raise InputError(self.info, "is not that of a run of sehdr-warp", _CHOOSE_OTHER)
+        if not {"format", "base_time", "response"} <= self._read(self.info_file, _read_own).keys():
+            raise InputError(self.info_file, "is not that of a run of sehdr-warp", _CHOOSE_OTHER)
         with self._lock_held():  # Only to see that no other training holds it.
             return resume
 
@@ -168,10 +168,10 @@ class RunWriter(RunFolder):
         with atomic_folder(self.path / NEW, internal=True) as beside:
             new = RunWriter(beside)
             if plan is not None:
-                write_json(new.plan, plan)
-            write_json(new.scene, scene)
-            write_json(new.info, info)
-            write_json(new.config, config.model_dump())
+                write_json(new.plan_file, plan)
+            write_json(new.scene_file, scene)
+            write_json(new.info_file, info)
+            write_json(new.config_file, config.model_dump())
             new.write_checkpoint(*state, keep=1)
         self._finish_replacement()
         self._hashes, self.checkpoint_hash = new._hashes, new.checkpoint_hash
@@ -184,9 +184,10 @@ class RunWriter(RunFolder):
             _refuse_foreign(folder)
         with writing(self.path):
             if new.is_dir():
-                parts = ("summary", "metrics", "confidence", "plan", "extension", "orientation")
-                for name in (*parts, "scene", "info", "config"):
-                    getattr(self, name).unlink(missing_ok=True)
+                results = self.summary_file, self.metrics, self.confidence, self.plan_file
+                settings = self.extension, self.orientation
+                for file in (*results, *settings, self.scene_file, self.info_file, self.config_file):
+                    file.unlink(missing_ok=True)
                 for checkpoint in self._checkpoint_folders():
                     remove_checkpoint(checkpoint)
                 os.rename(new, ready)
@@ -215,7 +216,7 @@ class RunWriter(RunFolder):
     def write_summary(self, values: dict) -> None:
         """Write times, memory and counts of the training; see SummaryValues."""
         self._check_lock()
-        write_json(self.summary, values, internal=True)
+        write_json(self.summary_file, values, internal=True)
 
     def append_metrics(self, line: dict) -> None:
         """Add the figures of an evaluation; see MetricsValues."""

@@ -43,7 +43,7 @@ class Values(BaseModel):
 
 
 class DataValues(Values):
-    """The arguments of load_scene that the photos were read with."""
+    """LoadArguments (load_arguments.py), as run.json holds them."""
 
     path: Text | None = None
     exposure_index: _Photos | None = None

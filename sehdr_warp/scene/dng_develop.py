@@ -5,13 +5,12 @@ demosaicing as a plain file in memory, so that one range holds for all channels.
 """
 
 import io
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 
 from ..errors import InputError
 from .dng import DngRaw, JpegTiles
@@ -156,46 +155,22 @@ def _plain_dng(mosaic: np.ndarray, pattern: np.ndarray) -> bytes:
     """Return a DNG of 16-bit samples with black level 0 and white level 65535."""
     height, width = mosaic.shape
     samples = np.rint(np.clip(mosaic, 0, 1) * 65535).astype("<u2")
-    size = len(pattern)
+    size, cells = len(pattern), bytes(int(channel) for channel in pattern.ravel())
     short, long, byte, text, rational, signed = 3, 4, 1, 2, 5, 10
-
-    def fractions(*values: int) -> bytes:
-        return b"".join(struct.pack("<ii", value, 1) for value in values)
-
-    tags: dict[int, tuple[int, int, bytes]] = {
-        254: (long, 1, struct.pack("<I", 0)),
-        256: (long, 1, struct.pack("<I", width)),
-        257: (long, 1, struct.pack("<I", height)),
-        258: (short, 1, struct.pack("<H", 16)),
-        259: (short, 1, struct.pack("<H", 1)),
-        262: (short, 1, struct.pack("<H", 32803)),
-        271: (text, 6, b"plain\0"),
-        272: (text, 6, b"plain\0"),
-        273: (long, 1, b"\0\0\0\0"),
-        277: (short, 1, struct.pack("<H", 1)),
-        278: (long, 1, struct.pack("<I", height)),
-        279: (long, 1, struct.pack("<I", samples.nbytes)),
-        33421: (short, 2, struct.pack("<HH", size, size)),
-        33422: (byte, size * size, bytes(int(channel) for channel in pattern.ravel())),
-        50706: (byte, 4, bytes([1, 4, 0, 0])),
-        50708: (text, 6, b"plain\0"),
-        50714: (long, 1, struct.pack("<I", 0)),
-        50717: (long, 1, struct.pack("<I", 65535)),
-        50721: (signed, 9, fractions(1, 0, 0, 0, 1, 0, 0, 0, 1)),
-        50728: (rational, 3, fractions(1, 1, 1)),
-        50778: (short, 1, struct.pack("<H", 21)),
-    }
-    start, blobs, entries = 8 + 2 + 12 * len(tags) + 4, b"", b""
-    room = sum(len(data) + len(data) % 2 for _, _, data in tags.values() if len(data) > 4)
-    for tag, (kind, count, data) in sorted(tags.items()):
-        if tag == 273:
-            data = struct.pack("<I", start + room)
-        elif len(data) > 4:
-            place, blobs = start + len(blobs), blobs + data + b"\0" * (len(data) % 2)
-            data = struct.pack("<I", place)
-        entries += struct.pack("<HHI", tag, kind, count) + data.ljust(4, b"\0")
-    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + struct.pack("<I", 0)
-    return b"".join((head, blobs, samples.tobytes()))
+    tags: dict[int, tuple[int, Any]] = {
+        254: (long, 0), 256: (long, width), 257: (long, height), 258: (short, 16), 259: (short, 1),
+        262: (short, 32803), 271: (text, "plain"), 272: (text, "plain"), 273: (long, 0), 277: (short, 1),
+        278: (long, height), 279: (long, samples.nbytes), 33421: (short, (size, size)), 33422: (byte, cells),
+        50706: (byte, bytes([1, 4, 0, 0])), 50708: (text, "plain"), 50714: (long, 0), 50717: (long, 65535),
+        50721: (signed, (1, 0, 0, 0, 1, 0, 0, 0, 1)), 50728: (rational, (1, 1, 1)), 50778: (short, 21),
+    }  # fmt: skip
+    directory = TiffImagePlugin.ImageFileDirectory_v2()
+    for tag, (kind, value) in tags.items():
+        directory.tagtype[tag] = kind
+        directory[tag] = value
+    file = io.BytesIO()
+    directory.save(file)  # Adds its end to the place of the samples, tag 273.
+    return file.getvalue() + samples.tobytes()
 
 
 def _crop(image: np.ndarray, dng: DngRaw) -> np.ndarray:

@@ -119,13 +119,13 @@ def looks_down(cameras: Sequence[Camera], up: np.ndarray) -> bool:
 
 
 def is_pitch_known(cameras: Sequence[Camera], up: np.ndarray) -> bool:
-    """Return whether cameras turn enough for their level axes to tell the horizon, not only its direction along one.
+    """Return whether cameras turn enough for their level axes to show the horizon, not only its direction along one.
 
     Cameras that all look one way are level along their common axis; how far they are pitched, their poses do not say.
     """
     level = _level_axes(_rotations(cameras), up)
     spread = np.linalg.eigvalsh(level.T @ level / len(level))[1]
-    return looks_down(cameras, up) or bool(spread > _ONE_WAY)  # From the air the axes of view tell up.
+    return looks_down(cameras, up) or bool(spread > _ONE_WAY)  # From the air the axes of view show up.
 
 
 def up_from_lines(views: Sequence[View], up: np.ndarray) -> np.ndarray | None:

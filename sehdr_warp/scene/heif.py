@@ -1,6 +1,6 @@
 """The boxes of HEIF and AVIF files (ISO/IEC 14496-12 and 23008-12): which pictures they hold, and what belongs to them.
 
-pillow-heif and Pillow decode pictures. Neither tells of a gain map that is a derived item (`tmap`), of metadata of
+pillow-heif and Pillow decode pictures. Neither reads a gain map that is a derived item (`tmap`), of metadata of
 another picture than the primary one, or, for AVIF, of the stated transfer function.
 """
 

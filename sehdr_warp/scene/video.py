@@ -220,7 +220,7 @@ def _planes(frame: Any) -> list[np.ndarray]:
 def _chroma_places(frame: Any, layout: str) -> tuple[float, float]:
     """Return where a frame's first chroma sample lies, down and to the right of its first luma sample, in luma samples.
 
-    PyAV does not tell what the stream states, so FFmpeg interpolates a ramp of chroma with this frame's properties.
+    PyAV does not pass on what the stream states, so FFmpeg interpolates a ramp of chroma with this frame's properties.
     """
     probe = frame.reformat(width=32, height=32, format=layout)
     steps = (2 if layout == "yuv420p16le" else 1), 2

@@ -187,6 +187,7 @@ def _train(args: Train, ranks=None) -> None:
         from .advice import advice, option_words
         from .train import create_trainer
 
+        assert output.out is not None, "_run_to_resume() refuses a training without --out"
         trainer = create_trainer(
             scene,
             output.out,
@@ -327,7 +328,7 @@ def _refuse_run(args: Train) -> None:
     from ..runs.run_folder import RunFolder
 
     if args.data is None or not all(
-        file.is_file() for file in (RunFolder(args.data).config, RunFolder(args.data).info)
+        file.is_file() for file in (RunFolder(args.data).config_file, RunFolder(args.data).info_file)
     ):
         return
     steps = "" if args.training.iterations is None else f" --iterations {args.training.iterations}"

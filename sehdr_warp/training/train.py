@@ -221,7 +221,7 @@ def _check_same_config(config: Config, saved: Config, folder: RunWriter) -> None
             continue  # The values that the plan kept are compared; a longer schedule goes on.
         if old != new:
             problem = f"{path} = {old!r}, but {new!r} was asked for"
-            raise InputError(folder.config, problem, "resume with the run's own config, or train anew")
+            raise InputError(folder.config_file, problem, "resume with the run's own config, or train anew")
 
 
 def _cap_notes(trainer: Trainer) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""The viewer's server: a page, float frames, photos and files to save, for browsers on this machine unless told.
+"""The viewer's server: a page, float frames, photos and files to save, for browsers on this machine by default.
 
 Nothing that comes in is trusted: a fixed set of paths, bounded bodies and sizes, and no other site's page may ask.
 """

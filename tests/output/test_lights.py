@@ -11,6 +11,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.commands import Lights, run_lights
 from sehdr_warp.output.lights import lights_table, write_lights
+from sehdr_warp.output.options import WorldOptions
 from sehdr_warp.output.world_transform import WorldTransform, world_transform
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
@@ -131,9 +132,9 @@ def test_the_table_names_place_size_and_doubt():
 
 def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
     monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
-    run_lights(Lights(run=run.path, axes="scene"))
+    run_lights(Lights(run=run.path, world=WorldOptions(axes="scene")))
     assert "(1, 0.5, 2), 0.4 x 0.2" in capsys.readouterr().out
-    run_lights(Lights(run=run.path, scale=10.0))
+    run_lights(Lights(run=run.path, world=WorldOptions(scale=10.0)))
     place = ", ".join(f"{value:.3g}" for value in world_transform(run, scale=10.0).points(PANEL.position))
     assert f"({place}), 4 x 2" in capsys.readouterr().out
 

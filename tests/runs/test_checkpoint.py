@@ -79,12 +79,12 @@ def test_what_a_killed_writer_left_is_no_checkpoint(folder):
 
 
 def test_what_decides_the_picture_is_hashed_with_the_checkpoint(folder):
-    for file in (folder.config, folder.scene, folder.info):
+    for file in (folder.config_file, folder.scene_file, folder.info_file):
         file.write_text('{"a": 1, "data": {"path": "here"}}')
     folder.write_checkpoint(*state(1), keep=1)
-    folder.info.write_text('{"data": {"path": "moved"}, "a": 1}')
+    folder.info_file.write_text('{"data": {"path": "moved"}, "a": 1}')
     assert RunFolder(folder.path).newest_checkpoint().values["iteration"] == 1
-    for file in (folder.config, folder.scene, folder.info):
+    for file in (folder.config_file, folder.scene_file, folder.info_file):
         text = file.read_text()
         file.write_text(text.replace("1", "2"))
         with pytest.raises(InputError, match=f"{file.name}: was changed since"):

@@ -266,7 +266,7 @@ def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):
     assert train(scene, tmp_path / "run", config, device="cpu", resume=True).iterations == 12
     unplanned = load_config("default", {"response.name": "srgb", "schedule.iterations": 2, "plan.enabled": False})
     train(scene, tmp_path / "run", unplanned, device="cpu", overwrite=True)
-    assert not RunFolder(tmp_path / "run").plan.exists()
+    assert not RunFolder(tmp_path / "run").plan_file.exists()
 
 
 def test_plan_only_prints_and_trains_nothing(tmp_path, capsys, monkeypatch):

@@ -409,8 +409,8 @@ def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
 
 def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
     run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 1}), device="cpu")
-    info = json.loads(run.folder.info.read_text())
-    run.folder.info.write_text(json.dumps(info | {"format": 1}))
+    info = json.loads(run.folder.info_file.read_text())
+    run.folder.info_file.write_text(json.dumps(info | {"format": 1}))
     for use in (load_run, lambda path: train(scene, path, device="cpu", resume=True)):
         with pytest.raises(InputError, match="format = 1 is of sehdr-warp .* this one reads format 3; train again"):
             use(run.path)

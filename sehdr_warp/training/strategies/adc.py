@@ -189,7 +189,7 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
 
 
 def _resize(values: Tensor | None, rows: int, device: torch.device | str) -> Tensor:
-    """Return values [rows] that begin with the given ones, and are 0 behind them."""
+    """Return values [rows]: those of the argument, then zeros."""
     result = torch.zeros(rows, device=device)
     if values is not None:
         result[: len(values)] = values[:rows]

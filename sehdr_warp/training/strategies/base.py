@@ -31,7 +31,7 @@ class Proposals(NamedTuple):
 
 
 Propose = Callable[[Tensor, int], Proposals]
-"""Returns up to a number of new Gaussians, given as int64 [] on the device and as its upper bound on the host."""
+"""Returns up to a number of new Gaussians: int64 [] on the device, and its upper bound on the host."""
 
 
 @dataclass
