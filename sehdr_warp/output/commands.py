@@ -235,6 +235,11 @@ def run_lights(args: Lights) -> None:
 
 def run_environment_map(args: EnvironmentMap) -> None:
     """Run `sehdr-warp envmap`."""
+    from .colorspace import color_space
+    from .map_center import check_place
+
+    color_space(args.colorspace)  # Both are checked before the scene is opened.
+    check_place(args.at)
     from .environment_map import write_environment_map
 
     options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
@@ -243,6 +248,9 @@ def run_environment_map(args: EnvironmentMap) -> None:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
+    from .colorspace import color_space
+
+    color_space(args.pictures.colorspace)  # Before anything is loaded
     from .render_views import PATHS, SPLITS, check_cameras, read_size, reframe, render_views, select_cameras
     from .world_transform import world_transform
 
@@ -306,9 +314,10 @@ def _ramp(text: str | None) -> tuple[float, float]:
 def run_report(args: Report) -> None:
     """Run `sehdr-warp report`."""
     from ..evaluation.evaluate import evaluate
-    from .report import write_report
+    from .report import check_report_folder, write_report
 
     check_absent(args.out / "report.html", args.overwrite)
+    check_report_folder(args.out)
     run = open_run(args.run, args.device)
     scene = load_run_scene_with_confidence(run, args.data)
     for path in write_report(run, scene, args.out, overwrite=args.overwrite, evaluation=evaluate(run, scene)):

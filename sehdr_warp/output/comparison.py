@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ..runs.run import RenderableScene
 
 _GREY = 0.3  # Display light at which what photos clip is shown
+_CLIPPED, _LEAST_CLIPPED = 0.99, 0.002  # Encoded value that counts as clipped; share of a photo that shows light above
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,27 @@ def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: 
     """
     white = max(float(np.max(each.from_photo)) for each in comparisons) * exposure_time * gain
     return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), -8, -1))
+
+
+class Opening(NamedTuple):
+    """Stops from the exposure, title and lead with which a report shows photo and scene first."""
+
+    stops: int
+    title: str
+    lead: str
+
+
+def opening_of(comparison: Comparison, exposure_time: float, gain: float = 1.0) -> Opening:
+    """Return how a report opens: as dark as tells what the photo clips, or as it was taken if it clips next to nothing.
+
+    Arguments as in darker_stops().
+    """
+    if float((comparison.photo > _CLIPPED).mean()) < _LEAST_CLIPPED:
+        return Opening(0, "Photo and scene", f"View {comparison.name}, of which the photo clips next to nothing.")
+    stops = darker_stops([comparison], exposure_time, gain)
+    darker = f"{-stops} stop{'s' * (stops < -1)} darker"
+    lead = f"View {comparison.name}, {darker}. What the photo clipped stays flat grey."
+    return Opening(stops, "Light above white", lead)
 
 
 def compare(run: "RenderableScene", view: View, views: Sequence[View]) -> Comparison:

@@ -75,13 +75,24 @@ def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], tra
             some = first_names(list(cameras), 5)
             raise SehdrError(f"camera {name!r} is not one of the scene's ({some}); see scene.json of the run")
         return cameras[name].position
+    return transform.inverse().points(_numbers(at))
+
+
+def _numbers(at: str | tuple[float, float, float]) -> np.ndarray:
+    """Return the three numbers of a point [3]; raise SehdrError for anything else."""
     try:
         position = np.array([float(v) for v in (at.split(",") if isinstance(at, str) else at)])
     except (ValueError, TypeError):
         position = np.array([])
     if position.shape != (3,) or not np.isfinite(position).all():
         raise SehdrError(f"point {at!r} is neither x,y,z nor camera:NAME nor center; set --at, for example to 0,0,1.5")
-    return transform.inverse().points(position)
+    return position
+
+
+def check_place(at: str) -> None:
+    """Raise SehdrError for a place that is nothing that `--at` takes, before a scene is opened."""
+    if at != "center" and not at.startswith("camera:"):
+        _numbers(at)
 
 
 def subject_of_walk(photos: list[Camera]) -> np.ndarray | None:

@@ -4,16 +4,19 @@ import logging
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import SehdrError
+from ..errors import InputError, SehdrError
 from ..files import atomic_path, check_absent
+from ..own_files import first_foreign
 from ..progress import track_progress
 from ..scene import Scene, View
 from ..scene.exposure import shutter
+from ..scene.images import LDR_SUFFIXES, RAW_SUFFIXES
 from .camera_paths import evenly
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare, darker_stops
@@ -25,6 +28,17 @@ if TYPE_CHECKING:
     from ..runs.run import Run
 
 log = logging.getLogger(__name__)
+_PHOTOS = 3  # Pictures of others in a folder that tell that it is one of photos
+
+
+def check_report_folder(out: Path) -> None:
+    """Raise InputError for a folder of photos, for which pictures of a report would count from then on."""
+    if not out.is_dir():
+        return
+    pictures = (file for file in sorted(out.iterdir()) if file.suffix.lower() in (*LDR_SUFFIXES, *RAW_SUFFIXES))
+    photos = list(islice((file for file in pictures if first_foreign(file) is not None), _PHOTOS))
+    if len(photos) == _PHOTOS:
+        raise InputError(out, f"holds photos ({photos[0].name} ...)", "name a folder for the report alone")
 
 
 def write_report(
@@ -54,9 +68,10 @@ def write_report(
         evaluation: Result of evaluate(), for the page's figures.
 
     Raises:
-        InputError: If a file exists.
+        InputError: If a file exists, or the folder holds photos.
         SehdrError: For a scene without views.
     """
+    check_report_folder(Path(out))
     metrics = run.metrics()
     charted = any(training_points(metrics, key) for key in PANELS)
     names = ("report.html", "comparison.png", "stops.png", *["training.png"] * charted)

@@ -13,7 +13,7 @@ from ..scene import Scene
 from ..scene.camera import limited_size
 from ..scene.exposure import shutter
 from ..scene.lens import area_average
-from .comparison import Comparison, darker_stops
+from .comparison import Comparison, opening_of
 from .diagrams import camera_map, training_svg
 from .html import EMPTY, duration, join, markup, page_file, whole_page
 from .light_pictures import (
@@ -169,15 +169,14 @@ def _pictures(run: "Run", comparisons: Sequence[Comparison], times: Mapping[str,
 
 def _opening(comparison: Comparison, time: float, gain: float) -> Markup:
     """Return the picture that a reader sees first: photo and scene side by side, as dark as shows their difference."""
-    stops = darker_stops([comparison], time, gain)
+    stops, title, lead = opening_of(comparison, time, gain)
     figures = []
     for name, light in (("Photo", comparison.from_photo), ("Scene", comparison.hdr)):
         small = smaller(light, _PICTURE)
         picture = jpeg(expose(small, stops, scale=time * gain))
-        title = f"{name} at {stops_text(stops)}"
-        figures.append(_figure(img(picture, title, (small.shape[1], small.shape[0])), title))
-    lead = f"View {comparison.name}, {-stops} stop{'s' * (stops < -1)} darker. What the photo clipped stays flat grey."
-    return _section("Light above white", lead, markup('<div class="views">{}</div>', join(figures)))
+        caption = f"{name} at {stops_text(stops)}"
+        figures.append(_figure(img(picture, caption, (small.shape[1], small.shape[0])), caption))
+    return _section(title, lead, markup('<div class="views">{}</div>', join(figures)))
 
 
 def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:

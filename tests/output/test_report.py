@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.errors import SehdrError
+from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.charts import save_picture, training_chart
 from sehdr_warp.output.comparison import Comparison, compare, darker_stops
-from sehdr_warp.output.report import comparison_figure, stops_figure, write_report
+from sehdr_warp.output.report import check_report_folder, comparison_figure, stops_figure, write_report
 from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.scene import Scene, View, codes_of
 
@@ -137,3 +137,15 @@ def test_pictures_keep_their_shape(caption):
     figure.draw_without_rendering()
     boxes = [axes.get_window_extent() for axes in figure.axes]
     assert len(boxes) == 4 and all(box.width / box.height == pytest.approx(1.5, rel=0.02) for box in boxes)
+
+
+def test_a_folder_of_photos_is_not_for_a_report(tmp_path):
+    run, scene = make(tmp_path)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for index in range(3):
+        Image.new("RGB", (4, 4)).save(photos / f"IMG_{index}.jpg")
+    with pytest.raises(InputError, match=r"holds photos \(IMG_0.jpg ...\); name a folder for the report alone"):
+        write_report(run, scene, photos)
+    assert len(list(photos.iterdir())) == 3
+    check_report_folder(tmp_path / "new")

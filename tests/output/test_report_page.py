@@ -20,7 +20,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp import output
-from sehdr_warp.output.comparison import Comparison, darker_stops
+from sehdr_warp.output.comparison import Comparison, darker_stops, opening_of
 from sehdr_warp.output.light_pictures import dial, jpeg, packed_light
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report import write_report
@@ -258,3 +258,10 @@ def test_the_opening_shows_what_photos_clip_as_grey():
     assert darker_stops([thumbnail], 0.5) == -2
     assert darker_stops([thumbnail], 0.5, gain=8.0) == -5
     assert darker_stops([thumbnail], 1e-9) == -1 and darker_stops([thumbnail], 1e9) == -8
+    assert opening_of(thumbnail, 0.5).lead == "View v, 2 stops darker. What the photo clipped stays flat grey."
+
+
+def test_a_photo_that_clips_nothing_is_opened_as_it_was_taken():
+    flat = np.full((4, 4, 3), 0.5)
+    opening = opening_of(Comparison("v", flat, flat, flat), 0.5)
+    assert (opening.stops, opening.title) == (0, "Photo and scene") and "next to nothing" in opening.lead
