@@ -21,7 +21,7 @@ from sehdr_warp.scene.video import codes, decode, open_clip
 from sehdr_warp.scene.video_frames import choose_frames
 from tests.make_scenes import pattern
 from tests.scene.clips import pan, write_clip
-from tests.scene.dng_files import area, gain_map, mosaic, opcodes, write_tagged_dng
+from tests.scene.dng_files import area, gain_map, jpeg_tiles, longs, mosaic, opcodes, shorts, write_tagged_dng
 from tests.scene.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
 from tests.scene.raw_files import write_dng
 from tests.scene.test_color_encoding import icc_profile
@@ -182,11 +182,16 @@ def make_dng_opcodes(folder: Path) -> None:
         "bad": {51008: opcodes((5, struct.pack(">3I", 0, 1, 1) + struct.pack(">6I", 4, 6, 2, 3, 4, 5)))},
         "lens": {
             51022: opcodes((3, struct.pack(">7d", 1, 0, 0, 0, 0, 0.5, 0.5)),
-                           (1, struct.pack(">I8d", 1, 0.9, 0, 0, 0, 0, 0, 0.5, 0.5)))
+                           (1, struct.pack(">I8d", 1, 0.9, 0, 0, 0, 0, 0, 0.5, 0.5)),
+                           (14, struct.pack(">I21dI", 1, 1.1, *[0] * 16, 0, 1, 0.5, 0.5, 1)))
         },
     }  # fmt: skip
     for name, tags in lists.items():
         write_tagged_dng(folder / f"{name}.dng", stored, tags)
+    codes = np.full((24, 32, 3), 99, np.uint8)
+    table = longs(*np.arange(256).tolist())
+    tags = {258: shorts(8, 8, 8), 259: shorts(34892), 322: longs(16), 323: longs(16), 50712: table}
+    write_tagged_dng(folder / "lossy.dng", codes, tags, pieces=jpeg_tiles(codes, (16, 16)))
     write_tagged_dng(folder / "linear.dng", np.repeat(stored[..., None], 3, 2))
     write_tagged_dng(folder / "mosaic.dng", (mosaic(np.full((24, 32, 3), 0.3)) * 65535).astype(np.uint16))
 

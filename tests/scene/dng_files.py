@@ -1,9 +1,11 @@
 """DNG files with any tags, made in memory (Adobe's DNG specification 1.7)."""
 
+import io
 import struct
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from .raw_files import TO_CAMERA
 
@@ -87,3 +89,16 @@ def mosaic(light: np.ndarray, pattern=BAYER) -> np.ndarray:
     height, width = light.shape[:2]
     channels = np.tile(pattern, (-(-height // len(pattern)), -(-width // len(pattern))))[:height, :width]
     return np.take_along_axis(light, channels[..., None], axis=2)[..., 0]
+
+
+def jpeg_tiles(codes, size):
+    """JPEG pictures of codes [H, W, 3], padded to whole tiles of (width, height)."""
+    padded = np.pad(codes, ((0, -len(codes) % size[1]), (0, -codes.shape[1] % size[0]), (0, 0)), mode="edge")
+    tiles = []
+    for top in range(0, len(padded), size[1]):
+        for left in range(0, padded.shape[1], size[0]):
+            buffer = io.BytesIO()
+            tile = Image.fromarray(padded[top : top + size[1], left : left + size[0]])
+            tile.save(buffer, "JPEG", quality=100, subsampling=0)
+            tiles.append(buffer.getvalue())
+    return tiles

@@ -1,19 +1,17 @@
 """DNG files as phones, drones and converters write them: each from light that the test knows."""
 
-import io
 import json
 import struct
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.linear_photos import color_matrix, raw_sizes, read_raw
 
-from .dng_files import area, gain_map, longs, mosaic, opcodes, rationals, shorts, write_tagged_dng
+from .dng_files import area, gain_map, jpeg_tiles, longs, mosaic, opcodes, rationals, shorts, write_tagged_dng
 
 pytest.importorskip("rawpy")
 TRUTH = np.array([0.1, 0.3, 0.2])
@@ -209,19 +207,6 @@ def test_distortion_by_a_polynomial_of_the_radius(tmp_path):
     light, far = light_of(tmp_path / "a.dng")[HEIGHT // 2], slice(WIDTH - 12, WIDTH - 4)
     expected = TRUTH * (1 + 0.8 * (X[0, far, None] - (WIDTH - 1) / 2) / WIDTH)
     np.testing.assert_allclose(light[far], expected, rtol=0.01)
-
-
-def jpeg_tiles(codes, size):
-    """JPEG pictures of codes [H, W, 3], padded to whole tiles of (width, height)."""
-    padded = np.pad(codes, ((0, -len(codes) % size[1]), (0, -codes.shape[1] % size[0]), (0, 0)), mode="edge")
-    tiles = []
-    for top in range(0, len(padded), size[1]):
-        for left in range(0, padded.shape[1], size[0]):
-            buffer = io.BytesIO()
-            tile = Image.fromarray(padded[top : top + size[1], left : left + size[0]])
-            tile.save(buffer, "JPEG", quality=100, subsampling=0)
-            tiles.append(buffer.getvalue())
-    return tiles
 
 
 @pytest.mark.parametrize("size", [(80, 40), (WIDTH, HEIGHT)])
