@@ -248,8 +248,10 @@ def _raw_of(table: Any, first: Any) -> DngRaw:
 
 def _jpeg_tiles(table: Any, width: int, height: int) -> JpegTiles:
     """Return where a lossy DNG's pictures lie. Raises ValueError for a number of them that does not fill the image."""
-    places, lengths = (next(_numbers(table, tag, ()) for tag in tags if tag in table) for tags in (_PLACES, _LENGTHS))
-    size = int(table.get(_TILE_WIDTH, width)), int(table.get(_TILE_LENGTH, table.get(_ROWS_PER_STRIP, height)))
+    tiled = _TILE_WIDTH in table
+    places, lengths = (_numbers(table, tags[0] if tiled else tags[1], ()) for tags in (_PLACES, _LENGTHS))
+    rows = min(int(table.get(_ROWS_PER_STRIP, height)), height)  # 2^32 - 1 stands for one strip
+    size = (int(table[_TILE_WIDTH]), int(table[_TILE_LENGTH])) if tiled else (width, rows)
     if min(size) < 1 or max(size) > _MAX_SIDE:
         raise ValueError(f"tiles of {size[0]} x {size[1]} pixels")
     count = -(-width // size[0]) * -(-height // size[1])
