@@ -9,17 +9,23 @@ import io
 import logging
 import math
 import re
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, TiffImagePlugin
+from PIL import Image
 
 from ..errors import InputError
 from .color_encoding import ColorEncoding, encoding_of, encoding_of_boxes, encoding_of_profile
+from .gain_map_parameters import (
+    MOST_STOPS,
+    GainMapParameters,
+    parameters_of_apple,
+    parameters_of_iso,
+    parameters_of_xmp,
+)
 from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, with_primary
 from .images import PILLOW_ERRORS, EncodedImage, exif_of, open_image, orientation_of, turn_upright
 from .linear_photos import linear_codes
@@ -35,7 +41,6 @@ _ISO_JPEG = b"urn:iso:std:iso:ts:21496:-1\0"
 _HDRGM = "http://ns.adobe.com/hdr-gain-map/1.0/"
 _APPLE_AUX = "urn:com:apple:photo:2020:aux:hdrgainmap"
 _MOST_XMP = 1 << 22  # Bytes that describe a gain map; phones write about a thousand
-_MOST_STOPS = 16.0  # Between white and the largest light; encoders state 1 to 6
 
 
 @dataclass(frozen=True)
@@ -157,11 +162,11 @@ def _of_jpeg(path: Path) -> GainMap | None:
             iso = next((data for _, data in getattr(second, "applist", ()) if data.startswith(_ISO_JPEG)), None)
             xmp = _with_usual_prefix(_text(second.info.get("xmp", b"")))
             if iso is not None and len(iso) > len(_ISO_JPEG) + 4:
-                make = _of_iso(iso[len(_ISO_JPEG) :])
+                make = parameters_of_iso(iso[len(_ISO_JPEG) :])
             elif "hdrgm:" in xmp:
-                make = _of_xmp(xmp)
+                make = parameters_of_xmp(xmp)
             elif "HDRGainMap" in xmp:
-                make = _of_apple(xmp, exif)
+                make = parameters_of_apple(xmp, exif)
             else:
                 continue
             profile = second.info.get("icc_profile")
@@ -207,14 +212,14 @@ def _of_items(path: Path) -> GainMap | None:
     inputs = {number: to for kind, number, to in items.references if kind == "dimg"}
     for number, item in items.items.items():
         if item.kind == "tmap" and len(to := inputs.get(number, ())) >= 2 and to[0] == items.primary:
-            make = _of_iso(item_bytes(path, item)[1:])
+            make = parameters_of_iso(item_bytes(path, item)[1:])
             alternate = encoding_of_boxes([data for name, data in item.properties if name == "colr"])
             return _gain_map_of(make, _item_pixels(path, items, to[1], photo), _between(own, alternate))
     for number, item in items.items.items():
         kinds = [data[4:].split(b"\0")[0].decode("latin-1") for name, data in item.properties if name == "auxC"]
         if _APPLE_AUX in kinds:
             xmp = "".join(_text(item_bytes(path, items.items[n])) for n in _described_by(items, number))
-            return _gain_map_of(_of_apple(xmp, exif), _item_pixels(path, items, number, photo))
+            return _gain_map_of(parameters_of_apple(xmp, exif), _item_pixels(path, items, number, photo))
     return None
 
 
@@ -266,21 +271,6 @@ def _text(data: Any) -> str:
     return data.decode("utf-8", "replace") if isinstance(data, bytes) else str(data)
 
 
-@dataclass(frozen=True)
-class _Parameters:
-    """Parameters that metadata state: lists of 1 or 3 numbers, by the names of GainMap; apple_headroom is linear."""
-
-    minimum: tuple[float, ...] = (0.0,)
-    maximum: tuple[float, ...] = (1.0,)
-    gamma: tuple[float, ...] = (1.0,)
-    base_offset: tuple[float, ...] = (1 / 64,)
-    alternate_offset: tuple[float, ...] = (1 / 64,)
-    headroom: float = 1.0
-    base_is_hdr: bool = False
-    in_alternate_colors: bool = False
-    apple_headroom: float | None = None
-
-
 def _between(own: ColorEncoding | None, alternate: ColorEncoding | None) -> np.ndarray | None:
     """Return [3, 3] from the primaries of a photo to those of its alternate rendition; None if they do not differ.
 
@@ -293,7 +283,9 @@ def _between(own: ColorEncoding | None, alternate: ColorEncoding | None) -> np.n
     return None if np.allclose(matrix, np.eye(3), atol=1e-3) else matrix
 
 
-def _gain_map_of(parameters: _Parameters, encoded: np.ndarray, between: np.ndarray | None = None) -> GainMap | None:
+def _gain_map_of(
+    parameters: GainMapParameters, encoded: np.ndarray, between: np.ndarray | None = None
+) -> GainMap | None:
     """Return the gain map of parameters and pixels; None if the photo itself is the HDR rendition.
 
     `between` leads from the photo's primaries to those of the alternate rendition, where the metadata may apply gains.
@@ -306,7 +298,7 @@ def _gain_map_of(parameters: _Parameters, encoded: np.ndarray, between: np.ndarr
         linear = np.where(encoded <= 0.08145, encoded / 4.5, ((encoded + 0.099) / 1.099) ** (1 / 0.45))
         stops = math.log2(parameters.apple_headroom)
         encoded = (np.log2(1 + (parameters.apple_headroom - 1) * linear) / stops).astype(np.float32)
-        parameters = _Parameters(maximum=(stops,), base_offset=(0.0,), alternate_offset=(0.0,), headroom=stops)
+        parameters = GainMapParameters(maximum=(stops,), base_offset=(0.0,), alternate_offset=(0.0,), headroom=stops)
     names = ("minimum", "maximum", "gamma", "base_offset", "alternate_offset")
     numbers = {name: np.resize(np.array(getattr(parameters, name), np.float64), 3) for name in names}
     if not all(np.isfinite(values).all() for values in numbers.values()):
@@ -314,107 +306,9 @@ def _gain_map_of(parameters: _Parameters, encoded: np.ndarray, between: np.ndarr
     if not ((numbers["gamma"] > 0.01) & (numbers["gamma"] < 100)).all():
         raise ValueError(f"gamma {numbers['gamma'].tolist()}")
     low, high = numbers["minimum"], numbers["maximum"]
-    if not (low.min() >= -_MOST_STOPS and (low <= high).all() and high.max() <= _MOST_STOPS):
+    if not (low.min() >= -MOST_STOPS and (low <= high).all() and high.max() <= MOST_STOPS):
         raise ValueError(f"gains from {low.tolist()} to {high.tolist()} stops")
     if not max(np.abs(numbers["base_offset"]).max(), np.abs(numbers["alternate_offset"]).max()) <= 1:
         raise ValueError("offsets above the light of white")
     to_alternate = between if parameters.in_alternate_colors else None
     return GainMap(encoded=encoded, headroom=float(high.max()), to_alternate=to_alternate, **numbers)
-
-
-def _of_xmp(xmp: str) -> _Parameters:
-    """Return the parameters of Ultra HDR's XMP (hdrgm 1.0)."""
-
-    def values(name: str) -> list[str]:
-        return _xmp_values(xmp, f"hdrgm:{name}")
-
-    def numbers(name: str, default: float) -> tuple[float, ...]:
-        floats = tuple(float(value) for value in values(name))
-        return floats if len(floats) in (1, 3) else (default,)
-
-    return _Parameters(
-        minimum=numbers("GainMapMin", 0.0),
-        maximum=numbers("GainMapMax", 1.0),
-        gamma=numbers("Gamma", 1.0),
-        base_offset=numbers("OffsetSDR", 1 / 64),
-        alternate_offset=numbers("OffsetHDR", 1 / 64),
-        headroom=numbers("HDRCapacityMax", 1.0)[0],
-        base_is_hdr=[value.lower() for value in values("BaseRenditionIsHDR")[:1]] == ["true"],
-    )
-
-
-def _xmp_values(xmp: str, name: str) -> list[str]:
-    """Return what an XMP element or attribute such as `hdrgm:Gamma` states: one value, or those of its sequence.
-
-    Takes time in proportion to the length of `xmp`, whatever it holds.
-    """
-    if start := re.search(rf"<{name}(?:\s[^<>]*)?(?<!/)>", xmp):
-        body, closed, _ = xmp[start.end() :].partition(f"</{name}>")
-        if closed:
-            return re.findall(r"<rdf:li[^<>]*>([^<]*)</rdf:li>", body) or [body.strip()]
-    return re.findall(rf"""\b{name}\s*=\s*["']([^"']*)["']""", xmp)[-1:]
-
-
-def _of_iso(data: bytes) -> _Parameters:
-    """Return the parameters of ISO 21496-1's binary metadata, from the minimum version on.
-
-    libultrahdr's variant with one denominator for all numbers (flag 8) is read, too. Raises struct.error or ValueError.
-    """
-    least, _, flags = struct.unpack_from(">HHB", data)
-    if least > 0:
-        raise ValueError(f"metadata of version {least}")
-    channels, at = (3 if flags & 0x80 else 1), 5
-    common = struct.unpack_from(">I", data, at)[0] if flags & 8 else None
-    at += 4 if common is not None else 0
-
-    def take(signed: bool) -> float:
-        nonlocal at
-        (numerator,) = struct.unpack_from(">i" if signed else ">I", data, at)
-        at += 4
-        denominator = common
-        if denominator is None:
-            (denominator,) = struct.unpack_from(">I", data, at)
-            at += 4
-        if not denominator:
-            raise ValueError("a fraction with denominator 0")
-        return numerator / denominator
-
-    base, alternate = take(False), take(False)
-    rows = [(take(True), take(True), take(False), take(True), take(True)) for _ in range(channels)]
-    minimum, maximum, gamma, base_offset, alternate_offset = zip(*rows, strict=True)
-    colors, is_hdr = not flags & 0x40, base > alternate
-    return _Parameters(minimum, maximum, gamma, base_offset, alternate_offset, alternate, is_hdr, colors)
-
-
-def _of_apple(xmp: str, exif: Any) -> _Parameters:
-    """Return the headroom of Apple's gain map: from XMP, else from the maker note, by Apple's published formula.
-
-    Raises ValueError if neither states it.
-    """
-    if headroom_text := _xmp_values(xmp, "HDRGainMap:HDRGainMapHeadroom"):
-        headroom = float(headroom_text[0])
-    else:
-        note = _apple_note(exif.get_ifd(0x8769).get(0x927C, b""))
-        if 33 not in note or 48 not in note:
-            raise ValueError("neither XMP nor maker note states its headroom")
-        bright, gain = note[33], note[48]
-        if bright < 1:
-            stops = -20 * gain + 1.8 if gain <= 0.01 else -0.101 * gain + 1.601
-        else:
-            stops = -70 * gain + 3.0 if gain <= 0.01 else -0.303 * gain + 2.303
-        headroom = 2.0 ** max(stops, 0.0)
-    if not 1 < headroom <= 2**_MOST_STOPS:
-        raise ValueError(f"headroom {headroom:g}")
-    return _Parameters(apple_headroom=headroom)
-
-
-def _apple_note(note: Any) -> dict[int, float]:
-    """Return the fractions of Apple's maker note by tag: a TIFF directory, big-endian, after 14 bytes."""
-    if not isinstance(note, bytes) or not note.startswith(b"Apple iOS\0"):
-        return {}
-    table = TiffImagePlugin.ImageFileDirectory_v2(b"MM\0*\0\0\0\x0e")
-    # Places in the note count from its beginning.
-    file = io.BytesIO(note)
-    file.seek(14)
-    table.load(file)
-    return {tag: float(table[tag]) for tag in (33, 48) if tag in table}
