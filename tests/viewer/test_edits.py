@@ -226,6 +226,8 @@ def test_undo_goes_back_one_edit_at_a_time(server):
         page.select_option("#shape", "box")
         edit("#cut", 1, "--cut box:")
         edit("#floaters", 1, "--min-views 2")
+        page.click("#floaters")  # Again, and the next click does not wait for it.
+        edit("#undo", 1, "--min-views 2")
         edit("#undo", 1, "--cut box:")
         edit("#undo", 2, "all of it is shown")
         assert page.locator("#undo").is_disabled()

@@ -448,22 +448,27 @@ function region({shape, points}) {
   const values = shape === "box" ? [...a.map(x => x - half), ...a.map(x => x + half)] : [...a, Math.hypot(...offsets)];
   return `${shape}:${values.map(x => x.toPrecision(5)).join(",")}`;
 }
+let editing = Promise.resolve();  // One edit after the other: a refused one takes back its own
+const queued = change => { editing = editing.then(change); };
 async function leaveOut(part) {
   state.regions.push({...state.regions.at(-1), ...part});
   if (await edit()) return;
   state.regions.pop();  // As where nothing would be left
   fader();
 }
-for (const name of ["crop", "cut"]) $(name).addEventListener("click", () => leaveOut({[name]: {shape: $("shape").value, points: [...state.points]}}));
-$("floaters").addEventListener("click", () => leaveOut({min_views: 2}));
-$("unmasked").addEventListener("click", () => leaveOut({mask_only: true}));
-$("faint").addEventListener("change", () => leaveOut({min_opacity: Number($("faint").value)}));
+for (const name of ["crop", "cut"]) $(name).addEventListener("click", () => {
+  const drawn = {shape: $("shape").value, points: [...state.points]};
+  queued(() => leaveOut({[name]: drawn}));
+});
+$("floaters").addEventListener("click", () => queued(() => leaveOut({min_views: 2})));
+$("unmasked").addEventListener("click", () => queued(() => leaveOut({mask_only: true})));
+$("faint").addEventListener("change", () => queued(() => leaveOut({min_opacity: Number($("faint").value)})));
 const fader = () => { $("faint").value = state.regions.at(-1).min_opacity || 0; };
-$("undo").addEventListener("click", () => {
+$("undo").addEventListener("click", () => queued(() => {
   if (state.regions.length > 1) state.regions.pop();
   fader();
-  edit();
-});
+  return edit();
+}));
 function edit() {
   const edits = Object.fromEntries(Object.entries(state.regions.at(-1)).map(([name, value]) => [name, value.points ? region(value) : value]));
   const flags = Object.entries(edits).map(([name, value]) => ` --${name.replace("_", "-")}` + (value === true ? "" : ` ${value}`)).join("");
