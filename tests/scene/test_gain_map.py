@@ -5,6 +5,7 @@ import logging
 import struct
 import time
 
+import colour
 import numpy as np
 import pytest
 from PIL import Image
@@ -134,6 +135,22 @@ def test_libultrahdr_writes_what_is_read(tmp_path):
     np.testing.assert_allclose(result[inside], theirs[inside], rtol=0.05)
     assert np.abs(result / theirs - 1)[inside].mean() < 0.015
     median, high = np.percentile(np.abs(result / light - 1)[inside], [50, 90])
+    assert median < 0.015 and high < 0.035
+
+
+@pytest.mark.parametrize("gamut, space", [("BT_2100", "ITU-R BT.2020"), ("BT_709", "ITU-R BT.709")])
+def test_libultrahdr_writes_light_of_other_primaries_beside_display_p3(tmp_path, gamut, space):
+    imagecodecs = pytest.importorskip("imagecodecs")
+    light = scene() * [1.0, 0.4, 0.1]
+    pixels = np.concatenate([light, np.ones((HEIGHT, WIDTH, 1))], 2).astype(np.float16)
+    encoded_file = imagecodecs.ultrahdr_encode(pixels, level=97, gamut=getattr(imagecodecs.ULTRAHDR.CG, gamut))
+    (tmp_path / "a.jpg").write_bytes(encoded_file)
+    assert (read_gain_map(tmp_path / "a.jpg").to_alternate is not None) == (gamut == "BT_2100")
+    spaces = colour.RGB_COLOURSPACES
+    to_p3 = colour.matrix_RGB_to_RGB(spaces[space], spaces["Display P3"], None)
+    expected = np.maximum(light @ to_p3.T, 0)
+    error = np.abs(decoded(tmp_path / "a.jpg") - expected) / np.maximum(expected, 0.02)
+    median, high = np.percentile(error[4:-4, 4:-4], [50, 90])
     assert median < 0.015 and high < 0.035
 
 
