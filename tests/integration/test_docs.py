@@ -99,6 +99,7 @@ def test_flags_and_fields_on_the_pages_exist(page):
         "--master-addr",
         "--max-restarts",
         "--rdzv-backend",
+        "--rdzv-conf",
         "--rdzv-endpoint",
         "--rdzv-id",
         "--nodes",
