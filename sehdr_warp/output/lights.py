@@ -55,6 +55,7 @@ _LIGHT = """    def {kind} "{name}"
     }}"""
 _DOME = """    def DomeLight "Rest"
     {{
+        custom float sehdr:inpaintedShare = {inpainted}
         color3f inputs:color = (1, 1, 1)
         float inputs:intensity = {intensity}
         asset inputs:texture:file = @./{file}@
@@ -117,8 +118,8 @@ def write_lights(
     factor = unit or exposure_of_white(run, reference_white)
     rows = [_describe(f"light_{index}", light, transform, factor) for index, light in enumerate(lights)]
     if suffix == ".usda":
-        _write_rest(run, rest, lights, transform, unseen, overwrite)
-        text = usd_lights(rows, run.scene_name, rest.name, factor)
+        inpainted = _write_rest(run, rest, lights, transform, unseen, overwrite)
+        text = usd_lights(rows, run.scene_name, rest.name, factor, inpainted)
     else:
         relative = "relative radiance" if reference_white is None else f"white is {reference_white:g}"
         units = f"{relative if unit is None else 'cd/m^2'}, linear Rec.709"
@@ -150,12 +151,18 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
     return "\n".join(lines)
 
 
-def usd_lights(rows: Sequence[dict], scene: str, rest: str, rest_intensity: float = 1.0) -> str:
-    """Return the text of a stage of the lights that _described() gives, and a dome of a map beside the file.
+def usd_lights(rows: Sequence[dict], scene: str, rest: str, rest_intensity: float = 1.0, inpainted: float = 0.0) -> str:
+    """Return the text of a stage of lights, and a dome of a map beside the file.
 
-    `rest` is the name of the map's file, rest_intensity the factor of its values.
+    Args:
+        rows: Lights as _describe() returns them.
+        scene: Name of the scene.
+        rest: Name of the map's file.
+        rest_intensity: Factor of the map's values.
+        inpainted: Share, 0 to 1, of the map's light that is filled in, because no photo shows where it comes from.
     """
-    lights = [*(_usd(row) for row in rows), _DOME.format(file=rest, intensity=repr(float(rest_intensity)))]
+    dome = _DOME.format(file=rest, intensity=repr(float(rest_intensity)), inpainted=repr(float(inpainted)))
+    lights = [*(_usd(row) for row in rows), dome]
     return _STAGE.format(scene=json.dumps(scene), lights="\n".join(lights))
 
 
@@ -206,8 +213,11 @@ def _tuple(values) -> str:
 
 def _write_rest(
     run: "Run", path: Path, lights: Sequence[Any], transform: WorldTransform, unseen: str, overwrite: bool
-) -> None:
-    """Write the map of a scene's surroundings, with the lights dark; arguments as in write_lights."""
+) -> float:
+    """Write the map of a scene's surroundings, with the lights dark; arguments as in write_lights.
+
+    Returns the share of the map's light that is filled in.
+    """
     cameras = training_cameras(run)
     position, beyond = map_center(cameras)
     focal = float(np.median([np.sqrt(c.fx * c.fy) for c in cameras]))
@@ -217,16 +227,19 @@ def _write_rest(
     options = {"focal": focal, "beyond": beyond}
     # Dark lights are not the light around them.
     source = np.where(_shows_lights(run, members, position, transform.rotation, **options), 0, rest.alpha)
+    inpainted = 0.0
     if unseen == "inpaint" and (source > COVERED).any():
         added = (1 - rest.alpha[..., None]) * inpainted_light(hdr, source, directions, weight)
-        dark, total = (float((light.mean(2) * weight).sum()) for light in (added, hdr + added))
+        filled, total = (float((light.mean(2) * weight).sum()) for light in (added, hdr + added))
+        inpainted = filled / max(total, 1e-30)
         share = 100 * float((weight * (1 - rest.alpha)).sum() / weight.sum())
         text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"
-        log.info(text, path.name, share, 100 * dark / max(total, 1e-30))
+        log.info(text, path.name, share, 100 * inpainted)
         hdr = hdr + added
     header = exr_header("rec709", 1.0, provenance=provenance(run), white_luminance=luminance_of_one(run))
     header["envmap"] = envmap("latlong")
     write_exr(path, rgb_channels(hdr) | {"A": rest.alpha}, header=header, overwrite=overwrite)
+    return inpainted
 
 
 def _shows_lights(

@@ -1,6 +1,7 @@
 """Files of lights: what they hold, read by OpenUSD, and that they light as the scene does."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -92,8 +93,11 @@ def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, 
     channels, _ = read_exr_channels(tmp_path / "lights_rest.exr")
     filled, alpha = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
     assert "no photo shows 94 % of all directions" in logged[0]
+    share = float(re.search(r"sehdr:inpaintedShare = (\S+)", (tmp_path / "lights.usda").read_text())[1])
+    assert f"{100 * share:.0f} % of the map's light" in logged[0] and share > 0.5
     write_lights(run, tmp_path / "dark.usda", axes="scene", unseen="black")
     dark = read_hdr(tmp_path / "dark_rest.exr")
+    assert "sehdr:inpaintedShare = 0.0" in (tmp_path / "dark.usda").read_text()
     unseen, visible = alpha == 0, alpha > 0.98
     assert not dark[unseen].any() and filled[visible] == pytest.approx(dark[visible], rel=0.05, abs=0.2)
     # The three lamps that are lights are dark in the map, and do not darken what is filled in around them.
