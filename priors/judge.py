@@ -1,6 +1,7 @@
 """Compare the prior for clipped light on panoramas with white, a constant and a ridge regression.
 
-`python -m priors.judge PACK WEIGHTS --out FIGURES.json` judges weights of `priors.train --judge` again.
+`python -m priors.judge PACK WEIGHTS --out FIGURES.json` judges weights of `priors.train --judge` again. With `--folder`
+it judges any weights on the panoramas of a folder, such as those that sources.toml lists as `checked`.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from torch import Tensor
 from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import STOPS, LightNetwork, network_input
 
-from .panoramas import Pack, read_pack
+from .panoramas import Pack, pack_of_folder, read_pack
 from .photos import Camera, Photos
 
 PHOTOS, BATCH, SIZE = 384, 32, 96
@@ -26,6 +27,7 @@ SETS = {
     "bright lamps": {"stretch_share": 1.0},
     "lights put in": {"light_share": 1.0},
     "overexposed": {"overexposed_share": 1.0},
+    "pages": {"page_share": 1.0},
 }
 """Names of the sets of photos, and what is in them beside what the panoramas hold."""
 AREAS = (30, 300, 3000, 3 * SIZE**2)  # Most clipped values of a photo in a row of energies
@@ -33,24 +35,34 @@ MU = 5000.0
 
 
 def judge(
-    network: LightNetwork, scale: float, pack: Pack, unseen: np.ndarray, chosen: np.ndarray, *, seed: int, device: str
+    network: LightNetwork,
+    scale: float,
+    pack: Pack,
+    unseen: np.ndarray,
+    chosen: np.ndarray,
+    *,
+    seed: int,
+    device: str,
+    learned: Pack | None = None,
 ) -> dict:
     """Return figures of each estimate on photos of unseen panoramas.
 
     Photos are plain (sRGB, no noise), by cameras, by cameras with lamps brighter than in the panoramas, with lamps,
-    windows and screens put in, and overexposed.
+    windows and screens put in, overexposed, and with a white surface put in that is no lamp.
+
+    The panoramas `chosen`, of the pack `learned` if it is another one, are those that constant and ridge are fitted on.
 
     For each estimate: rms (stops, all clipped values alike), level (spread of the mean error of photos, stops), light
     (median over photos of |log2| of total clipped light over the truth), psnr and worst (mu-law dB over whole photos,
     mean and mean of the worst 5 %). For the network also calibration: the share within one deviation, and by deviation;
     energy: expected over true light of all photos together, by the number of values that a photo clips (AREAS).
     """
-    learned = _collect(network, pack, chosen, seed + 100, device, plain=True)
+    examples = _collect(network, learned or pack, chosen, seed + 100, device, plain=True)
     result = {}
     for name, shares in SETS.items():
         photos = _collect(network, pack, unseen, seed, device, plain=name == "plain", **shares)
-        constant = float(np.mean(list(learned["level"])))
-        ridge = _ridge(learned["cues"], learned["level"])
+        constant = float(np.mean(list(examples["level"])))
+        ridge = _ridge(examples["cues"], examples["level"])
         guesses = {
             "white": [np.zeros_like(t) for t in photos["truth"]],
             "constant": [np.full_like(t, constant) for t in photos["truth"]],
@@ -90,11 +102,18 @@ def main() -> None:
     parser.add_argument("pack", type=Path)
     parser.add_argument("weights", type=Path)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--folder", type=Path, help="judge on the .hdr and .exr panoramas of a folder instead")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     args = parser.parse_args()
     pack, prior = read_pack(args.pack), load_prior(args.device, args.weights)
     unseen, chosen = np.flatnonzero(pack.held_out), np.flatnonzero(~pack.held_out)
-    figures = judge(prior.network, prior.deviation_scale, pack, unseen, chosen, seed=2, device=args.device)
+    learned = pack
+    if args.folder:
+        pack = pack_of_folder(args.folder, pack)
+        unseen = np.arange(len(pack.panoramas))
+    figures = judge(
+        prior.network, prior.deviation_scale, pack, unseen, chosen, seed=2, device=args.device, learned=learned
+    )
     args.out.write_text(json.dumps(figures))
 
 
@@ -110,10 +129,11 @@ def _collect(
     stretch_share: float = 0.0,
     light_share: float = 0.0,
     overexposed_share: float = 0.0,
+    page_share: float = 0.0,
 ) -> dict:
     """Return lists over photos: truth, mean and deviation of clipped values, cues, and what else figures need."""
     shares = {"stretch_share": stretch_share, "light_share": light_share, "overexposed_share": overexposed_share}
-    camera = Camera(pack, device, chosen, rooms=False, seed=seed, **shares)
+    camera = Camera(pack, device, chosen, rooms=False, seed=seed, page_share=page_share, **shares)
     pixels: dict = {name: [] for name in ("truth", "mean", "deviation", "cues", "level", "clipped", "exposure")}
     for _ in range(PHOTOS // BATCH):
         photos = camera.take(BATCH, SIZE, plain=plain)

@@ -5,7 +5,7 @@ The pack holds radiance as RGBE (a mantissa of 8 bits for each channel, a shared
 
 import tomllib
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +83,15 @@ def read_pack(path: Path) -> Pack:
     with np.load(path) as arrays:
         panoramas, rooms = from_rgbe(arrays["panoramas"]), from_rgbe(arrays["rooms"])
         return Pack(panoramas, arrays["held_out"], arrays["names"].tolist(), rooms, arrays["curves"])
+
+
+def pack_of_folder(folder: Path, pack: Pack) -> Pack:
+    """Return a pack of the panoramas of a folder, .hdr and .exr, as a packed file would hold them, with pack's rest."""
+    from sehdr_warp.scene.hdr_files import read_hdr
+
+    files = sorted(file for file in folder.iterdir() if file.suffix in (".hdr", ".exr"))
+    panoramas = np.stack([from_rgbe(to_rgbe(half_size(read_hdr(file), WIDTH))) for file in files])
+    return replace(pack, panoramas=panoramas, held_out=np.ones(len(files), bool), names=[file.stem for file in files])
 
 
 def write_pack(path: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -12,7 +12,7 @@ from .panoramas import Pack
 
 SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
 MOST_CLIPPED, LEAST_CLIPPED = 0.35, 5e-4  # Shares of the pixels of a photo that is not overexposed
-OVEREXPOSED_SHARE, OVEREXPOSED = 0.3, (0.1, 0.95)  # Share of the photos, and the shares of their pixels that clip
+OVEREXPOSED_SHARE, OVEREXPOSED = 0.2, (0.1, 0.95)  # Share of the photos, and the shares of their pixels that clip
 ROOM_SHARE = 0.35  # Of the photos of a training
 STRETCH_SHARE, MOST_STRETCH = 0.5, 2.2
 """Share of photos whose small lights are raised to a random power, and the largest power. Panoramas of 512 columns
@@ -21,13 +21,20 @@ LIGHT_WINDOW, MOST_LIGHT = 4, 0.004
 """A light is small where at most a share MOST_LIGHT of the photo is above white within a square of 1 / LIGHT_WINDOW of
 its width around it. At twice the share nothing is raised: a window or a sky is as bright in a panorama as it is. A
 pixel of such a panorama is 0.7 degrees wide, and 3 x 3 of them cover up to 0.36 % of a photo."""
-LIGHT_SHARE, MOST_LIGHTS = 0.4, 3  # Share of the photos that lights are put into, and the largest number of lights
+LIGHT_SHARE, OVEREXPOSED_LIGHT_SHARE = 0.05, 0.4
+"""Shares of the usual and of the overexposed photos that lights are put into. Lights at random places are not as
+frequent and as bright as those of panoramas, so they teach usual photos wrong expectations; overexposed photos of
+panoramas alone show too few lamps within what they light."""
+MOST_LIGHTS = 3  # Largest number of lights put in
 LAMP_RADII, LAMP_STOPS = (0.003, 0.06), (2.0, 11.0)
 """Radii of round lamps over the photo's width, and stops of their light over the photo's median."""
 PANEL_SIZES, PANEL_STOPS = (0.04, 0.5), (1.0, 8.0)
 """Half sides of windows and screens over the photo's width, and stops of their mean light over the photo's median."""
 HEIGHTS = (1.5, 40.0)  # Distances of lights from the surface behind them, over their radii
-PAGE_SHARE = 0.2  # Of the photos, those with a white surface that is no lamp
+PAGE_SHARE, PAGE_LIGHT = 0.25, (0.7, 2.0)  # Of the photos, those with a white surface that is no lamp; light over white
+DIM_SHARE, DIM_STOPS = 0.5, 4.0  # Share of these whose scene is darker, and by how many stops at most: it may not clip
+TEXT_SHARE, PICTURE_SHARE = 0.6, 0.25  # Shares of these surfaces that are printed with text and with a dark picture
+LINE_PITCH = (0.02, 0.14)  # Distances of lines of text over the photo's width
 PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
 LEVELS = 255
 
@@ -58,7 +65,9 @@ class Camera:
         seed: int,
         stretch_share: float = STRETCH_SHARE,
         light_share: float = LIGHT_SHARE,
+        overexposed_light_share: float = OVEREXPOSED_LIGHT_SHARE,
         overexposed_share: float = OVEREXPOSED_SHARE,
+        page_share: float = PAGE_SHARE,
     ):
         """Copy panoramas, rooms and curves to the device.
 
@@ -69,10 +78,13 @@ class Camera:
             rooms: whether rooms are photographed too.
             seed: of every random number.
             stretch_share: of the photos, unless they are plain.
-            light_share: share of the photos that lights are put into, unless they are plain.
+            light_share: share of the usual photos that lights are put into, unless they are plain.
+            overexposed_light_share: the same share of the overexposed photos.
             overexposed_share: share of the photos of which up to 95 % clip, unless they are plain.
+            page_share: share of the photos with a white surface that is no lamp, unless they are plain.
         """
-        self.stretch_share, self.light_share, self.overexposed_share = stretch_share, light_share, overexposed_share
+        self.stretch_share, self.overexposed_share, self.page_share = stretch_share, overexposed_share, page_share
+        self.light_share, self.overexposed_light_share = light_share, overexposed_light_share
         self.device, self.random = torch.device(device), np.random.default_rng(seed)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         panoramas = torch.from_numpy(pack.panoramas[chosen]).permute(0, 3, 1, 2)
@@ -137,15 +149,15 @@ class Camera:
     def _expose(self, radiance: Tensor, plain: bool) -> Photos:
         """Photograph radiance [B, 3, S, S] at random exposures."""
         count = len(radiance)
+        over = self._uniform(count, 0, 1)[:, 0, 0, 0] < self.overexposed_share
         if not plain:
-            radiance = self._with_lights(radiance) * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
+            radiance = self._with_lights(radiance, over) * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
         brightest = radiance.amax(1).flatten(1)
         # Half of the photos choose white by the share that clips, half by a distance from the middle grey.
         share = 2.0 ** self._uniform(count, math.log2(LEAST_CLIPPED), math.log2(MOST_CLIPPED))[:, 0, 0, 0]
         if plain:
             share = torch.from_numpy(self.random.choice(PLAIN_SHARES, count)).to(share)
         else:
-            over = self._uniform(count, 0, 1)[:, 0, 0, 0] < self.overexposed_share
             share = torch.where(over, self._uniform(count, *OVEREXPOSED)[:, 0, 0, 0], share)
         ranks = ((1 - share) * (brightest.shape[1] - 1)).long()
         by_share = brightest.sort(1).values.gather(1, ranks[:, None])
@@ -185,15 +197,18 @@ class Camera:
         power = 1 + (power - 1) * _smallness(brightest > 1)
         return exposure * brightest.clamp_min(1) ** (power - 1)
 
-    def _with_lights(self, radiance: Tensor) -> Tensor:
+    def _with_lights(self, radiance: Tensor, over: Tensor) -> Tensor:
         """Return radiance [B, 3, S, S], some with round lamps, windows and screens that light what is around them.
+
+        Photos that will be overexposed, where `over` [B] is set, have them by a share of their own.
 
         A surface at a distance h behind a light of radiance L and radius r receives L pi r^2 h / (d^2 + h^2)^1.5 at a
         distance d from its foot. The surface reflects it as it reflects the photo's mean radiance.
         """
         count, size = len(radiance), radiance.shape[-1]
         steps = (torch.arange(size, device=self.device) + 0.5) / size
-        has_lights = self._uniform(count, 0, 1) < self.light_share
+        light_share = torch.where(over, self.overexposed_light_share, self.light_share)[:, None, None, None]
+        has_lights = self._uniform(count, 0, 1) < light_share
         median = radiance.amax(1).flatten(1).median(1).values.clamp_min(1e-6)[:, None, None, None]
         ambient = radiance.mean((1, 2, 3), keepdim=True).clamp_min(1e-6)
         panel = self._uniform(count, 0, 1) < 0.5
@@ -255,16 +270,49 @@ class Camera:
         turn = self._uniform(count, 0, math.pi)[:, 0]
         u, v = turn.cos() * across + turn.sin() * down, turn.cos() * down - turn.sin() * across
         half_width, half_height = (2.0 ** self._uniform(count, -4.5, 1)[:, 0] for _ in range(2))
-        used = self._uniform(count, 0, 1)[:, 0] < PAGE_SHARE
+        used = self._uniform(count, 0, 1)[:, 0] < self.page_share
         inside = ((u.abs() < half_width) & (v.abs() < half_height) & used)[:, None]
         slope = self._uniform(count, -0.4, 0.4)[:, 0]
-        light = self._uniform(count, 0.7, 1.5) * torch.exp(slope * u / half_width.clamp_min(0.1))[:, None]
+        light = _log_range(self._uniform(count, 0, 1), *PAGE_LIGHT)
+        light = light * torch.exp(slope * u / half_width.clamp_min(0.1))[:, None]
         grain = torch.randn(exposure.shape, generator=self.generator, device=self.device)
         light = light * torch.exp(self._uniform(count, 0, 0.06) * grain)
-        # Lines of text, on half of them
-        lines = (torch.sin(v / half_height * self._uniform(count, 20, 90)[:, 0]) > 0.6)[:, None]
-        light = torch.where(lines & (self._uniform(count, 0, 1) < 0.5), 0.5 * light, light)
-        return torch.where(inside, light, exposure)
+        reflected = self._print_of(u, v, half_width, half_height)[:, None]
+        dim = torch.where(self._uniform(count, 0, 1) < DIM_SHARE, 2 ** self._uniform(count, -DIM_STOPS, 0), 1.0)
+        return torch.where(inside, light * reflected, torch.where(used[:, None], dim * exposure, exposure))
+
+    def _print_of(self, u: Tensor, v: Tensor, half_width: Tensor, half_height: Tensor) -> Tensor:
+        """Return what a printed surface reflects over what blank paper does, [B, S, S] in [0, 1].
+
+        Lines of words of letters of random widths, or a dark picture, within a margin; many surfaces are blank.
+
+        Args:
+            u: [B, S, S] places along the lines, from the surface's middle, over the photo's width.
+            v: the same across the lines.
+            half_width: [B, 1, 1] of the surface, along the lines.
+            half_height: the same across the lines.
+        """
+        count = len(u)
+
+        def uniform(low: float, high: float) -> Tensor:
+            return self._uniform(count, low, high)[:, 0]
+
+        def noise(column: Tensor, row: Tensor) -> Tensor:
+            return torch.frac((torch.sin(12.9898 * column + 78.233 * row + seed) * 4375.85).abs())
+
+        seed, margin = uniform(0, 100), uniform(0.75, 1)
+        printed = (u.abs() < margin * half_width) & (v.abs() < margin * half_height)
+        pitch = _log_range(uniform(0, 1), *LINE_PITCH)
+        row, column = torch.floor(v / pitch), u / (pitch * uniform(0.15, 0.6))
+        in_line = torch.remainder(v / pitch, 1) < uniform(0.35, 0.7)
+        letters = (noise(column.floor(), row) < uniform(0.4, 0.8)) & (noise((column / 6).floor(), row + 0.5) < 0.8)
+        text = in_line & letters & (uniform(0, 1) < TEXT_SHARE)
+        corner = [uniform(-1, 1) * margin * half for half in (half_width, half_height)]
+        sizes = [uniform(0.1, 0.7) * half for half in (half_width, half_height)]
+        picture = ((u - corner[0]).abs() < sizes[0]) & ((v - corner[1]).abs() < sizes[1])
+        picture = picture & (uniform(0, 1) < PICTURE_SHARE)
+        ink = _log_range(uniform(0, 1), 0.03, 0.6)
+        return torch.where(printed & (text | picture), ink, 1.0)
 
     def _jpeg(self, encoded: Tensor) -> Tensor:
         """Return a part of the photos as a JPEG of random quality leaves them, without subsampling of color."""

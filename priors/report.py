@@ -24,6 +24,7 @@ _SETS = {
     "bright lamps": "the same, small lights raised to a random power of up to 2.2",
     "lights put in": "as camera, with lamps, windows and screens put in",
     "overexposed": "as camera, 10 to 95 % of the pixels at white",
+    "pages": "as camera, with white surfaces put in that are no lamps, blank or printed",
 }
 _AREAS = {"30": "up to 30", "300": "31 to 300", "3000": "301 to 3000", "27648": "more"}
 _TEXT = """# The prior for light above white
