@@ -4,7 +4,7 @@ import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -40,6 +40,9 @@ _STAGE = """#usda 1.0
 
 def Xform "Lights"
 {{
+    custom string sehdr:units = {units}
+    custom matrix4d sehdr:worldMatrix = ( {matrix} )
+
 {lights}
 }}
 """
@@ -116,14 +119,17 @@ def write_lights(
         )
     unit = luminance_of_one(run) if reference_white is None else None
     factor = unit or exposure_of_white(run, reference_white)
+    relative = "relative radiance" if reference_white is None else f"white is {reference_white:g}"
+    units = f"{relative if unit is None else 'cd/m^2'}, linear Rec.709"
+    if unit is not None:
+        text = "%s: in cd/m^2; a value of 1 in plates is %.4g of them, and --reference-white puts all in one unit"
+        log.info(text, path.name, unit)
     rows = [_describe(f"light_{index}", light, transform, factor) for index, light in enumerate(lights)]
     if suffix == ".usda":
         inpainted = _write_rest(run, rest, lights, transform, unseen, overwrite)
-        text = usd_lights(rows, run.scene_name, rest.name, factor, inpainted)
+        text = usd_lights(rows, run.scene_name, DomeMap(rest.name, factor, inpainted), units, transform)
     else:
-        relative = "relative radiance" if reference_white is None else f"white is {reference_white:g}"
-        units = f"{relative if unit is None else 'cd/m^2'}, linear Rec.709"
-        facts = {**provenance(run), "units": units, "axes": axes}
+        facts = {**provenance(run), "units": units, "axes": axes, "world_matrix": transform.matrix.tolist()}
         text = json.dumps({**facts, "lights": rows}, indent=1)
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -151,19 +157,34 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
     return "\n".join(lines)
 
 
-def usd_lights(rows: Sequence[dict], scene: str, rest: str, rest_intensity: float = 1.0, inpainted: float = 0.0) -> str:
-    """Return the text of a stage of lights, and a dome of a map beside the file.
+class DomeMap(NamedTuple):
+    """The map of a DomeLight.
+
+    Attributes:
+        file: Name of the file, beside the stage.
+        intensity: Factor of its values.
+        inpainted: Share, 0 to 1, of its light that is filled in, because no photo shows where it comes from.
+    """
+
+    file: str
+    intensity: float
+    inpainted: float
+
+
+def usd_lights(rows: Sequence[dict], scene: str, dome: DomeMap, units: str, transform: WorldTransform) -> str:
+    """Return the text of a stage of lights and a dome.
 
     Args:
         rows: Lights as _describe() returns them.
         scene: Name of the scene.
-        rest: Name of the map's file.
-        rest_intensity: Factor of the map's values.
-        inpainted: Share, 0 to 1, of the map's light that is filled in, because no photo shows where it comes from.
+        dome: Map of everything else.
+        units: Of light, in words.
+        transform: From the scene's coordinates to those of the file.
     """
-    dome = _DOME.format(file=rest, intensity=repr(float(rest_intensity)), inpainted=repr(float(inpainted)))
-    lights = [*(_usd(row) for row in rows), dome]
-    return _STAGE.format(scene=json.dumps(scene), lights="\n".join(lights))
+    rest = _DOME.format(file=dome.file, intensity=repr(float(dome.intensity)), inpainted=repr(float(dome.inpainted)))
+    matrix = ", ".join(_tuple(row) for row in transform.matrix.T)  # USD's matrices act on row vectors.
+    lights = "\n".join([*(_usd(row) for row in rows), rest])
+    return _STAGE.format(scene=json.dumps(scene), units=json.dumps(units), matrix=matrix, lights=lights)
 
 
 def _describe(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:

@@ -67,6 +67,9 @@ def test_usd_lights_stand_and_shine_as_the_scene_s(tmp_path, run):
     # USD's rectangles emit along -Z, and no light is mirrored.
     assert np.array([0, 0, -1, 0]) @ matrix == pytest.approx([0, 0, -1, 0])
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
+    root = stage.GetDefaultPrim()
+    assert root.GetAttribute("sehdr:units").Get() == "relative radiance, linear Rec.709"
+    assert np.array(root.GetAttribute("sehdr:worldMatrix").Get()) == pytest.approx(np.eye(4))
     dome = UsdLux.DomeLight(stage.GetPrimAtPath("/Lights/Rest"))
     assert (
         dome.GetTextureFileAttr().Get().path == "./lights_rest.exr" and dome.GetTextureFormatAttr().Get() == "latlong"
