@@ -32,6 +32,7 @@ _UNDECODED = {5: "LZW", 8: "Deflate", 9: "VC-5 (GoPro GPR)", 32773: "PackBits", 
 _MOST_IFDS = 64
 _LARGEST_SCALE = 8.0  # Of DefaultScale; files state 1 or 2
 _FLOAT = 3  # SampleFormat
+_MOST_JPEG = 1 << 20  # Bytes of a JPEG picture beside six for each of its pixels
 _BIG_HEADS = b"II+\0", b"MM\0+"
 _CONVERT = "convert it with Adobe DNG Converter"
 _MAX_SIDE = 65536
@@ -247,7 +248,10 @@ def _raw_of(table: Any, first: Any) -> DngRaw:
 
 
 def _jpeg_tiles(table: Any, width: int, height: int) -> JpegTiles:
-    """Return where a lossy DNG's pictures lie. Raises ValueError for a number of them that does not fill the image."""
+    """Return where a lossy DNG's pictures lie.
+
+    Raises ValueError for a number of them that does not fill the image, or one of more bytes than its pixels need.
+    """
     tiled = _TILE_WIDTH in table
     places, lengths = (_numbers(table, tags[0] if tiled else tags[1], ()) for tags in (_PLACES, _LENGTHS))
     rows = min(int(table.get(_ROWS_PER_STRIP, height)), height)  # 2^32 - 1 stands for one strip
@@ -257,6 +261,8 @@ def _jpeg_tiles(table: Any, width: int, height: int) -> JpegTiles:
     count = -(-width // size[0]) * -(-height // size[1])
     if not len(places) == len(lengths) == count:
         raise ValueError(f"{len(places)} tiles, not {count}")
+    if max(lengths) > (most := _MOST_JPEG + 6 * size[0] * size[1]):
+        raise ValueError(f"a tile of {max(lengths):.0f} bytes, more than {most}")
     values = np.array(_numbers(table, _LINEARIZATION, 0.0), np.float32) if _LINEARIZATION in table else None
     parts = tuple((int(place), int(length)) for place, length in zip(places, lengths, strict=True))
     return JpegTiles(size, parts, values)

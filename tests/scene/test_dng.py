@@ -237,6 +237,7 @@ def test_damaged_pictures_of_lossy_files_are_named(tmp_path):
         "cannot be read as RAW": [tiles[0][:300], *tiles[1:]],
         "a JPEG picture in it is damaged .96 x": [*jpeg_tiles(codes[:, :96], (96, 40))[:1], *tiles[1:]],
         "5 tiles, not 6": tiles[:-1],
+        "a tile of 2000000 bytes, more than 1067776": [tiles[0].ljust(2_000_000, b"\0"), *tiles[1:]],
         r"its DNG tags cannot be used: tag 324 is \(\)": [],
     }
     for match, pieces in cases.items():
