@@ -103,7 +103,7 @@ def test_useless_stacks_get_one_line(tmp_path):
     moved = [np.roll(photo, 25 * number, axis=1) for number, photo in enumerate(good)]
     black = [np.zeros((64, 64, 3), np.uint8)] * 3
     for place, (photos, exposure_times, words) in enumerate((
-        (good[:1], times[:1], "no exposure stack"),
+        (good[:1], times[:1], "not an exposure stack"),
         (good, (1.0, 1.0, 1.0), "same exposure time"),
         (good, times[::-1], "darker than one of shorter"),
         (moved, times, "contradict each other"),
