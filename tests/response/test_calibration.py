@@ -116,7 +116,7 @@ def test_useless_stacks_get_one_line(tmp_path):
             sw.calibrate(folder, out=tmp_path / "camera.csv")
         assert str(folder) in str(error.value) and "\n" not in str(error.value)
     assert not (tmp_path / "camera.csv").exists()
-    with pytest.raises(InputError, match="no folder of photos"):
+    with pytest.raises(InputError, match="not a folder of photos"):
         sw.calibrate(tmp_path)
     with pytest.raises(InputError, match="2 times are given"):
         sw.calibrate(folder, times=(1, 2))
