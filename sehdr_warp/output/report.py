@@ -35,7 +35,8 @@ def check_report_folder(out: Path) -> None:
     """Raise InputError for a folder of photos, for which pictures of a report would count from then on."""
     if not out.is_dir():
         return
-    pictures = (file for file in sorted(out.iterdir()) if file.suffix.lower() in (*LDR_SUFFIXES, *RAW_SUFFIXES))
+    files = (file for file in sorted(out.iterdir()) if not file.name.startswith("."))  # As what a stopped report left.
+    pictures = (file for file in files if file.suffix.lower() in (*LDR_SUFFIXES, *RAW_SUFFIXES))
     photos = list(islice((file for file in pictures if first_foreign(file) is not None), _PHOTOS))
     if len(photos) == _PHOTOS:
         raise InputError(out, f"holds photos ({photos[0].name} ...)", "name a folder for the report alone")

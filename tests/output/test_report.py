@@ -139,6 +139,12 @@ def test_pictures_keep_their_shape(caption):
     assert len(boxes) == 4 and all(box.width / box.height == pytest.approx(1.5, rel=0.02) for box in boxes)
 
 
+def test_pictures_that_a_stopped_report_left_are_not_photos(tmp_path):
+    for index in range(3):
+        Image.new("RGB", (4, 4)).save(tmp_path / f".comparison.{index}.tmp.png")
+    check_report_folder(tmp_path)
+
+
 def test_a_folder_of_photos_is_not_for_a_report(tmp_path):
     run, scene = make(tmp_path)
     photos = tmp_path / "photos"
