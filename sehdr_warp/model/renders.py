@@ -1,4 +1,4 @@
-"""What a radiance field renders: a training view, a view of the scene, its light along directions."""
+"""Results of rendering a radiance field: a training view, a view of the scene, its light along directions."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Where an environment map is rendered from, and what it leaves out."""
+"""Choose where an environment map is rendered from, and what it leaves out."""
 
 import logging
 from typing import TYPE_CHECKING, NamedTuple

@@ -1,4 +1,4 @@
-"""What metadata of gain maps state: Ultra HDR's XMP, ISO 21496-1's binary metadata, and Apple's maker note."""
+"""Read metadata of gain maps: Ultra HDR's XMP, ISO 21496-1's binary metadata, and Apple's maker note."""
 
 import io
 import re

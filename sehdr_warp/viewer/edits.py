@@ -38,8 +38,8 @@ class EditedOpacities:
             SehdrError: If nothing is left; the scene then stays as it was.
         """
         logits = run.field.gaussians.opacity_logits
-        shown = logits.detach().clone()
-        original = shown if self.original is None else self.original
+        current = logits.detach().clone()
+        original = current if self.original is None else self.original
         with torch.no_grad():
             logits.copy_(original)  # Views and masks are counted on the whole scene.
         mask = np.ones(len(original), bool)
@@ -50,7 +50,7 @@ class EditedOpacities:
                 mask = edits.mask(opacities, world_transform(run).points(means), run)
             except SehdrError:
                 with torch.no_grad():
-                    logits.copy_(shown)
+                    logits.copy_(current)
                 raise
         with torch.no_grad():
             logits[torch.from_numpy(~mask).to(logits.device)] = _HIDDEN_LOGIT

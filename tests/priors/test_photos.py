@@ -92,14 +92,14 @@ def test_overexposed_photos_clip_up_to_nearly_all(pack):
     assert shares[0].quantile(0.9) < 0.55 < shares[1].quantile(0.8) and shares[1].min() > 0.05
 
 
+def even_panorama(light, folder) -> Pack:
+    """Return a pack of one panorama of the same light everywhere."""
+    pictures = np.full((1, 64, 128, 3), light, np.float32)
+    return Pack(pictures, np.array([False]), ["a"], np.zeros((0, 1, 8, 8, 3), np.float32), curves(folder / "none.mat"))
+
+
 def test_lights_that_are_put_in_are_bright_and_light_what_is_around_them(tmp_path):
-    grey = Pack(
-        np.full((1, 64, 128, 3), 0.2, np.float32),
-        np.array([False]),
-        ["a"],
-        np.zeros((0, 1, 8, 8, 3), np.float32),
-        curves(tmp_path / "none.mat"),
-    )
+    grey = even_panorama(0.2, tmp_path)
     unlit, lit = (
         Camera(
             grey, "cpu", np.array([0]), rooms=False, seed=7, light_share=share, stretch_share=0, overexposed_share=0
@@ -115,13 +115,7 @@ def test_lights_that_are_put_in_are_bright_and_light_what_is_around_them(tmp_pat
 
 
 def test_printed_pages_are_put_in_and_are_no_lamps(tmp_path):
-    dim = Pack(
-        np.full((1, 64, 128, 3), 0.01, np.float32),
-        np.array([False]),
-        ["a"],
-        np.zeros((0, 1, 8, 8, 3), np.float32),
-        curves(tmp_path / "none.mat"),
-    )
+    dim = even_panorama(0.01, tmp_path)
     shares = {"stretch_share": 0, "light_share": 0, "overexposed_share": 0}
     blank, printed = (
         Camera(dim, "cpu", np.array([0]), rooms=False, seed=2, page_share=share, **shares).take(200, 64)

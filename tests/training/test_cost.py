@@ -64,7 +64,7 @@ def test_memory_is_as_measured():
 
 
 def test_blocks_take_as_long_and_as_much_memory_as_measured():
-    """Of a town of 400 photos of 560 x 420 pixels; its memory was not used for the fit."""
+    """Predict a block of a town of 400 photos of 560 x 420 pixels; its memory was not used for the fit."""
     for row in rows("blocks"):
         if row["what"].startswith("block_") and row.get("steps"):
             cost = training_cost(Workload(row["photos"], 560 * 420, row["gaussians"], row["steps"]))

@@ -72,13 +72,13 @@ def test_a_file_without_cameras_is_a_page_that_shows_it(run, tmp_path):
     with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
         page.wait_for_selector(FULL)
         assert (pixels(page, "#picture").max(axis=2) > 0.05).mean() > 0.1
-        seen = page.evaluate("document.getElementById('stage').seen.world_to_camera")
+        pose = page.evaluate("document.getElementById('stage').seen.world_to_camera")
         page.locator("#stage").evaluate("stage => delete stage.dataset.frame")
         page.keyboard.press("d")  # Before any click
         page.wait_for_selector(FULL)
-        assert page.evaluate("document.getElementById('stage').seen.world_to_camera") != seen
+        assert page.evaluate("document.getElementById('stage').seen.world_to_camera") != pose
         page.keyboard.press("Home")
-        page.wait_for_function("seen => JSON.stringify(stage.seen.world_to_camera) === JSON.stringify(seen)", arg=seen)
+        page.wait_for_function("pose => JSON.stringify(stage.seen.world_to_camera) === JSON.stringify(pose)", arg=pose)
         for _ in range(3):
             page.keyboard.press("[")
         assert "1.0" in page.text_content("#stopsTold")

@@ -1,4 +1,4 @@
-"""What gsplat's DefaultStrategy collects of a step, by autograd over every pixel and Gaussian (no kernel of ours)."""
+"""Compute what gsplat's DefaultStrategy collects of a step, by autograd over every pixel and Gaussian in float64."""
 
 from typing import NamedTuple
 
