@@ -4,20 +4,15 @@ import json
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from sehdr_warp import __version__, cli
-from sehdr_warp.response import response_by_name, response_names
+from sehdr_warp.response import response_names
 from sehdr_warp.runs.config_files import config_fields, flag_of, load_config, preset_names
-from sehdr_warp.runs.open import enclosing_run_response
-from sehdr_warp.scene.hdr_files import read_hdr
-from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.training.commands import _ending
 
 from .refusals import call
@@ -177,19 +172,6 @@ def test_wrong_usage_is_one_line_with_the_nearest_right_word(line, message, caps
     assert error.count("\n") == 1
 
 
-def test_training_leaves_a_run_that_says_how_it_was_made(run):
-    config = json.loads((run / "config.json").read_text())
-    assert (config["seed"], config["schedule"]["iterations"], config["response"]["name"]) == (3, 30, "hdr-nerf")
-    assert json.loads((run / "run.json").read_text())["data"] == {
-        "path": "embedded",
-        "exposure_index": None,
-        "max_size": 48,
-        "holdout": None,
-    }
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert lines[-1]["iteration"] == 30 and {"seconds", "psnr_ldr", "psnr_mu", "gaussians", "split"} <= lines[-1].keys()
-
-
 def test_existing_run_is_refused_and_resume_continues(run, capsys):
     arguments = ("train", "embedded", "--out", run, "--device", "cpu")
     assert call(*arguments) == 1
@@ -298,13 +280,6 @@ def test_config_prints_what_train_takes(run, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == json.loads((run / "config.json").read_text())
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shells_can_complete(shell, capsys):
-    assert call("completion", shell) == 0
-    text = capsys.readouterr().out
-    assert all(word in text for word in ("sehdr-warp", "render", "ssim-weight", "quiet", "verbose", "debug"))
-
-
 def test_debug_shows_where_an_error_comes_from(tmp_path, capsys):
     assert call("eval", tmp_path / "nowhere", "--debug") == 1
     assert "Traceback" in capsys.readouterr().err
@@ -334,96 +309,3 @@ def test_an_interrupt_while_modules_load_is_130(tmp_path):
     command = [sys.executable, "-m", "sehdr_warp", "presets"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert (ended.returncode, ended.stderr) == (130, "sehdr-warp: interrupted\n")
-
-
-def test_render_writes_hdr_previews_and_brackets(run, tmp_path, capsys):
-    out = tmp_path / "renders"
-    assert call("render", run, "--out", out, "--evs=-2,0,2", "--device", "cpu", "--json") == 0
-    files = json.loads(capsys.readouterr().out)["files"]
-    assert files and all((tmp_path / name).exists() for name in files)
-    views = sorted(path.stem for path in (out / "hdr").glob("*.exr"))
-    assert views and views == sorted(path.stem for path in (out / "preview").glob("*.png"))
-    assert len(json.loads((out / "brackets.json").read_text())["views"]) == len(views)
-    assert call("render", run, "--out", out, "--device", "cpu") == 1, "nothing is replaced without --overwrite"
-
-
-@pytest.mark.parametrize("kind, tolerance", [("png", 0.005), ("png16", 1e-4)])
-def test_simulated_photos_merge_back_to_the_rendered_radiance(run, tmp_path, kind, tolerance, capsys):
-    """From a trained run to photos and, by Debevec and Malik 1997, Eq. 6, back to its HDR views: RMS error."""
-    out = tmp_path / "renders"
-    evs = ",".join(str(ev) for ev in range(-8, 9, 2))
-    flags = ("--device", "cpu", "--pixel", "float", "--ldr-brackets", kind)
-    assert call("render", run, "--out", out, f"--evs={evs}", *flags) == 0
-    manifest = json.loads((out / "brackets.json").read_text())
-    decode = response_by_name(manifest["response"]).decode
-    for view in manifest["views"]:
-        total = weights = 0.0
-        for exposure in view["exposures"]:
-            photo = read_ldr(out / exposure["ldr_file"])
-            value = photo.pixels / photo.levels
-            weight = np.where((value > 0.02) & (value < 0.98), np.minimum(value, 1 - value), 0)
-            total += weight * np.log(np.maximum(decode(value), 1e-12) / exposure["exposure_time"])
-            weights += weight
-        radiance = read_hdr(out / "hdr" / f"{view['view']}.exr")
-        weighted = weights > 0
-        assert weighted[radiance > 1e-3].mean() > 0.99
-        error = np.exp(total[weighted] / weights[weighted]) / radiance[weighted] - 1
-        assert np.sqrt(np.mean(error**2)) < tolerance
-
-
-def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys):
-    file = tmp_path / "figures.json"
-    assert call("eval", run, "--json", file, "--device", "cpu") == 0
-    result = json.loads(file.read_text())
-    assert result["protocol"]["gt-max"]["psnr_mu"] > 10 and result["ldr"]["psnr"] > 10 and result["train_seconds"] > 0
-    assert "gt-max" in capsys.readouterr().out
-    assert call("eval", run, "--json", file, "--device", "cpu") == 1
-    capsys.readouterr()
-    assert call("eval", run, "--json", "-", "--device", "cpu") == 0
-    assert json.loads(capsys.readouterr().out)["ldr"] == result["ldr"]
-
-
-def test_score_parts_photos_into_the_regions_of_eval(run, tmp_path, capsys):
-    """They are reduced through the run's response: the pictures lie in the run, or a training would choose it."""
-
-    def shares(*words):
-        assert call(*words, "--json", "-") == 0
-        return {name: region["fraction"] for name, region in json.loads(capsys.readouterr().out)["regions"].items()}
-
-    inside, outside = shutil.copytree(run, tmp_path / "run") / "views", tmp_path / "views"
-    assert call("render", run, "--out", outside, "--device", "cpu") == 0
-    shutil.copytree(outside, inside)
-    capsys.readouterr()
-    expected, options = shares("eval", run, "--device", "cpu"), ("--truth", "embedded", "--max-size", 48)
-    assert expected == shares("eval", inside / "hdr", *options) == shares("eval", outside / "hdr", *options)
-    assert expected != shares("eval", inside / "hdr", *options, "--response", "srgb")
-    assert enclosing_run_response(outside / "hdr") is None
-    assert getattr(enclosing_run_response(inside / "hdr"), "name", None) == "hdr-nerf"
-
-
-def test_export_writes_files_that_render_and_convert(run, tmp_path, capsys):
-    file, other = tmp_path / "scene.ply", tmp_path / "scene.glb"
-    assert call("export", run, "--out", file, "--kind", "hdr", "--cameras", "--device", "cpu") == 0
-    assert file.read_bytes().startswith(b"ply\n") and str(file) in capsys.readouterr().out
-    assert call("convert", file, other, "--degree", 3, "--device", "cpu") == 0
-    assert call("render", other, "--cameras", "train", "--out", tmp_path / "views", "--device", "cpu") == 0
-    assert call("convert", file, tmp_path / "scene.splat") == 1
-    assert "holds 8 bits" in capsys.readouterr().err and not (tmp_path / "scene.splat").exists()
-
-
-def test_report_writes_pictures(run, tmp_path, capsys, coarse_figures):
-    assert call("report", run, "--out", tmp_path / "report", "--device", "cpu") == 0
-    assert len(list((tmp_path / "report").iterdir())) >= 2
-
-
-def test_libraries_are_silent_when_python_ends():
-    """OpenImageIO lists what Python still held of it, tens of lines."""
-    pytest.importorskip("OpenImageIO")
-    hold = "import ctypes, sys, OpenImageIO; "
-    hold += "ctypes.pythonapi.Py_IncRef(ctypes.py_object(OpenImageIO.TypeDesc('float'))); "
-    code = hold + "from sehdr_warp.cli import main; main(['--version'])"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ended.stdout == f"sehdr-warp {__version__}\n" and ended.stderr == ""
-    code = hold + "from sehdr_warp.quiet import silence_exit; silence_exit(); sys.exit('what the program says last')"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ended.stderr == "what the program says last\n"

@@ -113,7 +113,7 @@ HELD_BY = {
     ],
     "The caches": [
         "rasterizer/test_kernel_cache.py::test_damaged_modules_go_and_are_told_once",
-        "scene/test_video.py::test_frames_are_kept_in_the_cache",
+        "scene/test_video_frames.py::test_frames_are_kept_in_the_cache",
     ],
     "The processes of one training": ["training/test_ranks.py::test_ranks_stay_alike_and_one_can_go_on"],
     "It reads the paths": [f"{HOSTILE_PLACES}_what_commands_open"],

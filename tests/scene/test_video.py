@@ -1,6 +1,5 @@
 """Clips that the test encodes: what their streams state, and which of their frames are used."""
 
-import logging
 import resource
 import struct
 from fractions import Fraction
@@ -13,10 +12,9 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, load_scene, look_at
 from sehdr_warp.scene.images import read_ldr
-from sehdr_warp.scene.names import list_images
 from sehdr_warp.scene.video import codes, decode, is_video, open_clip
 from sehdr_warp.scene.video_color import VideoColor
-from sehdr_warp.scene.video_frames import choose_frames, frames_folder, read_video
+from sehdr_warp.scene.video_frames import choose_frames, read_video
 
 from .clips import pan, write_clip
 from .panorama_room import light, walls
@@ -148,23 +146,6 @@ def test_dolby_vision_without_another_layer_is_named(tmp_path):
     assert open_clip(tmp_path / "b.mp4").color.curve == "HLG"
 
 
-def test_the_sharpest_frame_of_each_interval_of_movement(tmp_path):
-    blur = {i for i in range(60) if i % 3}
-    write_clip(tmp_path / "a.mp4", pan(60, blur=blur), codec="libx264", pixels="yuv420p")
-    choice = choose_frames(open_clip(tmp_path / "a.mp4"))
-    # 59 steps of 4 of 128 pixels are 1.84 widths.
-    assert choice.total == 60 and choice.movement == pytest.approx(59 * 4 / 128, rel=0.05)
-    assert 20 <= len(choice.numbers) <= 24
-    assert np.mean([number % 3 == 0 for number in choice.numbers]) > 0.8
-
-
-def test_a_resting_camera_gives_no_frames(tmp_path):
-    frames = list(pan(30))
-    write_clip(tmp_path / "a.mp4", frames[:15] + [frames[15]] * 60 + frames[15:], codec="libx264", pixels="yuv420p")
-    choice = choose_frames(open_clip(tmp_path / "a.mp4"))
-    assert sum(17 <= number <= 73 for number in choice.numbers) <= 2
-
-
 @pytest.mark.parametrize("aspect, rotation, size", [("4/3", 0, (171, 96)), ("1/2", 0, (128, 192)),
                                                     ("4/3", 90, (96, 171))])  # fmt: skip
 def test_anamorphic_pixels_become_square(tmp_path, aspect, rotation, size):
@@ -175,19 +156,6 @@ def test_anamorphic_pixels_become_square(tmp_path, aspect, rotation, size):
     dataset = read_video(tmp_path / "a.mp4", tmp_path / "cache")
     assert f"its pixels are not square: frames are resampled to {size[0]} x {size[1]} square" in " ".join(dataset.notes)
     assert read_ldr(dataset.records[0].image).pixels.shape == (size[1], size[0], 3)
-
-
-def test_frames_are_kept_in_the_cache(tmp_path, caplog):
-    write_clip(tmp_path / "a.mp4", pan(30), tags=(18, 9, 9))
-    clip = open_clip(tmp_path / "a.mp4")
-    folder = frames_folder(clip, tmp_path / "cache")
-    files = list_images(folder, (".png",))
-    assert len(files) == 24 and read_ldr(files[0]).pixels.dtype == np.uint16
-    with caplog.at_level(logging.INFO, "sehdr_warp.scene"):
-        assert frames_folder(clip, tmp_path / "cache") == folder
-    assert "using the cached result" in caplog.text
-    files[0].write_bytes(b"")
-    assert frames_folder(clip, tmp_path / "cache") == folder and files[0].stat().st_size > 0
 
 
 def test_clips_that_cannot_be_used(tmp_path):
@@ -379,15 +347,6 @@ def test_a_thumbnail_in_a_stream_of_its_own_is_not_the_clip(tmp_path, thumbnail_
     assert clip.size == (128, 96) and sum(1 for _ in decode(clip)) == 8
 
 
-def test_frames_of_another_size_are_left_out(tmp_path, caplog):
-    """Recordings that were joined."""
-    large, small = bytes_of(30), [frame[:64, :96] for frame in bytes_of(10)]
-    parts = [encode(tmp_path / f"{i}.mts", [("libx264", "yuv420p", frames)]) for i, frames in enumerate([large, small])]
-    (tmp_path / "a.mts").write_bytes(b"".join(part.read_bytes() for part in parts))
-    assert choose_frames(open_clip(tmp_path / "a.mts")).total == 30
-    assert "frames of another size from frame 30 on are left out" in caplog.text
-
-
 def test_interlaced_and_tiny_clips(tmp_path):
     assert open_clip(encode(tmp_path / "a.mpg", [("mpeg2video", "yuv420p", bytes_of(4))])).interlaced
     assert not open_clip(encode(tmp_path / "b.mp4", [("libx264", "yuv420p", bytes_of(4))])).interlaced
@@ -400,3 +359,12 @@ def test_clips_of_two_lenses_are_named(tmp_path):
     (tmp_path / "a.insv").write_bytes(b"x")
     with pytest.raises(InputError, match="holds the pictures of two lenses; export it as one equirectangular MP4"):
         load_scene(tmp_path / "a.insv")
+
+
+def test_frames_of_another_size_are_left_out(tmp_path, caplog):
+    """Recordings that were joined."""
+    large, small = bytes_of(30), [frame[:64, :96] for frame in bytes_of(10)]
+    parts = [encode(tmp_path / f"{i}.mts", [("libx264", "yuv420p", frames)]) for i, frames in enumerate([large, small])]
+    (tmp_path / "a.mts").write_bytes(b"".join(part.read_bytes() for part in parts))
+    assert choose_frames(open_clip(tmp_path / "a.mts")).total == 30
+    assert "frames of another size from frame 30 on are left out" in caplog.text

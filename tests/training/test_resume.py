@@ -1,5 +1,6 @@
 """N steps equal N/2, an end without warning, resume, N/2: bit for bit on the CPU."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -9,6 +10,7 @@ import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.runs.checkpoint import Checkpoint
+from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
@@ -17,7 +19,7 @@ from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import TrainingState, load_state, state_of
 
-from .toy import VARIANTS, quick, without_truth
+from .toy import VARIANTS, quick, toy_scene, without_truth
 
 
 @pytest.mark.parametrize("variant", ["adc", "default", "paper"])
@@ -128,3 +130,44 @@ def test_a_trainer_continues_from_its_state(scene, variant):
 def _steps(trainer, count):
     for _ in range(count):
         trainer.step()
+
+
+def test_resume_refuses_another_config_or_scene(scene, tmp_path):
+    short = quick(**{"schedule.iterations": 5})
+    train(scene, tmp_path / "run", short, device="cpu")
+    with pytest.raises(InputError, match="seed = 0, but 1"):
+        train(scene, tmp_path / "run", override_config(short, {"seed": 1}), device="cpu", resume=True)
+    with pytest.raises(InputError, match="views differ"):
+        train(toy_scene(view_count=6), tmp_path / "run", short, device="cpu", resume=True)
+
+
+def test_resuming_with_the_same_config_keeps_the_planned_length(scene, tmp_path):
+    config = load_config("default", {"model.initial_density": 4.0, "mcmc.cap_density": 4.0})
+    trainer = create_trainer(scene, tmp_path / "run", config, device="cpu")
+    planned = trainer.total
+    assert planned < config.schedule.iterations
+    for _ in trainer:
+        break
+    again = create_trainer(scene, tmp_path / "run", config, device="cpu", resume=True)
+    assert again.total == planned
+    again.output.folder.unlock()
+    named = override_config(config, {"schedule.iterations": planned + 50, "plan.keep": ["schedule.iterations"]})
+    longer = create_trainer(scene, tmp_path / "run", named, device="cpu", resume=True)
+    assert longer.total == planned + 50
+    longer.output.folder.unlock()
+
+
+def test_resuming_names_other_fields_that_have_the_same_values(scene, tmp_path):
+    first = load_config("demo", {"schedule.iterations": 3, "plan.keep": ["schedule.iterations"]})
+    train(scene, tmp_path / "run", first, device="cpu")
+    again = load_config("demo", {"schedule.iterations": 5, "plan.keep": ["schedule.iterations", "seed"]})
+    assert train(scene, tmp_path / "run", again, device="cpu", resume=True).iterations == 5
+
+
+def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
+    run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 1}), device="cpu")
+    info = json.loads(run.folder.info_file.read_text())
+    run.folder.info_file.write_text(json.dumps(info | {"format": 1}))
+    for use in (load_run, lambda path: train(scene, path, device="cpu", resume=True)):
+        with pytest.raises(InputError, match="format = 1 is of sehdr-warp .* this one reads format 3; train again"):
+            use(run.path)

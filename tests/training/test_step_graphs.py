@@ -1,10 +1,18 @@
 """Room for pairs: enough for what was seen, not much more, and mended where it was not."""
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 
+from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer.training_step import check_finite
+from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.step_graphs import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
+from sehdr_warp.training.trainer import Trainer
+
+from .recorded import check_recorded_like_launched
+from .toy import VARIANTS, quick, toy_scene
 
 MANY = 10 * MIN_CAPACITY
 
@@ -70,3 +78,26 @@ def test_few_pairs_get_the_least_room(device):
     capacity = GraphCapacity(device)
     capacity.observe(1)
     assert replay(capacity, [1]) == MIN_CAPACITY
+
+
+def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, monkeypatch):
+    class BrokenRunner:
+        def on_capture_stream(self):
+            return nullcontext()
+
+        def run(self, key, function):
+            raise RuntimeError("operation not permitted when stream is capturing\nmore")
+
+    config = quick()
+    trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
+    trainer.graphs._first = BrokenRunner()
+    monkeypatch.setattr(trainer.graphs, "is_ready", lambda *_: trainer.iteration > 1)
+    trainer.step()
+    with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.use-cuda-graph=false"):
+        trainer.step()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+@pytest.mark.parametrize("variant", ["default", "adc"])
+def test_recorded_steps_train_like_launched_ones(variant):
+    check_recorded_like_launched(toy_scene(), VARIANTS[variant], 60)

@@ -1,16 +1,14 @@
 """Whole trainings of seconds: they learn, they report, they stop tidily, and they refuse what cannot work."""
 
 import dataclasses
-import json
 import sys
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.runs.config_files import load_config, override_config
+from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import codes_of
@@ -20,7 +18,6 @@ from sehdr_warp.training.run_output import evaluate_views
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 
-from .recorded import check_recorded_like_launched
 from .toy import EXPOSURE_TIME, VARIANTS, quick, toy_scene
 
 
@@ -143,15 +140,6 @@ def test_overwrite_starts_anew(scene, tmp_path):
         train(scene, tmp_path / "run", short, device="cpu")
     run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 3}), device="cpu", overwrite=True)
     assert run.iterations == 3 and [line["iteration"] for line in run.metrics()][-1] == 3
-
-
-def test_resume_refuses_another_config_or_scene(scene, tmp_path):
-    short = quick(**{"schedule.iterations": 5})
-    train(scene, tmp_path / "run", short, device="cpu")
-    with pytest.raises(InputError, match="seed = 0, but 1"):
-        train(scene, tmp_path / "run", override_config(short, {"seed": 1}), device="cpu", resume=True)
-    with pytest.raises(InputError, match="views differ"):
-        train(toy_scene(view_count=6), tmp_path / "run", short, device="cpu", resume=True)
 
 
 def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
@@ -289,29 +277,6 @@ def test_unknown_device_is_refused(scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, monkeypatch):
-    class BrokenRunner:
-        def on_capture_stream(self):
-            return nullcontext()
-
-        def run(self, key, function):
-            raise RuntimeError("operation not permitted when stream is capturing\nmore")
-
-    config = quick()
-    trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
-    trainer.graphs._first = BrokenRunner()
-    monkeypatch.setattr(trainer.graphs, "is_ready", lambda *_: trainer.iteration > 1)
-    trainer.step()
-    with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.use-cuda-graph=false"):
-        trainer.step()
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
-@pytest.mark.parametrize("variant", ["default", "adc"])
-def test_recorded_steps_train_like_launched_ones(variant):
-    check_recorded_like_launched(toy_scene(), VARIANTS[variant], 60)
-
-
 def test_tensorboard_gets_the_figures_of_the_held_out_views(scene, tmp_path, monkeypatch):
     short = quick(**{"schedule.iterations": 4})
     with monkeypatch.context() as without:
@@ -367,29 +332,6 @@ def test_the_last_score_is_that_of_the_saved_gaussians(scene, tmp_path):
     assert last[0]["psnr_ldr"] == pytest.approx(scores["psnr_ldr"], abs=1e-3)
 
 
-def test_resuming_with_the_same_config_keeps_the_planned_length(scene, tmp_path):
-    config = load_config("default", {"model.initial_density": 4.0, "mcmc.cap_density": 4.0})
-    trainer = create_trainer(scene, tmp_path / "run", config, device="cpu")
-    planned = trainer.total
-    assert planned < config.schedule.iterations
-    for _ in trainer:
-        break
-    again = create_trainer(scene, tmp_path / "run", config, device="cpu", resume=True)
-    assert again.total == planned
-    again.output.folder.unlock()
-    named = override_config(config, {"schedule.iterations": planned + 50, "plan.keep": ["schedule.iterations"]})
-    longer = create_trainer(scene, tmp_path / "run", named, device="cpu", resume=True)
-    assert longer.total == planned + 50
-    longer.output.folder.unlock()
-
-
-def test_resuming_names_other_fields_that_have_the_same_values(scene, tmp_path):
-    first = load_config("demo", {"schedule.iterations": 3, "plan.keep": ["schedule.iterations"]})
-    train(scene, tmp_path / "run", first, device="cpu")
-    again = load_config("demo", {"schedule.iterations": 5, "plan.keep": ["schedule.iterations", "seed"]})
-    assert train(scene, tmp_path / "run", again, device="cpu", resume=True).iterations == 5
-
-
 @pytest.mark.parametrize("config", ["demo", {"schedule.iterations": 3, "response.name": "srgb"}, 7])
 def test_a_config_may_be_a_name_or_fields(scene, tmp_path, config):
     if config == 7:
@@ -405,12 +347,3 @@ def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
     training.output.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
     training.train()
     assert "held-out photos scored best at iteration 2 (99.00 dB), now" in caplog.text
-
-
-def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
-    run = train(scene, tmp_path / "run", quick(**{"schedule.iterations": 1}), device="cpu")
-    info = json.loads(run.folder.info_file.read_text())
-    run.folder.info_file.write_text(json.dumps(info | {"format": 1}))
-    for use in (load_run, lambda path: train(scene, path, device="cpu", resume=True)):
-        with pytest.raises(InputError, match="format = 1 is of sehdr-warp .* this one reads format 3; train again"):
-            use(run.path)
