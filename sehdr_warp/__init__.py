@@ -24,6 +24,7 @@ _HOMES = {
     "output.environment_map": ("write_environment_map",),
     "output.film": ("write_film",),
     "output.lights": ("write_lights",),
+    "output.merged_scene": ("MergedScene", "merge_scenes"),
     "output.proxy_mesh": ("write_proxy_mesh",),
     "output.render_views": ("render_views", "select_cameras"),
     "output.report": ("write_report",),

@@ -9,6 +9,7 @@ from .output.environment_map import write_environment_map
 from .output.export import export
 from .output.film import write_film
 from .output.lights import write_lights
+from .output.merged_scene import MergedScene, merge_scenes
 from .output.proxy_mesh import write_proxy_mesh
 from .output.render_views import render_views, select_cameras
 from .output.report import write_report
@@ -32,6 +33,7 @@ __all__ = [
     "Camera",
     "Config",
     "InputError",
+    "MergedScene",
     "Plan",
     "Rendering",
     "Response",
@@ -58,6 +60,7 @@ __all__ = [
     "load_splats",
     "make_plan",
     "match_points",
+    "merge_scenes",
     "preset_names",
     "rasterize",
     "rasterize_directions",

@@ -6,14 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..errors import InputError, SehdrError
 from ..files import atomic_path, check_absent
 from ..model.baking import agreement, field_of, gaussians_of, refine
-from ..runs.run import Splats
 from ..scene import Camera
 from ..scene.exposure import shutter
 from ..splats import (
@@ -25,7 +24,6 @@ from ..splats import (
     read_gaussians,
     write_gaussians,
 )
-from ..splats.arrays import join_gaussians
 from ..subsets import every_nth
 from .camera_paths import training_cameras
 from .splat_edits import SplatEdits, most_visible, without_strays
@@ -53,7 +51,6 @@ def export(
     up: str | Sequence[float] | None = None,
     scale: float | None = None,
     edits: SplatEdits | None = None,
-    merge: Sequence[Any] = (),
     overwrite: bool = False,
 ) -> Path:
     """Write the Gaussians of a trained run; return the path.
@@ -61,7 +58,7 @@ def export(
     How well the file keeps the scene is measured on pictures and logged.
 
     Args:
-        run: From load_run, train or load_splats.
+        run: From load_run, train, load_splats or merge_scenes.
         path: The file; its suffix decides: see sehdr_warp.splats.SUFFIXES.
         kind: "ldr" for the colors of a photo, which viewers show, refined to the run's own pictures; "hdr" for
             scene-linear radiance. None: hdr for USD, else ldr.
@@ -74,7 +71,6 @@ def export(
         up: As in world_transform.
         scale: As in world_transform.
         edits: What the file leaves out; by default Gaussians too faint to be drawn.
-        merge: Further runs or files of Gaussians in the same coordinates, which the file holds as well.
         overwrite: Replace files that exist.
 
     Raises:
@@ -96,18 +92,13 @@ def export(
     time = run.base_time if exposure_time is None else float(exposure_time)
     radiance = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
     color_model = "display" if kind == "ldr" else radiance
-    most = None if edits.max_gaussians is None else max(1, edits.max_gaussians // (1 + len(merge)))
-    whole, parts = [], []
-    for scene in (run, *merge):
-        means = scene.field.gaussians.means.detach().cpu().numpy()
-        edits.check_regions(upright.points(scene.field.normalization.scene_points(means)))  # Before minutes of fitting
-        gaussians = _gaussians_in_colors(scene, color_model, time)
-        whole.append(gaussians)
-        mask = edits.mask(gaussians.opacities, upright.points(gaussians.means), scene)
-        parts.append(_select_rows(scene, gaussians, mask, most, edits, time))
-    gaussians = join_gaussians(parts)
+    means = run.field.gaussians.means.detach().cpu().numpy()
+    edits.check_regions(upright.points(run.field.normalization.scene_points(means)))  # Before minutes of fitting
+    whole = _gaussians_in_colors(run, color_model, time)
+    mask = edits.mask(whole.opacities, upright.points(whole.means), run)
+    gaussians = _select_rows(run, whole, mask, edits, time)
     file_gaussians = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
-    if isinstance(run, Splats) and run.world_matrix is not None:
+    if run.world_matrix is not None:
         file_gaussians = replace(file_gaussians, world_matrix=to_file.matrix @ run.world_matrix)
     write_gaussians(path, file_gaussians.padded(degree or 0), overwrite=overwrite)
     if cameras:
@@ -115,11 +106,10 @@ def export(
     meaning = f"display colors of {shutter(time)}" if kind == "ldr" else "scene-linear radiance"
     count, harmonics = file_gaussians.count, max(file_gaussians.degree, degree or 0)
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, count, harmonics, meaning)
-    if not merge:
-        reference = gaussians if edits.shows_part else None
-        _log_loss(run, whole[0] if edits.shows_part else gaussians, kind, time, is_part=edits.shows_part)
-        if path_is_lossy(path):
-            _log_file_loss(path, run, reference, to_file, kind, time)
+    reference = gaussians if edits.shows_part else None
+    _log_loss(run, whole if edits.shows_part else gaussians, kind, time, is_part=edits.shows_part)
+    if path_is_lossy(path):
+        _log_file_loss(path, run, reference, to_file, kind, time)
     return path
 
 
@@ -146,12 +136,11 @@ def _select_rows(
     run: "RenderableScene",
     gaussians: GaussianArrays,
     mask: np.ndarray,
-    most: int | None,
     edits: SplatEdits,
     time: float,
 ) -> GaussianArrays:
-    """Return the Gaussians of a mask without strays; the most visible ones, refined, if they are more than `most`."""
-    part = gaussians.rows(mask)
+    """Return the Gaussians of a mask without strays; the most visible ones, refined, if they are too many."""
+    part, most = gaussians.rows(mask), edits.max_gaussians
     if most is not None and part.count > most:
         subset = gaussians.rows(most_visible(mask, most, run))
         picture = _gaussians_renderer(part, time) if edits.changes_pictures else _photo_renderer(run, time)

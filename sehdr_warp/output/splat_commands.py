@@ -11,7 +11,7 @@ from ..runs.open import load_run_scene, open_run, open_scene
 from .options import WorldOptions, changed_flags
 
 if TYPE_CHECKING:
-    from ..runs.run import Run, Splats
+    from ..runs.run import RenderableScene, Run, Splats
     from .splat_edits import SplatEdits
 
 _MESH_SUFFIXES = (".obj", ".abc", ".fbx", ".stl")
@@ -126,6 +126,13 @@ def _with_masks(edits: "SplatEdits", options: EditOptions, run: "Run | Splats") 
     return replace(edits, mask_views=load_run_scene(run, options.data).views)
 
 
+def _merged(run: "Run | Splats", others: tuple[Path, ...], device: str | None) -> "RenderableScene":
+    """Return a scene with the Gaussians of other runs and files added."""
+    from .merged_scene import merge_scenes
+
+    return merge_scenes(run, *(open_scene(path, device) for path in others)) if others else run
+
+
 def run_mesh(args: Mesh) -> None:
     """Run `sehdr-warp mesh`."""
     from .proxy_mesh import check_mesh, write_proxy_mesh
@@ -145,14 +152,14 @@ def run_export(args: Export) -> None:
         from ..files import check_absent
         from .scene_page import write_scene_page
 
-        flags = [*changed_flags(args.world), *changed_flags(args.file), *["--cameras"] * args.cameras]
-        if flags or args.merge:
-            refused = ", ".join([*flags, *["--merge"] * bool(args.merge)])
+        if flags := [*changed_flags(args.world), *changed_flags(args.file), *["--cameras"] * args.cameras]:
+            refused = ", ".join(flags)
             raise UsageError(f"{refused}: without effect on a page, which has its own exposure, cameras and axes")
         check_absent(args.out, args.overwrite)
         edits = _splat_edits(args.edits)
         run = open_scene(args.run, args.device)
         edits = _with_masks(edits, args.edits, run)
+        run = _merged(run, args.merge, args.device)
         print(write_scene_page(run, args.out, edits=edits, overwrite=args.overwrite))
         return
     _export(
@@ -204,11 +211,11 @@ def _export(
     run = open_scene(source, device)
     if edits:
         splat_edits = _with_masks(splat_edits, edits, run)
-    others = [open_scene(path, device) for path in merge]
+    run = _merged(run, merge, device)
     times = () if options.exposure is None else exposure_times(run.base_time, options.exposure)
     if len(times) > 1:
         raise UsageError(f"--exposure {options.exposure}: a splat file holds the colors of one exposure; name one")
     time = times[0] if times else None
     arguments: dict[str, Any] = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
     arguments |= ({"axes": None} if world is None else vars(world)) | flags
-    print(export(run, out, edits=splat_edits, merge=others, **arguments))
+    print(export(run, out, edits=splat_edits, **arguments))

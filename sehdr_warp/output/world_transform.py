@@ -123,6 +123,7 @@ def world_transform(
     """
     if axes not in AXES:
         raise SehdrError(f"axes {axes!r} is not one of {', '.join(AXES)}")
+    run = run.reference or run
     matrix = run.world_matrix
     orientation = read_orientation(run)
     if axes == "scene":
@@ -159,6 +160,7 @@ def world_transform(
 
 def scene_up(run: "RenderableScene", up: str | Sequence[float] | None = None) -> np.ndarray:
     """Return the up direction [3] in the scene's own coordinates, as world_transform takes it; says nothing."""
+    run = run.reference or run
     direction = _known_up(run, up, read_orientation(run))
     if direction is None and run.world_matrix is None and (cameras := training_cameras(run)):
         direction = up_direction(cameras)

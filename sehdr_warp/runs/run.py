@@ -57,6 +57,7 @@ class RenderableScene:
         world_matrix: [4, 4] from the scene's own coordinates to those of its file of Gaussians, if stated; else None.
         exposure_compensation: Exposure compensation of the training photos, if there was one.
         up: Up direction that photos and poses show; None if it was not looked for.
+        reference: Scene whose upright coordinates are those of this one; None for its own.
     """
 
     path: Path
@@ -71,6 +72,7 @@ class RenderableScene:
     world_matrix: np.ndarray | None = None
     exposure_compensation: ExposureCompensation | None = None
     up: UpDirection | None = None
+    reference: "RenderableScene | None" = None
 
     @property
     def model(self) -> RadianceField:
@@ -128,6 +130,27 @@ class RenderableScene:
     def clipped_share(self) -> Tensor | None:
         """Return the fraction [N] of clipped values that show each Gaussian; None if it was not measured."""
         return None
+
+    def find_lights(self) -> list[Light]:
+        """Return the lights of the scene that the photos clipped, those that give most first.
+
+        Radiance is in linear Rec.709.
+
+        Raises:
+            SehdrError: if it was not measured what clipped.
+        """
+        clipped = self.clipped_share()
+        if clipped is None:
+            problem = "holds no record of what the photos clipped"
+            raise SehdrError(f"{self.path}: {problem}; lights are found in the folder of a run")
+        views = [(entry.camera, entry.exposure_time) for entry in self.cameras if entry.split == "train"]
+        lights = find_lights(self.field, clipped, views, degree=self.degree)
+        if self.color_matrix is None:
+            return lights
+        colors = [[light.radiance, light.lower_bound] for light in lights]
+        rec709 = self.in_rec709(torch.tensor(np.array(colors).reshape(-1, 2, 3), dtype=torch.float32)).numpy()
+        pairs = zip(lights, rec709, strict=True)
+        return [replace(light, radiance=pair[0], lower_bound=pair[1]) for light, pair in pairs]
 
     def render_clipped(self, camera: Camera) -> Tensor | None:
         """Render the fraction [H, W] of clipped values behind what a camera sees; None if it was not measured."""
@@ -233,27 +256,6 @@ class Run(RenderableScene):
             return None
         clipped = self.folder.read_clipped()
         return None if clipped is None else clipped.to(self.device)
-
-    def find_lights(self) -> list[Light]:
-        """Return the lights of the scene that the photos clipped, those that give most first.
-
-        Radiance is in linear Rec.709.
-
-        Raises:
-            SehdrError: if it was not measured what clipped.
-        """
-        clipped = self.clipped_share()
-        if clipped is None:
-            problem = "holds no record of what the photos clipped"
-            raise SehdrError(f"{self.path}: {problem}; lights are found in the folder of a run")
-        views = [(entry.camera, entry.exposure_time) for entry in self.cameras if entry.split == "train"]
-        lights = find_lights(self.field, clipped, views, degree=self.degree)
-        if self.color_matrix is None:
-            return lights
-        colors = [[light.radiance, light.lower_bound] for light in lights]
-        rec709 = self.in_rec709(torch.tensor(np.array(colors).reshape(-1, 2, 3), dtype=torch.float32)).numpy()
-        pairs = zip(lights, rec709, strict=True)
-        return [replace(light, radiance=pair[0], lower_bound=pair[1]) for light, pair in pairs]
 
     def metrics(self) -> list[dict]:
         """Return the evaluations during the training, as in metrics.jsonl."""

@@ -8,11 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..errors import SehdrError
 from ..model.lights import Light
 from ..output.camera_paths import facts_of_cameras
 from ..output.framing import opening_facts
 from ..output.light_pictures import curve_table
 from ..output.light_unit import luminance_of_one
+from ..output.merged_scene import merge_scenes
 from ..output.splat_edits import SplatEdits
 from ..output.tonemap import display_gain
 from ..output.world_transform import world_transform
@@ -38,9 +40,16 @@ class ViewerScene:
     def __init__(self, run: Any, name: str, clipped: Tensor | None = None):
         """Show a run under a name."""
         self.run, self.name, self.clipped = run, name, clipped
+        self._own = run, clipped
         self.lock, self.version = SceneLock(), 0
-        self.opacities, self.visible_count = EditedOpacities(), None
         self._opened: list[dict[str, Any]] = []
+        self._start_edits()
+
+    def _start_edits(self) -> None:
+        """Forget edits, because another scene is shown."""
+        self.opacities, self.visible_count = EditedOpacities(), None
+        self._edits: SplatEdits | None = None
+        self._merged: tuple[ViewerScene, ...] = ()
         self._start_lights()
 
     def _start_lights(self) -> None:
@@ -51,9 +60,8 @@ class ViewerScene:
     def replace(self, run: Any, clipped: Tensor | None) -> None:
         """Show another run from now on."""
         with self.lock.changing():
-            self.run, self.clipped = run, clipped
-            self.opacities, self.visible_count = EditedOpacities(), None
-            self._start_lights()
+            self.run, self.clipped = self._own = run, clipped
+            self._start_edits()
             self.version += 1
 
     def lights(self) -> list[Light]:
@@ -89,12 +97,41 @@ class ViewerScene:
         ]
         return {"lights": rows, "unit": luminance_of_one(self.run)}
 
-    def edit(self, edits: SplatEdits | None) -> None:
-        """Show what edits leave of the scene, or all of it for None; see EditedOpacities.apply."""
+    def edit(self, edits: SplatEdits | None, merged: Sequence["ViewerScene"] = ()) -> None:
+        """Show what edits leave of the scene and of scenes that are merged with it, or all of them for None.
+
+        Gains of lights end when other scenes are merged, because the lights are others.
+
+        Raises:
+            SehdrError: If nothing is left, a merged scene is this one or has edits, or merge_scenes() refuses it; what
+                is shown then stays as it was.
+        """
+        for other in merged:
+            if other is self or other.visible_count is not None:
+                problem = "is the scene that is shown" if other is self else "has edits of its own; undo these first"
+                raise SehdrError(f"{other.name}: {problem}")
         with self.lock.changing():
-            count = self.opacities.apply(self.run, edits)
-            self.visible_count = None if edits is None else count
+            before = self._edits, self._merged
+            try:
+                self._show(edits, tuple(merged))
+            except SehdrError:
+                self._show(*before)
+                raise
             self.version += 1
+
+    def _show(self, edits: SplatEdits | None, merged: tuple["ViewerScene", ...]) -> None:
+        if merged != self._merged:
+            self.opacities.apply(self.run, None)  # A merged scene is a copy, which hides nothing yet.
+            if self._stops:
+                self.light_gains.apply(self.run, [], {})
+            own, clipped = self._own
+            run = merge_scenes(own, *(other.run for other in merged)) if merged else own
+            self.run, self.clipped = run, run.clipped_share() if merged else clipped
+            self._start_edits()
+            self._merged = merged
+        count = self.opacities.apply(self.run, edits)
+        self.visible_count = None if edits is None and not merged else count
+        self._edits = edits
 
     def turned(self) -> None:
         """Tell pages that up or scale have changed."""
@@ -148,6 +185,7 @@ class ViewerScene:
             with torch.no_grad():
                 if part == "clipped":
                     with self.lock.rendering():
+                        assert shares is not None
                         frame[5].copy_(run.field.render_mean(camera, shares)).clamp_(0, _HALF_MOST)
                 elif (confidence := self.render_confidence(camera)) is not None:
                     picture[..., 3] = torch.as_tensor(confidence)
@@ -177,6 +215,7 @@ class ViewerScene:
             "scene": self.scene_name,
             "gaussians": self.gaussian_count if self.visible_count is None else self.visible_count,
             "edited": self.visible_count is not None,
+            "merged": len(self._merged),
             "iterations": self.iterations,
             "response": self.response.name,
             "base_time": self.base_time,
@@ -184,7 +223,7 @@ class ViewerScene:
             "curve": curve_table(self.response),
             "clipped": self.clipped is not None,
         }
-        return facts | facts_of_cameras(self.cameras) | own
+        return facts | facts_of_cameras((self.reference or self).cameras) | own
 
 
 def camera_of(values: dict) -> Camera:

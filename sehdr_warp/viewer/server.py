@@ -115,7 +115,8 @@ class Viewer:
             run = self._run(request)
             if path == "/edit":
                 edits = edits_of(request, partial(self._photos_of, int(request.get("run", 0))))
-                self.on_renderer(client, partial(run.edit, edits))
+                merged = [self._run({"run": index}) for index in request.get("merge", ())]
+                self.on_renderer(client, partial(run.edit, edits, merged))
             else:
                 self.on_renderer(client, partial(orient, run, request))
             run.turned()
@@ -134,9 +135,8 @@ class Viewer:
                 cameras = interpolate(cameras, min(int(request["count"]), MOST_VIEWS))
             if path == "/path":
                 return "application/json", camera_file(cameras).encode()
-            return self._save(
-                SavedRun(self.on_renderer, self._run(request), client), cameras, str(request["kind"]), request
-            )
+            saved = SavedRun(self.on_renderer, self._run(request), client)
+            return self._save(saved, cameras, str(request["kind"]), request)
         raise Refusal(404, "no such page")
 
     def close(self) -> None:

@@ -49,7 +49,7 @@ class GammaResponse:
 class AnalyticRun:
     """Stands for a trained run: a sky whose radiance depends on the viewing direction, six decades of it."""
 
-    world_matrix = up = None
+    world_matrix = up = reference = None
 
     response = GammaResponse()
     base_time, color_matrix, exposure_compensation = 0.5, None, None

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.model.visibility import mask_shares
@@ -173,13 +172,3 @@ def test_strays_come_near_or_go(tmp_path, logged):
     assert any("2 Gaussians beyond" in line and "1 faint ones left out, 1 moved" in line for line in logged)
     near = splats([(0, 0, 0), (5, 5, 5)], [0.9, 0.9])
     assert without_strays(near, cameras) is near and without_strays(original, []) is original
-
-
-def test_merged_runs_show_both(tmp_path, run):
-    other = run_of(tmp_path, splats([(-1, 0, 0)], [0.9]), "other")
-    export(run, tmp_path / "both.ply", axes="scene", merge=[other])
-    both = load_splats(tmp_path / "both.ply")
-    assert both.gaussian_count == 4
-    view = run.cameras[1].camera
-    alone = [torch.as_tensor(each.render(view).alpha) for each in (run, other)]
-    np.testing.assert_allclose(both.render(view).alpha, torch.maximum(*alone), atol=0.02)

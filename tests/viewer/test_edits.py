@@ -3,6 +3,7 @@
 import json
 import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,7 +105,7 @@ def test_the_page_flies_to_a_light_and_sets_its_gain(lamps):
     assert lamps.viewer.runs[0].describe_lights()["lights"][0]["stops"] == 3
 
 
-def edit(server, **request):
+def edit(server, **request) -> tuple[int, Any]:
     status, _, content = ask(server, "/edit", request)
     return status, json.loads(content) if status == 200 else content.decode()
 
@@ -237,3 +238,90 @@ def test_undo_goes_back_one_edit_at_a_time(server):
         until(page, "$('edited').textContent.includes('kept: 4')")
         pick((0, 0, 0), (0.5, 0, 0))
         assert page.inner_text("#distance") == "2.00 m"
+
+
+@pytest.fixture
+def two_runs(tmp_path):
+    """A viewer of two runs in the same coordinates, of two Gaussians and one."""
+    north = run_of(tmp_path, splats([(0, 0, 0), (1, 0, 0)], [0.9, 0.9]), "north")
+    south = run_of(tmp_path, splats([(-1, 0, 0)], [0.9]), "south")
+    scenes = [ViewerScene(run, f"runs/{run.scene_name}") for run in (north, south)]
+    with Server(Viewer(scenes), port=18700) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+def test_another_run_is_merged_edited_and_taken_out_again(two_runs):
+    north, south = two_runs.viewer.runs
+    view = north.cameras[1].camera
+    before, other = frame(two_runs, view)[0], south.run.render(view)
+    views = north.facts()["views"]
+    status, facts = edit(two_runs, merge=[1])
+    assert status == 200 and facts["gaussians"] == 3 and facts["edited"] and facts["merged"] == 1
+    assert facts["views"] == views, "photos stay those of the run"
+    merged, covered = frame(two_runs, view)[0], np.asarray(other.alpha) > 0.5
+    assert covered.any() and np.allclose(merged[covered][:, :3], np.asarray(other.hdr)[covered], atol=5e-3)
+    x, y, z = world_transform(north).points(np.array([-1.0, 0, 0]))
+    status, facts = edit(two_runs, merge=[1], crop=f"sphere:{x},{y},{z},0.2")
+    assert status == 200 and facts["gaussians"] == 1
+    # What is refused leaves everything as it was.
+    shown = frame(two_runs, view)[0]
+    status, words = edit(two_runs, crop="sphere:99,0,0,1")
+    assert status == 409 and "leave no Gaussian" in words and north.facts()["gaussians"] == 1
+    np.testing.assert_array_equal(frame(two_runs, view)[0], shown)
+    assert edit(two_runs)[1]["gaussians"] == 2
+    np.testing.assert_array_equal(frame(two_runs, view)[0], before)
+
+
+def test_an_edited_run_takes_in_another_as_a_whole(two_runs):
+    north, south = two_runs.viewer.runs
+    x, y, z = world_transform(north).points(np.array([1.0, 0, 0]))
+    assert edit(two_runs, cut=f"sphere:{x},{y},{z},0.2")[1]["gaussians"] == 1
+    assert edit(two_runs, merge=[1])[1]["gaussians"] == 3
+    assert (torch.sigmoid(north.field.gaussians.opacity_logits) > 0.5).all()
+    status, words = edit(two_runs, run=1, merge=[0])
+    assert status == 409 and words == "runs/north: has edits of its own; undo these first"
+    assert edit(two_runs, merge=[0])[0] == 409 and edit(two_runs, merge=[2])[0] == 404
+    assert north.facts()["gaussians"] == 3 and south.facts()["gaussians"] == 1
+
+
+def test_gains_end_where_a_run_is_merged(two_runs, tmp_path):
+    north = two_runs.viewer.runs[0]
+    run = run_of(tmp_path, replace(splats([(0, 0, 0)], [0.9]), color_model="log"), "lamp")
+    shape = LightShape("sphere", np.zeros(3), np.eye(3), (0.3, 0.3))
+    run.find_lights = lambda: [Light(shape, np.full(3, 8.0), np.ones(3), 0.75, 0.4, torch.tensor([0]))]
+    north.replace(run, torch.tensor([1.0]))
+    view = run.cameras[1].camera
+    before = frame(two_runs, view)[0]
+    assert ask(two_runs, "/gain", {"light": 0, "stops": 3})[0] == 200
+    assert edit(two_runs, merge=[1])[0] == 200 and not north.facts()["clipped"]
+    assert edit(two_runs)[0] == 200 and north.facts()["clipped"]
+    np.testing.assert_array_equal(frame(two_runs, view)[0], before)
+
+
+def test_the_page_merges_shares_and_undoes(two_runs, tmp_path):
+    with browser() as chromium, page_of(chromium, two_runs.url) as page:
+        page.wait_for_selector("#stage[data-frame=full]")
+
+        def until_told(count, words):
+            until(page, f"facts.gaussians === {count} && $('edited').textContent.includes({words!r})")
+
+        page.select_option("#merge", "1")
+        until_told(3, "part.ply --merge runs/south")
+        assert page.evaluate("$('merge').value") == "" and page.locator("#merge option:disabled").count() == 2
+        page.click("#floaters")
+        until_told(3, "--merge runs/south --min-views 2")
+        with page.expect_download() as download:
+            page.click("#share")
+        download.value.save_as(tmp_path / "both.html")
+        page.click("#undo")
+        until_told(3, "part.ply --merge runs/south")
+        page.select_option("#run", "1")  # Edits are those of a run.
+        until(page, "facts.name === 'runs/south' && !facts.edited && $('undo').disabled")
+        page.select_option("#run", "0")
+        page.click("#undo")
+        until_told(2, "all of it is shown")
+        page.select_option("#merge", "1")
+        until_told(3, "--merge")
+    assert (tmp_path / "both.html").stat().st_size > 1e6

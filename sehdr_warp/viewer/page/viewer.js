@@ -29,8 +29,9 @@ async function start() {
   runs.forEach((run, i) => {
     $("run").add(new Option(run.name, i));
     if (runs.length > 1) $("left").add(new Option(run.name, "run" + i));
+    $("merge").add(new Option(run.name, i));
   });
-  $("runRow").hidden = runs.length < 2;
+  $("runRow").hidden = $("mergeRow").hidden = runs.length < 2;
   $("edit").hidden = $("lights").hidden = $("share").hidden = told.training;
   if (told.training) startTraining();
   else setInterval(renew, 2000);
@@ -66,8 +67,9 @@ function useRun(index) {
   light.putCurve(facts.curve);
   light.settings.grey = facts.grey;
   $("overlay").querySelector("[value=clipped]").disabled = !facts.clipped;
-  if (state.run !== index) listLights(null);
-  state.run = index;
+  if (state.run !== index || state.merged !== facts.merged) listLights(null);
+  Object.assign(state, {run: index, merged: facts.merged});
+  offer();
   $("findLights").disabled = !facts.clipped;
   measured();
   expose();
@@ -384,7 +386,8 @@ function fly(now) {
 
 // Points that are picked measure lengths, set scale and up, and crop
 const upright = point => { const m = facts.upright; return m ? [0, 1, 2].map(i => dot(m[i].slice(0, 3), point) + m[i][3]) : point; };
-state.points = [], state.regions = [{}];  // The last one is shown; Undo goes back by one
+state.points = [], state.regions = {};
+const regions = () => state.regions[state.run] ||= [{}];  // Of the run; the last one is shown, and Undo goes back by one
 function pick(place) {
   const point = pointAt(place);
   if (!point) return note("nothing is there to pick");
@@ -450,28 +453,38 @@ function region({shape, points}) {
 }
 let editing = Promise.resolve();  // One edit after the other: a refused one takes back its own
 const queued = change => { editing = editing.then(change); };
-async function leaveOut(part) {
-  state.regions.push({...state.regions.at(-1), ...part});
-  if (await edit()) return;
-  state.regions.pop();  // As where nothing would be left
-  fader();
+async function put(part) {
+  regions().push({...regions().at(-1), ...part});
+  if (!await edit()) regions().pop();  // As where nothing would be left
+  offer();
 }
 for (const name of ["crop", "cut"]) $(name).addEventListener("click", () => {
   const drawn = {shape: $("shape").value, points: [...state.points]};
-  queued(() => leaveOut({[name]: drawn}));
+  queued(() => put({[name]: drawn}));
 });
-$("floaters").addEventListener("click", () => queued(() => leaveOut({min_views: 2})));
-$("unmasked").addEventListener("click", () => queued(() => leaveOut({mask_only: true})));
-$("faint").addEventListener("change", () => queued(() => leaveOut({min_opacity: Number($("faint").value)})));
-const fader = () => { $("faint").value = state.regions.at(-1).min_opacity || 0; };
+$("floaters").addEventListener("click", () => queued(() => put({min_views: 2})));
+$("unmasked").addEventListener("click", () => queued(() => put({mask_only: true})));
+$("faint").addEventListener("change", () => queued(() => put({min_opacity: Number($("faint").value)})));
+$("merge").addEventListener("change", () => {
+  const index = Number($("merge").value);
+  $("merge").value = "";
+  queued(() => put({merge: [...regions().at(-1).merge || [], index]}));
+});
+// Shows what is left to choose after an edit.
+function offer() {
+  const {min_opacity, merge} = regions().at(-1);
+  $("faint").value = min_opacity || 0;
+  [...$("merge").options].slice(1).forEach((option, i) => { option.disabled = i === state.run || (merge || []).includes(i); });
+}
 $("undo").addEventListener("click", () => queued(() => {
-  if (state.regions.length > 1) state.regions.pop();
-  fader();
+  if (regions().length > 1) regions().pop();
+  offer();
   return edit();
 }));
 function edit() {
-  const edits = Object.fromEntries(Object.entries(state.regions.at(-1)).map(([name, value]) => [name, value.points ? region(value) : value]));
-  const flags = Object.entries(edits).map(([name, value]) => ` --${name.replace("_", "-")}` + (value === true ? "" : ` ${value}`)).join("");
+  const edits = Object.fromEntries(Object.entries(regions().at(-1)).map(([name, value]) => [name, value.points ? region(value) : value]));
+  const words = value => value === true ? "" : " " + (Array.isArray(value) ? value.map(i => runs[i].name).join(" ") : value);
+  const flags = Object.entries(edits).map(([name, value]) => ` --${name.replace("_", "-")}` + words(value)).join("");
   return change("edit", edits, () => flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.name} --out part.ply${flags}` : "all of it is shown");
 }
 measured();

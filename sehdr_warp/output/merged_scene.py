@@ -1,0 +1,105 @@
+"""Several scenes of the same coordinates as one."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import SehdrError
+from ..model.baking import field_of, gaussians_of
+from ..runs.run import RenderableScene, on_device
+from ..splats import GaussianArrays
+from ..splats.arrays import join_gaussians
+from .camera_paths import training_cameras
+from .world_transform import WorldTransform
+
+
+class MergedScene(RenderableScene):
+    """The Gaussians of several scenes as one scene to render, edit and export.
+
+    Cameras are those of all scenes. Path, name, response, exposure and coordinates are those of the first one.
+    """
+
+    def __init__(self, scenes: Sequence[RenderableScene]):
+        """Join scenes; merge_scenes() says how."""
+        first = scenes[0]
+        self.reference, self.world_matrix = first, first.world_matrix
+        self.path, self.scene_name, self.response = first.path, first.scene_name, first.response
+        self.base_time = first.base_time
+        moves = [_to_coordinates_of(first, scene) for scene in scenes]
+        self.cameras = tuple(
+            replace(entry, camera=move.camera(entry.camera))
+            for scene, move in zip(scenes, moves, strict=True)
+            for entry in scene.cameras
+        )
+        field = field_of(_joined_gaussians(scenes, moves))
+        field.response, field.deterministic = first.field.response, first.field.deterministic
+        field.confidence = _joined([scene.field.confidence for scene in scenes])
+        self.field = on_device(field, first.device)
+        self.degree = self.field.gaussians.degree
+        self._clipped = _joined([scene.clipped_share() for scene in scenes])
+
+    def clipped_share(self) -> Tensor | None:
+        """Return the fraction [N] of clipped values that show each Gaussian; None if a scene does not state it."""
+        return None if self._clipped is None else self._clipped.to(self.device)
+
+
+def merge_scenes(run: RenderableScene, *others: RenderableScene) -> MergedScene:
+    """Return one scene with the Gaussians of several scenes that have the same coordinates.
+
+    A file of Gaussians that states how it was turned and scaled is turned back. Nothing is left out where scenes
+    overlap: see SplatEdits. Colors stay as they are if all scenes have the same color model, as after trainings with
+    one preset; else log radiance is fitted to them.
+
+    Args:
+        run: From load_run, train or load_splats; the result has its response, exposure and coordinates.
+        others: Further ones.
+
+    Raises:
+        SehdrError: If some scenes were trained with opacity compensation and others without, because they are
+            rendered in different ways.
+    """
+    scenes = (run, *others)
+    if len({scene.field.antialiased for scene in scenes}) > 1:
+        plain = next(scene.path for scene in scenes if not scene.field.antialiased)
+        problem = "was trained without opacity compensation (model.antialiased), unlike another scene to merge"
+        raise SehdrError(f"{plain}: {problem}; train all of them alike")
+    return MergedScene(scenes)
+
+
+def _to_coordinates_of(first: RenderableScene, scene: RenderableScene) -> WorldTransform:
+    """Return the map from a scene's coordinates to those of the first scene, by what their files state."""
+    to_first, back = (
+        WorldTransform.identity() if each.world_matrix is None else WorldTransform.from_matrix(each.world_matrix)
+        for each in (first, scene)
+    )
+    if scene is first:
+        return WorldTransform.identity()
+    return WorldTransform.from_matrix(to_first.matrix @ back.inverse().matrix)
+
+
+def _joined_gaussians(scenes: Sequence[RenderableScene], moves: Sequence[WorldTransform]) -> GaussianArrays:
+    """Return the moved Gaussians of all scenes in one color model."""
+    names = {scene.field.color_model.name for scene in scenes}
+    if "display" in names and len({json.dumps(scene.response.to_dict()) for scene in scenes}) > 1:
+        names.add("log")  # Codes of different responses have light alone in common.
+    color_model = names.pop() if len(names) == 1 else "log"
+    time = scenes[0].base_time if color_model == "display" else None
+    pairs = zip(scenes, moves, strict=True)
+    return join_gaussians([_gaussians_in(color_model, scene, move, time) for scene, move in pairs])
+
+
+def _gaussians_in(color_model: str, scene: RenderableScene, move: WorldTransform, time: float | None) -> GaussianArrays:
+    """Return the moved Gaussians of a scene in a color model; `time`: exposure of display colors, seconds."""
+    positions = np.array([camera.position for camera in training_cameras(scene)]).reshape(-1, 3)
+    gaussians = gaussians_of(scene.field, color_model, positions, time, scene.color_matrix)
+    return gaussians if move.is_identity else gaussians.transformed(move.matrix)
+
+
+def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """Return tensors [N] of all scenes as one on the CPU; None if one is missing."""
+    known = [part.cpu() for part in parts if part is not None]
+    return torch.cat(known) if len(known) == len(parts) else None
