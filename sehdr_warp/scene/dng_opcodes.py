@@ -14,6 +14,7 @@ from ..errors import InputError
 from .images import DAMAGED
 
 _OPTIONAL = 1  # Flag: a reader that does not know the opcode may skip it
+_TRIM_BOUNDS = 6  # DNG leaves open whether the default crop and later opcodes count from the trimmed image
 _MOST_OPCODES = 64  # Files have up to a dozen; each may cost a pass over the picture
 _LARGEST_DEGREE = 8
 
@@ -86,7 +87,8 @@ def apply_opcodes(data: bytes, image: np.ndarray, source: Path, *, cell: int = 1
             if function is not None:
                 image = function(_Reader(body), image, cell)
             elif not flags & _OPTIONAL:
-                problem = f"demands opcode {number} of DNG, which is not supported"
+                name = " (TrimBounds)" if number == _TRIM_BOUNDS else ""
+                problem = f"demands opcode {number}{name} of DNG, which is not supported"
                 raise InputError(source, problem, "develop the photos as JPEG, PNG or TIFF")
         except (ValueError, struct.error, OverflowError, MemoryError) as error:
             raise InputError(source, f"its DNG opcode {number} is damaged ({error!s:.80})", DAMAGED) from None

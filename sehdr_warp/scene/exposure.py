@@ -89,16 +89,21 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
         state = "no exposure times were found" if not known_times else "most photos state no exposure time"
         notes.append(f"{state}: each view counts as 1 s{ignored}")
         return [replace(record, exposure_time=1.0) for record in records], False, notes
-    shortest, longest = min(known_times), max(known_times)
-    if longest > shortest * 1.01:
-        span = f"{shutter(shortest)} to {shutter(longest)}".replace(" s to", " to")
-        notes.append(f"exposures differ: {span} ({math.log2(longest / shortest):.1f} stops); each view keeps its own")
     middle = math.exp(sum(map(math.log, known_times)) / len(known_times))
     timed = [
         replace(record, exposure_time=middle if time is None else time, time_known=time is not None)
         for record, time in zip(records, times, strict=True)
     ]
     return timed, True, notes
+
+
+def exposures_note(records: Sequence[ImageRecord]) -> tuple[str, ...]:
+    """Return a note on the range of known exposure times of the photos that are used, if they differ."""
+    times = [record.seconds / (record.light_scale if record.gain_map else 1) for record in records if record.time_known]
+    if not times or max(times) <= min(times) * 1.01:
+        return ()
+    span = f"{shutter(min(times))} to {shutter(max(times))}".replace(" s to", " to")
+    return (f"exposures differ: {span} ({math.log2(max(times) / min(times)):.1f} stops); each view keeps its own",)
 
 
 def stated_times(records: Sequence[ImageRecord], source: Path) -> tuple[list[float | None], list[str]]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
+from .exposure import exposures_note
 from .names import unique_names
 from .parse import parse_dataset
 from .preprocess import preprocess
@@ -89,4 +90,8 @@ def load_scene(
 
         scene = with_estimated_times(scene, guessed, curve)
     light_known = dataset.kind != "encoded"
+    if dataset.kind != "float":
+        used = {view.name for view in scene.views}
+        records = [record for name, record in zip(names, dataset.records, strict=True) if name in used]
+        scene = replace(scene, notes=(*scene.notes, *exposures_note(records)))
     return replace(scene, chosen_by=choice.chosen_by, color_matrix=choice.color_matrix, light_known=light_known)

@@ -76,6 +76,10 @@ def parse_dataset(
     unplaced: list[str] = []
     if records and records[0].lens is UNPLACED:
         dataset, records, unplaced = place_photos(dataset, records, folder, kind, cache)
+        if unplaced:  # Their times are not to be told of, nor the others' relative to theirs.
+            untimed = [replace(record, exposure_time=None, time_known=True) for record in records]
+            records, times_known, times = _with_times(untimed, kind, folder)
+            dataset = replace(dataset, times_known=times_known)
     records, split = _with_splits(records, dataset, holdout)
     training = sum(record.split == "train" for record in records)
     if training < 2:

@@ -260,6 +260,7 @@ def test_what_cannot_be_read_is_named(tmp_path):
     refused("color filter's samples are compressed with loss", tags={259: shorts(34892)})
     refused("floating-point samples", values=mosaic(EVEN).astype(np.float32), tags={50714: longs(0), 50717: longs(1)})
     refused("demands opcode 99", tags={51009: opcodes((99, b""))})
+    refused(r"demands opcode 6 \(TrimBounds\)", tags={51022: opcodes((6, struct.pack(">4I", 8, 8, 64, 96)))})
     refused("list of DNG opcodes is damaged", tags={51009: (7, 6, b"\0\0\0\2xx")})
     refused("DNG opcode 9 is damaged", tags={51009: opcodes((9, b"\0" * 20))})
     refused("white level .* is not above black level", tags={50714: longs(20000)})

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -37,6 +38,28 @@ def test_exif_times_count_sensitivity_and_aperture(tmp_path):
     assert scene.exposure_times_known
     text = " ".join(scene.notes)
     assert "ISO differs (100 to 400)" in text and "exposures differ: 1/400 to 1 s" in text
+
+
+def test_exposures_of_photos_that_are_left_out_are_not_told_of(tmp_path, monkeypatch):
+    exif = {i: {_TIME: 0.01, _ISO: 100} for i in range(5)} | {5: {_TIME: 1.0, _ISO: 400}}
+    write_colmap(tmp_path / "model", name="{:03d}.jpg", exif=exif)
+    placed = load(tmp_path / "model")
+    assert "exposures differ: 1/100 to 4 s" in " ".join(placed.notes)
+    photos = shutil.copytree(tmp_path / "model" / "images", tmp_path / "bare")
+
+    def place_all_but_the_last(dataset, records, *_):
+        camera = placed.views[0].camera
+        lens = Lens("PINHOLE", camera.width, camera.height, tuple(camera.intrinsics), photos)
+        records = [replace(r, lens=lens, world_to_camera=np.eye(4)) for r in records if r.view != "005"]
+        return dataset, records, ["005.jpg"]
+
+    monkeypatch.setattr("sehdr_warp.scene.parse.place_photos", place_all_but_the_last)
+    notes = " ".join(load(photos).notes)
+    assert "exposures differ" not in notes and "ISO" not in notes
+    damaged = tmp_path / "model" / "images" / "005.jpg"
+    damaged.write_bytes(damaged.read_bytes()[:-600])
+    notes = " ".join(load(tmp_path / "model").notes)
+    assert "1 of 6 photos cannot be used" in notes and "exposures differ" not in notes
 
 
 def test_a_response_that_is_a_guess_is_noted(tmp_path):
