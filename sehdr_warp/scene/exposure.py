@@ -85,7 +85,7 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
             remedy = f"correct it, or state every image's seconds in {EXPOSURES}"
             raise InputError(record.image, f"exposure time {time} s is not in {SHORTEST} to {LONGEST}", remedy)
     if 2 * len(known_times) <= len(records):
-        ignored = f"; those of {len(known_times)} photos are not counted" if known_times else ""
+        ignored = f"; times of {len(known_times)} are not counted" if known_times else ""
         state = "no exposure times were found" if not known_times else "most photos state no exposure time"
         notes.append(f"{state}: each view counts as 1 s{ignored}")
         return [replace(record, exposure_time=1.0) for record in records], False, notes

@@ -54,7 +54,8 @@ class GainMap:
         gamma: exponent of the encoding.
         base_offset: added to the photo's light before it is multiplied.
         alternate_offset: subtracted afterwards.
-        headroom: log2 of the brightest light that the file means, as a multiple of white.
+        headroom: log2 of the brightest light that its pixels make of white, as a multiple of white. Metadata may state
+            more, such as what the encoder could have stored.
         to_alternate: [3, 3] from the photo's primaries to those in which the gains apply; None if they are the photo's.
     """
 
@@ -311,4 +312,6 @@ def _gain_map_of(
     if not max(np.abs(numbers["base_offset"]).max(), np.abs(numbers["alternate_offset"]).max()) <= 1:
         raise ValueError("offsets above the light of white")
     to_alternate = between if parameters.in_alternate_colors else None
-    return GainMap(encoded=encoded, headroom=float(high.max()), to_alternate=to_alternate, **numbers)
+    gain_map = GainMap(encoded=encoded, headroom=0.0, to_alternate=to_alternate, **numbers)
+    largest = replace(gain_map, encoded=encoded.max((0, 1), keepdims=True)).light(np.ones((1, 1, 3), np.float32))
+    return replace(gain_map, headroom=math.log2(max(float(largest.max()), 2.0**-MOST_STOPS)))

@@ -89,7 +89,7 @@ def load_scene(
         from .exposure_estimate import with_estimated_times
 
         scene = with_estimated_times(scene, guessed, curve)
-    light_known = dataset.kind != "encoded"
+    light_known = dataset.kind != "encoded" or curve.name == dataset.stated_response
     if dataset.kind != "float":
         used = {view.name for view in scene.views}
         records = [record for name, record in zip(names, dataset.records, strict=True) if name in used]

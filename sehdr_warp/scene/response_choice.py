@@ -54,7 +54,7 @@ def choose_response(
     """
     from ..response import response_by_name
 
-    curve, name = response, str(response)
+    curve, name = response, str(response) if isinstance(response, str | Path) else response.name
     if isinstance(response, str | Path) and name not in ("auto", "learned", "linear"):
         curve = response_by_name(response)
     if dataset.stated_response is not None and name == "auto":

@@ -86,7 +86,7 @@ def test_gain_maps_in_jpeg(tmp_path, segment):
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [segment])
     assert has_gain_map(tmp_path / "a.jpg")
     assert_light(decoded(tmp_path / "a.jpg"), light)
-    assert read_gain_map(tmp_path / "a.jpg").headroom == STOPS
+    assert read_gain_map(tmp_path / "a.jpg").headroom == pytest.approx(STOPS, abs=0.05)
 
 
 def test_a_gain_map_of_three_channels(tmp_path):
@@ -134,6 +134,8 @@ def test_libultrahdr_writes_what_is_read(tmp_path):
     inside = slice(4, -4), slice(4, -4)
     np.testing.assert_allclose(result[inside], theirs[inside], rtol=0.05)
     assert np.abs(result / theirs - 1)[inside].mean() < 0.015
+    # It states what it could have stored, 5.6 stops; codes hold what there is.
+    assert read_gain_map(tmp_path / "a.jpg").headroom == pytest.approx(STOPS, abs=0.3)
     median, high = np.percentile(np.abs(result / light - 1)[inside], [50, 90])
     assert median < 0.015 and high < 0.035
 
@@ -269,10 +271,10 @@ def test_a_set_with_gain_maps_has_their_light(tmp_path):
     assert any("4 of 4 photos have a gain map: light is taken from it, up to 2.5 stops" in note for note in scene.notes)
     view = scene.views[0]
     # As if exposed 2.5 stops shorter: nothing is clipped.
-    assert view.exposure_time == pytest.approx(0.97 * 2**-2.5) and view.codes.max() < 65535
+    assert view.exposure_time == pytest.approx(0.97 * 2**-2.5, rel=0.02) and view.codes.max() < 65535
     assert_light(linear(view.codes) / view.exposure_time, light)
-    again = load_scene(tmp_path, response=scene.response.name)  # As a run does that goes on.
-    np.testing.assert_array_equal(again.views[0].codes, view.codes)
+    for response in (scene.response.name, scene.response):  # As runs and blocks load their photos again.
+        np.testing.assert_array_equal(load_scene(tmp_path, response=response).views[0].codes, view.codes)
 
 
 def test_a_named_response_keeps_the_codes_and_has_the_light_of_white_ones(tmp_path):
@@ -316,7 +318,7 @@ def test_a_photo_without_a_map_in_such_a_set_is_clipped_at_white(tmp_path):
     _, base, _ = pair()
     Image.fromarray(base).save(tmp_path / "3.jpg", quality=100, subsampling=0)
     with_map, without = (load_scene(tmp_path, holdout=0).views[i] for i in (0, 3))
-    assert (with_map.exposure_time, without.exposure_time) == (pytest.approx(0.97 * 2**-2.5), 1)
+    assert (with_map.exposure_time, without.exposure_time) == (pytest.approx(0.97 * 2**-2.5, rel=0.02), 1)
     clipped = without.codes == 65535
     assert clipped.mean() > 0.2
     dark = linear(with_map.codes)[~clipped] / with_map.exposure_time

@@ -10,11 +10,13 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config import Config
 from sehdr_warp.scene import Camera, load_scene, look_at
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.video import codes, decode, is_video, open_clip
 from sehdr_warp.scene.video_color import VideoColor
 from sehdr_warp.scene.video_frames import choose_frames, read_video
+from sehdr_warp.training.initialization import response_for_training
 
 from .clips import pan, write_clip
 from .panorama_room import light, walls
@@ -226,6 +228,7 @@ def test_an_hlg_clip_of_a_room_becomes_a_scene(tmp_path):
     write_clip(tmp_path / "clip.mov", frames, tags=(18, 9, 9), pixels="yuv420p10le")
     scene = load_scene(tmp_path / "clip.mov", cache=tmp_path / "cache", max_size=128)
     assert scene.format == "video" and scene.name == "clip.mov" and scene.response.name == response.name
+    assert response_for_training(scene, Config()) is scene.response, "the stated curve is not guessed again"
     assert any(
         note.startswith("video: the sharpest ") and "of 20 frames" in note and "HLG" in note for note in scene.notes
     ), scene.notes
