@@ -277,17 +277,18 @@ def run_render(args: Render) -> None:
         film_format(args.video)
         check_absent(args.video, args.overwrite)
     run = open_scene(args.run, args.device)
-    usual = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
-    path = {"cameras": args.cameras, "camera": args.camera, "count": usual if args.count is None else args.count}
+    default_count = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
+    count = default_count if args.count is None else args.count
+    selection = {"cameras": args.cameras, "camera": args.camera, "count": count}
     if args.out is not None:
-        options = path | vars(args.world) | vars(args.pictures)
+        options = selection | vars(args.world) | vars(args.pictures)
         files = render_views(run, args.out, size=args.size, overwrite=args.overwrite, fps=fps, **options)
         summary = f"{args.out}: {len(files)} files"
     if args.video is not None:
         from .film import write_film
 
         transform = world_transform(run, **vars(args.world))
-        cameras = [camera for _, camera in select_cameras(run, **path, transform=transform, up=args.world.up)]
+        cameras = [camera for _, camera in select_cameras(run, **selection, transform=transform, up=args.world.up)]
         if args.size is not None:
             cameras = [reframe(camera, *read_size(args.size)) for camera in cameras]
         film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}

@@ -127,8 +127,8 @@ def adam_steps(
         for name in ("gradient", "first_moment", "second_moment"):
             tensor: Tensor = getattr(each, name)
             if tensor.shape != shape or tensor.dtype != torch.float32 or not tensor.is_contiguous():
-                is_ = f"{tensor.dtype} {list(tensor.shape)}"
-                raise ValueError(f"the {name.replace('_', ' ')} is {is_}, expected contiguous float32 {list(shape)}")
+                actual = f"{tensor.dtype} {list(tensor.shape)}"
+                raise ValueError(f"the {name.replace('_', ' ')} is {actual}, expected contiguous float32 {list(shape)}")
     steps = [step for step in steps if step.parameter.numel()]
     if skipped.device.type == "cuda":
         _steps_by_kernel(steps, skipped, betas, epsilon, active_count)

@@ -161,7 +161,7 @@ def _run_as_rank(words: list[str]) -> None:
 
 def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, or print a plan, on this rank."""
-    from .losses import check_dataset_truth
+    from .hdr_truth import check_dataset_truth
 
     plan_only, output = args.training.plan_only, args.output
     # What can be refused is refused before the photos are read, which may take minutes.

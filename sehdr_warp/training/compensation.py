@@ -112,13 +112,13 @@ class PreparedPhotos:
     Attributes:
         scene: The scene, with drift of exposure, white balance and vignetting taken out of its photos.
         compensation: What was taken out; None if there is no drift.
-        matcher: Returns the matcher of the training photos, which is created once.
+        get_matcher: Returns the matcher of the training photos, which is created once.
         decision: Line of the plan; None if nothing was estimated.
     """
 
     scene: Scene
     compensation: ExposureCompensation | None
-    matcher: Callable[[], Matcher]
+    get_matcher: Callable[[], Matcher]
     decision: Decision | None
 
 
@@ -167,13 +167,14 @@ def prepare_photos(
     normalization = normalization_of(scene)
     if shared is None and estimate and estimates_compensation(scene, config, response):
         result = estimate_compensation(normalization.scene(scene), config, response, device)
-        compensation, decision, matcher = result.compensation, result.decision, lambda: result.matcher
+        compensation, decision, get_matcher = result.compensation, result.decision, lambda: result.matcher
     else:
-        compensation, decision, matcher = None if shared is None else shared.compensation_of(scene.views), None, None
+        compensation = None if shared is None else shared.compensation_of(scene.views)
+        decision = get_matcher = None
     if compensation is not None:
         scene = compensation.normalize_photos(scene, response)
-    matcher = matcher or cache(partial(make_matcher, normalization.scene(scene), response, device))
-    return PreparedPhotos(scene, compensation, matcher, decision)
+    get_matcher = get_matcher or cache(partial(make_matcher, normalization.scene(scene), response, device))
+    return PreparedPhotos(scene, compensation, get_matcher, decision)
 
 
 def estimates_compensation(scene: Scene, config: Config, response: Response) -> bool:

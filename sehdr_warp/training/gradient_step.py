@@ -17,7 +17,8 @@ from ..rasterizer import HarmonicsGradients, Rendering
 from ..rasterizer.training_step import differentiate
 from ..runs.config import Config
 from ..scene import Scene
-from .losses import compares_exposures, data_loss, extra_images, largest_hdr_truth
+from .hdr_truth import largest_hdr_truth
+from .losses import compares_exposures, data_loss, extra_images
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
 from .scene_facts import share_in_view

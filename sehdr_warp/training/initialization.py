@@ -68,7 +68,7 @@ def make_field(
     config: Config,
     response: Response,
     device: torch.device | str,
-    matcher: Callable[[], Matcher] | None = None,
+    get_matcher: Callable[[], Matcher] | None = None,
     time: float | None = None,
 ) -> RadianceField:
     """Return the field at iteration 0, in the normalized coordinates of the scene.
@@ -78,7 +78,7 @@ def make_field(
         config: of the training.
         response: of the camera.
         device: that the field is on.
-        matcher: makes what matches the photos, in normalized coordinates.
+        get_matcher: returns the matcher of the photos, in normalized coordinates.
         time: exposure time that colors refer to, seconds; by default base_time().
 
     Raises:
@@ -93,8 +93,8 @@ def make_field(
     if config.model.init_file:
         gaussians = start_gaussians(normalized, config, response, rng, normalization, time)
         return assemble_field(gaussians, config, response, time, normalization).to(device)
-    matcher = matcher or partial(make_matcher, normalized, response, device)
-    points, colors = start_points(normalized, config, matcher, rng)
+    get_matcher = get_matcher or partial(make_matcher, normalized, response, device)
+    points, colors = start_points(normalized, config, get_matcher, rng)
     most = config.densification.cap_max
     if len(points) > most:
         subset = np.sort(rng.choice(len(points), most, replace=False))
@@ -133,7 +133,7 @@ def start_gaussians(
 
 
 def start_points(
-    scene: Scene, config: Config, matcher: Callable[[], Matcher], rng: np.random.Generator
+    scene: Scene, config: Config, get_matcher: Callable[[], Matcher], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points to start from.
 
@@ -146,7 +146,7 @@ def start_points(
     points, colors = scene.points, scene.point_colors
     number = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
     if number > len(points):
-        matches = _match_points(matcher(), number - len(points), config.seed)
+        matches = _match_points(get_matcher(), number - len(points), config.seed)
         points, colors = (np.concatenate(both) for both in zip((points, colors), matches, strict=True))
         _log.info("%d points matched between the photos", len(matches[0]))
     points = within_reach(points)

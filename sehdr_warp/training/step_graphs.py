@@ -68,18 +68,21 @@ class StepGraphs:
     def run(
         self,
         graph_key: Hashable,
-        optimize: Callable[[Compute, Apply], Any],
+        run_step: Callable[[Compute, Apply], Any],
         compute_gradients: Compute,
         apply_gradients: Apply,
         iteration: int,
     ) -> Any:
-        """Replay optimize(compute_gradients, apply_gradients), after capturing it if this key has no graph."""
+        """Replay run_step(compute_gradients, apply_gradients), after capturing it if this key has no graph.
+
+        `run_step` is GradientStep.run: it averages the gradients of the ranks between the two.
+        """
         first, second = self._first, self._second
         assert first is not None
         try:
             if second is None:
-                return first.run(graph_key, lambda: optimize(compute_gradients, apply_gradients))
-            return optimize(
+                return first.run(graph_key, lambda: run_step(compute_gradients, apply_gradients))
+            return run_step(
                 lambda: first.run(graph_key, compute_gradients),
                 lambda gradients: second.run(graph_key, lambda: apply_gradients(gradients)),
             )

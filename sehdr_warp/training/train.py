@@ -21,8 +21,8 @@ from ..scene.normalization import normalization_of
 from .clipped_start import brighten_clipped
 from .compensation import SharedDecisions, prepare_photos
 from .following import send_training, several_ranks_notes
+from .hdr_truth import check_scene_truth
 from .initialization import make_field, response_for_training, sizes_of
-from .losses import check_scene_truth
 from .machine import Stopwatch, summary_writer
 from .plan import apply_plan
 from .ranks import Ranks
@@ -136,9 +136,9 @@ def _new_trainer(
     with watch:
         prepared = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
         base_time = None if shared is None else shared.base_time
-        field = make_field(prepared.scene, config, response, device, prepared.matcher, base_time)
+        field = make_field(prepared.scene, config, response, device, prepared.get_matcher, base_time)
     output = RunOutput(folder, config, tensorboard=tensorboard, is_block=shared is not None)
-    trainer = Trainer(prepared.scene, config, field, matcher=prepared.matcher, ranks=ranks, output=output)
+    trainer = Trainer(prepared.scene, config, field, get_matcher=prepared.get_matcher, ranks=ranks, output=output)
     with watch:
         estimates = trainer.views.loss_estimates
         if estimates is not None and not config.model.init_file:

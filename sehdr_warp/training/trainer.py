@@ -74,7 +74,8 @@ class Trainer:
         iteration: Iterations done; a step on several ranks counts one for each photo.
         first_iteration: Iterations done before this process.
         total: Iterations in all.
-        step_batch: Photos of the last step, one for each rank; each counts as an iteration.
+        batch: Photos of a step, one for each rank; each counts as an iteration.
+        step_batch: Photos of the last step: `batch`, or as many as iterations were left.
         seconds: Duration so far, without evaluation and checkpoints.
     """
 
@@ -84,7 +85,7 @@ class Trainer:
         config: Config,
         field: RadianceField,
         *,
-        matcher: Callable[[], Matcher] | None = None,
+        get_matcher: Callable[[], Matcher] | None = None,
         ranks: Ranks | None = None,
         output: RunOutput | None = None,
     ):
@@ -94,7 +95,7 @@ class Trainer:
             scene: Scene with at least two training views.
             config: Options of the training, after the plan.
             field: Field at iteration 0, on the device to train on.
-            matcher: Creates the matcher of the training photos that seeding uses.
+            get_matcher: Returns the matcher of the training photos that seeding uses, created at the first call.
             ranks: Processes that train together.
             output: Run folder to evaluate, log and save to; None to save nothing.
         """
@@ -114,7 +115,7 @@ class Trainer:
         self.order = PhotoOrder(len(views), config.seed, self.rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self.can_seed = not has_wide_views(normalized, config)  # Seeding samples pixels of pinhole photos.
-        self._matcher = matcher or cache(partial(make_matcher, normalized, field.response, self.device))
+        self._get_matcher = get_matcher or cache(partial(make_matcher, normalized, field.response, self.device))
 
         self._result: StepResult | None = None
         self._view_index = 0
@@ -283,7 +284,7 @@ class Trainer:
             image = result.image
             rendered = image if self.gradient_step.needs_encoded else self.field.response.encode_extended(image)
             return seed_gaussians(
-                self.field, self._matcher(), rendered, view, self._view_index, number, bound, random_seed
+                self.field, self._get_matcher(), rendered, view, self._view_index, number, bound, random_seed
             )
 
     def _reserve_rows(self) -> None:
