@@ -25,7 +25,7 @@ from tests.scene.dng_files import area, gain_map, jpeg_tiles, longs, mosaic, opc
 from tests.scene.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
 from tests.scene.raw_files import write_dng
 from tests.scene.test_color_encoding import icc_profile
-from tests.trial.test_hostile_sets import exif_of_place
+from tests.trial.test_sets import exif_of_place
 
 from .reader import Reader, each
 

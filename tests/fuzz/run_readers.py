@@ -24,7 +24,7 @@ from sehdr_warp.training.train import create_trainer
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
 from tests.training.toy import toy_scene
-from tests.trial.test_hostile_later import PLAN as BLOCKS
+from tests.trial.test_blocks import PLAN as BLOCKS
 
 from .reader import Reader, each
 

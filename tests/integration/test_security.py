@@ -21,29 +21,28 @@ from tests.make_scenes import write_llff
 from tests.trial import harness
 
 ROOT = Path(__file__).resolve().parents[2]
-STRANGERS, CASES, REQUESTS = (f"trial/test_{n}.py::test" for n in ("strangers", "cases", "requests"))
-HOSTILE_CAMERAS, HOSTILE_LOOKS, HOSTILE_PHOTOS, HOSTILE_PLACES, HOSTILE_RUNS, HOSTILE_SETS, HOSTILE_SPLATS = (
-    f"trial/test_hostile_{n}.py::test" for n in ("cameras", "looks", "photos", "places", "runs", "sets", "splats")
+CASES, COMMAND_LINES, LOOKS, PHOTOS, PLACES, REQUESTS, SENT_RUNS, SETS = (
+    f"trial/test_{n}.py::test"
+    for n in ("cases", "command_lines", "looks", "photos", "places", "requests", "runs", "sets")
 )
 RUNS, HERE = "runs/test_run_folder.py::test", "integration/test_security.py::test"
 HELD_BY = {
-    "Looking at a run changes nothing": [f"{RUNS}_reading_changes_nothing", f"{STRANGERS}_links_in_a_sent_run"],
+    "Looking at a run changes nothing": [f"{RUNS}_reading_changes_nothing", f"{SENT_RUNS}_links_in_a_sent_run"],
     "Only a training that holds": [
         f"{RUNS}_only_a_training_finishes_an_interrupted_write",
         f"{CASES}_two_trainings_do_not_mix",
-        f"{HOSTILE_RUNS}_locks_that_are_no_locks",
+        f"{SENT_RUNS}_locks_that_are_no_locks",
     ],
     "Links inside a run are refused": [
         f"{RUNS}_a_link_is_refused_even_to_a_sound_file",
-        f"{STRANGERS}_links_in_a_sent_run",
-        f"{HOSTILE_RUNS}_further_links_in_a_run",
-        f"{HOSTILE_PLACES}_links_that_a_user_made",
+        f"{SENT_RUNS}_links_in_a_sent_run",
+        f"{PLACES}_links_that_a_user_made",
         "blocks/test_block_plan.py::test_links_in_the_run_are_not_followed",
     ],
     "All JSON of a run is checked": [
         f"{RUNS}_a_summary_of_another_shape_is_refused",
         f"{CASES}_tampered_runs",
-        f"{HOSTILE_RUNS}_shapes_of_summary_plan_and_metrics",
+        f"{SENT_RUNS}_texts_of_a_run",
     ],
     "What decides the picture": [
         "runs/test_checkpoint.py::test_what_decides_the_picture_is_hashed_with_the_checkpoint"
@@ -58,21 +57,20 @@ HELD_BY = {
     "Text from outside enters HTML escaped": [
         "output/test_report_page.py::test_browsers_run_our_script_and_no_other",
         "output/test_report_page.py::test_no_markup_is_made_but_by_the_one_function",
-        f"{HOSTILE_PLACES}_names_of_photos_on_pages_and_terminals",
+        f"{PLACES}_names_of_photos_on_pages_and_terminals",
     ],
     "Control characters from outside": [
         "test_console.py::test_a_terminal_obeys_nothing_of_what_files_say",
-        f"{HOSTILE_PLACES}_names_in_lists_on_terminals",
+        f"{PLACES}_names_in_lists_on_terminals",
     ],
-    "Pictures are decoded by content": [f"{CASES}_hostile_photos", f"{HOSTILE_PHOTOS}_photos_that_were_made"],
+    "Pictures are decoded by content": [f"{CASES}_hostile_photos", f"{PHOTOS}_photos_that_were_made"],
     "Sizes and counts are bounded": [
-        f"{STRANGERS}_gltf_of_strangers",
         f"{CASES}_sparse_files_of_4_gib_are_not_read_whole",
-        f"{HOSTILE_SPLATS}_splats_that_were_made",
-        f"{HOSTILE_PHOTOS}_opcodes_of_dng",
+        "trial/test_splats.py::test_splats",
+        f"{PHOTOS}_opcodes_of_dng",
         f"{RUNS}_sparse_files_are_not_read",
         f"{RUNS}_a_sparse_checkpoint_is_refused_by_its_length",
-        f"{HOSTILE_SETS}_states_of_a_checkpoint",
+        f"{SENT_RUNS}_tensors_of_a_run",
         "splats/test_streamed_sog.py::test_a_small_index_takes_no_memory_that_its_chunks_do_not_state",
         "scene/test_heif.py::test_parts_of_an_item_that_overlap_take_no_memory",
     ],
@@ -82,18 +80,18 @@ HELD_BY = {
     ],
     "What has the name of a run's or a set's file": [
         "test_files.py::test_what_has_the_name_of_a_file_is_not_taken_for_a_missing_one",
-        "trial/test_outsider_runs.py::test_kinds_of_files_of_a_run_of_an_outsider",
-        "trial/test_outsider_sets.py::test_kinds_of_files_of_a_set_of_an_outsider",
+        "trial/test_runs.py::test_kinds_of_files_of_a_run",
+        "trial/test_sets.py::test_kinds_of_files_of_a_set",
     ],
     "Environment variables of a launcher": [
         "training/test_nodes.py::test_numbers_that_no_launcher_sets_are_refused",
         "training/test_nodes.py::test_ports_that_cannot_be_are_refused",
-        "trial/test_outsider_output.py::test_ranks_of_an_outsider",
+        "trial/test_command_lines.py::test_ranks",
     ],
     "Names in a data set stay inside": [
         f"{HERE}_names_of_a_set_stay_inside",
-        f"{HOSTILE_PLACES}_links_in_a_set",
-        f"{HOSTILE_SETS}_links_that_lead_out_of_a_set",
+        f"{PLACES}_links_in_a_set",
+        f"{SETS}_links_that_lead_out_of_a_set",
         "scene/test_masks.py::test_folders_that_lead_out_of_the_set_are_not_searched",
         "scene/test_scene_colmap.py::test_the_folder_of_photos_may_be_a_link",
     ],
@@ -104,20 +102,20 @@ HELD_BY = {
     "A stage that refers to files": [
         "test_sandbox.py::test_a_stage_leads_to_no_other_folder",
         "scene/test_video.py::test_a_clip_that_names_other_files_is_refused",
-        f"{HOSTILE_CAMERAS}_clips_that_were_made",
+        "trial/test_clips.py::test_clips_that_were_made",
     ],
     "LUTs of a config must be files": [
         "output/test_ocio.py::test_luts_that_cannot_be_read_are_told_in_a_line",
-        f"{HOSTILE_LOOKS}_luts_that_were_made",
-        f"{HOSTILE_LOOKS}_archives_of_configs",
+        f"{LOOKS}_luts_that_were_made",
+        f"{LOOKS}_archives_of_configs",
     ],
     "The caches": [
         "rasterizer/test_kernel_cache.py::test_damaged_modules_go_and_are_told_once",
         "scene/test_video_frames.py::test_frames_are_kept_in_the_cache",
     ],
     "The processes of one training": ["training/test_ranks.py::test_ranks_stay_alike_and_one_can_go_on"],
-    "It reads the paths": [f"{HOSTILE_PLACES}_what_commands_open"],
-    "It writes only to the paths": [f"{STRANGERS}_names_of_output", f"{HOSTILE_PLACES}_what_commands_open"],
+    "It reads the paths": [f"{PLACES}_what_commands_open"],
+    "It writes only to the paths": [f"{COMMAND_LINES}_names_of_output", f"{PLACES}_what_commands_open"],
     "A file is replaced only": [
         f"{CASES}_obstacles_are_kept",
         "test_files.py::test_existing_file_is_kept_unless_asked",
@@ -127,11 +125,11 @@ HELD_BY = {
     "A film is one file": [
         "output/test_film.py::test_urls_are_refused",
         "output/test_film.py::test_formats_of_several_files_and_none_are_refused_before_the_work",
-        f"{STRANGERS}_films",
+        f"{LOOKS}_films",
     ],
     "It connects to nothing": [
         f"{HERE}_the_trial_sees_programs_and_connections",
-        f"{HOSTILE_CAMERAS}_clips_that_were_made",
+        "trial/test_clips.py::test_clips_that_were_made",
     ],
     "`view` alone listens": [
         f"{HERE}_the_viewer_listens_on_this_machine_alone",
@@ -162,7 +160,7 @@ HELD_BY = {
     ],
     "Blocks exchange them": [
         "blocks/test_train.py::test_jobs_exchange_values_in_a_new_folder",
-        f"{HOSTILE_SETS}_more_plans_of_blocks",
+        "trial/test_blocks.py::test_more_plans_of_blocks",
     ],
 }
 """Beginnings of sentences, and the functions that hold them."""

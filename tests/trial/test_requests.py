@@ -96,6 +96,7 @@ REFUSED = {
     "no length": b"POST /frame HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n\r\n{}",
     "length below 0": posted("/frame", {}, Content_Length=-1),
     "length of 10^18": posted("/frame", {}, Content_Length=10**18),
+    "length of 5,000 digits": posted("/frame", {}, Content_Length="9" * 5000),
     "length of words": posted("/frame", {}, Content_Length="many"),
     "length of other digits": posted("/frame", {}, Content_Length="²"),
     "chunks": posted("/frame", {}, Content_Length="", Transfer_Encoding="chunked"),
@@ -247,3 +248,29 @@ def test_a_viewer_among_silent_and_deaf_clients(prepared, record_property):
           f"{largest:.0f} MiB at most")  # fmt: skip
     assert "Traceback" not in output and largest < 600
     assert waits[len(waits) * 99 // 100] < 1, waits[-9:]
+
+
+ASKED = {
+    "run of 1e400": ("/frame", b'{"camera": {}, "run": 1e400}'),
+    "count of 1e400": ("/path", b'{"cameras": [{}], "count": 1e400}'),
+    "count of 5,000 digits": ("/path", b'{"cameras": [{}], "count": ' + b"9" * 5000 + b"}"),
+    "light of 1e400": ("/gain", b'{"light": 1e400, "stops": 1}'),
+    "gain of 1e400": ("/gain", b'{"light": 0, "stops": 1e400}'),
+    "gain of a text": ("/gain", b'{"light": 0, "stops": "nan"}'),
+    "up of zeros": ("/orientation", b'{"up": [0, 0, 0]}'),
+    "up of 1e400": ("/orientation", b'{"up": [1e400, 0, 0]}'),
+    "up of many": ("/orientation", json.dumps({"up": [1] * 100_000}).encode()),
+    "scale of 1e-320": ("/orientation", b'{"scale": 1e-320}'),
+    "crop of a text": ("/edit", b'{"crop": "' + b"9," * 50_000 + b'"}'),
+    "page of a run that is none": ("/save", b'{"kind": "page", "run": 7, "cameras": [{}]}'),
+}
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_further_requests_that_are_refused(served, name):
+    path, body = ASKED[name]
+    if path in ("/path", "/frame", "/save"):
+        body = body.replace(b"{}", json.dumps(served.camera).encode())
+    said = answer_to(served.server_address[1], posted(path, body), 60)
+    assert said.startswith((b"HTTP/1.1 4", b"HTTP/1.1 5")) and b"Traceback" not in said, said[:300]
+    assert answer_to(served.server_address[1], got("/versions")).startswith(b"HTTP/1.1 200")

@@ -1,12 +1,11 @@
-"""Cameras and COLMAP models of an outsider."""
+"""Files of cameras, and COLMAP models, that are damaged or were made to do harm."""
 
 import os
 import struct
 
 import pytest
 
-from .hostile import tried
-from .outsider import CAMERA, DEEP, EITHER, FAR, IDENTITY, NAN, case, put
+from .hostile import CAMERA, DEEP, EITHER, FAR, IDENTITY, NAN, case, put, tried
 
 pytestmark = pytest.mark.trial
 ROTATIONS = ([[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]], [[-1, 0, 0, 0], *IDENTITY[1:]])
@@ -74,7 +73,7 @@ CAMERAS = [
         case(f"usd, {text[:40]}", "c.usda", "#usda 1.0\n" + text)
         for text in (
             LENS.format("float focalLength = 0"), LENS.format("float focalLength = nan"), 'def Xform "a" {\n}\n',
-            LENS.format("float horizontalAperture = 0"),
+            LENS.format("float horizontalAperture = 0"), "(\n metersPerUnit = 0\n)\n" + LENS.format(""),
             "(\n startTimeCode = 0\n endTimeCode = 1e12\n)\n"
             + LENS.format("float focalLength.timeSamples = {0: 30, 1e12: 40}"),
         )
@@ -83,7 +82,7 @@ CAMERAS = [
 
 
 @pytest.mark.parametrize(("name", "content", "codes"), CAMERAS)
-def test_cameras_of_an_outsider(space, name, content, codes):
+def test_cameras(space, name, content, codes):
     put(space / name, content)
     tried(space, f"render files/a.glb --cameras {name} --out new --device cpu", codes)
 
@@ -108,7 +107,7 @@ COLMAP = [
 
 
 @pytest.mark.parametrize(("cameras", "images", "codes"), COLMAP)
-def test_models_of_an_outsider(space, cameras, images, codes):
+def test_models(space, cameras, images, codes):
     put(space / "model" / "sparse" / "0" / "cameras.bin", cameras)
     put(space / "model" / "sparse" / "0" / "images.bin", images)
     model = space / "model"

@@ -5,8 +5,10 @@ import zipfile
 
 import pytest
 
+from sehdr_warp.own_files import LIST
 from tests.ocio_config import ocio_config
 
+from .harness import call, files_in
 from .hostile import tried
 
 pytestmark = pytest.mark.trial
@@ -131,3 +133,28 @@ def test_archives_of_configs(space, name):
                 "../a.cube" if name == "up" else "a.cube", "0 0 0\n" * (60_000_000 if name == "bomb" else 1)
             )
     tried(space, VIEW_LINE.replace("own.ocio", "own.ocioz"), codes=(1,))
+
+
+FILMS = {
+    **dict.fromkeys(
+        ("film.mp4", "film.mov", "film.MP4", "tour-12:30.mp4", "a b.mp4", "ü%03d.mp4", "-y.mp4", "film.mkv"), 0),
+    **dict.fromkeys(
+        ("film.mpd", "film.m3u8", "film.ism", "film.gif", "film%d.png", "film.sdp", "film.ffmeta", "film", "film.mp4.",
+         ".mp4", "film.tee", "pipe:1", "http://127.0.0.1:9/film.mp4", "rtmp://127.0.0.1/film.mp4",
+         "file:///tmp/film.mp4", "concat:a|b.mp4/x", "/dev/null", "/dev/stdout", "/proc/film.mp4"), 1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILMS)
+def test_films(space, name):
+    pytest.importorskip("av")
+    (space / "d").mkdir()
+    for own in ("init-stream0.m4s", "chunk-stream0-00001.m4s", "film0.ts", "film.mp4.txt"):
+        (space / "d" / own).write_text("the user's own")
+    before = files_in(space)
+    place = name if "/" in name or name.startswith("pipe:") else f"d/{name}"
+    ended = call("render", "run", "--video", place, "--cameras", "all", "--device", "cpu", folder=space)
+    created = {path: files_in(space)[path] for path in files_in(space) if path not in before and LIST not in path}
+    assert ended.code == FILMS[name], ended.err
+    assert list(created) == ([f"d/{name}"] if ended.code == 0 else [])
+    assert {path: text for path, text in files_in(space).items() if path in before} == before

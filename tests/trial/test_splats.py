@@ -1,8 +1,9 @@
-"""Files of Gaussians of an outsider."""
+"""Files of Gaussians that are damaged, or were made to do harm."""
 
 import gzip
 import json
 import os
+import shutil
 import struct
 import zipfile
 import zlib
@@ -15,8 +16,7 @@ import pytest
 from PIL import Image
 
 from .harness import call
-from .hostile import tried
-from .outsider import CAMERA, DEEP, EITHER, FAR, NAN, REFUSED, case, put
+from .hostile import CAMERA, DEEP, EITHER, FAR, NAN, REFUSED, case, put, tried
 
 pytestmark = pytest.mark.trial
 COLUMNS = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
@@ -153,6 +153,8 @@ SPLATS = [
     ),
     case("glb, nested nodes", ".glb", partial(glb, "nodes", value=NESTED), codes=(0,)),
     case("glb of NaN", ".glb", partial(glb, fill=NAN)),
+    case("glb, deep", ".glb", lambda: glb()[:20] + DEEP.encode()),
+    case("glb, a chunk of 4 GiB", ".glb", lambda: glb()[:12] + b"\xff" * 4 + glb()[16:]),
     case("spz of 2^32 - 1", ".spz", partial(spz, 2**32 - 1, body=b"")),
     case("spz of 300 MB", ".spz", bomb),
     case("spz, version 77", ".spz", partial(spz, version=77)),
@@ -186,7 +188,7 @@ SPLATS = [
 
 
 @pytest.mark.parametrize(("suffix", "make", "codes"), SPLATS)
-def test_splats_of_an_outsider(space, suffix, make, codes):
+def test_splats(space, suffix, make, codes):
     put(space / f"x{suffix}", make())
     put(space / "cams.json", {"cameras": [CAMERA]})
     assert tried(space, f"render x{suffix} --cameras cams.json --out new --device cpu", codes).memory < 1500
@@ -205,7 +207,7 @@ def test_splats_of_an_outsider(space, suffix, make, codes):
     ]
     + [case("30 GB without content", b"", "render x.ply --cameras cams.json --out new")],
 )
-def test_places_of_splats_of_an_outsider(space, content, line, codes):
+def test_places_of_splats(space, content, line, codes):
     put(space / "x.ply", content or ply(500_000_000))
     if not content:
         os.truncate(space / "x.ply", 30 << 30)  # Nothing of it is on the disk.
@@ -219,3 +221,57 @@ def test_places_of_splats_of_an_outsider(space, content, line, codes):
 def _refused_unread(space: Path, line: str) -> None:
     ended = call(*line.split(), folder=space)
     assert ended.code == 1 and "GB of memory" in ended.err and ended.memory < 1500
+
+
+def node(**part):
+    return {"bound": {"min": [0, 0, 0], "max": [1, 1, 1]}, "lods": {"0": {"file": 0, "offset": 0, "count": 1} | part}}
+
+
+def circle(depth: int):
+    tree = node()
+    for _ in range(depth):
+        tree = {"bound": tree["bound"], "children": [tree]}
+    return tree
+
+
+STREAMED = {
+    "a chunk above": {"filenames": ["../../precious/meta.json"]},
+    "a chunk of the disk": {"filenames": ["/etc/passwd"]},
+    "a chunk of a device": {"filenames": ["/dev/zero"]},
+    "a chunk of 10^18": {"tree": node(file=10**18)},
+    "a count of 10^18": {"tree": node(count=10**18)},
+    "an offset below 0": {"tree": node(offset=-5)},
+    "a count of a text": {"tree": node(count="9" * 5000)},
+    "deep": {"tree": circle(400)},
+    "no tree": {"tree": None},
+    "names of numbers": {"filenames": [7]},
+    "no chunk": {"filenames": []},
+}
+
+
+@pytest.mark.parametrize("name", STREAMED)
+def test_indexes_of_streamed_sog(space, name):
+    meta = {"version": 1, "count": 1, "counts": [1], "lodLevels": 1, "filenames": ["0_0/meta.json"], "tree": node()}
+    (space / "town").mkdir()
+    (space / "town" / "lod-meta.json").write_text(json.dumps(meta | STREAMED[name]))
+    ended = tried(space, "convert town/lod-meta.json seen.ply", codes=(1,))
+    assert "root:" not in ended.err
+
+
+COMPRESSED = {
+    "chunks of 10^12": (b"element chunk 1", b"element chunk 1000000000000"),
+    "an element below 0": (b"element vertex ", b"element vertex -"),
+    "no format": (b"format binary_little_endian 1.0\n", b""),
+    "bounds of another type": (b"property float min_x", b"property double min_x"),
+    "bounds of another name": (b"property float max_z", b"property float max_q"),
+}
+
+
+@pytest.mark.parametrize("name", COMPRESSED)
+def test_headers_of_compressed_ply(space, name):
+    data = (space / "files" / "a.compressed.ply").read_bytes()
+    old, new = COMPRESSED[name]
+    assert old in data
+    (space / "b.compressed.ply").write_bytes(data.replace(old, new, 1))
+    shutil.rmtree(space / "files")
+    tried(space, "convert b.compressed.ply seen.ply", codes=(1,))

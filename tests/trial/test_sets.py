@@ -1,9 +1,7 @@
-"""Places, links, masks and copies in sets of photos, checkpoints, blocks and requests, made to do harm."""
+"""Sets of photos that were made to do harm: places, links, masks, cameras, truth, copies."""
 
-import hashlib
 import json
 import os
-import pickle
 import shutil
 import struct
 import sys
@@ -17,10 +15,7 @@ from sehdr_warp.output.exr import rgb_channels
 from sehdr_warp.output.exr import write_exr as write_channels
 from tests.make_scenes import pattern, write_colmap
 
-from .harness import call
-from .hostile import MARKUP, SHORT, gif_named, heic, link, png, tried
-from .test_hostile_later import PLAN
-from .test_requests import answer_to, got, posted, served  # noqa: F401 - a fixture
+from .hostile import EITHER, FAR, MARKUP, NAN, SHORT, case, gif_named, heic, link, png, put, tried
 
 pytestmark = pytest.mark.trial
 
@@ -86,28 +81,6 @@ def test_places_of_photos(space, name):
     place_photos(space / "photos", PLACES[name], SCALES.get(name, 10.0))
     tried(space, TRAIN_SET, codes=(0,))
     tried(space, "render new --out seen --device cpu", codes=(0,))
-
-
-UPS = {
-    "1e308": [1e308, 1e308, 1e308],
-    "1e-320": [1e-320, 0, 0],
-    "zeros": [0, 0, 0],
-    "1e300": [0, 1e300, 0],
-}
-
-
-@pytest.mark.parametrize("name", UPS)
-def test_ups_of_a_run(space, name):
-    values = json.loads((space / "run" / "run.json").read_text())
-    values["up"] = {"direction": UPS[name], "source": MARKUP, "unit": 1.0}
-    (space / "run" / "run.json").write_text(json.dumps(values))
-    hashes = {"run": {"run.json": hashlib.sha256((space / "run" / "run.json").read_bytes()).hexdigest()}}
-    for state in (space / "run").glob("checkpoints/*/checkpoint.json"):
-        known = json.loads(state.read_text())
-        state.write_text(json.dumps(known | {"run": known["run"] | hashes["run"]}))
-    ended = tried(space, "render run --out seen --cameras orbit --count 2 --device cpu")
-    assert ended.code or all(np.isfinite(np.asarray(Image.open(file))).all() for file in (space / "seen").glob("*.png"))
-    tried(space, "envmap run --out seen.exr --size 16 --device cpu")
 
 
 LAYOUTS = ("transforms", "colmap")
@@ -191,96 +164,6 @@ def test_masks_of_all_photos_and_files_beside_them(space, name):
     tried(space, TRAIN_SET)
 
 
-def tensors(path: Path, header: dict | bytes, data: bytes = b"", length: int | None = None, sparse: int = 0) -> None:
-    """Writes a checkpoint's tensors, with the hash that fits."""
-    text = header if isinstance(header, bytes) else json.dumps(header).encode()
-    path.write_bytes(struct.pack("<Q", len(text) if length is None else length) + text + data)
-    if sparse:
-        os.truncate(path, sparse)
-        return
-    values = path.with_name("checkpoint.json")
-    known = json.loads(values.read_text()) | {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-    values.write_text(json.dumps(known))
-
-
-MEANS = {"gaussians.means": {"dtype": "F32", "shape": [4, 3], "data_offsets": [0, 48]}}
-STATES = {
-    "header of 2^63": {"header": b"{}", "length": 2**63},
-    "header of 100 MB": {"header": b"{}" + b" " * 100_000_000},
-    "header of many names": {"header": {f"t{n}": MEANS["gaussians.means"] for n in range(100_000)}, "data": bytes(48)},
-    "no tensors": {"header": {}},
-    "means alone": {"header": MEANS, "data": bytes(48)},
-    "means of 10^12": {"header": {"gaussians.means": MEANS["gaussians.means"] | {"shape": [10**12, 3]}}},
-    "means of integers": {
-        "header": {"gaussians.means": MEANS["gaussians.means"] | {"dtype": "I32"}},
-        "data": bytes(48),
-    },
-    "means of one number": {
-        "header": {"gaussians.means": MEANS["gaussians.means"] | {"shape": [12]}},
-        "data": bytes(48),
-    },
-    "offsets that overlap": {"header": {**MEANS, "gaussians.quaternions": MEANS["gaussians.means"]}, "data": bytes(48)},
-    "offsets below 0": {"header": {"a": MEANS["gaussians.means"] | {"data_offsets": [-48, 0]}}, "data": bytes(48)},
-    "deep": {"header": b"[" * 100_000},
-}
-
-
-LOOKS = ("render run --out seen --device cpu", "train --resume --out run --device cpu -q")
-
-
-@pytest.mark.parametrize("line", LOOKS)
-@pytest.mark.parametrize("name", STATES)
-def test_states_of_a_checkpoint(space, name, line):
-    tensors(next((space / "run").glob("checkpoints/*/state.safetensors")), **STATES[name])
-    tried(space, line, codes=(1,), seconds=100)
-
-
-@pytest.mark.parametrize("line", LOOKS)
-def test_a_state_of_60_gib_of_zeros(space, line):
-    """A sparse file of a few kilobytes: it is not read whole before its header says that it is none of ours."""
-    tensors(next((space / "run").glob("checkpoints/*/state.safetensors")), MEANS, sparse=60 << 30)
-    ended = call(*line.split(), folder=space)
-    assert ended.code == 1 and ended.seconds < 20 and not (space / "seen").exists()
-
-
-MORE_PLANS = {
-    "a base time of 1e400": {"base_time": "@1e400"},
-    "times of 1e400": {"exposure_times": {"r_0": "@1e400"}},
-    "times of others": {"exposure_times": {"nobody": 1.0}},
-    "views of nobody": {"blocks": [PLAN["blocks"][0] | {"views": ["nobody", "r_0", "r_0"]}]},
-    "a share of 1e-320": {"blocks": [PLAN["blocks"][0] | {"fraction": 1e-320}]},
-    "walls of nan": {"blocks": [PLAN["blocks"][0] | {"low": ["@NaN"] * 3}]},
-    "a margin of 1e308": {"blocks": [PLAN["blocks"][0] | {"margin": [1e308] * 3}]},
-    "a unit of 1e-320": {"normalization": {"center": [1e308] * 3, "unit": 1e-320}},
-    "bytes of 10^30": {"photo_bytes": {"r_0": 10**30}},
-    "two of a name": {"blocks": PLAN["blocks"] * 2},
-    "a number of 9 digits": {"blocks": [PLAN["blocks"][0] | {"name": "block_999999999"}]},
-    "steps of 10^18": {"config": {"schedule": {"iterations": 10**18}}},
-}
-
-
-@pytest.mark.parametrize("name", MORE_PLANS)
-def test_more_plans_of_blocks(space, name):
-    """With pickled values where submitit would put its own: nobody reads them."""
-    logs = space / "new" / "blocks" / "logs"
-    logs.mkdir(parents=True)
-    for file in ("0_0_result.pkl", "0_submitted.pkl", "20261126-000000-aaaaaaaa/1_0_result.pkl"):
-        (logs / file).parent.mkdir(exist_ok=True)
-        (logs / file).write_bytes(pickle.dumps(_Harm(str(space / "PWNED"))))
-    text = json.dumps(PLAN | MORE_PLANS[name]).replace('"@1e400"', "1e400").replace('"@NaN"', "NaN")
-    (space / "new" / "blocks.json").write_text(text)
-    tried(space, "train photos --resume --out new --device cpu -q", seconds=100)
-    assert not (space / "PWNED").exists()
-
-
-class _Harm:
-    def __init__(self, path: str):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (self.path,)
-
-
 def patched_exr(path: Path, value: float) -> None:
     import OpenEXR
 
@@ -337,32 +220,35 @@ def test_copies_of_photos(space, name):
     tried(space, TRAIN_SET, codes=(1,), seconds=100)
 
 
-ASKED = {
-    "run of 1e400": ("/frame", b'{"camera": {}, "run": 1e400}'),
-    "count of 1e400": ("/path", b'{"cameras": [{}], "count": 1e400}'),
-    "count of 5,000 digits": ("/path", b'{"cameras": [{}], "count": ' + b"9" * 5000 + b"}"),
-    "light of 1e400": ("/gain", b'{"light": 1e400, "stops": 1}'),
-    "gain of 1e400": ("/gain", b'{"light": 0, "stops": 1e400}'),
-    "gain of a text": ("/gain", b'{"light": 0, "stops": "nan"}'),
-    "up of zeros": ("/orientation", b'{"up": [0, 0, 0]}'),
-    "up of 1e400": ("/orientation", b'{"up": [1e400, 0, 0]}'),
-    "up of many": ("/orientation", json.dumps({"up": [1] * 100_000}).encode()),
-    "scale of 1e-320": ("/orientation", b'{"scale": 1e-320}'),
-    "crop of a text": ("/edit", b'{"crop": "' + b"9," * 50_000 + b'"}'),
-    "page of a run that is none": ("/save", b'{"kind": "page", "run": 7, "cameras": [{}]}'),
-}
+OUTSIDE = ("/etc/passwd", "../../etc/passwd", "http://127.0.0.1:9/a.png", "/dev/zero", "a\0b", "x" * 5000, 5, None)
 
 
-@pytest.mark.parametrize("name", ASKED)
-def test_further_requests_that_are_refused(served, name):  # noqa: F811
-    path, body = ASKED[name]
-    if path in ("/path", "/frame", "/save"):
-        body = body.replace(b"{}", json.dumps(served.camera).encode())
-    said = answer_to(served.server_address[1], posted(path, body), 60)
-    assert said.startswith((b"HTTP/1.1 4", b"HTTP/1.1 5")) and b"Traceback" not in said, said[:300]
-    assert answer_to(served.server_address[1], got("/versions")).startswith(b"HTTP/1.1 200")
+SETS = [
+    *((("frames", 0, "file_path"), value) for value in OUTSIDE),
+    *((("frames", 0, "transform_matrix"), value) for value in ("abc", [[NAN] * 4] * 4, [[FAR] * 4] * 4)),
+    *((("frames",), value) for value in ({}, [], 5)),
+    *((("camera_angle_x",), value) for value in (NAN, 0, "x", 7)),
+    *((("w",), value) for value in (-1, 10**12)),
+]
 
 
-def test_a_length_of_5000_digits(served):  # noqa: F811
-    said = answer_to(served.server_address[1], posted("/frame", {}, Content_Length="9" * 5000), ends=True)
-    assert not said.startswith(b"HTTP/1.1 2") and b"Traceback" not in said
+@pytest.mark.parametrize(
+    ("place", "value", "codes"), [case(f"{place[-1]} = {value!s:.20}", place, value) for place, value in SETS]
+)
+def test_sets(space, place, value, codes):
+    tree = at = json.loads((space / "photos" / "transforms.json").read_text())
+    for name in ("fl_x", "fl_y") if place[0] == "camera_angle_x" else ():
+        tree.pop(name, None)
+    for key in place[:-1]:
+        at = at[key]
+    at[place[-1]] = value
+    put(space / "photos" / "transforms.json", tree)
+    either = place[0] == "w" or place[-1] == "transform_matrix" or str(value).startswith(("http", "/"))  # Left out
+    tried(space, SHORT, EITHER if either else codes)
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "exposures.json", "images/r_1.png"])
+@pytest.mark.parametrize("kind", ["fifo", "zero", "folder"])
+def test_kinds_of_files_of_a_set(space, name, kind):
+    put(space / "photos" / name, kind)
+    tried(space, SHORT, EITHER if name.startswith("images") else (1,))
