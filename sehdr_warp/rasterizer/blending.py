@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from .tile_lists import PackedSplats, TileLists
 from .torch_contract import direct_apply, keeps_graph, once_differentiable
 from .warp_launch.launching import launch, warp_scalar
 
+ROWS_OF_TILE = blend_cpu.HALVES * TILE_SIZE  # Of LANES pixels each
 PIECES_PER_THREAD = 16  # Of the image, on the CPU: their work differs by more than their intersections.
 Backward = Callable[[Tensor, Tensor | None], Tensor]
 """Maps the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6 or more]: features, conic
@@ -120,68 +122,86 @@ def blend_on_cpu(
     transmittance: Tensor,
     alpha_threshold: float,
     deterministic: bool,
-) -> Backward:
+) -> "TileBackward":
     """Fill image [H, W, C] and transmittance [H, W]: balanced pieces of tiles, a thread each."""
-    scalar, emit_order = warp_scalar(features.dtype), lists.emit_order
-    assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
-    height, width, channels = image.shape
-    kind = scalar, channels, exp_squarings(alpha_threshold)
-    tile_count, pieces = lists.columns * lists.rows, balanced_pieces(lists)
+    assert lists.emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
+    tiles, channels = _Tiles(features, lists, packed, alpha_threshold, balanced_pieces(lists)), image.shape[2]
+    tile_transmittance, last_contributor = tiles.rows(ROWS_OF_TILE), tiles.rows(ROWS_OF_TILE)
+    inputs = lists.tile_ranges, lists.gaussians, packed.means_opacities, packed.conics_cutoffs, *tiles.frame()
+    outputs = last_contributor, image.view(-1, channels), transmittance
+    arguments = *inputs, tile_transmittance, tiles.rows(channels, ROWS_OF_TILE), *outputs
+    tiles.launch(blend_cpu.forward_kernel, *arguments)
+    return TileBackward(tiles, transmittance, tile_transmittance, last_contributor)
 
-    def rows(*shape):
-        return features.new_empty(tile_count, *shape, blend_cpu.LANES)
 
-    count = blend_cpu.HALVES * TILE_SIZE
-    lane_offsets = torch.arange(blend_cpu.LANES, dtype=features.dtype, device=features.device)
-    means_opacities, conics_cutoffs = packed.means_opacities, packed.conics_cutoffs
-    frame = features, lists.columns, width, height, alpha_threshold, lane_offsets
-    tile_transmittance, last_contributor = rows(count), rows(count)
-    launch(
-        blend_cpu.forward_kernel(*kind),
-        tile_count,
-        lists.tile_ranges,
-        lists.gaussians,
-        means_opacities,
-        conics_cutoffs,
-        *frame,
-        tile_transmittance,
-        rows(channels, count),
-        last_contributor,
-        image.view(-1, channels),
-        transmittance,
-        ranges=pieces,
-    )
+@dataclass(frozen=True)
+class _Tiles:
+    """Values that the forward and the backward pass of blend_on_cpu() share.
 
-    def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
+    Attributes:
+        features: [N, C].
+        lists: to blend.
+        packed: Gaussians to blend.
+        alpha_threshold: contributions with a smaller alpha are left out.
+        pieces: ranges of tiles, see balanced_pieces().
+    """
+
+    features: Tensor
+    lists: TileLists
+    packed: PackedSplats
+    alpha_threshold: float
+    pieces: Tensor
+
+    def launch(self, kernel_of: Callable[..., Any], *arguments: Any) -> None:
+        """Launch a kernel over the tiles; kernel_of makes it for a scalar type and a number of channels."""
+        squarings = exp_squarings(self.alpha_threshold)
+        kernel = kernel_of(warp_scalar(self.features.dtype), self.features.shape[1], squarings)
+        launch(kernel, self.lists.columns * self.lists.rows, *arguments, ranges=self.pieces)
+
+    def rows(self, *shape: int) -> Tensor:
+        """Allocate rows of LANES numbers for each tile, [tiles, *shape, LANES]."""
+        return self.features.new_empty(self.lists.columns * self.lists.rows, *shape, blend_cpu.LANES)
+
+    def frame(self) -> tuple[Any, ...]:
+        """Return the arguments that both kernels take behind the packed Gaussians."""
+        lane_offsets = torch.arange(blend_cpu.LANES, dtype=self.features.dtype, device=self.features.device)
+        lists = self.lists
+        return self.features, lists.columns, lists.width, lists.height, self.alpha_threshold, lane_offsets
+
+
+@dataclass(frozen=True)
+class TileBackward:
+    """The backward pass of blend_on_cpu(); see Backward.
+
+    Attributes:
+        tiles: that were blended.
+        transmittance: [H, W], the result.
+        tile_transmittance: the same by tile; the kernel takes it back to the front, in place.
+        last_contributor: by tile, of the forward kernel.
+    """
+
+    tiles: _Tiles
+    transmittance: Tensor
+    tile_transmittance: Tensor
+    last_contributor: Tensor
+
+    def __call__(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
+        """Return the gradients by Gaussian."""
+        tiles, lists, packed = self.tiles, self.tiles.lists, self.tiles.packed
+        emit_order, channels = lists.emit_order, grad_image.shape[2]
+        assert emit_order is not None
         if grad_transmittance is None:
-            grad_transmittance = torch.zeros_like(transmittance)
-        # The kernel takes the transmittance back to the front, in place.
-        tile_state = tile_transmittance.clone() if keeps_graph() else tile_transmittance
-        grad_intersections = features.new_empty(lists.intersection_count, channels + 6)
-        launch(
-            blend_cpu.backward_kernel(*kind),
-            tile_count,
-            lists.tile_ranges,
-            lists.gaussians,
-            emit_order.emit_indices,
-            means_opacities,
-            conics_cutoffs,
-            *frame,
-            last_contributor,
-            grad_image.view(-1, channels),
-            grad_transmittance,
-            tile_state,
-            rows(count),
-            rows(channels, count),
-            rows(TILE_SIZE),
-            rows(TILE_SIZE),
-            rows(channels + 6),
-            grad_intersections,
-            ranges=pieces,
-        )
+            grad_transmittance = torch.zeros_like(self.transmittance)
+        tile_state = self.tile_transmittance.clone() if keeps_graph() else self.tile_transmittance
+        grad_intersections = tiles.features.new_empty(lists.intersection_count, channels + 6)
+        inputs = lists.tile_ranges, lists.gaussians, emit_order.emit_indices
+        inputs += packed.means_opacities, packed.conics_cutoffs, *tiles.frame(), self.last_contributor
+        gradients = grad_image.view(-1, channels), grad_transmittance, tile_state
+        scratch = tiles.rows(ROWS_OF_TILE), tiles.rows(channels, ROWS_OF_TILE)
+        scratch += tiles.rows(TILE_SIZE), tiles.rows(TILE_SIZE), tiles.rows(channels + 6)
+        arguments = *inputs, *gradients, *scratch, grad_intersections
+        tiles.launch(blend_cpu.backward_kernel, *arguments)
         return emit_order.sum_by_gaussian(grad_intersections)
-
-    return backward
 
 
 def exp_squarings(alpha_threshold: float) -> int:

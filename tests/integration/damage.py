@@ -51,10 +51,5 @@ def remove_value(path, name):
     path.write_text(json.dumps({key: value for key, value in json.loads(path.read_text()).items() if key != name}))
 
 
-def cut_tensors(run):
-    path = checkpoint_of(run) / "state.safetensors"
-    path.write_bytes(path.read_bytes()[:-9])
-
-
 def shorten_means(tensors):
     tensors["gaussians.means"] = tensors["gaussians.means"][:3].clone()
