@@ -68,12 +68,12 @@ def _address_space_left() -> float:
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         with open("/proc/self/statm", "rb") as file:
-            used = int(file.read().split()[0]) * resource.getpagesize()
+            in_use = int(file.read().split()[0]) * resource.getpagesize()
     except ImportError:
         return float("inf")
     except OSError as error:
         return 0 if error.errno == errno.ENOMEM else float("inf")
-    return float("inf") if limit == resource.RLIM_INFINITY else limit - used
+    return float("inf") if limit == resource.RLIM_INFINITY else limit - in_use
 
 
 if __name__ == "__main__":

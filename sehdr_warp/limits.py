@@ -44,8 +44,8 @@ def available_memory() -> int:
     with suppress(OSError, StopIteration, ValueError):
         lines = (PROC / "meminfo").read_text().splitlines()
         limits.append(1024 * int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]))
-    if (left := memory_left()) is not None:
-        limits.append(left)
+    if (available := memory_left()) is not None:
+        limits.append(available)
     return min(limits)
 
 

@@ -122,8 +122,8 @@ def _evaluate_pictures(options: Evaluate, truth_path: str) -> dict[str, Any]:
         dataset = parse_dataset(truth_path)
         resampled = dataset.alpha == "background" or not all(record.lens.is_pinhole for record in dataset.records)
         # Photos that are not resampled keep their codes, so every response finds the same regions clipped and dark.
-        known = dataset.kind != "encoded"  # Light that needs no response
-        response = "auto" if known or resampled or max_size is not None else "srgb"
+        states_light = dataset.kind != "encoded"  # Light that needs no response
+        response = "auto" if states_light or resampled or max_size is not None else "srgb"
     truth = load_scene(truth_path, response=response, max_size=max_size)
     return evaluate_folder(options.run, truth, lpips_weights=options.result.lpips)
 

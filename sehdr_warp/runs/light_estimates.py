@@ -61,8 +61,8 @@ def light_estimates(
         stated_light = view.light_above_white
         stated_light = None if stated_light is None else torch.from_numpy(stated_light).to(device).float()
         deviation = view.light_above_white_deviation
-        known = combined_estimates(exposure, mask.to(device), seeing, stated_light, deviation)
-        result.append(ClippedLight(_by_solid_angle(known.log_light.cpu(), view.camera), known.certainty.cpu()))
+        light = combined_estimates(exposure, mask.to(device), seeing, stated_light, deviation)
+        result.append(ClippedLight(_by_solid_angle(light.log_light.cpu(), view.camera), light.certainty.cpu()))
     return result
 
 

@@ -78,8 +78,8 @@ def advice(
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
     """Return the words of a command line that state options, by their names, but for the number of steps."""
-    stated = {name: value for name, value in options.items() if value is not None and name != "schedule.iterations"}
-    return [word for name, value in stated.items() for word in ("--" + name.replace("_", "-"), str(value))]
+    values = {name: value for name, value in options.items() if value is not None and name != "schedule.iterations"}
+    return [word for name, value in values.items() for word in ("--" + name.replace("_", "-"), str(value))]
 
 
 def _exposure_jump(offsets: Mapping[str, float], again: str) -> str | None:

@@ -39,19 +39,19 @@ def brighten_clipped(field: RadianceField, views: Sequence[View], estimates: Seq
     values = gaussians.harmonics_dc[:, 0] * HARMONIC_0
     white = torch.from_numpy(model.start(np.ones((1, 3)), field.response)).to(values)
     is_white = values >= white - TOLERANCE
-    chosen = is_white.any(1).nonzero()[:, 0]
-    points, sums, weights = gaussians.means[chosen], 0.0, torch.full((len(chosen), 3), 1e-12).to(values)
+    index = is_white.any(1).nonzero()[:, 0]
+    points, sums, weights = gaussians.means[index], 0.0, torch.full((len(index), 3), 1e-12).to(values)
     for view, estimate in every_nth(list(zip(views, estimates, strict=True)), MOST_VIEWS):
-        if len(chosen) and bool(estimate.any()):
+        if len(index) and bool(estimate.any()):
             places = _places(view.camera, points)
             inside = ((places >= 0) & (places < 1)).all(1)
             x, y = torch.where(inside[:, None], places, 0).T
-            known = _cells(estimate.to(values), x, y)
-            weight = known[:, 3:].square() * inside[:, None]
-            sums = sums + weight * (known[:, :3] + math.log(field.base_time / view.exposure_time))
+            cells = _cells(estimate.to(values), x, y)
+            weight = cells[:, 3:].square() * inside[:, None]
+            sums = sums + weight * (cells[:, :3] + math.log(field.base_time / view.exposure_time))
             weights += weight
-    excess = torch.where(is_white[chosen], (sums / weights).clamp_min(0), 0)
-    gaussians.harmonics_dc[chosen, 0] = model.brighten(values[chosen], excess) / HARMONIC_0
+    excess = torch.where(is_white[index], (sums / weights).clamp_min(0), 0)
+    gaussians.harmonics_dc[index, 0] = model.brighten(values[index], excess) / HARMONIC_0
     return int((excess > 0).any(1).sum())
 
 

@@ -85,8 +85,8 @@ def exchange_seconds(gaussians: float, gpus: int, nodes: int = 1) -> float:
     """Return the additional duration of a step on several GPUs, seconds."""
     if gpus == 1:
         return 0.0
-    sent = exchange_bytes(gaussians, gpus)
-    return EXCHANGE_SECONDS + max(sent / 4 * NUMBER_SECONDS, sent / NETWORK if nodes > 1 else 0.0)
+    size = exchange_bytes(gaussians, gpus)
+    return EXCHANGE_SECONDS + max(size / 4 * NUMBER_SECONDS, size / NETWORK if nodes > 1 else 0.0)
 
 
 def training_cost(work: Workload, gpus: int = 1, nodes: int = 1) -> Cost:
