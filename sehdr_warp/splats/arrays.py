@@ -231,13 +231,8 @@ def rotate_harmonics(harmonics: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     return np.einsum("ij,njc->nic", turned, harmonics.astype(np.float64)).astype(np.float32)
 
 
-def evaluate_colors(gaussians: GaussianArrays, directions: np.ndarray) -> np.ndarray:
-    """Return [N, D, 3] colors, as the color model defines them, for directions [D, 3] or [N, D, 3]."""
-    return colors_of_basis(gaussians, harmonic_basis(directions, gaussians.degree))
-
-
 def colors_of_basis(gaussians: GaussianArrays, basis: np.ndarray) -> np.ndarray:
-    """Return evaluate_colors() for the harmonic_basis() of the directions."""
+    """Return [N, D, 3] colors, as the color model defines them, for the harmonic_basis() of directions."""
     value = basis @ gaussians.harmonics.astype(np.float64)
     if gaussians.color_model == "log":
         return np.exp(np.clip(value, -80, 80))

@@ -7,12 +7,16 @@ from sehdr_warp.model.baking import agreement, bake, field_of, gaussians_of, ref
 from sehdr_warp.rasterizer import spherical_harmonics
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, look_at
-from sehdr_warp.splats.arrays import evaluate_colors, harmonic_basis
+from sehdr_warp.splats.arrays import colors_of_basis, harmonic_basis
 
 from ..splats.test_splat_files import gaussians
 
 NOWHERE = np.empty((0, 3))
 SRGB = response_by_name("srgb")
+
+
+def evaluate_colors(gaussians, directions):
+    return colors_of_basis(gaussians, harmonic_basis(directions, gaussians.degree))
 
 
 def camera(x=0.0, size=32):

@@ -142,7 +142,7 @@ def case(name: str, *values: Any, codes: tuple[int, ...] = REFUSED):
 
 
 def put(path: Path, content: Any) -> None:
-    """Write bytes, text or JSON to a file, or make one of another kind: `fifo`, `zero`, `folder`, `sparse`."""
+    """Write bytes, text or JSON to a file, or make one of another kind: `fifo`, `zero`, `folder`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
     kinds = {"fifo": os.mkfifo, "zero": lambda place: place.symlink_to("/dev/zero"), "folder": os.mkdir}
