@@ -64,12 +64,12 @@ def parse_dataset(
     folder = folder if folder.is_dir() else dataset.folder
     if not dataset.records:
         raise InputError(folder, "has no views", "check the data folder")
-    records, masks = assign_masks(dataset.records, folder)
-    records, truth = assign_truth(records, folder) if dataset.format in _WITH_TRUTH else (records, [])
-    every = records
-    records, exposures = choose_exposure(records, exposure_index, folder)
-    records, kind, odd = usable_photos(records)
-    records, times_known, times = _with_times(records, kind, folder)
+    records, mask_notes = assign_masks(dataset.records, folder)
+    records, truth_notes = assign_truth(records, folder) if dataset.format in _WITH_TRUTH else (records, [])
+    all_records = records
+    records, exposure_notes = choose_exposure(records, exposure_index, folder)
+    records, kind, photo_notes = usable_photos(records)
+    records, times_known, time_notes = _with_times(records, kind, folder)
     dataset = replace(dataset, kind=kind, records=tuple(records), folder=folder, times_known=times_known)
     if check is not None:
         check(dataset)
@@ -78,16 +78,16 @@ def parse_dataset(
         dataset, records, unplaced = place_photos(dataset, records, folder, kind, cache)
         if unplaced:  # Their times are not to be told of, nor the others' relative to theirs.
             untimed = [replace(record, exposure_time=None, time_known=True) for record in records]
-            records, times_known, times = _with_times(untimed, kind, folder)
+            records, times_known, time_notes = _with_times(untimed, kind, folder)
             dataset = replace(dataset, times_known=times_known)
-    records, split = _with_splits(records, dataset, holdout)
+    records, split_notes = _with_splits(records, dataset, holdout)
     training = sum(record.split == "train" for record in records)
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
-    mentioned = [*unplaced, *dataset.mentioned]
-    notes_unused = [] if is_embedded(path) or dataset.format == "video" else unused_notes(folder, every, mentioned)
-    notes = (*dataset.notes, *masks, *truth, *exposures, *odd, *times, *split, *notes_unused)
+    notes = (*dataset.notes, *mask_notes, *truth_notes, *exposure_notes, *photo_notes, *time_notes, *split_notes)
+    if not is_embedded(path) and dataset.format != "video":
+        notes = (*notes, *unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]))
     return replace(dataset, records=tuple(records), notes=notes, name=name)
 
 
