@@ -58,7 +58,7 @@ class ModelConfig(_Table):
     exposure_compensation: Literal["auto", "unstated", "always", "never"] = "auto"
     """correct changes of exposure, white balance and vignetting between photos, measured at points that they share;
     auto: exposure only if photos state no times, or times that the points contradict; unstated: only photos without
-    times; needs the plan and matched points"""
+    times; always: as if no times were stated; needs the plan and matched points"""
     init_file: str = ""
     """file of Gaussians (PLY, OpenUSD, glTF) in the scene's coordinates to start from instead of points; empty: none"""
     antialiased: bool = False
