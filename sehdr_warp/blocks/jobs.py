@@ -59,15 +59,12 @@ def run_blocks(
     Raises:
         SehdrError: If submitit is missing, or if blocks cannot be trained, after all others have been.
     """
-    unfinished = (index for index in range(len(plan.blocks)) if not is_finished(folder_of(out, plan, index)))
-    # The longest first, so that none of them is left alone at the end.
-    waiting = deque(sorted(unfinished, key=lambda index: -plan.blocks[index].fraction))
-    finished = len(plan.blocks) - len(waiting)
-    if finished:
-        log.info("%d of %d blocks are finished already", finished, len(plan.blocks))
-    if not waiting:
+    queue = _Queue(out, plan)
+    if queue.finished:
+        log.info("%d of %d blocks are finished already", queue.finished, len(plan.blocks))
+    if not queue.waiting:
         return
-    slots = min(gpus, len(waiting)) if slurm is None else len(waiting)
+    slots = min(gpus, len(queue.waiting)) if slurm is None else len(queue.waiting)
     on_cpu = slurm_device == "cpu" if slurm is not None else device.type == "cpu"
     executors = (
         _executors(out, device, slots) if slurm is None else [_slurm_executor(out, slurm, gpu=not on_cpu)] * slots
@@ -75,48 +72,80 @@ def run_blocks(
     arguments = ("cpu" if on_cpu else None), photo_storage, installed_versions()
     # Jobs that run beside each other on this machine share its processors.
     job = BlockJob(max(1, thread_count() // slots) if slurm is None and slots > 1 else None)
-    tries, errors = dict.fromkeys(waiting, 0), {}
-    reached = {index: _newest_checkpoint(folder_of(out, plan, index)) for index in waiting}
     running: dict[int, tuple[int, Any]] = {}
     notes = None if slurm is None else _waiting_notes()
     try:
-        while waiting or running:
+        while queue.waiting or running:
             for slot in range(slots):
-                if slot in running or not waiting:
-                    continue
-                index = waiting.popleft()
-                tries[index] += 1
-                running[slot] = index, _submit(executors[slot], job, out.absolute(), index, *arguments)
-                log.info("%s: training begins, %d photos", plan.blocks[index].name, len(plan.blocks[index].views))
+                if slot not in running and queue.waiting:
+                    index = queue.start()
+                    running[slot] = index, _submit(executors[slot], job, out.absolute(), index, *arguments)
+                    log.info("%s: training begins, %d photos", plan.blocks[index].name, len(plan.blocks[index].views))
             time.sleep(POLL if slurm is None else SLURM_POLL)
             if notes is not None:
                 notes.look([submitted.job_id for _, submitted in running.values()])
             for slot, (index, submitted) in list(running.items()):
-                if not submitted.done():
-                    continue
-                del running[slot]
-                name, folder = plan.blocks[index].name, folder_of(out, plan, index)
-                error = _error_of(submitted, folder)
-                if (now := _newest_checkpoint(folder)) != reached[index]:
-                    tries[index], reached[index] = 0, now
-                if error is None:
-                    finished += 1
-                    log.info("%s: finished, %d of %d", name, finished, len(plan.blocks))
-                elif submitted.exception() is not None and tries[index] < TRIES:
-                    log.warning("%s: %s; it continues from its newest checkpoint", name, error)
-                    waiting.append(index)
-                else:
-                    log.info("%s: cannot be trained: %s", name, error)
-                    errors[name] = error
+                if submitted.done():
+                    del running[slot]
+                    queue.end(index, submitted)
     except BaseException:
         for _, submitted in running.values():
             submitted.cancel(check=False)
         raise
-    if errors:
-        name, error = next(iter(errors.items()))
-        others = f" and {len(errors) - 1} more blocks" if len(errors) > 1 else ""
-        progress = f"{finished} of {len(plan.blocks)} blocks are finished"
-        remedy = f"--resume trains the others (logs in {out / FOLDER / 'logs'})"
+    queue.require_all()
+
+
+class _Queue:
+    """Blocks of a plan that wait, and how often each was started.
+
+    Attributes:
+        waiting: Indices of blocks to start, the longest first, so that none of them is left alone at the end.
+        finished: Number of blocks that are trained.
+    """
+
+    def __init__(self, out: Path, plan: BlockPlan):
+        """Queue the blocks that are not finished."""
+        self._out, self._plan = out, plan
+        unfinished = (index for index in range(len(plan.blocks)) if not is_finished(self._folder(index)))
+        self.waiting = deque(sorted(unfinished, key=lambda index: -plan.blocks[index].fraction))
+        self.finished = len(plan.blocks) - len(self.waiting)
+        self._tries = dict.fromkeys(self.waiting, 0)
+        self._checkpoints = {index: _newest_checkpoint(self._folder(index)) for index in self.waiting}
+        self._errors: dict[str, str] = {}
+
+    def _folder(self, index: int) -> Path:
+        return folder_of(self._out, self._plan, index)
+
+    def start(self) -> int:
+        """Return the index of the next block, which is no longer waiting."""
+        index = self.waiting.popleft()
+        self._tries[index] += 1
+        return index
+
+    def end(self, index: int, submitted: Any) -> None:
+        """Count a block whose job has ended; queue it again if its process died, unless TRIES got no further."""
+        name, folder = self._plan.blocks[index].name, self._folder(index)
+        error = _error_of(submitted, folder)
+        if (newest := _newest_checkpoint(folder)) != self._checkpoints[index]:
+            self._tries[index], self._checkpoints[index] = 0, newest
+        if error is None:
+            self.finished += 1
+            log.info("%s: finished, %d of %d", name, self.finished, len(self._plan.blocks))
+        elif submitted.exception() is not None and self._tries[index] < TRIES:
+            log.warning("%s: %s; it continues from its newest checkpoint", name, error)
+            self.waiting.append(index)
+        else:
+            log.info("%s: cannot be trained: %s", name, error)
+            self._errors[name] = error
+
+    def require_all(self) -> None:
+        """Raise SehdrError, which names a block and counts the others, if some cannot be trained."""
+        if not self._errors:
+            return
+        name, error = next(iter(self._errors.items()))
+        others = f" and {len(self._errors) - 1} more blocks" if len(self._errors) > 1 else ""
+        progress = f"{self.finished} of {len(self._plan.blocks)} blocks are finished"
+        remedy = f"--resume trains the others (logs in {self._out / FOLDER / 'logs'})"
         raise SehdrError(f"{name}{others}: {error}; {progress}; {remedy}")
 
 
