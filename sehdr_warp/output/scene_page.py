@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..files import atomic_path, check_absent
+from ..kernels.constants import FRUSTUM_MARGIN, NEAR_PLANE
 from ..model.baking import gaussians_of
 from ..scene import Camera
 from ..splats.arrays import HARMONIC_0
@@ -74,6 +75,8 @@ def write_scene_page(
         **opening,
         "up": transform.rotation[1].tolist(),
         "columns": list(columns),
+        "near": NEAR_PLANE * run.field.normalization.unit,
+        "margin": FRUSTUM_MARGIN,
         "base_time": run.base_time,
         "grey": display_gain(run.response),
         "curve": curve_table(run.response),

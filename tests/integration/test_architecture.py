@@ -58,6 +58,7 @@ ALLOWED = {
         "model.lights",
         "model.color_models",
         "model.visibility",
+        "kernels.constants",
     },
     "viewer": ANY | {"runs", "scene", "output", "splats", "model.lights"},
     "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.images", "output.charts"},

@@ -27,10 +27,14 @@ def browser():
 
 
 @contextmanager
-def page_of(chromium_browser, url, width=700, height=420, script=""):
-    """A page that may reach nothing but its own server or file, and must not complain. script: runs before its own."""
+def page_of(chromium_browser, url, width=700, height=420, script="", **options):
+    """A page that may reach nothing but its own server or file, and must not complain.
+
+    script: runs before its own. options: of the browser's context, such as has_touch.
+    """
     complaints = []
-    context = chromium_browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
+    viewport = {"width": width, "height": height}
+    context = chromium_browser.new_context(viewport=viewport, accept_downloads=True, **options)
     context.add_init_script(script)
     page = context.new_page()
     page.on("console", lambda line: complaints.append(line.text) if line.type in ("error", "warning") else None)
@@ -44,6 +48,14 @@ def page_of(chromium_browser, url, width=700, height=420, script=""):
     context.close()
     # What the driver of a software GPU says of its speed is none of the page's.
     assert [line for line in complaints if "GPU stall" not in line and "swiftshader" not in line.lower()] == []
+
+
+def pinch(page, before, after):
+    """Move two fingers from two places to two others, in pixels of the page."""
+    touch = page.context.new_cdp_session(page)
+    for kind, fingers in (("touchStart", before), ("touchMove", after), ("touchEnd", ())):
+        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(fingers)]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
 
 def pixels(page, selector):

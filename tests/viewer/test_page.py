@@ -8,7 +8,7 @@ from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.scene import Camera
 
 from ..output.helpers import AnalyticRun, read_exr
-from .browser import browser, page_of, pixels
+from .browser import browser, page_of, pinch, pixels
 
 FULL = "#stage[data-frame=full]"
 
@@ -237,6 +237,14 @@ def test_moving_resizing_and_two_at_once(chromium, serve):
             page.click("#savePath")
         assert '"cameras"' in download.value.path().read_text()
         np.testing.assert_array_equal(pixels(other, "#picture"), theirs)
+
+
+def test_two_fingers_come_nearer(chromium, serve):
+    with page_of(chromium, serve().url, has_touch=True) as page:
+        page.wait_for_selector(FULL)
+        ahead = page.evaluate("camera.ahead")
+        settle(page, lambda: pinch(page, [(100, 80), (120, 80)], [(90, 80), (130, 80)]))
+        assert page.evaluate("camera.ahead") == pytest.approx(ahead / 2)
 
 
 def test_brackets_and_a_film_are_saved_and_what_is_wrong_is_told(chromium, serve):

@@ -1,9 +1,11 @@
 """The page to send, in a real browser and from disk: the light is that of our own renders."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.errors import InputError, UsageError
 from sehdr_warp.output.export import export
@@ -15,8 +17,9 @@ from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera
 from sehdr_warp.training.train import train
 
+from ..output.test_splat_edits import run_of, splats
 from ..training.toy import toy_scene
-from .browser import browser, page_of, pixels
+from .browser import browser, page_of, pinch, pixels
 
 FULL = "#stage[data-frame=full]"
 
@@ -82,3 +85,36 @@ def test_a_file_without_cameras_is_a_page_that_shows_it(run, tmp_path):
         for _ in range(3):
             page.keyboard.press("[")
         assert "1.0" in page.text_content("#stopsTold")
+
+
+def test_two_fingers_come_nearer_and_one_turns(run, tmp_path):
+    file = write_scene_page(run, tmp_path / "scene.html")
+    with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200, has_touch=True) as page:
+        page.wait_for_selector(FULL)
+        ahead, pivot = page.evaluate("[camera.ahead, camera.pivot]")
+        pinch(page, [(100, 80), (120, 80)], [(90, 80), (130, 80)])
+        until = "ahead => Math.abs(camera.ahead / ahead - 0.5) < 1e-6"
+        page.wait_for_function(until, arg=ahead)
+        # Fingers are told one after the other, so their middle moves a little on the way.
+        np.testing.assert_allclose(page.evaluate("camera.pivot"), pivot, atol=0.05 * ahead)
+        pivot = page.evaluate("camera.pivot")
+        pinch(page, [(100, 80)], [(140, 90)])  # One finger, as before: about the same point
+        page.wait_for_function("pivot => Math.hypot(...add(camera.pivot, pivot, -1)) < 1e-6", arg=pivot)
+        assert page.evaluate("camera.ahead") == pytest.approx(ahead / 2)
+        page.wait_for_selector(FULL)
+
+
+def test_gaussians_beyond_the_picture_are_drawn_as_ours_are(tmp_path):
+    """Larger than the picture, far off its axis, and nearer than the near plane: fog in front of a camera."""
+    # The nearest first, because the engine does not order so few.
+    gaussians = splats([(0, 0, -5.993), (0.5, 0, -5.6), (0, 0, -5), (0, 0, 0)], [0.9, 0.6, 0.3, 0.9])
+    gaussians.harmonics[:] *= np.float32([8, 2, 1, 4])[:, None, None]
+    sizes = np.log([[0.01] * 3, [0.3] * 3, [6, 2, 0.5], [0.3] * 3]).astype(np.float32)
+    run = run_of(tmp_path, replace(gaussians, log_scales=sizes, color_model="linear"))
+    file = write_scene_page(run, tmp_path / "fog.html")
+    with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
+        page.wait_for_selector(FULL)
+        camera = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
+        exposure = as_array(run.render(camera).hdr) * run.base_time
+        error = pixels(page, "#picture") - as_array(run.response.encode(torch.as_tensor(exposure)))
+        assert exposure.max() > 0.1 and -10 * np.log10(np.mean(error**2)) > 38

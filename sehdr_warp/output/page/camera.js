@@ -43,6 +43,13 @@ class FlyingCamera {
     this.ahead *= factor;
     this.position = add(about, this.forward, -this.ahead);
   }
+  // Two fingers at two places before and after: their distance moves nearer and away, their middle pans.
+  pinch(before, after, size) {
+    const apart = ([a, b]) => Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1]));
+    const [from, to] = [before, after].map(([a, b]) => [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]);
+    this.dolly(apart(before) / apart(after));
+    this.pan((to[0] - from[0]) / size, (to[1] - from[1]) / size);
+  }
   // Stands at a place and looks at another, upright.
   face(place, target) {
     const away = add(target, place, -1), ahead = Math.hypot(...away), forward = unit(away), side = cross(forward, this.up);

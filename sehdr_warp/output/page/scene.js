@@ -9,7 +9,12 @@ let app, eye, color, target, sorted = 0, wanted = null, busy = false, timer = 0,
 async function start() {
   if (!light.gl) throw new Error("this browser has no WebGL2, by which the scene is drawn");
   light.putCurve(facts.curve);
-  const means = new Float32Array((await unpackLight($("means").textContent)).buffer), half = await unpackLight($("rest").textContent);
+  const unpacked = async name => {
+    const values = await unpackLight($(name).textContent);
+    $(name).remove();  // Of a large scene 60 MB of text, which phones lack
+    return values;
+  };
+  const means = new Float32Array((await unpacked("means")).buffer), half = await unpacked("rest");
   const count = means.length / 3;
   const properties = facts.columns.map((name, k) => {
     const storage = k < 3 ? means.subarray(k * count, (k + 1) * count) : Float32Array.from(half.subarray((k - 3) * count, (k - 2) * count), fromHalf);
@@ -42,14 +47,21 @@ async function start() {
 }
 const opening = () => facts.opening || facts.views[facts.first].camera;
 
-// The engine's Gaussians end early, are lifted to make up for it, and left out where small; ours end at the same opacity alone.
+// The engine's Gaussians end early, are lifted to make up for it, are left out where small, shrunk where larger than the
+// picture, and drawn at any nearness; ours end at the same opacity alone and behind the near plane. Both linearize the
+// projection, ours no farther outside of the picture than a margin.
 function asOurs(material, chunks) {
   const change = (name, from, to) => {
-    if (chunks.get(name).search(from) < 0) throw new Error(`the engine has another ${name}`);
-    material.getShaderChunks(pc.SHADERLANGUAGE_GLSL).set(name, chunks.get(name).replace(from, to));
+    const own = material.getShaderChunks(pc.SHADERLANGUAGE_GLSL), before = own.get(name) || chunks.get(name), after = before.replace(from, to);
+    if (after === before) throw new Error(`the engine has another ${name}`);
+    own.set(name, after);
   };
   change("gsplatCommonVS", /min\(1.0, (sqrt\(max\(0.0, log\(alpha \/ alphaClipValue\)\)\) \* 0.5)\)/, "$1");
   change("gsplatPS", /if \(A > 1.0\) \{\s*discard;\s*\}\s*mediump float alpha = normExp\(A\)/, "mediump float alpha = exp(A * -4.0)");
+  change("gsplatCornerVS", "float vmin = min(1024.0, min(viewport_size.x, viewport_size.y));", "float vmin = 1e9;\n\tif (center.proj.w < camera_params.z) return false;");
+  change("gsplatCornerVS", "vec2 J2 = -J1 / vp.z * vp.xy;",
+    `vec2 at = clamp(center.proj.xy / center.proj.w, ${-1 - facts.margin}, ${1 + facts.margin}) + matrix_projection[2].xy;\n\t\tvec2 J2 = J1 * at / vec2(center.projMat00, center.projMat11);`);
+  change("gsplatCornerVS", "vec2(offDiagonal, lambda1 - diagonal1)", "vec2(offDiagonal + 1e-12, lambda1 - diagonal1)");  // Not (0, 0)
   material.setParameter("minPixelSize", 0);
   material.update();
 }
@@ -64,7 +76,7 @@ function resize(width, height) {
 }
 
 function place(c) {  // The engine's camera: OpenGL axes, +y up and +z back
-  const [x, y, z] = c.world_to_camera, at = centerOf(c), pose = new pc.Mat4(), near = facts.size * 1e-3, far = facts.size * 1e3;
+  const [x, y, z] = c.world_to_camera, at = centerOf(c), pose = new pc.Mat4(), near = facts.near, far = Math.max(facts.size, near) * 1e3;
   pose.set([x[0], x[1], x[2], 0, -y[0], -y[1], -y[2], 0, -z[0], -z[1], -z[2], 0, ...at, 1]);
   eye.setPosition(pose.getTranslation());
   eye.setRotation(new pc.Quat().setFromMat4(pose));
@@ -122,13 +134,17 @@ $("stops").addEventListener("input", paint);
 $("tone").addEventListener("change", paint);
 $("view").addEventListener("change", () => jump($("view").value ? facts.views[$("view").value].camera : opening()));
 $("panel").addEventListener("submit", event => event.preventDefault());
-let drag = null;
-stage.addEventListener("pointerdown", event => { stage.setPointerCapture(event.pointerId); drag = [event.clientX, event.clientY]; });
+const pointers = new Map();  // That are down, with their places
+stage.addEventListener("pointerdown", event => { stage.setPointerCapture(event.pointerId); pointers.set(event.pointerId, [event.clientX, event.clientY]); });
+for (const end of ["pointerup", "pointercancel"]) stage.addEventListener(end, event => pointers.delete(event.pointerId));
 stage.addEventListener("pointermove", event => {
-  if (!drag || !event.buttons) return;
-  const size = Math.min(stage.clientWidth, stage.clientHeight), x = (event.clientX - drag[0]) / size, y = (event.clientY - drag[1]) / size;
-  drag = [event.clientX, event.clientY];
-  if (event.buttons & 6 || event.shiftKey) camera.pan(x, y);
+  const last = pointers.get(event.pointerId);
+  if (!last) return;
+  const size = Math.min(stage.clientWidth, stage.clientHeight), x = (event.clientX - last[0]) / size, y = (event.clientY - last[1]) / size;
+  const before = [...pointers.values()];
+  pointers.set(event.pointerId, [event.clientX, event.clientY]);
+  if (before.length === 2) camera.pinch(before, [...pointers.values()], size);
+  else if (event.buttons & 6 || event.shiftKey) camera.pan(x, y);
   else if (event.altKey) camera.look(-x, -y);
   else camera.orbit(2.5 * x, 2.5 * y);
   moved();

@@ -312,14 +312,10 @@ picture.addEventListener("pointerdown", event => {
   state.drag = [event.clientX, event.clientY, 0];
 });
 for (const end of ["pointerup", "pointercancel"]) picture.addEventListener(end, event => fingers.delete(event.pointerId));
-// Two fingers: their distance moves nearer and away, their middle pans.
 function pinch(event) {
-  const before = [...fingers.values()], size = Math.min(stage.clientWidth, stage.clientHeight);
+  const before = [...fingers.values()];
   fingers.set(event.pointerId, [event.clientX, event.clientY]);
-  const after = [...fingers.values()], apart = ([a, b]) => Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1]));
-  const middle = ([a, b]) => [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], [from, to] = [middle(before), middle(after)];
-  camera.dolly(apart(before) / apart(after));
-  camera.pan((to[0] - from[0]) / size, (to[1] - from[1]) / size);
+  camera.pinch(before, [...fingers.values()], Math.min(stage.clientWidth, stage.clientHeight));
   state.drag = [event.clientX, event.clientY, 99];
   moved();
 }
