@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..scene import Camera
-from ..scene.wide_camera import pixels_of_directions, steradians
+from ..scene.wide_camera import pixels_of_directions, steradians, typical_focal_length
 from ..subsets import every_nth
 from .radiance_field import RadianceField
 
@@ -130,7 +130,7 @@ def find_lights(
 
 def _light_at(field: RadianceField, point: np.ndarray, cameras: Sequence[Camera], degree: int | None) -> float:
     """Return the light that reaches a point: the mean of the channels' radiance, integrated over all directions."""
-    focal = float(np.median([np.sqrt(camera.fx * camera.fy) for camera in cameras]))
+    focal = typical_focal_length(cameras)
     # A latitude-longitude map, because its tiles are compact: those of evenly spread directions meet all Gaussians.
     rows = int(np.clip(np.pi * focal, LEAST_ROWS, MOST_ROWS))
     angle = np.pi / rows

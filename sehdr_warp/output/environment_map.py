@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import SehdrError
 from ..files import check_absent
 from ..scene import Camera
+from ..scene.wide_camera import typical_focal_length
 from .camera_paths import training_cameras
 from .colorspace import color_space, from_rec709
 from .exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr, write_radiance
@@ -108,7 +109,7 @@ def write_environment_map(
     center = find_center(run, photos, at, beyond, transform)
     to_world = transform.rotation.T
     directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
-    focal = float(np.median([np.sqrt(c.fx * c.fy) for c in photos])) if photos else 0.0
+    focal = typical_focal_length(photos) if photos else 0.0
     options = {"beyond": center.beyond, "shares": run.clipped_share()}
     rendered = render_map(run, center.position, size, layout, to_world.T, focal, **options)
     weight = solid_angles(size, layout)

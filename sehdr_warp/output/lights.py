@@ -11,6 +11,7 @@ import torch
 
 from ..errors import SehdrError
 from ..files import atomic_path, check_absent
+from ..scene.wide_camera import typical_focal_length
 from .camera_paths import training_cameras
 from .environment_map import COVERED, envmap, inpainted_light, latlong, render_map, solid_angles
 from .exr import exr_header, rgb_channels, write_exr
@@ -241,7 +242,7 @@ def _write_rest(
     """
     cameras = training_cameras(run)
     position, beyond = map_center(cameras)
-    focal = float(np.median([np.sqrt(c.fx * c.fy) for c in cameras]))
+    focal = typical_focal_length(cameras)
     members = [light.members for light in lights]
     rest = render_map(run, position, MAP_SIZE, "latlong", transform.rotation, focal, without=members, beyond=beyond)
     hdr, directions, weight = rest.hdr, latlong(MAP_SIZE) @ transform.rotation, solid_angles(MAP_SIZE, "latlong")

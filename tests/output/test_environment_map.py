@@ -21,7 +21,9 @@ from sehdr_warp.output.exr import write_radiance
 from sehdr_warp.output.map_center import subject_of_walk
 from sehdr_warp.output.world_transform import WorldTransform, world_transform
 from sehdr_warp.runs.run import Splats
+from sehdr_warp.scene import look_at
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
+from sehdr_warp.scene.wide_camera import steradians, typical_focal_length
 from sehdr_warp.splats import GaussianArrays
 
 from .helpers import Entry, camera
@@ -46,6 +48,20 @@ def run(tmp_path):
 def read(path):
     channels, header = read_exr_channels(path)
     return np.stack([channels[name] for name in "RGB"], axis=2), channels, header
+
+
+def test_a_map_has_the_light_of_small_lamps_that_photos_have(tmp_path):
+    """Wherever in the photos they are: pixels at the border see less, and lamps are smoothed to pixels."""
+    lamp = lamps(0.002).rows(np.array([4]))
+    wide = replace(camera(size := 96, size), fx=70.0, fy=70.0, cx=size / 2, cy=size / 2)
+    targets = [(x, y, 1.0) for x in np.linspace(-0.6, 0.6, 9) for y in np.linspace(-0.6, 0.6, 9)]
+    cameras = [replace(wide, world_to_camera=look_at((0, 0, 0), target, up=(0, -1, 0))) for target in targets]
+    run = Splats(tmp_path / "run", field_of(lamp), tuple(Entry(str(i), "train", c) for i, c in enumerate(cameras)))
+    photos = [float((run.render(each).hdr[..., 2].numpy() * steradians(each)).sum()) for each in cameras]
+    whole = render_map(run, np.zeros(3), 1024, "latlong", np.eye(3), typical_focal_length(cameras))
+    weight = solid_angles(1024, "latlong")
+    light = float((whole.hdr[..., 2] * weight).sum() * 4 * np.pi / weight.sum())
+    assert light == pytest.approx(np.mean(photos), rel=0.05) and max(photos) > 1.8 * min(photos)
 
 
 def test_a_map_has_openexrs_orientation(tmp_path, run):
