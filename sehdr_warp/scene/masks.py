@@ -13,7 +13,7 @@ from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import UNPLACED, ImageRecord
 from .images import LDR_SUFFIXES, open_image, read_ldr
-from .names import Listing, bases_of, fold_name, natural_key, without_mask_ending
+from .names import Listing, bases_of, fold_name, folders_named, natural_key, without_mask_ending
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
@@ -50,7 +50,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     shared = Counter(
         key for image, view in {(s.image, s.view) for s in records} for key in {image.name, image.stem, view}
     )
-    places = _mask_folders(folder)
+    places = folders_named(folder, MASK_FOLDERS)
     files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
     index = [{fold_name(key): file for file, key in reversed(keys.items())} for keys in files.values()]
     beside = {parent: _masks_beside(parent) for parent in {record.image.parent for record in records}}
@@ -192,17 +192,10 @@ def _masks_beside(parent: Path) -> dict[str, Path]:
         return {}
     files = (file for file in parent.iterdir() if file.suffix.lower() in LDR_SUFFIXES)
     masks = {fold_name(key): file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
-    inner = (file for place in _mask_folders(parent) for file in _files_below(place) if file.parent == place)
+    inner = (
+        file for place in folders_named(parent, MASK_FOLDERS) for file in _files_below(place) if file.parent == place
+    )
     return {fold_name(without_mask_ending(file.stem)): file for file in inner} | masks
-
-
-def _mask_folders(folder: Path) -> list[Path]:
-    """List the folders of masks in a folder, `masks` before `mask`, in any case."""
-    if not folder.is_dir():
-        return []
-    inner = [place for place in sorted(folder.iterdir()) if place.name.lower() in MASK_FOLDERS and place.is_dir()]
-    inner = [resolve_inside(folder, place.name, folder) for place in inner]
-    return sorted(inner, key=lambda place: MASK_FOLDERS.index(place.name.lower()))
 
 
 def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list[str]:

@@ -36,6 +36,15 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
         return None
 
 
+def folders_named(folder: Path, names: Sequence[str]) -> list[Path]:
+    """List the folders in a folder that have some names, in any case, in the order of the names; none without it."""
+    if not folder.is_dir():
+        return []
+    places = [place for place in sorted(folder.iterdir()) if place.name.lower() in names and place.is_dir()]
+    places = [resolve_inside(folder, place.name, folder) for place in places]
+    return sorted(places, key=lambda place: names.index(place.name.lower()))
+
+
 class Listing:
     """The files of folders, each folder read once: a set may state hundred thousands of names."""
 

@@ -12,7 +12,7 @@ from ..subsets import first_names
 from .dataparser import ImageRecord
 from .hdr_files import is_without_colors
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
-from .names import bases_of, fold_name
+from .names import bases_of, fold_name, folders_named
 
 TRUTH_FOLDERS = ("hdr", "exr")
 _MOST_FILES = 1 << 20  # Files among which photos of one name are looked for
@@ -40,7 +40,7 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     if not photos:
         return list(records), []
     bases = bases_of([record.image for record in photos], folder)
-    places = _truth_folders(folder)
+    places = folders_named(folder, TRUTH_FOLDERS)
     files = {place: {_key(file.relative_to(place)): file for file in _float_files(place)} for place in places}
     stems = _stems_below(bases[0]) if places else Counter()
     beside = {parent: _beside(parent) for parent in {record.image.parent for record in photos}}
@@ -73,15 +73,6 @@ def _may_have_truth(record: ImageRecord) -> bool:
 def _inside(place: Path, file: Path, folder: Path) -> Path:
     """Return a file in a folder, or raise InputError if it is a link that leads out of it."""
     return resolve_inside(place, file.relative_to(place).as_posix(), folder)
-
-
-def _truth_folders(folder: Path) -> list[Path]:
-    """List the folders of truth in a data folder, `hdr` before `exr`, in any case."""
-    if not folder.is_dir():
-        return []
-    places = [place for place in sorted(folder.iterdir()) if place.name.lower() in TRUTH_FOLDERS and place.is_dir()]
-    places = [resolve_inside(folder, place.name, folder) for place in places]
-    return sorted(places, key=lambda place: TRUTH_FOLDERS.index(place.name.lower()))
 
 
 def _float_files(place: Path) -> list[Path]:
