@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from ..errors import InputError, SehdrError
 from ..files import atomic_path, check_absent
@@ -42,6 +43,9 @@ RESOLUTIONS = 16, 512
 _FEWEST_VIEWS = 2  # Views that must have measured a voxel
 _LEAST_PART = 0.01  # Share of all triangles that a connected part needs to stay
 _CHECKED = 3  # Held-out views that the mesh's depth is compared in
+# Triangles nearer to a Gaussian of a light than so many standard deviations and voxels are left out. Of the Gaussians
+# near a vertex so many are asked, because the nearest one may be small.
+_REACH, _CLEAR, _NEAREST = 2.0, 1.5, 8
 _LEVEL = 1.0  # Degrees to which a floor counts as level
 _CLOSE = 0.03  # Relative difference of depth that counts as agreement
 
@@ -102,6 +106,8 @@ def write_proxy_mesh(
     overwrite: bool = False,
 ) -> Path:
     """Write a mesh of a scene's surfaces, and log how far its depth agrees with that of the scene.
+
+    Lights that write_lights() would write are left out, because the mesh would block them.
 
     An OpenUSD file holds `/World/Proxy` with radiance as displayColor and, if a floor was found, a level plane
     `/World/Ground`. An OBJ file holds both as objects, with display colors.
@@ -176,11 +182,33 @@ def proxy_mesh(
         outside = ~region.contains(voxel_centers(low, voxel, shape).reshape(-1, 3)).reshape(shape)
         weight[outside] = 0
     vertices, faces = zero_surface(distance, weight >= min(_FEWEST_VIEWS, len(cameras)), voxel)
+    faces = _without_lights(run, transform, vertices + low, faces, longest)
     colors = nearest_values(radiance, vertices / voxel)
     vertices, faces, colors = _large_parts(vertices + low, faces, colors)
     places = np.array([view.camera.position for view in views])
     ground = find_ground(vertices, faces, places, longest)
     return ProxyMesh(vertices.astype(np.float32), faces.astype(np.int32), colors.astype(np.float32), longest, ground)
+
+
+def _without_lights(
+    run: "RenderableScene", transform: WorldTransform, vertices: np.ndarray, faces: np.ndarray, voxel: float
+) -> np.ndarray:
+    """Return the triangles that are not at Gaussians of the scene's lights, whose light they would block."""
+    from scipy.spatial import KDTree
+
+    lights = run.find_lights() if run.clipped_share() is not None else []
+    if not lights:
+        return faces
+    gaussians, normalization = run.field.gaussians, run.field.normalization
+    members = torch.cat([light.members for light in lights]).to(gaussians.means.device)
+    means = normalization.scene_points(gaussians.means[members].cpu().numpy())
+    scale = normalization.unit * transform.scale
+    reach = _REACH * scale * gaussians.log_scales[members].exp().amax(1).cpu().numpy() + _CLEAR * voxel
+    distance, nearest = KDTree(transform.points(means)).query(vertices, k=min(_NEAREST, len(means)))
+    at_light = (distance < reach[nearest]).reshape(len(vertices), -1).any(1)[faces].any(1)
+    text = "left out: %d of %d triangles at the scene's lights (%d), whose light they would block"
+    log.info(text, at_light.sum(), len(faces), len(lights))
+    return faces[~at_light]
 
 
 def _large_parts(

@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.model.baking import field_of
+from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.depth_fusion import zero_surface
 from sehdr_warp.output.proxy_mesh import find_ground, mesh_depth, proxy_mesh, write_proxy_mesh
 from sehdr_warp.output.splat_edits import Box
@@ -15,6 +18,7 @@ from sehdr_warp.scene.wide_camera import pixel_directions
 
 from ..full_disk import full_disk
 from .helpers import AnalyticRun, Entry, Rendered
+from .test_splat_edits import splats
 
 pytest.importorskip("skimage")
 RADIUS, FLOOR = 0.6, -0.6  # The ball lies on the floor, its center at the origin; +Y is up
@@ -211,6 +215,50 @@ def test_mitsuba_composites_and_shadows_by_the_mesh(tmp_path):
     under = floor & (distance < 0.3) & ~visible
     assert under.sum() > 3 and np.median(shaded[under]) < 0.1 * np.median(lit[away])
     assert np.median(shaded[away]) == pytest.approx(np.median(lit[away]), rel=0.05)
+
+
+class LampOnFloor(BallOnFloor):
+    """The same, whose ball is a lamp: Gaussians on its surface are a light."""
+
+    def __init__(self):
+        super().__init__()
+        steps = np.arange(300) + 0.5
+        height, angle = 1 - 2 * steps / 300, np.pi * (1 + np.sqrt(5)) * steps
+        ring = np.sqrt(1 - height**2)
+        means = RADIUS * np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], axis=1)
+        self.field = field_of(splats(means, np.full(300, 0.9), scale=0.04))
+        self.clipped_share = lambda: torch.ones(300)
+
+    def find_lights(self):
+        shape = LightShape("sphere", np.zeros(3), np.eye(3), (2 * RADIUS, 2 * RADIUS))
+        return [Light(shape, np.full(3, 5.0), np.ones(3), None, 1.0, torch.arange(300))]
+
+
+def test_a_lamp_of_the_scene_lights_the_floor_of_its_mesh(tmp_path, logged):
+    """As a lamp on a plane does, in Mitsuba; a mesh with the lamp as well would block most of it."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    lamp = {"type": "sphere", "radius": RADIUS, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 5.0}}}
+    to_world = mi.ScalarTransform4f().look_at([0, 4, 0], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": 60, "to_world": to_world, "film": film}
+    plain = {"type": "scene", "integrator": {"type": "direct"}, "sensor": sensor, "lamp": lamp}
+    material = {"type": "twosided", "inside": {"type": "diffuse"}}
+
+    def floor_by(shape):
+        picture = np.array(mi.render(mi.load_dict(plain | {"floor": shape | {"bsdf": material}}), spp=32)).mean(2)
+        y, x = np.mgrid[:32, :32] - 15.5
+        distance = np.hypot(x, y) * 4.6 * np.tan(np.pi / 6) / 16  # From the axis, on the floor
+        return picture[(distance > 1.3 * RADIUS) & (distance < 1.5)]
+
+    turned = mi.ScalarTransform4f().translate([0, FLOOR, 0]).rotate([1, 0, 0], -90).scale(20)
+    truth = floor_by({"type": "rectangle", "to_world": turned})
+    path = write_proxy_mesh(LampOnFloor(), tmp_path / "lamp.obj", resolution=64, axes="scene")
+    assert "triangles at the scene's lights (1), whose" in "".join(logged)
+    mesh = {"type": "obj", "filename": str(path), "face_normals": True}
+    assert np.median(floor_by(mesh) / truth) == pytest.approx(1, abs=0.03)
+    whole = write_proxy_mesh(BallOnFloor(), tmp_path / "ball.obj", resolution=64, axes="scene")
+    assert np.median(floor_by(mesh | {"filename": str(whole)}) / truth) < 0.5
 
 
 @pytest.mark.parametrize(
