@@ -162,6 +162,9 @@ def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
     rotation = u @ vt
     if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(rotation) < 0:
         problem = f"pose of {name!r:.90} is not a rotation (stretch {np.round(stretch, 4).tolist()})"
+        if np.linalg.det(rotation) < 0:
+            problem = f"pose of {name!r:.90} mirrors the scene"
+            remedy = "export the poses again with right-handed axes"
         raise InputError(source, problem, remedy)
     if not np.abs(matrix[:3, 3]).max() < 1e12:
         raise InputError(source, f"position of {name!r:.90} is {matrix[:3, 3].tolist()}", "check the units")
