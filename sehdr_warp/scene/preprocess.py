@@ -17,7 +17,7 @@ from .camera import Camera
 from .color_encoding import DEVIATION, ColorEncoding
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .float_table import FloatTable
-from .gain_map import has_gain_map, light_of, read_gain_map, with_light_above_white
+from .gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
 from .hdr_files import hdr_size, read_hdr, read_light
 from .images import EncodedImage
 from .lens import Lens, Undistortion, area_average
@@ -88,6 +88,7 @@ def preprocess(
         masks.append(f"transparency: {count} have transparent pixels, which {meaning}")
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
+    masks += gain_map_notes(preprocessor.gain_map_problems)
     times_known = dataset.times_known
     return Scene(dataset.name, dataset.format, tuple(views), points, colors, times_known, notes, response=response)
 
@@ -123,7 +124,7 @@ class ContentCheck:
 
 def read_codes(record: ImageRecord) -> EncodedImage:
     """Read a photo's codes, or compute them from HDR truth or light, before anything is undistorted or resized."""
-    stored = _read_stored(record, oriented=False)
+    stored = _read_stored(record, {}, oriented=False)
     return stored.encoding.convert(stored.photo)
 
 
@@ -139,8 +140,13 @@ class _StoredPhoto(NamedTuple):
     encoding: ColorEncoding
 
 
-def _read_stored(record: ImageRecord, *, oriented: bool, masked: bool = False) -> _StoredPhoto:
-    """Read a photo; `masked` leaves float pictures without the black that their transparent parts lie over."""
+def _read_stored(
+    record: ImageRecord, problems: dict[Path, str], *, oriented: bool, masked: bool = False
+) -> _StoredPhoto:
+    """Read a photo; the problem of a damaged gain map goes to `problems`.
+
+    `masked` leaves float pictures without the black that their transparent parts lie over.
+    """
     srgb, kind = ColorEncoding("sRGB"), kind_of(record.image)
     if record.derived:
         codes = codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8)
@@ -151,8 +157,8 @@ def _read_stored(record: ImageRecord, *, oriented: bool, masked: bool = False) -
         codes = float_codes(pixels * record.light_scale, record.seconds)
         return _StoredPhoto(EncodedImage(codes, light.coverage if masked else None), srgb)
     photo, encoding = read_photo(record.image, oriented=oriented), record.encoding or srgb
-    if record.gain_map or (kind == "encoded" and not record.linear and has_gain_map(record.image)):
-        gain_map = read_gain_map(record.image, oriented=oriented)
+    if record.gain_map or (kind == "encoded" and not record.linear):
+        gain_map = read_gain_map(record.image, oriented=oriented, problems=problems)
         if record.gain_map:
             photo = light_of(photo, gain_map, record.light_scale)
             encoding = replace(encoding, curves=(), table=None)  # The light is in sRGB's curve already
@@ -202,6 +208,7 @@ class _Preprocessor:
         self.unusable_truth: list[InputError] = []
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
 
+        self.gain_map_problems: dict[Path, str] = {}
     def view_or_error(self, record: ImageRecord, name: str) -> View | InputError:
         """Return the view of a photo, or the error if the photo or its mask cannot be used; raises other errors."""
         try:
@@ -227,7 +234,7 @@ class _Preprocessor:
             mask = _by_solid_angle(None if stored is None else resample(stored), camera)
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
-        photo, encoding = _read_stored(record, oriented=oriented, masked=self.alpha == "mask")
+        photo, encoding = _read_stored(record, self.gain_map_problems, oriented=oriented, masked=self.alpha == "mask")
         masks = resample.borders()
         if stored is not None:
             masks.append(resample(stored))

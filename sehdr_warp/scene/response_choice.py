@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..subsets import every_nth
 from .dataparser import DataparserOutputs
 from .exif import are_camera_jpegs
-from .gain_map import MOST_STOPS_IN_CODES, has_gain_map, read_gain_map
+from .gain_map import MOST_STOPS_IN_CODES, read_gain_map
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix
 from .preprocess import ContentCheck, read_codes
@@ -121,7 +121,7 @@ def as_linear(dataset: DataparserOutputs) -> DataparserOutputs:
 def as_gain_mapped(dataset: DataparserOutputs) -> DataparserOutputs:
     """Take the light of photos from their gain maps if most photos of a dataset have one."""
     images = [record.image for record in dataset.records if not record.derived]
-    maps = {image: read_gain_map(image) for image in images if has_gain_map(image)}
+    maps = {image: read_gain_map(image, problems={}) for image in images}  # Preprocessing names damaged ones.
     headrooms = {image: gain_map.headroom for image, gain_map in maps.items() if gain_map is not None}
     if 2 * len(headrooms) <= len(dataset.records):
         return dataset
