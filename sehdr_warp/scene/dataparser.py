@@ -105,6 +105,8 @@ class DataparserOutputs:
         times_known: False if no file states exposure times.
         stated_response: name of the response that the files state (a video's log curve); None if they do not.
         color_matrix: [3, 3] from the colors of the photos' light to linear Rec.709; None if they are Rec.709.
+        within_rec709: the light of the stated response lies within Rec.709, to which photos are converted when they
+            are read.
         mentioned: names of photos that a note names, and that are in no record.
         kind: of the photos: encoded, linear, gain-map, raw or float; see linear_photos.py.
     """
@@ -121,6 +123,7 @@ class DataparserOutputs:
     kind: str = "encoded"
     stated_response: str | None = None
     color_matrix: np.ndarray | None = None
+    within_rec709: bool = False
     mentioned: tuple[str, ...] = ()
 
     @property

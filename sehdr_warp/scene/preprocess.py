@@ -29,6 +29,7 @@ from .photos import fitted_lens, read_photo, truth_notes, unusable_notes
 from .primaries import linear_to_srgb
 from .srgb_codes import bands_of
 from .types import Scene, View, codes_of
+from .video_color import codes_in_rec709
 from .wide_camera import solid_angles
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ def preprocess(
     Raises:
         InputError: if a file is damaged, sizes disagree, or the photos show nothing but black or white.
     """
-    preprocessor = _Preprocessor(max_size, response, dataset.alpha)
+    to_rec709 = dataset.color_matrix if dataset.within_rec709 else None
+    preprocessor = _Preprocessor(max_size, response, dataset.alpha, to_rec709)
     names = unique_names(dataset.records) if names is None else names
     keeper = PhotoKeeper(
         photo_storage, len(names), sum(record.lens.width * record.lens.height for record in dataset.records)
@@ -86,9 +88,9 @@ def preprocess(
         meaning = "are left out" if dataset.alpha == "mask" else "count as black light"
         count = f"{len(preprocessor.transparent)} of {len(names)} photos"
         masks.append(f"transparency: {count} have transparent pixels, which {meaning}")
+    masks += gain_map_notes(preprocessor.gain_map_problems)
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
-    masks += gain_map_notes(preprocessor.gain_map_problems)
     times_known = dataset.times_known
     return Scene(dataset.name, dataset.format, tuple(views), points, colors, times_known, notes, response=response)
 
@@ -197,8 +199,8 @@ class _Resampler:
 
 
 class _Preprocessor:
-    def __init__(self, max_size: int | None, response: "Response", alpha: str):
-        self.max_size, self.response, self.alpha = max_size, response, alpha
+    def __init__(self, max_size: int | None, response: "Response", alpha: str, to_rec709: np.ndarray | None):
+        self.max_size, self.response, self.alpha, self.to_rec709 = max_size, response, alpha, to_rec709
         self._tables: dict[int, np.ndarray] = {}
         self._light_of_srgb: FloatTable | None = None  # Of photos whose colors are converted
         self._last: tuple[Lens, Undistortion] | None = None
@@ -206,9 +208,9 @@ class _Preprocessor:
         self.labeled_masks: set[Path] = set()
         self.transparent: set[str] = set()  # Views whose photos have transparent pixels
         self.unusable_truth: list[InputError] = []
+        self.gain_map_problems: dict[Path, str] = {}
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
 
-        self.gain_map_problems: dict[Path, str] = {}
     def view_or_error(self, record: ImageRecord, name: str) -> View | InputError:
         """Return the view of a photo, or the error if the photo or its mask cannot be used; raises other errors."""
         try:
@@ -245,6 +247,9 @@ class _Preprocessor:
         photo = self._resampled(
             photo, encoding, resample, resized=(camera.width, camera.height) != (lens.width, lens.height)
         )
+        if self.to_rec709 is not None:
+            with self._alone:
+                photo = replace(photo, pixels=codes_in_rec709(photo.pixels, self.response, self.to_rec709))
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         return View(

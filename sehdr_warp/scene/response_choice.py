@@ -66,6 +66,9 @@ def choose_response(
     if dataset.kind == "encoded" and (str(curve) == "auto" or name == CURVES["gain-map"]):
         dataset = as_gain_mapped(dataset)
     matrix = dataset.color_matrix
+    if matrix is not None and dataset.stated_response is not None:
+        dataset = _with_clip_colors(dataset, str(getattr(curve, "name", curve)))
+        matrix = None if dataset.within_rec709 else matrix
     if dataset.kind != "encoded":
         if dataset.kind == "raw":
             matrix = color_matrix([record.image for record in dataset.records])
@@ -108,6 +111,15 @@ def check_response(dataset: DataparserOutputs, *, response: "str | Path | Respon
     if str(response) not in allowed:
         problem = f"its photos are {dataset.kind}: their light is known, and response {response} does not apply"
         raise InputError(path, problem, "leave the response out")
+
+
+def _with_clip_colors(dataset: DataparserOutputs, response: str) -> DataparserOutputs:
+    """Decide, and note, whether the photos of a clip with a stated response are converted to Rec.709."""
+    within = dataset.within_rec709 and response == dataset.stated_response
+    note = "colors: the clip's lie within Rec.709 and are converted to it"
+    if not within:
+        note = "colors: the scene is trained in the clip's primaries, and its light is converted to Rec.709"
+    return replace(dataset, within_rec709=within, notes=(*dataset.notes, note))
 
 
 def as_linear(dataset: DataparserOutputs) -> DataparserOutputs:
