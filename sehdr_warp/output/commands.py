@@ -163,6 +163,10 @@ class Lights:
     out: Path | None = None
     """The file: .json, or .usda, with a map of the rest beside it. Without it the lights are only listed."""
     world: WorldOptions = field(default_factory=WorldOptions)
+    at: str = "center"
+    """Place of the map, as of envmap: that of a CG object, so that what is near it fits."""
+    beyond: float | None = None
+    """Leave out of the map what is nearer than this, as in envmap."""
     unseen: Literal["inpaint", "black"] = "inpaint"
     """inpaint: directions of the map that no photo covers get the light around them; alpha still marks them."""
     reference_white: float | None = None
@@ -219,15 +223,18 @@ def run_lights(args: Lights) -> None:
     """Run `sehdr-warp lights`."""
     from .light_unit import luminance_of_one
     from .lights import lights_table, write_lights
+    from .map_center import check_place
     from .world_transform import world_transform
 
-    run = open_run(args.run, args.device)
     if args.out is None:
-        if args.reference_white is not None:
-            raise UsageError("--reference-white: set for a file, which --out names")
+        if flags := [flag for flag in changed_flags(args) if flag in ("--reference-white", "--at", "--beyond")]:
+            raise UsageError(f"{', '.join(flags)}: set for a file, which --out names")
+        run = open_run(args.run, args.device)
         transform = world_transform(run, **vars(args.world))
         print(lights_table(run.find_lights(), luminance_of_one(run), transform))
         return
+    check_place(args.at)
+    run = open_run(args.run, args.device)
     options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
     for path in write_lights(run, args.out, **options, **vars(args.world)):
         print(path)

@@ -17,7 +17,7 @@ from .environment_map import COVERED, envmap, inpainted_light, latlong, render_m
 from .exr import exr_header, rgb_channels, write_exr
 from .images import as_array
 from .light_unit import luminance_of_one
-from .map_center import map_center
+from .map_center import MapCenter, find_center
 from .render_views import provenance
 from .tonemap import exposure_of_white
 from .world_transform import WorldTransform, world_transform
@@ -74,6 +74,8 @@ def write_lights(
     axes: str = "upright",
     up: str | None = None,
     scale: float | None = None,
+    at: str | tuple[float, float, float] = "center",
+    beyond: float | None = None,
     unseen: str = "inpaint",
     reference_white: float | None = None,
     overwrite: bool = False,
@@ -82,8 +84,9 @@ def write_lights(
 
     A light is a group of Gaussians that the photos clipped. With its size, its radiance gives the light that the
     training views show. A USD file has a SphereLight or RectLight for each, and a DomeLight for everything else: a
-    map from where write_environment_map() takes it, `<stem>_rest.exr`, in which the lights are dark. Its alpha is the
-    coverage by photos. If the unit of the run's light is known, lights and dome are in cd/m^2, as USD has them.
+    map as write_environment_map() takes it at the same place, `<stem>_rest.exr`, in which the lights are dark. Its
+    alpha is the coverage by photos. If the unit of the run's light is known, lights and dome are in cd/m^2, as USD has
+    them.
 
     Args:
         run: From load_run or train.
@@ -91,6 +94,8 @@ def write_lights(
         axes: As in world_transform.
         up: As in world_transform.
         scale: As in world_transform.
+        at: Place of the dome's map, as in write_environment_map(). Lights stay where they are.
+        beyond: Distance within which the map leaves everything out, as there.
         unseen: "inpaint": directions of the dome that no photo covers get the light around them, so that they do not
             darken what the dome lights. "black": they are black.
         reference_white: Value of the photos' white in the plates that the lights go with, as in render_views; lights
@@ -111,7 +116,10 @@ def write_lights(
     files = [path] if suffix == ".json" else [path, rest]
     for file in files:
         check_absent(file, overwrite)
+    if suffix == ".json" and (at, beyond) != ("center", None):
+        raise SehdrError(f"{path}: a place is that of the dome's map, which .json has not; write .usda")
     transform = world_transform(run, axes, up=up, scale=scale)
+    center = None if suffix == ".json" else find_center(run, training_cameras(run), at, beyond, transform)
     exposure_of_white(run, reference_white)  # Before minutes of looking for lights
     lights = run.find_lights()
     if not lights:
@@ -126,8 +134,8 @@ def write_lights(
         text = "%s: in cd/m^2; a value of 1 in plates is %.4g of them, and --reference-white puts all in one unit"
         log.info(text, path.name, unit)
     rows = [_describe(f"light_{index}", light, transform, factor) for index, light in enumerate(lights)]
-    if suffix == ".usda":
-        inpainted = _write_rest(run, rest, lights, transform, unseen, overwrite)
+    if center is not None:
+        inpainted = _write_rest(run, rest, lights, transform, center, unseen, overwrite)
         text = usd_lights(rows, run.scene_name, DomeMap(rest.name, factor, inpainted), units, transform)
     else:
         facts = {**provenance(run), "units": units, "axes": axes, "world_matrix": transform.matrix.tolist()}
@@ -234,15 +242,19 @@ def _tuple(values) -> str:
 
 
 def _write_rest(
-    run: "Run", path: Path, lights: Sequence[Any], transform: WorldTransform, unseen: str, overwrite: bool
+    run: "Run",
+    path: Path,
+    lights: Sequence[Any],
+    transform: WorldTransform,
+    center: MapCenter,
+    unseen: str,
+    overwrite: bool,
 ) -> float:
     """Write the map of a scene's surroundings, with the lights dark; arguments as in write_lights.
 
     Returns the share of the map's light that is filled in.
     """
-    cameras = training_cameras(run)
-    position, beyond = map_center(cameras)
-    focal = typical_focal_length(cameras)
+    (position, beyond), focal = center, typical_focal_length(training_cameras(run))
     members = [light.members for light in lights]
     rest = render_map(run, position, MAP_SIZE, "latlong", transform.rotation, focal, without=members, beyond=beyond)
     hdr, directions, weight = rest.hdr, latlong(MAP_SIZE) @ transform.rotation, solid_angles(MAP_SIZE, "latlong")

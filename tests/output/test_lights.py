@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.commands import Lights, run_lights
+from sehdr_warp.output.environment_map import write_environment_map
 from sehdr_warp.output.lights import lights_table, write_lights
 from sehdr_warp.output.options import WorldOptions
 from sehdr_warp.output.world_transform import WorldTransform, world_transform
@@ -127,6 +128,21 @@ def lights_map(folder, field, cameras):
     folder.mkdir()
     write_lights(scene, folder / "lights.usda", axes="scene")
     return read_hdr(folder / "lights_rest.exr")
+
+
+def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
+    run.find_lights = list
+    place = {"at": (0.5, 0.2, 1.0), "beyond": 4.3, "axes": "scene"}  # One lamp is nearer.
+    write_lights(run, tmp_path / "lights.usda", unseen="black", **place)
+    rest = read_hdr(tmp_path / "lights_rest.exr")
+    write_environment_map(run, tmp_path / "env.exr", size=1024, **place)
+    np.testing.assert_allclose(rest, read_hdr(tmp_path / "env.exr"), rtol=2e-3, atol=1e-4)
+    write_lights(run, tmp_path / "center.usda", unseen="black", axes="scene")
+    assert np.abs(read_hdr(tmp_path / "center_rest.exr") - rest).max() > 1
+    with pytest.raises(SehdrError, match=r"which \.json has not; write \.usda"):
+        write_lights(run, tmp_path / "lights.json", **place)
+    with pytest.raises(UsageError, match="--at, --beyond: set for a file"):
+        run_lights(Lights(run=run.path, at="0,0,1", beyond=1.0))
 
 
 def test_the_table_names_place_size_and_doubt():
