@@ -29,6 +29,7 @@ from .cached_folder import cached_folder
 from .colmap_model import SparseModel, read_model
 from .colmap_rows import counted_rows
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
+from .photo_pairs import likely_pairs, pairs_with
 from .photos import read_photo, unusable_notes
 
 _log = logging.getLogger("sehdr_warp.scene")
@@ -39,8 +40,9 @@ SEED = 0
 FEWEST_SHARED = 60  # Points of a photo with fewer shared ones place it badly; sound photos have hundreds
 MOST_ERROR = 1.0  # Pixels; sound sets have 0.2 to 0.8
 _VERSION = 3
-# Up to so many photos every pair is matched; in larger sets each photo is matched with its neighbors by name.
-EXHAUSTIVE_LIMIT = 150
+# Up to so many photos every pair is matched; in larger sets those that are likely to share points, and in still larger
+# ones each photo is matched with its neighbors by name.
+EXHAUSTIVE_LIMIT, COMPARED_LIMIT = 30, 150
 OVERLAP = 20  # Neighbors on each side with which a photo of a larger set is matched, and as many powers of two
 _PAIR_COST, _PLACE_COST = 0.1, 0.45  # Time to match a pair and to place a photo, as parts of that of a photo's features
 
@@ -94,7 +96,8 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
     Raises:
         InputError: if fewer than two photos can be placed.
     """
-    key = cache_key("photos", MAX_SIDE, SEED, [(photo.name, file_digest(photo)) for photo in photos])
+    rule = ["likely pairs"] * (EXHAUSTIVE_LIMIT < len(photos) <= COMPARED_LIMIT)
+    key = cache_key("photos", MAX_SIDE, SEED, [(photo.name, file_digest(photo)) for photo in photos], *rule)
 
     def solve(work: Path, result: Path) -> None:
         sizes, small = _write_photos(photos, work / "images")
@@ -116,7 +119,9 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
             photo_seconds = progress.seconds / count
             progress.update(count)
         _match(database, count, photo_seconds)
-        model = run_mapper(database, work, len(photos), photos[0].parent)
+        names = {image_name(i) for i in range(len(photos)) if (work / "images" / image_name(i)).is_file()}
+        again = partial(_match_missing, database, names) if rule else None
+        model = run_mapper(database, work, len(photos), photos[0].parent, before_again=again)
         model.write_binary(result)
         (result / "sizes.json").write_text(json.dumps(sizes))
 
@@ -259,10 +264,12 @@ def _show_features(progress: Stage, done: int) -> None:
 
 
 def _pairs(count: int) -> set[tuple[int, int]]:
-    """Return the pairs of photos that are matched: all, or in large sets neighbors by name at these distances."""
+    """Return about so many pairs of photos as are matched: all, or neighbors by name at some distances."""
     if count <= EXHAUSTIVE_LIMIT:
         return set(itertools.combinations(range(count), 2))
     steps = {*range(1, OVERLAP + 1), *(2**power for power in range(OVERLAP))}
+    if count <= COMPARED_LIMIT:
+        steps = set(range(1, 9))  # Of likely pairs there are about eight for each photo.
     return {(i, i + step) for i in range(count) for step in steps if i + step < count}
 
 
@@ -279,19 +286,48 @@ def _match(database: Path, count: int, photo_seconds: float) -> None:
     """Match features between photos; those of a photo took `photo_seconds`, from which later stages are estimated."""
     import pycolmap
 
-    options = matching_options()
+    options, total = matching_options(), len(_pairs(count))
     match = partial(pycolmap.match_exhaustive, database, **options)
-    if count > EXHAUSTIVE_LIMIT:
+    if EXHAUSTIVE_LIMIT < count <= COMPARED_LIMIT:
+        pairs = likely_pairs(database)
+        match, total = partial(_match_pairs, database, pairs), len(pairs)
+    elif count > COMPARED_LIMIT:
         pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
         match = partial(pycolmap.match_sequential, database, pairing_options=pairing, **options)
-    with quiet_colmap(), stage("matching pairs of photos", len(_pairs(count)), _log) as progress:
+    with quiet_colmap(), stage("matching pairs of photos", total, _log) as progress:
         progress.later = photo_seconds * _PLACE_COST * count
         with counted_rows(database, "two_view_geometries", progress.update):
             run_interruptibly(match)
         progress.update(progress.total)
 
 
-def run_mapper(database: Path, work: Path, count: int, source: Path, *, name: str = "photo", views: int = 1):
+def _match_pairs(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
+    """Match features between pairs of images by their names."""
+    import pycolmap
+
+    file = database.with_name("pairs.txt")
+    file.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=str(file))
+    pycolmap.match_image_pairs(database, pairing_options=pairing, **matching_options())
+
+
+def _match_missing(database: Path, names: set[str], placed: set[str]) -> None:
+    """Match photos that could not be placed with all others."""
+    pairs = pairs_with(names - placed, database)
+    with quiet_colmap(), stage("matching pairs of photos that could not be placed", len(pairs), _log):
+        run_interruptibly(partial(_match_pairs, database, pairs))
+
+
+def run_mapper(
+    database: Path,
+    work: Path,
+    count: int,
+    source: Path,
+    *,
+    name: str = "photo",
+    views: int = 1,
+    before_again: Callable[[set[str]], None] | None = None,
+):
     """Return the largest reconstruction, after a second try with weaker conditions if photos are missing from it.
 
     Args:
@@ -301,13 +337,14 @@ def run_mapper(database: Path, work: Path, count: int, source: Path, *, name: st
         source: folder to name in the error.
         name: of one photo, in messages.
         views: of each photo, which form a rig; if there are several, their lenses and places in the rig are known.
+        before_again: called before the second try with the names of the images that were placed.
 
     Raises:
         InputError: if fewer than two photos can be placed.
     """
     import pycolmap
 
-    best = None
+    best: Any = None
     placed = methodcaller("num_reg_images" if views == 1 else "num_reg_frames")
     for patient in (False, True):
         options = pycolmap.IncrementalPipelineOptions(min_model_size=2)
@@ -319,6 +356,8 @@ def run_mapper(database: Path, work: Path, count: int, source: Path, *, name: st
             options.mapper.init_min_tri_angle = 4.0
             options.mapper.init_min_num_inliers = 50
             options.mapper.abs_pose_min_num_inliers = 15
+            if before_again is not None:
+                before_again(set() if best is None else {best.images[i].name for i in best.reg_image_ids()})
             _log.info("placing the %ss again with weaker conditions", name)
         output = work / f"model{int(patient)}"
         output.mkdir()

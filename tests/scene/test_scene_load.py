@@ -15,17 +15,19 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene import load_scene
+from sehdr_warp.scene import load_scene, sfm
 from sehdr_warp.scene.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.dataparser import ImageRecord, PointCloud
 from sehdr_warp.scene.exposure import shutter
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.names import natural_key, unique_names
 from sehdr_warp.scene.parse import _held_out
-from sehdr_warp.scene.sfm import MOST_ERROR, Reconstruction, reconstruct
+from sehdr_warp.scene.sfm import MOST_ERROR, Reconstruction, image_name, reconstruct
 from tests.make_scenes import load, write_blender, write_colmap, write_ply
 
 _TIME, _NUMBER, _ISO, _APEX = 33434, 33437, 34855, 37377
+
+LOST = image_name(2)
 
 
 def test_exif_times_count_sensitivity_and_aperture(tmp_path):
@@ -272,6 +274,24 @@ def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
     reconstruction = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
     assert {(image.lens.width, image.lens.height) for image in reconstruction.model.images} == {(567, 426), (708, 532)}
     assert 0 < reconstruction.error < MOST_ERROR and not reconstruction.notes(photos)
+
+
+def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypatch, caplog):
+    """And a photo that none is likely for is matched with all others before the second try."""
+    monkeypatch.setattr(sfm, "EXHAUSTIVE_LIMIT", 3)
+    photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
+    for photo in photos:
+        with Image.open(photo) as image:
+            image.reduce(4).save(tmp_path / photo.name, quality=95)
+    photos = sorted(tmp_path.glob("*.JPG"))
+    caplog.set_level("INFO", "sehdr_warp.scene")
+    assert len(reconstruct(photos, tmp_path / "cache").model.images) == 5
+    assert "comparing photos: 5" in caplog.messages
+    likely = sfm.likely_pairs
+    monkeypatch.setattr(sfm, "likely_pairs", lambda database: [pair for pair in likely(database) if LOST not in pair])
+    again = reconstruct(photos, tmp_path / "again")
+    assert "matching pairs of photos that could not be placed: 4" in caplog.messages
+    assert LOST in {image.name for image in again.model.images} and len(again.model.images) == 5
 
 
 def test_poor_placement_is_named_with_its_photos():
