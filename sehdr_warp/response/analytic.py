@@ -135,6 +135,7 @@ _ACES = Filmic(2.51, 0.03, 2.43, 0.59, 0.14, (0.56 + math.sqrt(0.56**2 + 4 * 0.0
 _CURVES = {
     "camera": (_REC709, Knee(0.55, 0.25)),
     "srgb": (_SRGB, None),
+    "gain-map": (_SRGB, None),
     "rec709": (_REC709, None),
     "gamma-2.2": (_gamma(2.2), None),
     "linear": (PowerLaw(1.0, 0.0, 1.0, 1.0), None),

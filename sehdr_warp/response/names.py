@@ -8,6 +8,7 @@ DESCRIPTIONS = {
     "linear": "values proportional to light",
     "hdr-nerf": "Reinhard's curve and gamma 2.2, of HDR-NeRF's sets; also reinhard-gamma",
     "filmic": "Hable's filmic curve (Uncharted 2), shown as sRGB",
+    "gain-map": "sRGB, for light from gain maps, whose codes reach up to four stops above white",
     "aces": "Narkowicz's fit to the ACES display transform, shown as sRGB",
 }
 """Response of each name; without aliases and without other exponents of `gamma-`."""

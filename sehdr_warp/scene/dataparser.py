@@ -105,6 +105,8 @@ class DataparserOutputs:
         times_known: False if no file states exposure times.
         stated_response: name of the response that the files state (a video's log curve); None if they do not.
         color_matrix: [3, 3] from the colors of the photos' light to linear Rec.709; None if they are Rec.709.
+        within_rec709: the light of the stated response lies within Rec.709, to which photos are converted when they
+            are read.
         mentioned: names of photos that a note names, and that are in no record.
         kind: of the photos: encoded, linear, gain-map, raw or float; see linear_photos.py.
     """
@@ -121,6 +123,7 @@ class DataparserOutputs:
     kind: str = "encoded"
     stated_response: str | None = None
     color_matrix: np.ndarray | None = None
+    within_rec709: bool = False
     mentioned: tuple[str, ...] = ()
 
     @property
@@ -162,6 +165,9 @@ def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
     rotation = u @ vt
     if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(rotation) < 0:
         problem = f"pose of {name!r:.90} is not a rotation (stretch {np.round(stretch, 4).tolist()})"
+        if np.linalg.det(rotation) < 0:
+            problem = f"pose of {name!r:.90} mirrors the scene"
+            remedy = "export the poses again with right-handed axes"
         raise InputError(source, problem, remedy)
     if not np.abs(matrix[:3, 3]).max() < 1e12:
         raise InputError(source, f"position of {name!r:.90} is {matrix[:3, 3].tolist()}", "check the units")

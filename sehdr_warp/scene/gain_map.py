@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import InputError
+from ..subsets import first_names
 from .color_encoding import ColorEncoding, encoding_of, encoding_of_boxes, encoding_of_profile
 from .gain_map_parameters import (
     MOST_STOPS,
@@ -118,16 +119,18 @@ def _above_white(light: np.ndarray, white: np.ndarray) -> np.ndarray | None:
     return np.where(white, np.maximum(light, 1), 0).astype(np.float16) if white.any() else None
 
 
-def read_gain_map(path: Path, *, oriented: bool = False) -> GainMap | None:
+def read_gain_map(path: Path, *, oriented: bool = False, problems: dict[Path, str] | None = None) -> GainMap | None:
     """Return the gain map of a photo, or None if it has none that applies to it as it is decoded.
 
-    A damaged one is named in a warning and counts as none, because the photo itself is good. `oriented` turns it like
-    the photo, as EXIF's orientation says.
+    A damaged one counts as none, because the photo itself is good. It is named in a warning, or added to `problems`.
+    `oriented` turns it like the photo, as EXIF's orientation says.
 
     Raises:
         InputError: if the photo itself is missing or damaged.
     """
     try:
+        if not _is_marked(path):
+            return None
         gain_map = _of_jpeg(path) if _is_jpeg(path) else _of_items(path)
         if gain_map is not None and oriented:
             with open_image(path) as image:
@@ -136,19 +139,34 @@ def read_gain_map(path: Path, *, oriented: bool = False) -> GainMap | None:
     except InputError:
         raise
     except (*PILLOW_ERRORS, IndexError, KeyError) as error:
-        _log.warning("%s: its gain map is damaged (%s): the photo is used without it", path, str(error)[:80])
+        if problems is None:
+            _log.warning("%s: its gain map is damaged (%s): the photo is used without it", path, str(error)[:80])
+        else:
+            problems[path] = str(error)[:80]
         return None
 
 
 def has_gain_map(path: Path) -> bool:
     """Return whether a photo has a gain map that read_gain_map() decodes."""
+    return read_gain_map(path, problems={}) is not None
+
+
+def gain_map_notes(problems: dict[Path, str]) -> list[str]:
+    """Return a note on photos whose gain maps are damaged."""
+    if not problems:
+        return []
+    first = min(problems)
+    names = first_names(sorted(path.name for path in problems))
+    return [f"gain maps of {len(problems)} photos are damaged and not used: {names} ({problems[first]})"]
+
+
+def _is_marked(path: Path) -> bool:
+    """Return whether the head of a file says that it holds a second picture."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     if head[:2] == b"\xff\xd8":
-        marked = b"MPF\0" in head or b"GainMap" in head
-    else:
-        marked = head[4:8] == b"ftyp" and (b"tmap" in head or b"auxC" in head)
-    return marked and read_gain_map(path) is not None
+        return b"MPF\0" in head or b"GainMap" in head
+    return head[4:8] == b"ftyp" and (b"tmap" in head or b"auxC" in head)
 
 
 def _is_jpeg(path: Path) -> bool:

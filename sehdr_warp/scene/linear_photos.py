@@ -23,7 +23,7 @@ from .images import HDR_SUFFIXES, RAW_SUFFIXES, EncodedImage, check_size, requir
 from .primaries import linear_to_srgb
 from .types import codes_of
 
-CURVES = {"raw": "srgb", "linear": "srgb", "gain-map": "srgb", "float": "hdr-nerf"}
+CURVES = {"raw": "srgb", "linear": "srgb", "gain-map": "gain-map", "float": "hdr-nerf"}
 """The response of each kind's codes. Float pictures have no white level, nor has Reinhard's curve."""
 _XYZ_FROM_REC709 = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]

@@ -17,7 +17,7 @@ from .camera import Camera
 from .color_encoding import DEVIATION, ColorEncoding
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .float_table import FloatTable
-from .gain_map import has_gain_map, light_of, read_gain_map, with_light_above_white
+from .gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
 from .hdr_files import hdr_size, read_hdr, read_light
 from .images import EncodedImage
 from .lens import Lens, Undistortion, area_average
@@ -29,6 +29,7 @@ from .photos import fitted_lens, read_photo, truth_notes, unusable_notes
 from .primaries import linear_to_srgb
 from .srgb_codes import bands_of
 from .types import Scene, View, codes_of
+from .video_color import codes_in_rec709
 from .wide_camera import solid_angles
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ def preprocess(
     Raises:
         InputError: if a file is damaged, sizes disagree, or the photos show nothing but black or white.
     """
-    preprocessor = _Preprocessor(max_size, response, dataset.alpha)
+    to_rec709 = dataset.color_matrix if dataset.within_rec709 else None
+    preprocessor = _Preprocessor(max_size, response, dataset.alpha, to_rec709)
     names = unique_names(dataset.records) if names is None else names
     keeper = PhotoKeeper(
         photo_storage, len(names), sum(record.lens.width * record.lens.height for record in dataset.records)
@@ -86,6 +88,7 @@ def preprocess(
         meaning = "are left out" if dataset.alpha == "mask" else "count as black light"
         count = f"{len(preprocessor.transparent)} of {len(names)} photos"
         masks.append(f"transparency: {count} have transparent pixels, which {meaning}")
+    masks += gain_map_notes(preprocessor.gain_map_problems)
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
     times_known = dataset.times_known
@@ -123,7 +126,7 @@ class ContentCheck:
 
 def read_codes(record: ImageRecord) -> EncodedImage:
     """Read a photo's codes, or compute them from HDR truth or light, before anything is undistorted or resized."""
-    stored = _read_stored(record, oriented=False)
+    stored = _read_stored(record, {}, oriented=False)
     return stored.encoding.convert(stored.photo)
 
 
@@ -139,8 +142,13 @@ class _StoredPhoto(NamedTuple):
     encoding: ColorEncoding
 
 
-def _read_stored(record: ImageRecord, *, oriented: bool, masked: bool = False) -> _StoredPhoto:
-    """Read a photo; `masked` leaves float pictures without the black that their transparent parts lie over."""
+def _read_stored(
+    record: ImageRecord, problems: dict[Path, str], *, oriented: bool, masked: bool = False
+) -> _StoredPhoto:
+    """Read a photo; the problem of a damaged gain map goes to `problems`.
+
+    `masked` leaves float pictures without the black that their transparent parts lie over.
+    """
     srgb, kind = ColorEncoding("sRGB"), kind_of(record.image)
     if record.derived:
         codes = codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8)
@@ -151,8 +159,8 @@ def _read_stored(record: ImageRecord, *, oriented: bool, masked: bool = False) -
         codes = float_codes(pixels * record.light_scale, record.seconds)
         return _StoredPhoto(EncodedImage(codes, light.coverage if masked else None), srgb)
     photo, encoding = read_photo(record.image, oriented=oriented), record.encoding or srgb
-    if record.gain_map or (kind == "encoded" and not record.linear and has_gain_map(record.image)):
-        gain_map = read_gain_map(record.image, oriented=oriented)
+    if record.gain_map or (kind == "encoded" and not record.linear):
+        gain_map = read_gain_map(record.image, oriented=oriented, problems=problems)
         if record.gain_map:
             photo = light_of(photo, gain_map, record.light_scale)
             encoding = replace(encoding, curves=(), table=None)  # The light is in sRGB's curve already
@@ -191,8 +199,8 @@ class _Resampler:
 
 
 class _Preprocessor:
-    def __init__(self, max_size: int | None, response: "Response", alpha: str):
-        self.max_size, self.response, self.alpha = max_size, response, alpha
+    def __init__(self, max_size: int | None, response: "Response", alpha: str, to_rec709: np.ndarray | None):
+        self.max_size, self.response, self.alpha, self.to_rec709 = max_size, response, alpha, to_rec709
         self._tables: dict[int, np.ndarray] = {}
         self._light_of_srgb: FloatTable | None = None  # Of photos whose colors are converted
         self._last: tuple[Lens, Undistortion] | None = None
@@ -200,6 +208,7 @@ class _Preprocessor:
         self.labeled_masks: set[Path] = set()
         self.transparent: set[str] = set()  # Views whose photos have transparent pixels
         self.unusable_truth: list[InputError] = []
+        self.gain_map_problems: dict[Path, str] = {}
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
 
     def view_or_error(self, record: ImageRecord, name: str) -> View | InputError:
@@ -227,7 +236,7 @@ class _Preprocessor:
             mask = _by_solid_angle(None if stored is None else resample(stored), camera)
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
-        photo, encoding = _read_stored(record, oriented=oriented, masked=self.alpha == "mask")
+        photo, encoding = _read_stored(record, self.gain_map_problems, oriented=oriented, masked=self.alpha == "mask")
         masks = resample.borders()
         if stored is not None:
             masks.append(resample(stored))
@@ -238,6 +247,9 @@ class _Preprocessor:
         photo = self._resampled(
             photo, encoding, resample, resized=(camera.width, camera.height) != (lens.width, lens.height)
         )
+        if self.to_rec709 is not None:
+            with self._alone:
+                photo = replace(photo, pixels=codes_in_rec709(photo.pixels, self.response, self.to_rec709))
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         return View(

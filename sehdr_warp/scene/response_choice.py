@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..subsets import every_nth
 from .dataparser import DataparserOutputs
 from .exif import are_camera_jpegs
-from .gain_map import MOST_STOPS_IN_CODES, has_gain_map, read_gain_map
+from .gain_map import MOST_STOPS_IN_CODES, read_gain_map
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix
 from .preprocess import ContentCheck, read_codes
@@ -66,6 +66,9 @@ def choose_response(
     if dataset.kind == "encoded" and (str(curve) == "auto" or name == CURVES["gain-map"]):
         dataset = as_gain_mapped(dataset)
     matrix = dataset.color_matrix
+    if matrix is not None and dataset.stated_response is not None:
+        dataset = _with_clip_colors(dataset, str(getattr(curve, "name", curve)))
+        matrix = None if dataset.within_rec709 else matrix
     if dataset.kind != "encoded":
         if dataset.kind == "raw":
             matrix = color_matrix([record.image for record in dataset.records])
@@ -110,6 +113,15 @@ def check_response(dataset: DataparserOutputs, *, response: "str | Path | Respon
         raise InputError(path, problem, "leave the response out")
 
 
+def _with_clip_colors(dataset: DataparserOutputs, response: str) -> DataparserOutputs:
+    """Decide, and note, whether the photos of a clip with a stated response are converted to Rec.709."""
+    within = dataset.within_rec709 and response == dataset.stated_response
+    note = "colors: the clip's lie within Rec.709 and are converted to it"
+    if not within:
+        note = "colors: the scene is trained in the clip's primaries, and its light is converted to Rec.709"
+    return replace(dataset, within_rec709=within, notes=(*dataset.notes, note))
+
+
 def as_linear(dataset: DataparserOutputs) -> DataparserOutputs:
     """Take the photos' codes as proportional to light if all photos have 16 bits; codes of 8 bits stay codes."""
     photos = [record.image for record in dataset.records]
@@ -121,7 +133,7 @@ def as_linear(dataset: DataparserOutputs) -> DataparserOutputs:
 def as_gain_mapped(dataset: DataparserOutputs) -> DataparserOutputs:
     """Take the light of photos from their gain maps if most photos of a dataset have one."""
     images = [record.image for record in dataset.records if not record.derived]
-    maps = {image: read_gain_map(image) for image in images if has_gain_map(image)}
+    maps = {image: read_gain_map(image, problems={}) for image in images}  # Preprocessing names damaged ones.
     headrooms = {image: gain_map.headroom for image, gain_map in maps.items() if gain_map is not None}
     if 2 * len(headrooms) <= len(dataset.records):
         return dataset

@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import InputError
+from .types import codes_of
+
+if TYPE_CHECKING:
+    from ..response import Response
 
 # Codes of ITU-T H.273: transfer characteristics, color primaries and matrix coefficients.
 _HLG, _PQ, _LOG100, _LOG316 = 18, 16, 9, 10
@@ -40,6 +44,8 @@ _DOLBY_VISION = ("dvh1", "dvhe", "dva1", "dvav", "dav1")
 """Codec tags of Dolby Vision. Without a stated curve the stream is profile 5, whose colors only Dolby's decoder knows;
 phones write profile 8, which is HLG."""
 _FULL_RANGE = 2
+_OUTSIDE = 0.02  # Negative channel of a color outside Rec.709, as a part of its largest one: less is noise
+_NEAR_WHITE = 0.9  # In light
 # What makers call their log curves in a clip's metadata: colour-science's curve, and the primaries that belong to it.
 _LOGS = {
     "applelog": ("Apple Log Profile", "ITU-R BT.2020"),
@@ -90,6 +96,34 @@ class VideoColor:
         spaces = colour.RGB_COLOURSPACES
         matrix = colour.matrix_RGB_to_RGB(spaces[self.primaries], spaces["ITU-R BT.709"])
         return np.asarray(matrix, np.float64)
+
+
+def outside_rec709(pixels: np.ndarray, color: VideoColor) -> float:
+    """Return the part of a frame's pixels [H, W, 3], codes, whose colors lie outside Rec.709.
+
+    0 for a clip that states no curve or is in Rec.709. Pixels darker than a tenth of the mean do not count, because
+    their colors are noise.
+    """
+    from ..response import response_by_name
+
+    matrix = color.to_rec709()
+    if matrix is None or color.response is None:
+        return 0.0
+    light = response_by_name(color.response).decode(pixels / np.iinfo(pixels.dtype).max) @ matrix.T
+    largest = light.max(2)
+    return float(((light.min(2) < -_OUTSIDE * largest) & (largest > 0.1 * largest.mean())).mean())
+
+
+def codes_in_rec709(codes: np.ndarray, response: "Response", to_rec709: np.ndarray) -> np.ndarray:
+    """Return [H, W, 3] uint16 codes of a response in Rec.709, from codes of the same response in other primaries.
+
+    Where a channel is clipped, those that come out near white or above it are.
+    """
+    levels = int(np.iinfo(codes.dtype).max)
+    decoded = response.decode(np.arange(levels + 1, dtype=np.float64) / levels).astype(np.float32)
+    light = decoded[codes] @ to_rec709.T.astype(np.float32)
+    clipped = (codes == levels).any(2, keepdims=True) & (light > _NEAR_WHITE * decoded[-1])
+    return codes_of(np.where(clipped, np.float32(1), response.encode(np.maximum(light, 0))), 16)
 
 
 def read_color(container: Any, stream: Any, frame: Any, path: Path) -> VideoColor:

@@ -20,13 +20,15 @@ from .names import list_images
 from .read_folders import find_photos
 from .sfm import file_digest
 from .video import Clip, codes, decode, grey, in_square_pixels, open_clip
+from .video_color import outside_rec709
 
 _log = logging.getLogger("sehdr_warp.scene")
 
-_VERSION = 3
+_VERSION = 4
 _STEP = 0.08
 """Movement between two frames in parts of the width: neighbors overlap by more than nine tenths."""
 _FEWEST, _MOST = 24, 240  # Frames of a clip
+_MOST_OUTSIDE = 1e-3  # Part of a clip's pixels that may lie outside Rec.709 for its photos to be converted to it
 _LEAST_MOVEMENT = 0.05  # In parts of the width, of a whole clip: less shows no depth
 _LEAST_STEP = 4.0  # Pixels from a reference frame to the next one, at _MOVEMENT_WIDTH
 _MOST_LOOKED_AT = 3000
@@ -141,16 +143,17 @@ def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
 
 
 def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
-    numbers = frozenset(choice.numbers)
+    numbers, outside = frozenset(choice.numbers), []
     with stage("keeping frames", len(numbers), _log) as progress:
         for count, (number, frame) in enumerate(decode(clip, numbers), start=1):
             pixels, file = in_square_pixels(codes(frame, clip.color), clip), folder / f"frame_{number:06d}.png"
+            outside.append(outside_rec709(pixels[::4, ::4], clip.color))
             if pixels.dtype == np.uint8:
                 Image.fromarray(pixels).save(file, compress_level=1)
             else:
                 file.write_bytes(png16(pixels, level=1))
             progress.update(count)
-    facts = {"total": choice.total, "movement": choice.movement}
+    facts = {"total": choice.total, "movement": choice.movement, "outside_rec709": float(np.mean(outside))}
     (folder / "frames.json").write_text(json.dumps(facts))
 
 
@@ -179,4 +182,5 @@ def read_video(path: Path, cache: Path | str | None = None) -> DataparserOutputs
         folder=folder,
         stated_response=color.response,
         color_matrix=color.to_rec709(),
+        within_rec709=color.response is not None and facts["outside_rec709"] < _MOST_OUTSIDE,
     )

@@ -17,7 +17,8 @@ from ..runs.config import LossConfig
 
 CODE = 1 / 255  # One step of an 8-bit photo
 MU = 5000.0  # Parameter of the mu-law in which HDR images are compared
-KNEE = 8.0  # Code of 255 at white / mu in the mu-law of photos, linear below and logarithmic above
+KNEE = 8.0  # Code of 255 above black at white / mu in the mu-law of photos, linear below and logarithmic above
+GAIN_MAP_KNEE = 0.5  # The same exposure, where codes hold four stops more
 INTERVALS_FROM = 0.85
 """Fraction of a training after which bright codes are intervals. From the start, clipped light would have fewer pixels
 around it that determine it."""
@@ -176,8 +177,12 @@ def compares_exposures(config: LossConfig, field: RadianceField) -> bool:
 
 
 def mu_of_knee(response: Response) -> float:
-    """Return the mu whose knee, white / mu, is the exposure of code KNEE of 255, for any response."""
-    return response.white / max(float(response.decode(KNEE / 255)), 1e-12)
+    """Return the mu whose knee, white / mu, is the exposure of code KNEE of 255 above black, for any response.
+
+    Log curves have black at a tenth of their codes and more.
+    """
+    knee = GAIN_MAP_KNEE if response.name == "gain-map" else KNEE
+    return response.white / max(float(response.decode(float(response.black) + knee / 255)), 1e-12)
 
 
 def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:

@@ -243,6 +243,17 @@ def test_a_damaged_gain_map_is_named_and_the_photo_is_used(tmp_path, caplog, seg
     assert read_ldr(tmp_path / "a.jpg").pixels.shape == base.shape
 
 
+def test_damaged_gain_maps_of_a_set_are_named_in_one_note(tmp_path, caplog):
+    _, base, gain = pair()
+    write_set(tmp_path)
+    for i in (1, 3):
+        write_jpeg_pair(tmp_path / f"{i}.jpg", base, gain, [hdrgm(Gamma="0")])
+    for response in ("auto", "gamma-2.2"):
+        notes = [note for note in load_scene(tmp_path, response=response).notes if "damaged" in note]
+        assert notes == ["gain maps of 2 photos are damaged and not used: 1.jpg, 3.jpg (gamma [0.0, 0.0, 0.0])"]
+    assert "damaged" not in caplog.text
+
+
 def test_a_map_of_more_pixels_than_its_photo_counts_as_none(tmp_path, caplog):
     """A photo that was cut or scaled down leaves its map so."""
     _, base, gain = pair()
@@ -267,7 +278,7 @@ def write_set(folder, count=4):
 def test_a_set_with_gain_maps_has_their_light(tmp_path):
     light = write_set(tmp_path)
     scene = load_scene(tmp_path)
-    assert scene.light_known and scene.response.name == "srgb"
+    assert scene.light_known and scene.response.name == "gain-map"
     assert any("4 of 4 photos have a gain map: light is taken from it, up to 2.5 stops" in note for note in scene.notes)
     view = scene.views[0]
     # As if exposed 2.5 stops shorter: nothing is clipped.

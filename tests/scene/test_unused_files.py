@@ -187,6 +187,17 @@ def test_a_frame_without_a_usable_pose_is_left_out_and_named(tmp_path, pose):
         load(tmp_path)
 
 
+@pytest.mark.parametrize("sides, problem", [((1, 1, -1), "mirrors the scene"), ((2, 2, 2), r"stretch \[2.0, 2.0, 2.0")])
+def test_poses_that_are_no_rotations_are_refused(tmp_path, sides, problem):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in values["frames"]:
+        frame["transform_matrix"] = np.diag([*sides, 1.0]).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match=problem):
+        load(tmp_path)
+
+
 def test_text_models_as_other_tools_write_them(tmp_path):
     """Names with spaces and brackets, CRLF, a byte order mark, and exponents of three digits."""
     write_colmap(tmp_path, name="A DJI [1] ({:03d}).png")
