@@ -153,6 +153,8 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
         unit: cd/m^2 of a radiance of 1; None if it is not known.
         transform: To the coordinates of places and sizes; None for those of the scene.
     """
+    if not lights:
+        return "no lights: nothing that the photos clipped gives light"
     transform = transform or WorldTransform.identity()
     lines = [f"  share  shape  {'radiance' if unit is None else 'cd / m^2':>10}  at least  stops   place, size"]
     for light in lights:

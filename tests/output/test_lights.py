@@ -153,6 +153,13 @@ def test_the_table_names_place_size_and_doubt():
     assert "(-2, -1, 5), 0.8 x 0.4" in lights_table(LIGHTS, transform=moved).splitlines()[1]
 
 
+def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
+    run.find_lights = list
+    run_lights(Lights(run=run.path))
+    assert capsys.readouterr().out == "no lights: nothing that the photos clipped gives light\n"
+
+
 def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
     monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
     run_lights(Lights(run=run.path, world=WorldOptions(axes="scene")))
