@@ -206,8 +206,9 @@ def _without_lights(
     reach = _REACH * scale * gaussians.log_scales[members].exp().amax(1).cpu().numpy() + _CLEAR * voxel
     distance, nearest = KDTree(transform.points(means)).query(vertices, k=min(_NEAREST, len(means)))
     at_light = (distance < reach[nearest]).reshape(len(vertices), -1).any(1)[faces].any(1)
-    text = "left out: %d of %d triangles at the scene's lights (%d), whose light they would block"
-    log.info(text, at_light.sum(), len(faces), len(lights))
+    if at_light.any():
+        text = "left out: %d of %d triangles at the scene's lights (%d), whose light they would block"
+        log.info(text, at_light.sum(), len(faces), len(lights))
     return faces[~at_light]
 
 
