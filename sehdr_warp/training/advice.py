@@ -13,7 +13,7 @@ FALLING = 0.5  # dB that they lost since their best in a training that overfits;
 EXPOSURE_JUMP = (
     0.4  # Stops by which a whole photo is brighter or darker than the scene if its exposure is not as stated
 )
-_FEW_PHOTOS = 30
+_FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
 
@@ -71,6 +71,8 @@ def advice(
     if gain < UNFINISHED:
         if jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
             lines.append(jump)
+        elif not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
+            lines.append(f"{train_photos} photos are few: more from places between them would help most: {again}")
         elif movement := _movement(summary.get("unexplained"), train_photos, again):
             lines.append(movement)
     return lines

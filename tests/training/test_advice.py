@@ -50,7 +50,10 @@ def test_few_photos_and_movement():
     assert "masks/PHOTO.png" in line and "p0, p1, p2 ..." in line
     assert advice(Path("r"), summary([28, 28, 28], regions=100, stops=-1.1), 10) == []  # Blur
     assert advice(Path("r"), summary([28, 28, 28]), 100) == []
-    assert advice(Path("r"), {"iteration": 9, "metrics": []}, 3) == []
+    assert advice(Path("r"), {"iteration": 9, "metrics": []}, 6) == []
+    # A set that is too small to hold photos out does not tell whether things moved.
+    [line] = advice(Path("r"), summary([], regions=100), 3)
+    assert line.startswith("3 photos are few")
 
 
 def test_a_finished_run_goes_on_with_more_iterations(tmp_path, logged):
