@@ -8,6 +8,7 @@ import argparse
 import itertools
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -126,14 +127,13 @@ def _collect(
     device: str,
     *,
     plain: bool,
-    stretch_share: float = 0.0,
-    light_share: float = 0.0,
-    overexposed_share: float = 0.0,
-    page_share: float = 0.0,
+    **shares: Any,
 ) -> dict:
-    """Return lists over photos: truth, mean and deviation of clipped values, cues, and what else figures need."""
-    shares = {"stretch_share": stretch_share, "light_share": light_share, "overexposed_share": overexposed_share}
-    camera = Camera(pack, device, chosen, rooms=False, seed=seed, page_share=page_share, **shares)
+    """Return lists over photos: truth, mean and deviation of clipped values, cues, and what else figures need.
+
+    shares: of Camera; without them the photos hold what the panoramas do.
+    """
+    camera = Camera(pack, device, chosen, rooms=False, seed=seed, **shares)
     pixels: dict = {name: [] for name in ("truth", "mean", "deviation", "cues", "level", "clipped", "exposure")}
     for _ in range(PHOTOS // BATCH):
         photos = camera.take(BATCH, SIZE, plain=plain)

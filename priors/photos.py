@@ -12,27 +12,36 @@ from .panoramas import Pack
 
 SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
 MOST_CLIPPED, LEAST_CLIPPED = 0.35, 5e-4  # Shares of the pixels of a photo that is not overexposed
-OVEREXPOSED_SHARE, OVEREXPOSED = 0.2, (0.1, 0.95)  # Share of the photos, and the shares of their pixels that clip
+OVEREXPOSED = (0.1, 0.95)  # Shares of the pixels of an overexposed photo that clip
 ROOM_SHARE = 0.35  # Of the photos of a training
-STRETCH_SHARE, MOST_STRETCH = 0.5, 2.2
-"""Share of photos whose small lights are raised to a random power, and the largest power. Panoramas of 512 columns
-average small lamps with what surrounds them; photos resolve them."""
+CONTRAST = 0.35  # By how much the power may differ from 1 to which a panorama's light over its median is raised
+MOST_STRETCH = 2.2
+"""Largest power to which small lights are raised. Panoramas of 512 columns average small lamps with what surrounds
+them; photos resolve them."""
 LIGHT_WINDOW, MOST_LIGHT = 4, 0.004
 """A light is small where at most a share MOST_LIGHT of the photo is above white within a square of 1 / LIGHT_WINDOW of
 its width around it. At twice the share nothing is raised: a window or a sky is as bright in a panorama as it is. A
 pixel of such a panorama is 0.7 degrees wide, and 3 x 3 of them cover up to 0.36 % of a photo."""
-LIGHT_SHARE, OVEREXPOSED_LIGHT_SHARE = 0.05, 0.4
-"""Shares of the usual and of the overexposed photos that lights are put into. Lights at random places are not as
-frequent and as bright as those of panoramas, so they teach usual photos wrong expectations; overexposed photos of
-panoramas alone show too few lamps within what they light."""
+OVEREXPOSED_LIGHT_SHARE = 0.4
+"""Share of the overexposed photos that lights are put into: those of panoramas alone show too few lamps within what
+they light."""
 MOST_LIGHTS = 3  # Largest number of lights put in
-LAMP_RADII, LAMP_STOPS = (0.003, 0.06), (2.0, 11.0)
+LAMP_RADII, LAMP_STOPS = (0.003, 0.06), (2.0, 12.5)
 """Radii of round lamps over the photo's width, and stops of their light over the photo's median."""
 PANEL_SIZES, PANEL_STOPS = (0.04, 0.5), (1.0, 8.0)
 """Half sides of windows and screens over the photo's width, and stops of their mean light over the photo's median."""
+COLORED_SHARE, COLOR_STOPS = 0.4, (3.0, 10.0)
+"""Share of the photos whose lamps are colored, as LEDs and neon tubes are, and the range of the stops by which channels
+of one may differ. Of such lamps photos often clip one or two channels alone."""
+TINT_SHARE = 0.3  # Of the photos whose small lights are raised: those in which they are colored, too
+SOFT_SHARE, SHADE_STOPS = 0.3, 3.0  # Share of the photos whose lamps are darker at their rims, and by how many stops
+CELL_STOPS = 1.5  # Most stops by which the cells of a colored screen differ from their mean
 HEIGHTS = (1.5, 40.0)  # Distances of lights from the surface behind them, over their radii
-PAGE_SHARE, PAGE_LIGHT = 0.25, (0.7, 2.0)  # Of the photos, those with a white surface that is no lamp; light over white
+PAGE_LIGHT = (0.7, 2.0)  # Of a white surface that is no lamp, over white
 DIM_SHARE, DIM_STOPS = 0.5, 4.0  # Share of these whose scene is darker, and by how many stops at most: it may not clip
+WAVE_SHARE, WAVES, MOST_WAVE = 0.5, (2.0, 25.0), 0.4
+"""Share of these surfaces whose light varies smoothly, as on snow, radians of it over the photo's width, and the most
+change of its logarithm. Where it goes over into what clips without an edge, little is above white."""
 TEXT_SHARE, PICTURE_SHARE = 0.6, 0.25  # Shares of these surfaces that are printed with text and with a dark picture
 LINE_PITCH = (0.02, 0.14)  # Distances of lines of text over the photo's width
 PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
@@ -63,11 +72,12 @@ class Camera:
         *,
         rooms: bool,
         seed: int,
-        stretch_share: float = STRETCH_SHARE,
-        light_share: float = LIGHT_SHARE,
+        stretch_share: float = 0.0,
+        light_share: float = 0.0,
         overexposed_light_share: float = OVEREXPOSED_LIGHT_SHARE,
-        overexposed_share: float = OVEREXPOSED_SHARE,
-        page_share: float = PAGE_SHARE,
+        overexposed_share: float = 0.0,
+        page_share: float = 0.0,
+        varied: bool = False,
     ):
         """Copy panoramas, rooms and curves to the device.
 
@@ -77,12 +87,14 @@ class Camera:
             chosen: indices of the panoramas that are photographed.
             rooms: whether rooms are photographed too.
             seed: of every random number.
-            stretch_share: of the photos, unless they are plain.
+            stretch_share: of the photos, those whose small lights are raised, unless they are plain.
             light_share: share of the usual photos that lights are put into, unless they are plain.
             overexposed_light_share: the same share of the overexposed photos.
             overexposed_share: share of the photos of which up to 95 % clip, unless they are plain.
             page_share: share of the photos with a white surface that is no lamp, unless they are plain.
+            varied: whether panoramas have random contrasts and orders of channels, so that few of them teach more.
         """
+        self.varied = varied
         self.stretch_share, self.overexposed_share, self.page_share = stretch_share, overexposed_share, page_share
         self.light_share, self.overexposed_light_share = light_share, overexposed_light_share
         self.device, self.random = torch.device(device), np.random.default_rng(seed)
@@ -130,7 +142,17 @@ class Camera:
         views = F.grid_sample(self.panoramas[index], grid, mode="bilinear", padding_mode="border", align_corners=True)
         views = F.avg_pool2d(views, 2)
         mirrored = torch.from_numpy(random.random(count) < 0.5).to(self.device)
-        return torch.where(mirrored[:, None, None, None], views.flip(3), views)
+        views = torch.where(mirrored[:, None, None, None], views.flip(3), views)
+        return self._vary(views) if self.varied and count else views
+
+    def _vary(self, views: Tensor) -> Tensor:
+        """Return views [B, 3, S, S] of other contrasts about their medians, and half of them of other colors."""
+        count = len(views)
+        brightest = views.amax(1, keepdim=True).clamp_min(1e-9)
+        median = _median(brightest.flatten(1))[..., None, None]
+        views = views * (brightest / median) ** self._uniform(count, -CONTRAST, CONTRAST)
+        orders = np.stack([self.random.permutation(3) if self.random.random() < 0.5 else np.arange(3) for _ in views])
+        return views.gather(1, torch.from_numpy(orders).to(self.device)[:, :, None, None].expand_as(views))
 
     def _room_views(self, count: int, size: int) -> Tensor:
         assert self.rooms is not None
@@ -150,8 +172,10 @@ class Camera:
         """Photograph radiance [B, 3, S, S] at random exposures."""
         count = len(radiance)
         over = self._uniform(count, 0, 1)[:, 0, 0, 0] < self.overexposed_share
+        if not plain and (self.light_share or self.overexposed_share):
+            radiance = self._with_lights(radiance, over)
         if not plain:
-            radiance = self._with_lights(radiance, over) * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
+            radiance = radiance * 2 ** self._uniform(count, -0.5, 0.5, 3)  # White balance
         brightest = radiance.amax(1).flatten(1)
         # Half of the photos choose white by the share that clips, half by a distance from the middle grey.
         share = 2.0 ** self._uniform(count, math.log2(LEAST_CLIPPED), math.log2(MOST_CLIPPED))[:, 0, 0, 0]
@@ -161,7 +185,7 @@ class Camera:
             share = torch.where(over, self._uniform(count, *OVEREXPOSED)[:, 0, 0, 0], share)
         ranks = ((1 - share) * (brightest.shape[1] - 1)).long()
         by_share = brightest.sort(1).values.gather(1, ranks[:, None])
-        by_middle = brightest.median(1, keepdim=True).values * 2 ** self._uniform(count, 0.5, 9)[:, 0, 0]
+        by_middle = _median(brightest) * 2 ** self._uniform(count, 0.5, 9)[:, 0, 0]
         most = brightest.sort(1).values[:, int((1 - LEAST_CLIPPED) * (brightest.shape[1] - 1)), None]
         first = (torch.rand(count, 1, generator=self.generator, device=self.device) < 0.5) | plain
         if not plain:
@@ -169,7 +193,9 @@ class Camera:
         white = torch.where(first, by_share, torch.minimum(by_middle, most)).clamp_min(1e-12)
         exposure = radiance / white[:, :, None, None]
         if not plain:
-            exposure = self._with_pages(self._stretch(exposure))
+            exposure = self._stretch(exposure)
+        if not plain and self.page_share:
+            exposure = self._with_pages(exposure)
         truth = exposure.clamp_min(1).log2()
         noisy = exposure
         if not plain:
@@ -194,8 +220,16 @@ class Camera:
         power = self._uniform(count, 1, MOST_STRETCH)
         power = torch.where(self._uniform(count, 0, 1) < self.stretch_share, power, 1.0)
         brightest = exposure.amax(1, keepdim=True)
-        power = 1 + (power - 1) * _smallness(brightest > 1)
-        return exposure * brightest.clamp_min(1) ** (power - 1)
+        small = _smallness(brightest > 1)
+        raised = exposure * brightest.clamp_min(1) ** ((power - 1) * small)
+        tint = self._color(count)
+        is_tinted = (self._uniform(count, 0, 1) < TINT_SHARE * self.stretch_share) & (brightest > 1)
+        return raised * (tint / tint.amax(1, keepdim=True)) ** (small * is_tinted)
+
+    def _color(self, count: int) -> Tensor:
+        """Return [B, 3, 1, 1] colors of mean 1, whose channels differ by up to COLOR_STOPS."""
+        strength = math.log(2) / 2 * self._uniform(count, *COLOR_STOPS)
+        return 3 * torch.softmax(strength * self._uniform(count, -1, 1, 3), 1)
 
     def _with_lights(self, radiance: Tensor, over: Tensor) -> Tensor:
         """Return radiance [B, 3, S, S], some with round lamps, windows and screens that light what is around them.
@@ -209,19 +243,18 @@ class Camera:
         steps = (torch.arange(size, device=self.device) + 0.5) / size
         light_share = torch.where(over, self.overexposed_light_share, self.light_share)[:, None, None, None]
         has_lights = self._uniform(count, 0, 1) < light_share
-        median = radiance.amax(1).flatten(1).median(1).values.clamp_min(1e-6)[:, None, None, None]
+        median = _median(radiance.amax(1).flatten(1)).clamp_min(1e-6)[..., None, None]
         ambient = radiance.mean((1, 2, 3), keepdim=True).clamp_min(1e-6)
         panel = self._uniform(count, 0, 1) < 0.5
-        tint = 2 ** (0.6 * self._uniform(count, -1, 1, 3))
-        colored = self._uniform(count, 0, 1) < 0.15
-        tint = torch.where(colored, torch.softmax(4 * self._uniform(count, -1, 1, 3), 1) * 3, tint)
+        is_colored = ~panel & (self._uniform(count, 0, 1) < COLORED_SHARE)
+        is_soft = ~panel & (self._uniform(count, 0, 1) < SOFT_SHARE)
         lamp_light = median * 2 ** self._uniform(count, *LAMP_STOPS)
         panel_light = median * 2 ** self._uniform(count, *PANEL_STOPS)
         lamp_radius = _log_range(self._uniform(count, 0, 1), *LAMP_RADII)
         half_width, half_height = (_log_range(self._uniform(count, 0, 1), *PANEL_SIZES) for _ in range(2))
         half_width = torch.where(panel, half_width, lamp_radius * 2 ** self._uniform(count, -0.3, 3).clamp_min(0))
         half_height = torch.where(panel, half_height, lamp_radius)
-        content = torch.where(panel, self._panel_content(radiance, steps), 1.0) * tint
+        content = torch.where(panel, self._panel_content(radiance, steps), 1.0)
         light = torch.where(panel, panel_light, lamp_light)
         area = half_width * half_height
         height = area.sqrt() * _log_range(self._uniform(count, 0, 1), *HEIGHTS)
@@ -233,10 +266,12 @@ class Camera:
             down = steps[None, None, :, None] - self._uniform(count, -0.1, 1.1)
             turn = self._uniform(count, -0.15, 0.15)
             u, v = turn.cos() * across + turn.sin() * down, turn.cos() * down - turn.sin() * across
+            tint = torch.where(is_colored, self._color(count), 2 ** (0.6 * self._uniform(count, -1, 1, 3)))
+            shade = torch.where(is_soft, 2 ** (-SHADE_STOPS * ((u / half_width) ** 2 + (v / half_height) ** 2)), 1.0)
             box = torch.maximum(u.abs() - half_width, v.abs() - half_height)
             disc = (torch.hypot(u / half_width, v / half_height) - 1) * half_height
             inside = ((0.5 - size * torch.where(panel, box, disc)).clamp(0, 1) * used).to(radiance)
-            lights = lights * (1 - inside) + inside * light * content
+            lights = lights * (1 - inside) + inside * light * content * tint * shade
             covered = covered * (1 - inside) + inside
             glow = glow + light * tint * area * height / (u**2 + v**2 + height**2) ** 1.5 * used
         return radiance * (1 + glow / ambient) * (1 - covered) + lights
@@ -247,7 +282,8 @@ class Camera:
         other = radiance.roll(1, 0)
         other = other / other.mean((1, 2, 3), keepdim=True).clamp_min(1e-9)
         places = self._uniform(count, 0, 1, 48)[:, :, 0]
-        colors = torch.softmax(2.5 * self._uniform(count, -1, 1, 72).reshape(count, 24, 3), 2) * 3
+        colors = torch.softmax(3.5 * self._uniform(count, -1, 1, 72).reshape(count, 24, 3), 2) * 3
+        colors = colors * 2 ** (CELL_STOPS * self._uniform(count, -1, 1, 24)[..., 0])
         across, down = (
             (steps.repeat(size)[None, None] - places[:, :24]),
             (steps.repeat_interleave(size)[None, None] - places[:, 24:]),
@@ -274,12 +310,21 @@ class Camera:
         inside = ((u.abs() < half_width) & (v.abs() < half_height) & used)[:, None]
         slope = self._uniform(count, -0.4, 0.4)[:, 0]
         light = _log_range(self._uniform(count, 0, 1), *PAGE_LIGHT)
-        light = light * torch.exp(slope * u / half_width.clamp_min(0.1))[:, None]
+        light = light * torch.exp(slope * u / half_width.clamp_min(0.1) + self._waves(u, v))[:, None]
         grain = torch.randn(exposure.shape, generator=self.generator, device=self.device)
         light = light * torch.exp(self._uniform(count, 0, 0.06) * grain)
         reflected = self._print_of(u, v, half_width, half_height)[:, None]
         dim = torch.where(self._uniform(count, 0, 1) < DIM_SHARE, 2 ** self._uniform(count, -DIM_STOPS, 0), 1.0)
         return torch.where(inside, light * reflected, torch.where(used[:, None], dim * exposure, exposure))
+
+    def _waves(self, u: Tensor, v: Tensor) -> Tensor:
+        """Return [B, S, S] the logarithm of a factor of the light at places u, v [B, S, S]; 0 in most photos."""
+        count, wave = len(u), torch.zeros_like(u)
+        for _ in range(3):
+            angle, phase = (self._uniform(count, 0, 2 * math.pi)[:, 0] for _ in range(2))
+            rate = _log_range(self._uniform(count, 0, 1)[:, 0], *WAVES)
+            wave = wave + torch.sin(rate * (angle.cos() * u + angle.sin() * v) + phase) / 2
+        return wave * self._uniform(count, 0, MOST_WAVE)[:, 0] * (self._uniform(count, 0, 1)[:, 0] < WAVE_SHARE)
 
     def _print_of(self, u: Tensor, v: Tensor, half_width: Tensor, half_height: Tensor) -> Tensor:
         """Return what a printed surface reflects over what blank paper does, [B, S, S] in [0, 1].
@@ -335,6 +380,11 @@ class Camera:
 def _log_range(part: Tensor, low: float, high: float) -> Tensor:
     """Return the value at each part of a range, even in the logarithm."""
     return low * (high / low) ** part
+
+
+def _median(values: Tensor) -> Tensor:
+    """Return [B, 1] the lower median of each row of values [B, N]; torch.median has no deterministic form on GPUs."""
+    return values.sort(1).values[:, (values.shape[1] - 1) // 2, None]
 
 
 def _smallness(above: Tensor) -> Tensor:

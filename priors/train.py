@@ -1,11 +1,13 @@
 """Train the prior for clipped light: `python -m priors.train PACK --out WEIGHTS`.
 
-One run is deterministic on one machine. With --judge the held-out panoramas are left out, and the figures of the model
-card are printed and written beside the weights.
+One run is deterministic on one kind of machine. With --judge the held-out panoramas are left out, and the figures of
+the model card are printed and written beside the weights.
 """
 
 import argparse
+import copy
 import json
+import os
 import time
 from pathlib import Path
 
@@ -15,14 +17,17 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from sehdr_warp.prior import load_prior
-from sehdr_warp.prior.network import STOPS, WIDTH, LightNetwork, network_input
+from sehdr_warp.prior.network import STOPS, LightNetwork, network_input
 
+from .families import Families
 from .judge import judge
 from .panoramas import Pack, read_pack
-from .photos import Camera, Photos
+from .photos import Photos
 
-BATCH = 32
-RATE = 2e-3
+STEPS, BATCH = 6500, 48
+AT_ONCE = 4  # Batches that are simulated at one time
+RATE, WARM_UP, WEIGHT_DECAY = 2e-3, 200, 0.1
+AVERAGE = 0.998  # Of the weights before and those of a step, of which the result is made
 ENERGY_WEIGHT = 0.15  # Of the error of a photo's total light beside the pixels' likelihood
 LEAST_PIXELS = 20.0  # A photo with fewer clipped values counts as if it had so many, and some not
 USUAL_PIXELS = 800.0  # Clipped values of a photo that counts once
@@ -52,68 +57,56 @@ def train(
     chosen: np.ndarray,
     *,
     steps: int,
-    seconds: float,
     seed: int,
     device: str,
     begin: Path | None = None,
-    batch: int = BATCH,
     rate: float = RATE,
 ) -> LightNetwork:
-    """Return a network trained on some panoramas and the rooms.
+    """Return a network trained on some panoramas and the rooms: the average of its last weights.
 
     Args:
         pack: of `read_pack`.
         chosen: indices of the panoramas.
-        steps: most steps; the learning rate follows one cycle over them.
-        seconds: most seconds; the cycle is over by then too. Only 0 (no bound) is reproducible.
+        steps: the learning rate falls to 0 over them.
         seed: of every random number.
         device: "cpu", "cuda:0" ...
         begin: weights to go on from; None: random ones.
-        batch: photos of a step.
         rate: the largest learning rate.
     """
     torch.manual_seed(seed)
-    network = LightNetwork(WIDTH) if begin is None else load_prior("cpu", begin).network
-    network = network.to(device).train().requires_grad_()
-    camera = Camera(pack, device, chosen, rooms=True, seed=seed)
-    optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-3)
-    decay = min(0.998, 1 - 10 / steps)
+    network = LightNetwork() if begin is None else copy.deepcopy(load_prior("cpu", begin).network)
+    network = network.to(device).train()
+    families = Families(pack, device, chosen, rooms=True, seed=seed)
+    matrices, vectors = ([p for p in network.parameters() if (p.ndim > 1) is matrix] for matrix in (True, False))
+    groups = [{"params": matrices, "weight_decay": WEIGHT_DECAY}, {"params": vectors, "weight_decay": 0.0}]
+    optimizer = torch.optim.AdamW(groups, rate)
+    decay = min(AVERAGE, 1 - 10 / steps)
     average = torch.optim.swa_utils.AveragedModel(
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(decay)
     )
-    warm_up = min(300, steps / 10)
-    started = time.perf_counter()
+    started, batches = time.perf_counter(), []
     for step in range(steps):
-        done = step / steps
-        if seconds:
-            done = max(done, (time.perf_counter() - started) / seconds)
-        if done >= 1:
-            break
+        batches = batches or families.take(BATCH, AT_ONCE)
+        photos = batches.pop()
         for group in optimizer.param_groups:
-            group["lr"] = rate * min(1.0, step / warm_up + 0.05) * (0.5 + 0.5 * np.cos(np.pi * done))
-        photos = camera.take(batch)
+            group["lr"] = rate * min(1.0, (step + 1) / WARM_UP) * (0.5 + 0.5 * np.cos(np.pi * step / steps))
         loss = pixel_loss(*network(network_input(photos.exposure, photos.clipped)), photos)
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
         average.update_parameters(network)
-        if step % 200 == 0 or step % (steps // 10) == 0:
-            line = {
-                "step": step,
-                "loss": round(float(loss.detach()), 4),
-                "seconds": round(time.perf_counter() - started, 1),
-            }
-            print(json.dumps(line), flush=True)
+        if step % 200 == 0:
+            seconds = round(time.perf_counter() - started, 1)
+            print(json.dumps({"step": step, "loss": round(float(loss.detach()), 4), "seconds": seconds}), flush=True)
     return average.module
 
 
 def fit_scale(network: LightNetwork, pack: Pack, chosen: np.ndarray, *, seed: int, device: str) -> float:
     """Return the factor of the deviations at which 68 % of clipped values lie within one, on photos of panoramas."""
-    camera, parts = Camera(pack, device, chosen, rooms=False, seed=seed), []
+    families, parts = Families(pack, device, chosen, rooms=False, seed=seed), []
     with torch.no_grad():
-        for _ in range(SCALE_PHOTOS // BATCH):
-            photos = camera.take(BATCH, 96)
+        for photos in families.take(BATCH, SCALE_PHOTOS // BATCH, 96):
             mean, deviation = network(network_input(photos.exposure, photos.clipped))
             off = ((photos.truth - mean).abs() / deviation)[photos.clipped > 0]
             parts.append(off[torch.randperm(len(off), device=off.device)[:4000]].cpu())
@@ -121,25 +114,23 @@ def fit_scale(network: LightNetwork, pack: Pack, chosen: np.ndarray, *, seed: in
 
 
 def main() -> None:
-    """Train, judge where asked to, and write the weights."""
+    """Train, judge if asked to, and write the weights."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("pack", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=9000)
-    parser.add_argument("--seconds", type=float, default=0.0)
+    parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--begin", type=Path, help="go on from these weights")
-    parser.add_argument("--batch", type=int, default=BATCH, help="photos of a step")
     parser.add_argument("--rate", type=float, default=RATE, help="largest learning rate")
     parser.add_argument("--judge", action="store_true", help="leave out the held-out panoramas and judge on them")
     parser.add_argument("--deviation-scale", type=float, default=1.0, help="of a judged run, for one on all panoramas")
     args = parser.parse_args()
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=True)
     pack = read_pack(args.pack)
     chosen = np.flatnonzero(~pack.held_out) if args.judge else np.arange(len(pack.panoramas))
-    names = "steps", "seconds", "seed", "device", "begin", "batch", "rate"
-    options = {name: getattr(args, name) for name in names}
+    options = {name: getattr(args, name) for name in ("steps", "seed", "device", "begin", "rate")}
     network = train(pack, chosen, **options).eval()
     scale, unseen = args.deviation_scale, np.flatnonzero(pack.held_out)
     if args.judge:

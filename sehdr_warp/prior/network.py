@@ -10,6 +10,7 @@ DARKEST = -12.0  # log2 of exposure over white below which pixels look alike to 
 STOPS = 12.0  # Largest log2 excess that the network is trained on
 LEAST_DEVIATION = 0.05  # Stops
 INPUTS = 6
+DROPOUT = 0.25  # Share of the channels of the coarsest level that a step of the training leaves out
 
 
 class LightNetwork(nn.Module):
@@ -48,7 +49,8 @@ class LightNetwork(nn.Module):
             x = block(x)
             levels.append(x)
             x = F.avg_pool2d(x, 2)
-        x = self.middle(x + x.mean((2, 3), keepdim=True))
+        x = self.middle(F.dropout2d(x + x.mean((2, 3), keepdim=True), DROPOUT, self.training))
+        x = F.dropout2d(x, DROPOUT, self.training)
         for block in self.up:
             across = levels.pop()
             x = block(torch.cat([F.interpolate(x, size=across.shape[2:], mode="nearest"), across], 1))
