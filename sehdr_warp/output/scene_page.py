@@ -14,7 +14,8 @@ import numpy as np
 
 from ..files import atomic_path, check_absent
 from ..kernels.constants import FRUSTUM_MARGIN, NEAR_PLANE
-from ..model.baking import gaussians_of
+from ..model.baking import field_of, gaussians_of
+from ..runs.run import Splats
 from ..scene import Camera
 from ..splats.arrays import HARMONIC_0
 from .camera_paths import facts_of_cameras, training_cameras
@@ -60,6 +61,8 @@ def write_scene_page(
     if edits.max_gaussians is not None:
         mask = most_visible(mask, edits.max_gaussians, run)
     gaussians = without_strays(gaussians.rows(mask), cameras)
+    if edits.shows_part and not cameras:  # What is left is looked at from outside.
+        opening = opening_facts(Splats(Path(run.path), field_of(gaussians), ()))
     gaussians.require_finite(path)
     harmonics = np.clip(gaussians.harmonics * np.float32(run.base_time), -_HALF, _HALF)
     columns = dict(zip("xyz", gaussians.means.T))

@@ -1,5 +1,7 @@
 """The page to send, in a real browser and from disk: the light is that of our own renders."""
 
+import json
+import re
 import time
 from dataclasses import replace
 
@@ -12,7 +14,9 @@ from sehdr_warp.output.export import export
 from sehdr_warp.output.images import as_array
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.splat_commands import Export, run_export
+from sehdr_warp.output.splat_edits import SplatEdits
 from sehdr_warp.output.tonemap import display_gain, encode_srgb
+from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera
 from sehdr_warp.training.train import train
@@ -85,6 +89,19 @@ def test_a_file_without_cameras_is_a_page_that_shows_it(run, tmp_path):
         for _ in range(3):
             page.keyboard.press("[")
         assert "1.0" in page.text_content("#stopsTold")
+
+
+def test_a_part_of_a_file_without_cameras_is_framed(tmp_path):
+    random = np.random.default_rng(0)
+    places = np.concatenate([random.normal(size=(40, 3)) * 0.2, random.normal(size=(40, 3)) * 0.2 + (8, 0, 0)])
+    scene = run_of(tmp_path, splats(places, np.full(80, 0.9), scale=0.05))
+    scene.cameras = ()
+    x, y, z = world_transform(scene).points(np.array([8.0, 0, 0]))
+    file = write_scene_page(scene, tmp_path / "part.html", edits=SplatEdits(crop=f"sphere:{x},{y},{z},2"))
+    facts = json.loads(re.search(r'id="facts">(.*?)</script>', file.read_text())[1])
+    opening = Camera.from_dict(facts["opening"])
+    _, column, _, inside = opening.project(places[40:])
+    assert inside.mean() > 0.8 and np.ptp(column[inside]) > 0.3 * opening.width
 
 
 def test_two_fingers_come_nearer_and_one_turns(run, tmp_path):
