@@ -20,6 +20,7 @@ from .blend_cuda import (
     module_options,
     padded_channels,
 )
+from .compile_options import NO_AUTODIFF
 from .constants import ALPHA_MAX, SUBTILE, TILE_SIZE
 from .geometry import geometry, vector
 
@@ -46,6 +47,19 @@ def add_row(numbers: wp.array(dtype=wp.float32), i: int, a: float, b: float, c: 
 def adds_rows(dtype, ordered: bool, cuda: bool) -> bool:
     """Return whether gradients are added by rows of four numbers; they then have a multiple of four columns."""
     return cuda and dtype is wp.float32 and not ordered
+
+
+@cache
+def copy_features_kernel(dtype):
+    """Return copy_features() for one scalar type, launched over [N, C]."""
+
+    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
+    def copy_features(rows: wp.array2d(dtype=dtype), features: wp.array2d(dtype=dtype)):
+        """Copy the first columns of rows [N, C + 6 or more], gradients by features, to features [N, C]."""
+        gaussian, channel = wp.tid()
+        features[gaussian, channel] = rows[gaussian, channel]
+
+    return copy_features
 
 
 @cache

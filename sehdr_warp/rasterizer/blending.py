@@ -1,7 +1,7 @@
 """The last stage of a render: blend the tile lists front to back, any number of channels in one pass."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,9 +18,11 @@ from .warp_launch.launching import launch, warp_scalar
 
 ROWS_OF_TILE = blend_cpu.HALVES * TILE_SIZE  # Of LANES pixels each
 PIECES_PER_THREAD = 16  # Of the image, on the CPU: their work differs by more than their intersections.
-Backward = Callable[[Tensor, Tensor | None], Tensor]
-"""Maps the gradients by image and transmittance (None for 0) to those by Gaussian, [N, C + 6 or more]: features, conic
-a b c, x, y, opacity, and columns that pad a row."""
+Backward = Callable[[Tensor, Tensor | None], Sequence[Tensor]]
+"""Maps the gradients by image and transmittance (None for 0) to those by what they were blended from."""
+RowBackward = Callable[[Tensor, Tensor | None], Tensor]
+"""The same for gradients by Gaussian, [N, C + 6 or more]: features, conic a b c, x, y, opacity, and columns that pad a
+row."""
 
 
 class BlendResult(NamedTuple):
@@ -29,7 +31,7 @@ class BlendResult(NamedTuple):
     Attributes:
         image: [H, W, C].
         transmittance: [H, W].
-        backward: their backward pass.
+        backward: their backward pass, for the tensors that with_gradient() gets.
     """
 
     image: Tensor
@@ -68,20 +70,30 @@ def blend(
     transmittance = rows.new_empty(image.shape[:2])
     backend = blend_on_cuda if rows.device.type == "cuda" else blend_on_cpu
     # The backward pass keeps some of these, but it must not keep the results of the node that keeps it: so detach them.
-    backward = backend(rows, lists, packed, image.detach(), transmittance.detach(), alpha_threshold, deterministic)
-    return with_gradient(means2d, conics, opacities, features, BlendResult(image, transmittance, backward))
+    row_backward = backend(rows, lists, packed, image.detach(), transmittance.detach(), alpha_threshold, deterministic)
+
+    def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
+        gathered, channels = row_backward(grad_image, grad_transmittance), grad_image.shape[2]
+        sizes = channels, 3, 2, gathered.shape[1] - channels - 5
+        grad_features, grad_conics, grad_means2d, others = gathered.split_with_sizes(sizes, 1)
+        return grad_means2d, grad_features, grad_conics, others.select(1, 0)
+
+    return with_gradient(BlendResult(image, transmittance, backward), means2d, features, conics, opacities)
 
 
-def with_gradient(means2d, conics, opacities, features, result: BlendResult) -> tuple[Tensor, Tensor]:
-    """Return a result's image and transmittance as differentiable functions of what they were blended from."""
+def with_gradient(result: BlendResult, means2d: Tensor, features: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a result's image and transmittance as differentiable functions of what they were blended from.
+
+    others: the tensors whose gradients the result's backward pass returns after those by means2d and features.
+    """
     if not torch.is_grad_enabled():
         return result.image, result.transmittance
-    return _apply_blend(means2d, conics, opacities, features, result)
+    return _apply_blend(result, means2d, features, *others)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, features, result: BlendResult):
+    def forward(ctx, result: BlendResult, means2d, features, *others):
         ctx.sizes, ctx.gradients_of = result.image.shape, result.backward
         # The backward pass reads them: torch then raises its own error if one is changed in place before.
         ctx.save_for_backward(features, result.transmittance)
@@ -96,19 +108,15 @@ class _Blend(torch.autograd.Function):
         if not keeps_graph():
             ctx.gradients_of = None
         if grad_image is None and grad_transmittance is None:
-            return (None,) * 5
+            return (None,) * len(ctx.needs_input_grad)
         _, width, channels = ctx.sizes
         grad_image = grad_transmittance.new_zeros(ctx.sizes) if grad_image is None else grad_image.contiguous()
         # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
         if grad_image.stride() != (width * channels, channels, 1):
             grad_image = grad_image.as_strided(ctx.sizes, (width * channels, channels, 1))
-        gathered = gradients_of(grad_image, None if grad_transmittance is None else grad_transmittance.contiguous())
-        rest = gathered.shape[1] - channels - 6
-        grad_features, grad_conics, grad_means2d, grad_opacities, _ = gathered.split_with_sizes(
-            (channels, 3, 2, 1, rest), 1
-        )
-        gradients = grad_means2d, grad_conics, grad_opacities[:, 0], grad_features
-        return *(part if needed else None for part, needed in zip(gradients, ctx.needs_input_grad, strict=False)), None
+        if grad_transmittance is not None:
+            grad_transmittance = grad_transmittance.contiguous()
+        return None, *gradients_of(grad_image, grad_transmittance)
 
 
 _apply_blend = direct_apply(_Blend)

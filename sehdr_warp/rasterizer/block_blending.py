@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..kernels import blend_cuda, blend_cuda_backward
 from .tile_lists import MAX_SINGLE_SORT, PackedSplats, TileLists
-from .warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar, warp_stream
+from .warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar
 
 
 def blend_on_cuda(
@@ -40,7 +40,7 @@ def blend_on_cuda(
 
 @dataclass(frozen=True)
 class BlockBackward:
-    """The backward pass of blend_on_cuda(); see Backward.
+    """The backward pass of blend_on_cuda(); see RowBackward.
 
     Attributes:
         features: [N, C] or, padded, [N, more].
@@ -82,7 +82,8 @@ class BlockBackward:
     def on_fixed_memory(self) -> "FixedBackward":
         """Return the backward pass for less host time; for use while all tensors stay where they are.
 
-        features are padded, or the backward pass would read what they were at this call.
+        features are padded, or the backward pass would read what they were at this call. Each launch gives the
+        addresses of the gradients by image and transmittance (0 for none) and of the rows, zeros that it adds to.
         """
         assert not self.deterministic, "sums in a fixed order are several launches"
         grad_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
@@ -97,7 +98,7 @@ class BlockBackward:
             whole=(grad_image, grad_transmittance, gathered),
             block_dim=blend_cuda.BLOCK_DIM,
         )
-        return FixedBackward(fixed, gathered.device, len(gathered), gathered.shape[1])
+        return FixedBackward(fixed, gathered)
 
     def _zeros(self) -> Tensor:
         columns = self.channels + 6
@@ -129,20 +130,11 @@ class FixedBackward(NamedTuple):
 
     Attributes:
         fixed: its launch.
-        device: of the tensors.
-        count: N.
-        columns: of the gradients by Gaussian.
+        rows: a tensor like the gradients by Gaussian that BlockBackward returns.
     """
 
     fixed: FixedLaunch
-    device: torch.device
-    count: int
-    columns: int
-
-    def add_to(self, zeros: Tensor, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
-        """Return the gradients by Gaussian, see Backward: a view of zeros [N * columns or more]."""
-        self.fixed.launch((), (grad_image, grad_transmittance, zeros), warp_stream(self.device))
-        return zeros.as_strided((self.count, self.columns), (self.columns, 1))
+    rows: Tensor
 
 
 def blend_blocks(

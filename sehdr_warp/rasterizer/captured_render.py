@@ -3,21 +3,15 @@
 import ctypes
 import time
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..kernels.project import projection_kernel
-from .block_blending import BlockBackward, FixedBackward, blend_on_cuda, fixed_blend_blocks
+from .block_blending import BlockBackward, blend_on_cuda, fixed_blend_blocks
+from .captured_backward import CapturedBackward
 from .cuda_graphs import CudaGraphRunner
-from .projection import (
-    ProjectedGaussians,
-    RasterInputs,
-    adjoint_arguments,
-    project_to_camera,
-    projection_parameters,
-)
+from .projection import ProjectedGaussians, RasterInputs, project_to_camera, projection_parameters
 from .render_options import MAX_INTERSECTIONS, RenderOptions
 from .tile_lists import (
     MAX_SINGLE_SORT,
@@ -52,15 +46,22 @@ class CapturedRender:
         options: of the image.
         intersections: the least number to allocate memory for.
         differentiable: whether its backward passes may be called.
+
+    Attributes:
+        count: of the Gaussians.
+        max_intersections: that there is memory for.
+        backward: the backward passes, if differentiable.
     """
+
+    backward: CapturedBackward
 
     def __init__(
         self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
     ) -> None:
         """Launch the render once, then capture it."""
         width, height, threshold = options.width, options.height, options.alpha_threshold
-        projects = len(tensors) == FEATURES + 3
-        many = len(tensors[0]) > MAX_COPIED_GAUSSIANS
+        projects, self.count = len(tensors) == FEATURES + 3, len(tensors[0])
+        many = self.count > MAX_COPIED_GAUSSIANS
         self._copies = differentiable or options.depth or not projects or not many
         inputs = [tensor.detach().contiguous() for tensor in tensors]
         if self._copies:
@@ -107,27 +108,24 @@ class CapturedRender:
             self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
             blend(splats, packed, list_tiles(splats, packed, offsets))
             del offsets
-        self.backward: FixedBackward | None = None
-        self.projection_backward: FixedLaunch | None = None
         if self._copies:
             del splats, packed
-            self.splats, backward = self._runner.capture(None, whole)
-            self.backward = backward.on_fixed_memory() if differentiable else None
-            if projects:
-                self.projection_backward = _fixed_projection_backward(inputs, options, self.splats.projected)
+            splats, backward = self._runner.capture(None, whole)
+            if differentiable:
+                gaussians = _without_features(inputs) if projects else ()
+                self.backward = CapturedBackward(backward, gaussians, options, splats.projected)
             self._inputs = inputs
         else:
-            self.splats, lists = splats, self._runner.capture(None, lambda: middle(splats, packed))
+            lists = self._runner.capture(None, lambda: middle(splats, packed))
             assert packed.padded is not None
             self._project = _fixed_projection(inputs, options, splats.projected)
             self._pack = fixed_pack_splats(splats, packed, threshold, width, height)
             self._blend = fixed_blend_blocks(packed.padded, lists, packed, image, transmittance, threshold)
-        projected = self.splats.projected
+        projected = splats.projected
         outputs = projected.means2d, projected.depths, projected.extents
         images = [image, transmittance] if self._copies else []
         self._outputs = [*images, *(outputs if projects else outputs[2:])]
         self._image_shape = image.shape
-        self._slots = self._gradient_slots(inputs) if differentiable else []
 
     def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> list[Tensor]:
         """Render; return image and transmittance, and what follows them among the outputs.
@@ -149,11 +147,11 @@ class CapturedRender:
         inputs = [tensor.contiguous() for tensor in tensors]
         features = inputs.pop(FEATURES)
         stream = warp_stream(features.device)
-        self._project.launch((), inputs, stream)
-        self._pack.launch((), (features,), stream)
+        self._project.launch((), [tensor.data_ptr() for tensor in inputs], stream)
+        self._pack.launch((), (features.data_ptr(),), stream)
         self._runner.replay()
         image, transmittance = features.new_empty(self._image_shape), features.new_empty(self._image_shape[:2])
-        self._blend.launch((), (image, transmittance), stream)
+        self._blend.launch((), (image.data_ptr(), transmittance.data_ptr()), stream)
         others = [torch.empty_like(output) for output in self._outputs]
         torch._foreach_copy_(others, self._outputs)  # pyright: ignore[reportPrivateImportUsage]
         return [image, transmittance, *others]
@@ -169,51 +167,6 @@ class CapturedRender:
             if self._stream.query() and count.value < 0:
                 raise RuntimeError("the GPU has not counted the intersections of a render")
         return count.value
-
-    def _gradient_slots(self, inputs: Sequence[Tensor]) -> list["_Slot"]:
-        """Return where the backward passes put the gradients by the inputs of the projection, and the size of all."""
-        assert self.backward is not None
-        slots, end = [], self.backward.count * self.backward.columns
-        tensors = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
-        for tensor in tensors if self.projection_backward is not None else ():
-            begin = _aligned(end)
-            slots.append(_Slot(tensor.shape, tensor.stride(), begin))
-            end = begin + tensor.numel()
-        return slots
-
-    def zero_gradients(self, like: Tensor, *, of_projection: bool) -> Tensor:
-        """Return zeros for the gradients of one backward pass: those by Gaussian, and by the projection's inputs."""
-        assert self.backward is not None, "the CUDA graph is not differentiable"
-        size = self.backward.count * self.backward.columns
-        if of_projection:
-            last = self._slots[-1]
-            size = last.begin + last.shape.numel()
-        return like.new_zeros(size)
-
-    def add_projection_gradients(
-        self, zeros: Tensor, upstream: Sequence[Tensor | None], needed: Sequence[bool]
-    ) -> list[Tensor | None]:
-        """Return the gradients by the projection's inputs, views of zero_gradients(); None if they are not needed.
-
-        upstream: the gradients by the projection's outputs without the extents.
-        """
-        assert self.projection_backward is not None, "the CUDA graph begins with 2D Gaussians"
-        results = [zeros.as_strided(*slot) if need else None for slot, need in zip(self._slots, needed, strict=True)]
-        self.projection_backward.launch(upstream, results, warp_stream(zeros.device))
-        return results
-
-
-class _Slot(NamedTuple):
-    """Place of a contiguous tensor in a longer one."""
-
-    shape: torch.Size
-    strides: tuple[int, ...]
-    begin: int
-
-
-def _aligned(numbers: int) -> int:
-    """Return the next multiple of 64, where memory of its own could begin."""
-    return -(-numbers // 64) * 64
 
 
 def _project(inputs: Sequence[Tensor], options: RenderOptions) -> RasterInputs:
@@ -236,20 +189,12 @@ def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
 
 def _fixed_projection(inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
     """Return the launch of _project() for any inputs, to the same outputs."""
-    gaussians = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
+    gaussians = _without_features(inputs)
     kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
     arguments = *gaussians, *projection_parameters(options), None, *projected
     return fixed_launch(kernel, len(projected.depths), *arguments, whole=gaussians)
 
 
-def _fixed_projection_backward(
-    inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians
-) -> FixedLaunch:
-    """Return the launch of the adjoint of _project() on the same inputs and extents, for any gradients."""
-    gaussians = [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
-    rows = [torch.empty_like(tensor) for tensor in projected[:-1]]
-    whole = [torch.empty_like(tensor) for tensor in gaussians]
-    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
-    parameters = projection_parameters(options)
-    arguments, gradients = adjoint_arguments(gaussians, parameters, projected.extents, (*rows, None), whole)
-    return fixed_launch(kernel, len(projected.depths), *arguments, gradients=gradients, rows=rows, whole=whole)
+def _without_features(inputs: Sequence[Tensor]) -> list[Tensor]:
+    """Return the inputs of the projection among a call's seven tensors."""
+    return [tensor for place, tensor in enumerate(inputs) if place != FEATURES]

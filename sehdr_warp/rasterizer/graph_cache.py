@@ -21,9 +21,10 @@ import torch
 from torch import Tensor
 
 from .blending import BlendResult
+from .captured_backward import GradientMemory
 from .captured_render import CapturedRender
 from .cuda_graphs import is_capturing
-from .projection import Gradients, ProjectedGaussians, with_projection_gradient
+from .projection import Gradients, with_projection_gradient
 from .render_options import RenderOptions
 from .tile_lists import MAX_SINGLE_SORT
 from .warp_launch.launching import stream_handle
@@ -107,38 +108,63 @@ class ReplayedRender:
     Attributes:
         result: of the blend.
         intersections: of the render; 0 before fits().
+        means2d: [N, 2]; this and the next three if the CUDA graph began with 3D Gaussians.
+        depths: [N].
+        extents: [N, 2].
+        link: stands for conics and opacities in the autograd graph, see CapturedBackward.
     """
 
-    def __init__(self, pool: "GraphPool", graph: "CapturedRender", result: Sequence[Tensor]) -> None:
+    result: BlendResult
+    means2d: Tensor
+    depths: Tensor
+    extents: Tensor
+    link: Tensor | None
+
+    def __init__(self, pool: "GraphPool", graph: "CapturedRender") -> None:
         """Lease the CUDA graph."""
-        self._pool, self._graph = pool, graph
-        self._lease = _Lease(pool.idle, graph)
-        image, transmittance, *self._others = result
-        self.result = BlendResult(image, transmittance, self._lease.backward)
+        self._pool, self._lease = pool, _Lease(pool.idle, graph)
         self.intersections = 0
 
-    def project(self, gaussians: tuple[Tensor, ...]) -> ProjectedGaussians | None:
-        """Return the 2D Gaussians as differentiable functions of the seven tensors without the features.
+    def render(self, tensors: Sequence[Tensor]) -> None:
+        """Render from the seven tensors of a call; means2d, depths and link are differentiable functions of them."""
+        if not self._pool.differentiable:
+            (self.means2d, self.depths, self.extents), self.link = self._replay(tensors, ()), None
+            return
+        means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
+        gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
+        link = self._lease.graph.backward.link
+        assert link is not None, "the CUDA graph begins with 2D Gaussians"
 
-        None if the CUDA graph began with them. Their conics and opacities are its memory.
-        """
-        if not self._others:
-            return None
-        means2d, depths, extents = self._others
-        fixed = self._graph.splats.projected
-        outputs = means2d, fixed.conics.detach(), depths, fixed.opacities.detach(), extents
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in gaussians):
-            self._lease.differentiates_projection()
-            outputs = with_projection_gradient(gaussians, outputs, self._lease.projection_adjoint)
-        return ProjectedGaussians(*outputs)
+        def project() -> tuple[Tensor, ...]:
+            means2d, depths, extents = self._replay(tensors, ())
+            return means2d, link.detach(), depths, extents
+
+        outputs = with_projection_gradient(gaussians, project, self._lease.project_backward)
+        self.means2d, self.link, self.depths, self.extents = outputs
+        needed = [tensor.requires_grad for tensor in gaussians]
+        self._lease.prepare(needed, copies_features=features.is_leaf and features.requires_grad)
+
+    def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> None:
+        """Render from flatten() of RasterInputs; write the extents that are left, see pack_splats()."""
+        with torch.no_grad():
+            self._replay(tensors, (extents,))
+        if self._pool.differentiable:
+            features = tensors[-1]
+            self._lease.prepare((), copies_features=features.is_leaf and features.requires_grad)
+
+    def _replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> Sequence[Tensor]:
+        image, transmittance, *others = self._lease.graph.replay(tensors, outputs)
+        self.result = BlendResult(image, transmittance, self._lease.blend_backward)
+        return others
 
     def fits(self) -> bool:
         """Wait until the GPU has counted the intersections; return whether the graph has memory for them.
 
         If not, the render is not to be used.
         """
-        self.intersections = self._graph.count_intersections()
-        if self.intersections <= self._graph.max_intersections:
+        graph = self._lease.graph
+        self.intersections = graph.count_intersections()
+        if self.intersections <= graph.max_intersections:
             return True
         self._pool.grow(self.intersections)
         return False
@@ -180,24 +206,20 @@ class GraphPool:
             self.captured = self.max_graphs
             return None
 
-    def replay(
-        self, tensors: Sequence[Tensor], options: RenderOptions, outputs: Sequence[Tensor] = ()
-    ) -> ReplayedRender | None:
-        """Render by a CUDA graph, or return None if the call is to be launched instead.
+    def lease(self, tensors: Sequence[Tensor], options: RenderOptions) -> ReplayedRender | None:
+        """Return a render by a CUDA graph that is to be made, or None if the call is to be launched instead.
 
         Args:
             tensors: the seven tensors of a call, or flatten() of RasterInputs.
             options: of the image.
-            outputs: for RasterInputs (extents,), to be written to.
         """
 
         def capture(intersections: int) -> CapturedRender:
             with torch.inference_mode(False), torch.no_grad():
                 return CapturedRender(tensors, options, intersections, self.differentiable)
 
-        with torch.no_grad():
-            graph = self.take(capture)
-            return None if graph is None else ReplayedRender(self, graph, graph.replay(tensors, outputs))
+        graph = self.take(capture)
+        return None if graph is None else ReplayedRender(self, graph)
 
     def grow(self, intersections: int) -> None:
         """Let new CUDA graphs be captured, because one had too little memory for this many intersections."""
@@ -208,34 +230,37 @@ class _Lease:
     """Keeps a CUDA graph from other calls, and returns it to the idle ones when it is deleted."""
 
     def __init__(self, idle: list[CapturedRender], graph: CapturedRender) -> None:
-        self._idle, self._graph = idle, graph
-        self._zeros: list[Tensor] = []  # For the projection's gradients, from the blend's last backward pass.
-        self._of_projection = False
+        self._idle, self.graph = idle, graph
+        self._needed: Sequence[bool] = ()
+        self._copies_features = False
+        self._next: GradientMemory | None = None  # Of the next backward pass of the blend.
+        self._between: GradientMemory | None = None  # Of the last one, until that of the projection.
 
-    def differentiates_projection(self) -> None:
-        """Let backward() allocate memory for projection_adjoint() too: one allocation, one launch that fills it."""
-        self._of_projection = True
+    def prepare(self, needed: Sequence[bool], *, copies_features: bool) -> None:
+        """Prepare a backward pass; see CapturedBackward.allocate()."""
+        self._needed, self._copies_features = needed, copies_features
+        if self.graph.count <= MAX_SINGLE_SORT:  # With more of them memory is worth more than the host's time.
+            self._next = self._allocate()
 
-    def backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
-        graph, fixed = self._graph, self._graph.backward
-        assert fixed is not None, "the CUDA graph is not differentiable"
-        zeros = graph.zero_gradients(grad_image, of_projection=self._of_projection)
-        if self._of_projection:
-            self._zeros[:] = [zeros]
-        return fixed.add_to(zeros, grad_image, grad_transmittance)
+    def _allocate(self, zeros: Tensor | None = None) -> GradientMemory:
+        return self.graph.backward.allocate(self._needed, copies_features=self._copies_features, zeros=zeros)
 
-    def projection_adjoint(
+    def blend_backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
+        memory, self._next = self._next or self._allocate(), None
+        self._between = memory if self._needed else None
+        return self.graph.backward.blend(memory, grad_image, grad_transmittance)
+
+    def project_backward(
         self, inputs: Sequence[Tensor], culling: Tensor, upstream: Gradients, needed: Sequence[bool]
     ) -> Gradients:
-        graph = self._graph
-        try:
-            zeros = self._zeros.pop()
-        except IndexError:  # The image has no gradient, only the 2D Gaussians.
-            zeros = graph.zero_gradients(culling, of_projection=True)
-        return graph.add_projection_gradients(zeros, upstream[:-1], needed)
+        grad_means2d, zeros, grad_depths, _ = upstream
+        memory, self._between = self._between, None
+        if memory is None or memory.zeros is not zeros:  # Only if passes overlap, or the image has no gradient.
+            memory = self._allocate(zeros)
+        return self.graph.backward.project(memory, grad_means2d, grad_depths)
 
     def __del__(self) -> None:
-        self._idle.append(self._graph)
+        self._idle.append(self.graph)
 
 
 _lock = threading.Lock()

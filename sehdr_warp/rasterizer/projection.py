@@ -103,8 +103,10 @@ def launch_projection(
         outputs: with a row for each Gaussian. The last one is 0 if a Gaussian is culled, and not differentiable.
     """
     count = inputs[0].shape[0]
-    arguments = *inputs, *parameters, None, *outputs
-    launch(kernel, count, *arguments)
+
+    def project() -> tuple[Tensor, ...]:
+        launch(kernel, count, *inputs, *parameters, None, *outputs)
+        return outputs
 
     def adjoint(inputs: Sequence[Tensor], culling: Tensor, upstream: Gradients, needed: Sequence[bool]) -> Gradients:
         results = zero_gradients(inputs, needed, [tensor.is_leaf for tensor in inputs])
@@ -114,7 +116,7 @@ def launch_projection(
         launch(kernel, count, *arguments, gradients=gradients, ranges=ranges)
         return results
 
-    return with_projection_gradient(inputs, outputs, adjoint)
+    return with_projection_gradient(inputs, project, adjoint)
 
 
 def adjoint_arguments(
@@ -129,22 +131,21 @@ def adjoint_arguments(
 
 
 def with_projection_gradient(
-    inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], adjoint: ProjectionAdjoint
+    inputs: tuple[Tensor, ...], project: Callable[[], tuple[Tensor, ...]], adjoint: ProjectionAdjoint
 ) -> tuple[Tensor, ...]:
-    """Return a projection's outputs as differentiable functions of its inputs, if any input needs a gradient."""
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
-        return _apply_projection(adjoint, outputs, *inputs)
-    return outputs
+    """Return project(), the outputs of a projection, as differentiable functions of its inputs."""
+    return _apply_projection(project, adjoint, *inputs) if torch.is_grad_enabled() else project()
 
 
 class _Projection(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, adjoint: ProjectionAdjoint, outputs: tuple[Tensor, ...], *inputs: Tensor):
+    def forward(ctx, project: Callable[[], tuple[Tensor, ...]], adjoint: ProjectionAdjoint, *inputs: Tensor):
+        outputs = project()
         ctx.adjoint = adjoint
         ctx.save_for_backward(*inputs, outputs[-1])
         ctx.mark_non_differentiable(outputs[-1])
         ctx.set_materialize_grads(False)
-        return tuple(outputs)
+        return outputs
 
     @staticmethod
     @once_differentiable

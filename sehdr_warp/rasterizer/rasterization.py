@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
 from .captured_render import FEATURES, flatten
 from .checks import check_cameras, check_opacities, check_tensors
-from .graph_cache import ReplayedRender, find_pool, get_or_create_pool
+from .graph_cache import GraphPool, ReplayedRender, find_pool, get_or_create_pool
 from .memory import oom_context
 from .projection import ProjectedGaussians, RasterInputs, project_to_camera
 from .render_options import RenderOptions
@@ -155,8 +155,8 @@ def rasterize(
         options = options.checked(means.device)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
         if world_to_camera.ndim == 2:
-            view = _project(tensors, options, pool or get_or_create_pool(tensors, options))
-            rendering = _render(view, view.projected.means2d, features, options)
+            projection = _project(tensors, options, pool or get_or_create_pool(tensors, options))
+            rendering = _render(projection, projection.means2d, tensors, options)
         else:
             rendering = _render_cameras(tensors, options)
         if background is None:
@@ -201,39 +201,38 @@ def check_shapes(
         raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
 
 
-class _View(NamedTuple):
-    """Gaussians projected to a camera, and their render if a CUDA graph made it."""
+def _project(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool | None) -> "_Projection":
+    """Project to one camera. On a GPU, calls that repeat are replayed as CUDA graphs, which also render.
 
-    projected: ProjectedGaussians
-    replayed: ReplayedRender | None
-
-
-def _project(tensors: Sequence[Tensor], options: RenderOptions, pool: Any) -> _View:
-    """Project to one camera. On a GPU, calls that repeat are replayed as CUDA graphs (graph_cache.py).
-
-    pool: CUDA graphs of calls like this one; None if it is to be launched.
+    pool: CUDA graphs of calls like this one (graph_cache.py); None if it is to be launched.
     """
-    means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
-    gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
-    replayed = None if pool is None else pool.replay(tensors, options)
-    if replayed is not None:
-        projected = replayed.project(gaussians)
-        if projected is not None and replayed.fits():
-            return _View(projected, replayed)
-    dense = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
-    return _View(project_to_camera(*dense, opacities, world_to_camera, intrinsics, options), None)
-
-
-def _render(view: _View, means2d: Tensor, features: Tensor, options: RenderOptions) -> Rendering:
-    """Render a view with features [N, C], as a function of means2d [N, 2]."""
-    projected, replayed = view
+    replayed = None if pool is None else pool.lease(tensors, options)
     if replayed is None:
-        return render_projected(projected._replace(means2d=means2d), features, options, replays=False)
-    if options.depth:
-        features = torch.cat([features, projected.depths[:, None]], 1)
-    image, transmittance = with_gradient(means2d, projected.conics, projected.opacities, features, replayed.result)
-    count = replayed.intersections
-    return _rendering(image, transmittance, projected._replace(means2d=means2d), count, None, None, options)
+        return _launch_projection(tensors, options)
+    replayed.render(tensors)
+    return replayed
+
+
+_Projection = ProjectedGaussians | ReplayedRender
+
+
+def _launch_projection(tensors: Sequence[Tensor], options: RenderOptions) -> ProjectedGaussians:
+    means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
+    dense = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
+    return project_to_camera(*dense, opacities, world_to_camera, intrinsics, options)
+
+
+def _render(projection: _Projection, means2d: Tensor, tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
+    """Render what _project() returned for these tensors, as a function of means2d [N, 2]."""
+    features = tensors[FEATURES]
+    if isinstance(projection, ReplayedRender):
+        blended = torch.cat([features, projection.depths[:, None]], 1) if options.depth else features
+        image, transmittance = with_gradient(projection.result, means2d, blended, projection.link)
+        if projection.fits():  # Called last, because it waits for the GPU.
+            splats = means2d, projection.depths, projection.extents
+            return _rendering(image, transmittance, *splats, projection.intersections, None, None, options)
+        projection = _launch_projection(tensors, options)
+    return render_projected(projection._replace(means2d=means2d), features, options, replays=False)
 
 
 def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
@@ -248,12 +247,10 @@ def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Render
         strict=True,
     )
     calls = [(means, log_scales, quaternions, *own) for own in each]
-    views = [_project(call, options, get_or_create_pool(call, options)) for call in calls]
+    projections = [_project(call, options, get_or_create_pool(call, options)) for call in calls]
     # One tensor that every image is rendered from, so that its gradient holds every camera's.
-    means2d = torch.stack([view.projected.means2d for view in views])
-    renderings = [
-        _render(view, own, call[FEATURES], options) for view, own, call in zip(views, means2d, calls, strict=True)
-    ]
+    means2d = torch.stack([projection.means2d for projection in projections])
+    renderings = [_render(*view, options) for view in zip(projections, means2d, calls, strict=True)]
     return join_renderings(means2d, renderings)
 
 
@@ -284,10 +281,14 @@ def render_projected(
     # In place on memory that the projection's graph has saved: as data, so that it is not a change of a saved tensor.
     inputs = RasterInputs(projected._replace(extents=extents.data), features)
     pool = get_or_create_pool(flatten(inputs), options) if replays and store_absolute is None else None
-    replayed = None if pool is None else pool.replay(flatten(inputs), options, (extents.data,))
-    if replayed is not None and replayed.fits():
-        image, transmittance = with_gradient(means2d, conics, opacities, features, replayed.result)
-        return _rendering(image, transmittance, projected, replayed.intersections, None, None, options)
+    replayed = None if pool is None else pool.lease(flatten(inputs), options)
+    if replayed is not None:
+        replayed.render_projected(flatten(inputs), extents.data)
+        image, transmittance = with_gradient(replayed.result, means2d, features, conics, opacities)
+        if replayed.fits():
+            return _rendering(
+                image, transmittance, means2d, depths, extents, replayed.intersections, None, None, options
+            )
     lists, packed = list_splats(inputs._replace(features=features.detach()), options)
     image, transmittance = blend(
         means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic
@@ -297,13 +298,17 @@ def render_projected(
             image, transmittance, features, lists, packed, options.alpha_threshold, store_absolute
         )
     needed = None if options.max_intersections is None else lists.total
-    return _rendering(image, transmittance, projected, lists.intersection_count, lists.overflow, needed, options)
+    return _rendering(
+        image, transmittance, means2d, depths, extents, lists.intersection_count, lists.overflow, needed, options
+    )
 
 
 def _rendering(
     image: Tensor,
     transmittance: Tensor,
-    projected: ProjectedGaussians,
+    means2d: Tensor,
+    depths: Tensor,
+    extents: Tensor,
     count: int,
     overflow: Tensor | None,
     needed: Tensor | None,
@@ -312,7 +317,6 @@ def _rendering(
     depth = None
     if options.depth:
         image, depth = image[..., :-1], image[..., -1]
-    means2d, _, depths, _, extents = projected
     return Rendering(image, transmittance, means2d, depths, extents, count, overflow, needed, depth)
 
 

@@ -89,7 +89,7 @@ def fixed_launch(
         *arguments: the kernel's arguments.
         gradients: for the adjoint.
         rows: tensors among arguments and gradients whose addresses and distances of rows each launch gives.
-        whole: contiguous ones whose addresses each launch gives.
+        whole: those whose addresses each launch gives.
         block_dim: threads per block.
     """
     device, values = _packed_values(takes_range_start(kernel), arguments, gradients)

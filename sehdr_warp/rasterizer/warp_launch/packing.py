@@ -7,12 +7,14 @@ wp.launch().
 import ctypes
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 import warp as wp
 from torch import Tensor
+from warp._src import context as warp_context
 
 from . import threads
 from .loading import launch_object
@@ -134,7 +136,7 @@ class FixedLaunch:
         dim: number of threads.
         values: all arguments. Those that stay are kept alive.
         rows: those of the values whose addresses, and distances of rows, each launch gives.
-        whole: those of the values whose addresses each launch gives; contiguous.
+        whole: those of the values whose addresses each launch gives.
     """
 
     def __init__(
@@ -149,19 +151,38 @@ class FixedLaunch:
 
         self._rows, self._whole = slots(rows), slots(whole)
         self._packed = packed
+        self._on_stream = _on_stream(packed.command) if packed.command.device.is_cuda else None
         self._values = [value for value in values if not any(value is tensor for tensor in (*rows, *whole))]
         self._lock = threading.Lock()  # A retained graph may be differentiated by several threads.
 
-    def launch(self, rows: Sequence[Tensor | None], whole: Sequence[Tensor | None], stream: wp.Stream | None) -> None:
-        """Launch on tensors with the layouts of the first ones; None is an empty array."""
+    def launch(self, rows: Sequence[Tensor | None], addresses: Sequence[int], stream: wp.Stream | None) -> None:
+        """Launch on tensors with the layouts of the first ones; None and address 0 are an empty array."""
         with self._lock:
             for slot, tensor in zip(self._rows, rows, strict=True):
-                slot.put(tensor)
+                slot.put(0 if tensor is None else tensor.data_ptr())
                 if tensor is not None and (step := tensor.stride(0)) != slot.step:
                     slot.step, slot.strides[0] = step, step * slot.size
-            for slot, tensor in zip(self._whole, whole, strict=True):
-                slot.put(tensor)
-            self._packed.run(stream)
+            for slot, address in zip(self._whole, addresses, strict=True):
+                slot.put(address)
+            if self._on_stream is None or stream is None or self._on_stream(stream.cuda_stream, None):
+                self._packed.run(stream)  # After a launch that failed, for Warp's error.
+
+
+def _on_stream(command: Any) -> Callable[[int, None], int]:
+    """Return what Warp's Launch.launch() calls for a stream, without what that looks up before; 0 if it worked."""
+    hooks, adjoint = command.hooks, command.adjoint
+    return partial(
+        warp_context.runtime.core.wp_cuda_launch_kernel,
+        ctypes.c_void_p(command.device.context),
+        ctypes.c_void_p(hooks.backward if adjoint else hooks.forward),
+        ctypes.c_size_t(command.bounds.size),
+        ctypes.c_int(command.max_blocks),
+        ctypes.c_int(command.block_dim),
+        ctypes.c_int(command.grid_stride),
+        ctypes.c_int(command.cluster_dim),
+        ctypes.c_int(hooks.backward_smem_bytes if adjoint else hooks.forward_smem_bytes),
+        command.params_addr,
+    )
 
 
 class _Slot:
@@ -180,15 +201,12 @@ class _Slot:
         self._length, self._empty = array.shape[0], False
         self.size, self.step = tensor.element_size(), -1
 
-    def put(self, tensor: Tensor | None) -> None:
-        """Let the array be a tensor's memory, or empty."""
-        if tensor is not None:
-            self._array.data = tensor.data_ptr()
-            if self._empty:
-                self._shape[0], self._empty = self._length, False
-        elif not self._empty:
-            self._array.data = self._shape[0] = 0
-            self._empty = True
+    def put(self, address: int) -> None:
+        """Let the array be the memory at an address, or empty if that is 0."""
+        self._array.data = address
+        if self._empty != (address == 0):
+            self._empty = address == 0
+            self._shape[0] = 0 if self._empty else self._length
 
 
 def write_layout(array: Any, tensor: Tensor, kind: wp.array, label: str = "the kernel") -> None:

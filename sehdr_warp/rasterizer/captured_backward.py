@@ -1,0 +1,168 @@
+"""The backward passes of a render that a CUDA graph made: launches that read the graph's memory.
+
+Torch runs backward passes on a thread of their own, whose caches are cold: there an operation of torch takes several
+times as long as in the forward pass. So the forward pass allocates the gradients and makes their views.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels.blend_cuda_backward import copy_features_kernel
+from ..kernels.project import projection_kernel
+from .block_blending import BlockBackward
+from .projection import Gradients, ProjectedGaussians, adjoint_arguments, projection_parameters
+from .render_options import RenderOptions
+from .warp_launch.launching import FixedLaunch, fixed_launch, warp_scalar, warp_stream
+
+
+class _Place(NamedTuple):
+    """Layout of a tensor within a longer one, as as_strided() takes it."""
+
+    shape: Sequence[int]
+    strides: Sequence[int]
+    begin: int
+
+
+@dataclass(slots=True)
+class GradientMemory:
+    """Zeros that a backward pass of blend and projection adds to, and the views of them that it returns.
+
+    Attributes:
+        zeros: all of it.
+        of_splats: by means2d and features, and if the CUDA graph begins with 2D Gaussians, by conics and opacities;
+            empty once they were returned, as torch copies the gradient of a leaf that something else refers to.
+        of_gaussians: by the projection's inputs; None if they are not needed.
+        addresses: what the projection's adjoint takes: of the gradients by conics, opacities and inputs.
+        features: address of a copy of the features' gradient that is contiguous, 0 if there is none.
+    """
+
+    zeros: Tensor
+    of_splats: Sequence[Tensor]
+    of_gaussians: list[Tensor | None]
+    addresses: list[int]
+    features: int
+
+
+class CapturedBackward:
+    """The backward passes of blend and projection.
+
+    Their gradients share one tensor. It begins with a row for each Gaussian, which the blend adds to: features, conic,
+    x, y, opacity, and columns that pad the row. A copy of the features' gradient follows, and if the CUDA graph
+    projects, the gradients by the projection's inputs.
+
+    Args:
+        blend: of the captured render.
+        gaussians: inputs of the projection on the graph's memory; none if the graph begins with 2D Gaussians.
+        options: of the image.
+        projected: outputs of the projection on the graph's memory.
+
+    Attributes:
+        link: takes the place of conics and opacities in the autograd graph, between blend and projection: its gradient
+            is GradientMemory.zeros. None if the CUDA graph does not project.
+    """
+
+    def __init__(
+        self, blend: BlockBackward, gaussians: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians
+    ) -> None:
+        """Pack the launches."""
+        self._blend, rows = blend.on_fixed_memory()
+        self._device, self._like = rows.device, rows
+        (count, columns), channels = rows.shape, blend.channels
+        self._means2d = _Place((count, 2), (columns, 1), channels + 3)
+        self._features = _Place((count, channels), (columns, 1), 0)
+        self._conics = _Place((count, 3), (columns, 1), channels)
+        self._opacities = _Place((count,), (columns,), channels + 5)
+        self._features_copy = _Place((count, channels), (channels, 1), _aligned(rows.numel()))
+        copy = rows.new_empty(count, channels)
+        self._copy_features = fixed_launch(
+            copy_features_kernel(warp_scalar(rows.dtype)), copy.shape, rows, copy, whole=(rows, copy)
+        )
+        self._size = self._features_copy.begin + copy.numel()
+        self._of_gaussians: list[_Place] = []
+        for tensor in gaussians:
+            place = _Place(tensor.shape, tensor.stride(), _aligned(self._size))
+            self._of_gaussians.append(place)
+            self._size = place.begin + tensor.numel()
+        self.link: Tensor | None = None
+        if gaussians:
+            self.link = rows.new_empty(1).expand(self._size)
+            like = rows.as_strided(*self._conics), rows.as_strided(*self._opacities)
+            self._project = _fixed_projection_backward(gaussians, options, projected, *like)
+
+    def allocate(self, needed: Sequence[bool], *, copies_features: bool, zeros: Tensor | None = None) -> GradientMemory:
+        """Return memory for one backward pass.
+
+        needed: which gradients by the projection's inputs are needed; empty if the CUDA graph does not project.
+        copies_features: return a contiguous gradient by features, as torch can make the gradient of a leaf without a
+            copy of its own.
+        zeros: of a backward pass of the blend, whose memory it then is.
+        """
+        if zeros is None:
+            zeros = self._like.new_zeros(self._size)
+        first, size = zeros.data_ptr(), zeros.element_size()
+        features = self._features_copy if copies_features else self._features
+        of_splats = [zeros.as_strided(*self._means2d), zeros.as_strided(*features)]
+        if self.link is None:
+            of_splats += zeros.as_strided(*self._conics), zeros.as_strided(*self._opacities)
+        places = [place if need else None for place, need in zip(self._of_gaussians, needed, strict=True)]
+        return GradientMemory(
+            zeros,
+            of_splats,
+            [None if place is None else zeros.as_strided(*place) for place in places],
+            [0 if place is None else first + size * place.begin for place in (self._conics, self._opacities, *places)],
+            first + size * features.begin if copies_features else 0,
+        )
+
+    def blend(self, memory: GradientMemory, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
+        """Return the gradients by means2d, features, and either the link or conics and opacities."""
+        stream, rows = warp_stream(self._device), memory.zeros.data_ptr()
+        transmittance = 0 if grad_transmittance is None else grad_transmittance.data_ptr()
+        self._blend.launch((), (grad_image.data_ptr(), transmittance, rows), stream)
+        if memory.features:
+            self._copy_features.launch((), (rows, memory.features), stream)
+        gradients, memory.of_splats = memory.of_splats, ()
+        return gradients if self.link is None else (*gradients, memory.zeros)
+
+    def project(self, memory: GradientMemory, grad_means2d: Tensor | None, grad_depths: Tensor | None) -> Gradients:
+        """Return the gradients by the projection's inputs.
+
+        memory: of the blend's backward pass, or if the image has no gradient, a new one.
+        """
+        self._project.launch((grad_means2d, grad_depths), memory.addresses, warp_stream(self._device))
+        return memory.of_gaussians
+
+
+def _aligned(numbers: int) -> int:
+    """Return the next multiple of 64, where memory of its own could begin."""
+    return -(-numbers // 64) * 64
+
+
+def _fixed_projection_backward(
+    gaussians: Sequence[Tensor],
+    options: RenderOptions,
+    projected: ProjectedGaussians,
+    grad_conics: Tensor,
+    grad_opacities: Tensor,
+) -> FixedLaunch:
+    """Return the launch of a projection's adjoint on the same inputs and extents, for any gradients.
+
+    grad_conics, grad_opacities: with the strides that they will have.
+    """
+    grad_means2d, grad_depths = torch.empty_like(projected.means2d), torch.empty_like(projected.depths)
+    results = [torch.empty_like(tensor) for tensor in gaussians]
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
+    upstream = grad_means2d, grad_conics, grad_depths, grad_opacities, None
+    parameters = projection_parameters(options)
+    arguments, gradients = adjoint_arguments(gaussians, parameters, projected.extents, upstream, results)
+    return fixed_launch(
+        kernel,
+        len(projected.depths),
+        *arguments,
+        gradients=gradients,
+        rows=(grad_means2d, grad_depths),
+        whole=(grad_conics, grad_opacities, *results),
+    )
