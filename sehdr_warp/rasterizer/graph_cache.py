@@ -11,10 +11,9 @@ graph (training/step_graphs.py); within it, and with max_intersections, calls ar
 import atexit
 import logging
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, NamedTuple
 
 import torch
@@ -45,7 +44,9 @@ class _Signature(NamedTuple):
     options: RenderOptions
     stream: int
     differentiable: bool
-    tensors: tuple  # Shape, dtype and device of each.
+    dtype: torch.dtype
+    device: int
+    shapes: tuple[torch.Size, ...]
 
 
 def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
@@ -56,14 +57,13 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
     try:
         if not on_gpu(tensors[0]):
             return None
-        signature = _signature(tensors, options)
-        with _lock:
-            pool = _pools.get(signature)
-            if pool is not None:
-                _pools.move_to_end(signature)
+        pool = _pools.get(_signature(tensors, options))
     except (AttributeError, TypeError, RuntimeError):
         return None
-    return None if pool is None or is_capturing(tensors[0].device) else pool
+    if pool is None or is_capturing(tensors[0].device):
+        return None
+    pool.last_use = next(_uses)
+    return pool
 
 
 def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "GraphPool | None":
@@ -91,12 +91,17 @@ def on_gpu(tensor: Tensor) -> bool:
 
 
 def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> _Signature:
-    layouts, requires_grad = [], False
+    """Return a call's signature; raise TypeError if dtypes or devices differ."""
+    first = tensors[0]
+    dtype, device = first.dtype, first.get_device()
+    shapes, requires_grad = [], False
     for tensor in tensors:
-        layouts += tensor.shape, tensor.dtype, tensor.device
+        if tensor.dtype is not dtype or tensor.get_device() != device:
+            raise TypeError("tensors differ in dtype or device")
+        shapes.append(tensor.shape)
         requires_grad = requires_grad or tensor.requires_grad
     differentiable = requires_grad and torch.is_grad_enabled()
-    return _Signature(options, stream_handle(layouts[2]), differentiable, tuple(layouts))
+    return _Signature(options, stream_handle(first.device), differentiable, dtype, device, tuple(shapes))
 
 
 class ReplayedRender:
@@ -181,6 +186,7 @@ class GraphPool:
         captured: CUDA graphs that were captured since the memory last grew.
         intersections: the least number that the next CUDA graph allocates memory for.
         idle: CUDA graphs that no call holds.
+        last_use: number of the last call.
     """
 
     differentiable: bool = False
@@ -189,12 +195,14 @@ class GraphPool:
     captured: int = 0
     intersections: int = 0
     idle: list[CapturedRender] = field(default_factory=list)
+    last_use: int = 0
 
     def take(self, capture: Callable[[int], CapturedRender]) -> CapturedRender | None:
         """Return a CUDA graph that is the caller's until it is idle again; None for a call that is to be launched."""
-        if self.idle:
-            with suppress(IndexError):
-                return self.idle.pop()
+        try:
+            return self.idle.pop()
+        except IndexError:
+            pass
         self.launched += 1
         if self.launched <= WARMUP_CALLS or self.captured >= self.max_graphs:
             return None
@@ -264,7 +272,8 @@ class _Lease:
 
 
 _lock = threading.Lock()
-_pools: OrderedDict[_Signature, GraphPool] = OrderedDict()
+_pools: dict[_Signature, GraphPool] = {}
+_uses = count(1)
 
 
 def clear_graphs() -> None:
@@ -278,7 +287,7 @@ atexit.register(clear_graphs)  # CUDA graphs must be freed before CUDA is.
 def _pool_of(signature: _Signature, max_graphs: int) -> GraphPool:
     with _lock:
         pool = _pools.setdefault(signature, GraphPool(signature.differentiable, max_graphs))
-        _pools.move_to_end(signature)
+        pool.last_use = next(_uses)
         while len(_pools) > MAX_SIZES:
-            _pools.popitem(last=False)
+            del _pools[min(_pools, key=lambda key: _pools[key].last_use)]
     return pool
