@@ -81,7 +81,9 @@ def blend(
     return with_gradient(BlendResult(image, transmittance, backward), means2d, features, conics, opacities)
 
 
-def with_gradient(result: BlendResult, means2d: Tensor, features: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+def with_gradient(
+    result: BlendResult, means2d: Tensor, features: Tensor, *others: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Return a result's image and transmittance as differentiable functions of what they were blended from.
 
     others: the tensors whose gradients the result's backward pass returns after those by means2d and features.

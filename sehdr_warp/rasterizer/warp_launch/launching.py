@@ -74,7 +74,7 @@ def _packed_values(
 
 def fixed_launch(
     kernel: Any,
-    dim: int,
+    dim: int | Sequence[int],
     *arguments: Any,
     gradients: Sequence[Tensor | None] | None = None,
     rows: Sequence[Tensor] = (),

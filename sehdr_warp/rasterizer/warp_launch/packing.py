@@ -140,7 +140,12 @@ class FixedLaunch:
     """
 
     def __init__(
-        self, packed: PackedLaunch, dim: int, values: list, rows: Sequence[Tensor], whole: Sequence[Tensor]
+        self,
+        packed: PackedLaunch,
+        dim: int | Sequence[int],
+        values: list,
+        rows: Sequence[Tensor],
+        whole: Sequence[Tensor],
     ) -> None:
         """Pack the values."""
         packed.prepare(dim, values)
