@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import block_blending, captured_render, graph_cache, rasterize, tile_lists
+from sehdr_warp.rasterizer import block_blending, captured_backward, captured_render, graph_cache, rasterize, tile_lists
 from sehdr_warp.rasterizer.render_options import RenderOptions
 
 from .emulated_graphs import emulate
@@ -98,6 +98,60 @@ def test_pictures_stay_and_backward_passes_come_in_any_order():
         ]
         assert_alike(*pair)
     assert_alike(images, truths)
+
+
+@pytest.mark.parametrize("one_sort", [1 << 18, 0])
+def test_a_retained_graph_has_the_gradients_of_each_part_in_any_order(one_sort, monkeypatch):
+    monkeypatch.setattr(graph_cache, "MAX_SINGLE_SORT", one_sort)
+    scene = scene_of()
+    replayed, truth = [rasterize(*scene.arguments) for _ in range(CALLS)][-1], launched(*scene.arguments)
+    assert recordings()
+    parts = [
+        (lambda drawing: (drawing.image * random_like(drawing.image, 1)).sum(), scene.tensors[:5]),
+        (lambda drawing: (drawing.image * random_like(drawing.image, 2)).sum(), scene.tensors[4:5]),
+        (lambda drawing: drawing.depths.sum(), scene.tensors[:1]),
+        (lambda drawing: drawing.image.square().sum() + drawing.depths.sum(), scene.tensors[:4]),
+    ]
+    for loss, leaves in (*parts, *reversed(parts)):
+        pair = [torch.autograd.grad(loss(drawing), leaves, retain_graph=True) for drawing in (replayed, truth)]
+        assert_alike(*pair)
+    of_means2d = [
+        torch.autograd.grad(drawing.image.sum(), drawing.means2d, retain_graph=True) for drawing in (replayed, truth)
+    ]
+    assert_alike(*of_means2d)
+    assert_alike(
+        *[torch.autograd.grad(drawing.depths.square().sum(), scene.tensors[:1]) for drawing in (replayed, truth)]
+    )
+
+
+def test_gradients_of_leaves_are_contiguous_and_not_copied(monkeypatch):
+    scene, addresses = scene_of(), []
+    allocate = captured_backward.CapturedBackward.allocate
+
+    def remember(*arguments, **options):
+        memory = allocate(*arguments, **options)
+        addresses.append(memory.zeros.data_ptr())
+        return memory
+
+    monkeypatch.setattr(captured_backward.CapturedBackward, "allocate", remember)
+    for _ in range(CALLS):
+        for tensor in scene.tensors:
+            tensor.grad = None
+        rasterize(*scene.arguments).image.sum().backward()
+    gradients = [tensor.grad for tensor in scene.tensors[:5]]
+    assert all(gradient.is_contiguous() for gradient in gradients)
+    assert {gradient.untyped_storage().data_ptr() for gradient in gradients} == {addresses[-1]}
+
+
+@pytest.mark.parametrize("place", [0, 1, 4])
+def test_a_change_in_place_before_the_backward_pass_of_a_replay_is_refused(place):
+    scene = scene_of()
+    image = [rasterize(*scene.arguments).image for _ in range(CALLS)][-1]
+    assert recordings()
+    with torch.no_grad():
+        scene.tensors[place] *= 1.5
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        image.sum().backward()
 
 
 @pytest.mark.parametrize("one_sort", [1 << 18, 0])
