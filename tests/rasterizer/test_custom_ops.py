@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import custom_ops, rasterize
+from sehdr_warp.rasterizer import custom_ops, differentiable, rasterize
 
 from .scenes import random_scene
 from .test_torch_contract import HEIGHT, WIDTH, directions, splats
@@ -52,6 +52,14 @@ def test_a_loop_is_one_graph_with_the_same_bits_in_silence():
     assert done.returncode == 0, done.stderr
     assert not done.stderr.strip(), done.stderr
     assert float(done.stdout) < 60
+
+
+def test_an_operation_compiles_by_itself_after_programs_that_do_not():
+    program = differentiable(lambda program, values: program.empty_output(values.shape))
+    assert program(torch.ones(2)).shape == (2,)
+    arguments = *splats(dtype=torch.float32, channels=3), WIDTH, HEIGHT
+    compiled = torch.compile(rasterize, backend="aot_eager", fullgraph=True)(*arguments)
+    assert torch.equal(compiled.image, rasterize(*arguments).image)
 
 
 OPTIONS = 0.01, 0.3, 1e-3, False
