@@ -105,7 +105,8 @@ def launch_projection(
     count = inputs[0].shape[0]
 
     def project() -> tuple[Tensor, ...]:
-        launch(kernel, count, *inputs, *parameters, None, *outputs)
+        arguments = *inputs, *parameters, None, *outputs
+        launch(kernel, count, *arguments)
         return outputs
 
     def adjoint(inputs: Sequence[Tensor], culling: Tensor, upstream: Gradients, needed: Sequence[bool]) -> Gradients:

@@ -65,8 +65,8 @@ def torch_operation(function: Callable[P, T], *, compiles: bool = False) -> Call
     operation: Any = call
     if compiles:
         return operation
-    # What torch.compiler.disable() does, without its import of Dynamo, which takes two seconds. Dynamo marks code, which
-    # this operation must not share with those that compile.
+    # What torch.compiler.disable() does, without its import of Dynamo, which takes two seconds. Dynamo marks code,
+    # which this operation must not share with those that compile.
     operation.__code__ = operation.__code__.replace()
     operation._torchdynamo_disable = True
     operation._torchdynamo_disable_msg = "it launches Warp kernels"
