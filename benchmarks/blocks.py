@@ -3,9 +3,9 @@
 python -m benchmarks.blocks OUT --json blocks.json
 
 benchmarks.survey makes the photos. Blocks train as many steps on each photo as the whole does. With three GPUs the
-whole trains on the third, beside blocks that are not timed, with two after blocks were trained at once. Copies of the
-merged run are rendered from the disk and shown by `sehdr-warp view`. Each row is also a line of OUT/rows.jsonl as soon
-as it is known.
+whole trains on the third, beside blocks that are not timed; with fewer it trains after all blocks. Copies of the merged
+run are rendered from the disk and shown by `sehdr-warp view`. Each row is also a line of OUT/rows.jsonl as soon as it
+is known.
 """
 
 import json
@@ -27,7 +27,7 @@ from urllib.request import Request, urlopen
 import torch
 import tyro
 
-from sehdr_warp.blocks.block_plan import BlockPlan, make_block_plan
+from sehdr_warp.blocks.block_plan import Block, BlockPlan, make_block_plan
 from sehdr_warp.blocks.job import FOLDER
 from sehdr_warp.blocks.jobs import run_blocks, visible_gpus
 from sehdr_warp.blocks.merge import merge_blocks
@@ -46,6 +46,7 @@ from sehdr_warp.training.train import create_trainer
 
 from .results import new_result
 from .survey import write_survey
+from .timing import forget_peaks
 
 log = logging.getLogger(__name__)
 
@@ -158,10 +159,13 @@ def run_study(study: Study) -> None:
     # The two longest blocks train first, beside each other and without the whole, which would make them slower.
     pair = sorted(plan.blocks, key=lambda block: -block.fraction)[:AT_ONCE]
     spans = _train_blocks(study, plan, "at_once", at_once, start_whole if len(devices) > AT_ONCE else None)
-    if whole.pid is None:
-        start_whole()
     both = max(spans[block.name][1] for block in pair)
-    merge_blocks(study.out / "at_once", plan)
+    forget_peaks(study.device)
+    began = time.monotonic()
+    merge_blocks(study.out / "at_once", plan, study.device)
+    seconds = time.monotonic() - began
+    memory = torch.cuda.max_memory_allocated(study.device) if study.device.type == "cuda" else None
+    study.add("merging and refining borders", seconds=seconds, peak_memory_bytes=memory)
     run = load_run(study.out / "at_once", device=study.device)
     held_out = [entry.name for entry in run.cameras if entry.split == "test"]
     views = load_saved_scene({**data, "views": held_out}, response="srgb").views
@@ -169,23 +173,32 @@ def run_study(study: Study) -> None:
     peak = max(row["peak_memory_bytes"] or 0 for row in study.rows)
     errors = measure_seams(run, views, plan.division)
     study.add(f"{study.count} blocks, {at_once} at once, merged", **figures, peak_memory_bytes=peak, **asdict(errors))
-    names = " and ".join(block.name for block in pair)
-    study.add(f"{names} at once", seconds=both, beside_whole=False)
-    whole.join(study.seconds_left(3 * both))
-    if study.left > 2.2 * both:
-        for block in plan.blocks:
-            if block not in pair:  # Finished blocks are not trained again.
-                place = Path(FOLDER) / block.name
-                shutil.copytree(study.out / "at_once" / place, study.out / "one_by_one" / place)
-        beside_whole = whole.is_alive()
-        alone = _train_blocks(study, plan, "one_by_one", 1)
-        seconds = max(end for _, end in alone.values())
-        study.add(f"{names}, one after the other", seconds=seconds, ratio=both / seconds, beside_whole=beside_whole)
+    if at_once > 1:
+        names = " and ".join(block.name for block in pair)
+        study.add(f"{names} at once", seconds=both, beside_whole=False)
+        if whole.pid is not None:
+            whole.join(study.seconds_left(3 * both))
+        if study.left > 2.2 * both:
+            _add_one_by_one(study, plan, pair, both, beside_whole=whole.pid is not None and whole.is_alive())
+    if whole.pid is None:
+        start_whole()
     whole.join(study.seconds_left(15))
     if not whole.is_alive() and (study.out / "whole" / "summary.json").is_file():
         _add_whole(study, run, views, plan)
     if study.left > COPY_SECONDS:
         _add_copies(study, run, views)
+
+
+def _add_one_by_one(study: Study, plan: BlockPlan, pair: Sequence[Block], both: float, *, beside_whole: bool) -> None:
+    """Train the blocks of a pair again, one after the other, and compare with the seconds that both took at once."""
+    for block in plan.blocks:
+        if block not in pair:  # Finished blocks are not trained again.
+            place = Path(FOLDER) / block.name
+            shutil.copytree(study.out / "at_once" / place, study.out / "one_by_one" / place)
+    alone = _train_blocks(study, plan, "one_by_one", 1)
+    seconds = max(end for _, end in alone.values())
+    names = " and ".join(block.name for block in pair)
+    study.add(f"{names}, one after the other", seconds=seconds, ratio=both / seconds, beside_whole=beside_whole)
 
 
 def _config(study: Study) -> Config:

@@ -26,6 +26,7 @@ from ..scene.normalization import Normalization
 from ..splats.packing import compact_order
 from .block_plan import BlockPlan
 from .job import folder_of
+from .refine import refine_borders
 
 log = logging.getLogger(__name__)
 
@@ -54,12 +55,14 @@ class TrainedBlock(NamedTuple):
     summary: dict[str, Any]
 
 
-def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
+def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage: str = "auto") -> RunWriter:
     """Write the merged run of trained blocks to a folder, in place of an earlier merged run.
 
     Args:
         out: Run folder, with the blocks' runs in `blocks/`.
         plan: The plan of the blocks.
+        device: Device to refine borders on.
+        photo_storage: Where photos are stored, see load_scene().
 
     Raises:
         InputError: If a block is damaged or was trained with other options, or if no Gaussian is in any core.
@@ -71,6 +74,9 @@ def merge_blocks(out: Path, plan: BlockPlan) -> RunWriter:
     tensors = {name: torch.cat([block.gaussians[name] for block in blocks]) for name in PARAMETER_NAMES}
     if not len(tensors["means"]):
         raise InputError(out, "no Gaussian of any block is in its core", "train again, with --overwrite")
+    counts = torch.tensor([len(block.evidence.weight_sum) for block in blocks])
+    owners = torch.arange(len(blocks)).repeat_interleave(counts)
+    refine_borders(tensors, owners, out, plan, device, photo_storage)
     parts = [vars(block.evidence) for block in blocks]
     evidence = Evidence(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
     iterations = max(block.values["iteration"] for block in blocks)

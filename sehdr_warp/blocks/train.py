@@ -1,4 +1,4 @@
-"""Train a set of photos in blocks: plan, jobs, merged run, and its figures on the held-out photos."""
+"""Train a set of photos in blocks: plan, jobs, merged run with refined borders, its figures on held-out photos."""
 
 import logging
 import shutil
@@ -14,9 +14,10 @@ from ..runs.config import Config
 from ..runs.load_arguments import LoadArguments
 from ..runs.open import load_saved_scene, response_for_loading
 from ..runs.run import Run, load_run
+from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter
 from .block_plan import FILE, BlockPlan, make_block_plan
-from .job import FOLDER, folder_of
+from .job import FOLDER, folder_of, is_finished
 from .jobs import run_blocks
 from .merge import merge_blocks
 from .seams import SeamErrors, measure_seams
@@ -80,9 +81,12 @@ def train_in_blocks(
         with writing(out):
             make_parents(out / FILE)
         plan.write(out)
+    if resume and _is_merged(out, plan):
+        log.info("%s: all blocks are trained and merged", out)
+        return load_run(out, device=device)
     jobs = {"photo_storage": photo_storage, "slurm": slurm, "slurm_device": slurm_device}
     run_blocks(out, plan, device=device, gpus=gpus, **jobs)
-    folder = merge_blocks(out, plan)
+    folder = merge_blocks(out, plan, device, photo_storage)
     run = load_run(out, device=device)
     errors = _measure(run, plan, photo_storage)
     if errors is not None:
@@ -111,6 +115,15 @@ def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
         return resume
     RunWriter(out).prepare(resume=False, overwrite=overwrite)
     return False
+
+
+def _is_merged(out: Path, plan: BlockPlan) -> bool:
+    """Return whether all blocks are trained, and the merged run is newer than each."""
+    folders = [folder_of(out, plan, index) for index in range(len(plan.blocks))]
+    if not all(is_finished(folder) for folder in (out, *folders)):
+        return False
+    merged, *blocks = (RunFolder(folder).confidence.stat().st_mtime_ns for folder in (out, *folders))
+    return merged > max(blocks)
 
 
 def _continue(out: Path, data: LoadArguments, config: Config, count: int | None) -> BlockPlan:

@@ -26,11 +26,15 @@ class Adam:
         state: For each parameter "step", "exp_avg" and "exp_avg_sq".
         sh_update_interval: The harmonics above degree 0 are divided into this many parts, of which each step updates
             one, if their gradients come in factored form.
+        trained_rows: Number of Gaussians that are trained, the first ones; the others stay, and have no moments. None
+            trains all. Set it before the first step.
     """
+
+    trained_rows: int | None
 
     def __init__(self, groups: list[dict], betas: tuple[float, float] = BETAS, sh_update_interval: int = 1):
         """Create an optimizer without state."""
-        self.sh_update_interval = sh_update_interval
+        self.sh_update_interval, self.trained_rows = sh_update_interval, None
         self.param_groups = [{"betas": betas, "eps": EPSILON} | group for group in groups]
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
 
@@ -74,12 +78,12 @@ class Adam:
         steps_with_gradient, options = [], {}  # All groups have the same options.
         for group, parameter in grouped:
             first, second, step = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
-            options, values = {"betas": group["betas"], "epsilon": group["eps"]}, parameter.detach()
+            options = {"betas": group["betas"], "epsilon": group["eps"]}
+            values = _first_rows(parameter.detach(), first)
             if parameter.grad is not None:
                 width = values.numel() // len(values) if group.get("name") in PARAMETER_NAMES else 0
-                steps_with_gradient.append(
-                    AdamStep(values, parameter.grad.contiguous(), first, second, step, group["lr"], width)
-                )
+                gradient = _first_rows(parameter.grad.contiguous(), first)
+                steps_with_gradient.append(AdamStep(values, gradient, first, second, step, group["lr"], width))
             elif harmonics is not None:
                 start = FIRST_HARMONIC[group["name"]]
                 harmonics_adam_step(
@@ -109,8 +113,15 @@ class Adam:
 
     def _create_states(self, parameters: Iterable[Tensor]) -> None:
         """Create the state of parameters that have none: no step, moments of 0."""
+        gaussians = {p for group in self.param_groups if group.get("name") in PARAMETER_NAMES for p in group["params"]}
         for parameter in parameters:
             if not self.state[parameter]:
-                moments = (torch.zeros_like(parameter, memory_format=torch.contiguous_format) for _ in range(2))
+                trained = parameter[: self.trained_rows] if parameter in gaussians else parameter
+                moments = (torch.zeros_like(trained, memory_format=torch.contiguous_format) for _ in range(2))
                 self.state[parameter] = {"step": torch.zeros((), device=parameter.device)}
                 self.state[parameter] |= zip(("exp_avg", "exp_avg_sq"), moments, strict=True)
+
+
+def _first_rows(values: Tensor, moment: Tensor) -> Tensor:
+    """Return the rows of a parameter or its gradient that have a moment."""
+    return values if values.shape == moment.shape else values[: len(moment)]

@@ -163,6 +163,22 @@ class Gaussians(nn.Module):
         """Return to parameters without reserved rows, from the next change of the count on."""
         self._reserved = None
 
+    def surround(self, rows: dict[str, Tensor], optimizer: Optimizer | None = None) -> None:
+        """Reserve rows for Gaussians that steps render, but that are no part of count and tensors().
+
+        Call this before the first step, and not if the number of Gaussians will change: that takes the rows. They stay
+        as they are if the optimizer trains the others alone (Adam.trained_rows).
+
+        Args:
+            rows: Tensors of M Gaussians as returned by rows().
+            optimizer: The optimizer of the parameters.
+        """
+        count = self.count
+        self.reserve(count + len(rows["means"]), optimizer)
+        assert self._reserved is not None
+        for name, values in rows.items():
+            self._reserved.all_rows[name].detach()[count:] = values
+
     @property
     def row_count(self) -> int:
         """Number of rows of the parameters in memory: the count, or more if rows are reserved."""

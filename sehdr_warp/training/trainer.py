@@ -209,7 +209,7 @@ class Trainer:
         index = self._view_index = self.order.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
-        if self.reserves_rows and not self._reserved_rows:
+        if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
             self._reserve_rows()
         step, options = self.gradient_step, self._step_options()
         if options.needs_means2d_grad:

@@ -37,7 +37,7 @@ def trained(tmp_path_factory):
 def test_a_gaussian_that_reaches_far_into_another_block_is_left_out(trained, margins, fewer):
     """Its center is in its core, far from the border."""
     out, plan = trained
-    merge_blocks(out, plan)
+    merge_blocks(out, plan, torch.device("cpu"))
     before = load_run(out)
     places = before.field.normalization.scene_points(before.field.gaussians.means.detach().numpy())
     far = places[np.where(plan.division.block_of(places) == 1, plan.division.border_distance(places), 0).argmax()]
@@ -54,7 +54,7 @@ def test_a_gaussian_that_reaches_far_into_another_block_is_left_out(trained, mar
     folder.write_checkpoint(changed, checkpoint.values | {"iteration": checkpoint.values["iteration"] + 1}, keep=9)
     write_confidence(folder, evidence, folder.checkpoint_hash)
     try:
-        merge_blocks(out, plan)
+        merge_blocks(out, plan, torch.device("cpu"))
         assert load_run(out).gaussian_count == before.gaussian_count - fewer
     finally:
         folder.write_checkpoint(checkpoint.tensors, checkpoint.values, keep=1)

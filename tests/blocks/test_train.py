@@ -116,8 +116,9 @@ def test_each_place_has_the_gaussians_of_one_block(merged):
         inside = plan.division.block_of(own) == index
         mine = owner == index
         assert 0 < inside.sum() < len(own), "Gaussians beyond the border are dropped"
-        left_out = int(inside.sum()) - int(mine.sum())  # Those that reach far into the other block
-        assert -2 <= left_out <= 0.02 * inside.sum() and np.allclose(mine.nonzero()[0].min(), start, atol=2)
+        # A few reach far into the other block and are left out; a few cross the border as it is refined.
+        assert abs(int(inside.sum()) - int(mine.sum())) <= 0.02 * inside.sum()
+        assert mine[start : start + int(mine.sum())].mean() > 0.98
         sizes, merged_sizes = (
             np.sort((each.gaussians.log_scales.numpy()[rows] + np.log(each.normalization.unit)).ravel())
             for each, rows in ((block.field, inside), (run.field, mine))
@@ -142,7 +143,7 @@ def test_finished_blocks_are_not_run_again(merged, monkeypatch):
     monkeypatch.setattr(jobs, "_executors", lambda *_: pytest.fail("a job was started"))
     before = (merged / "checkpoints").stat().st_mtime_ns
     assert call("train", "--resume", "--out", merged, "--device", "cpu") == 0
-    assert (merged / "checkpoints").stat().st_mtime_ns != before, "merged again"
+    assert (merged / "checkpoints").stat().st_mtime_ns == before, "nor merged again"
 
 
 def test_a_block_is_a_run_of_its_own(merged, capfd):

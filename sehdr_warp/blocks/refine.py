@@ -1,0 +1,119 @@
+"""Refine the borders of merged blocks: Gaussians near them train on, beside those of the other blocks.
+
+Blocks are trained apart, so a surface that crosses a border consists of two halves that never were in one photo
+together. Block after block, the last part of its training is repeated in the merged scene: its Gaussians near a border
+are trained on its photos, and all others that these photos show are rendered, but stay as they are. That takes about
+the memory of the block's own training, however large the merged scene is.
+"""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..model.gaussians import Gaussians
+from ..model.paged_field import boxes_in_view
+from ..runs.config_files import override_config
+from ..runs.open import load_saved_scene, response_for_loading
+from ..runs.run import assemble_field
+from ..runs.run_folder import RunFolder
+from ..scene import Camera, Scene
+from ..training.initialization import response_for_training
+from ..training.trainer import Trainer
+from .block_plan import BlockPlan
+from .job import folder_of, shared_scene
+
+log = logging.getLogger(__name__)
+
+BAND = 1.0  # Distance from a border, in margins of a block, within which its Gaussians are trained
+PART = 0.3  # Part of a block's training that is repeated
+LEAST_SHARE = 0.02  # Part of the near Gaussians that a photo must show to be trained on
+BOX = 256  # Consecutive rows, which are neighbours in space, that are rendered or left out together
+DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its box, standard deviations
+
+
+def refine_borders(
+    tensors: Mapping[str, Tensor], blocks: Tensor, out: Path, plan: BlockPlan, device: torch.device, photo_storage: str
+) -> None:
+    """Train the Gaussians near borders, in place.
+
+    Args:
+        tensors: Parameters of the N merged Gaussians on the CPU, in the coordinates of the merged run.
+        blocks: [N] index of the block that each Gaussian comes from.
+        out: Folder of the merged run, which has the blocks' configs.
+        plan: The plan of the blocks.
+        device: Device to train on.
+        photo_storage: Where photos are stored, see load_scene().
+    """
+    places = plan.normalization.scene_points(tensors["means"].numpy())
+    distance = torch.from_numpy(plan.division.border_distance(places))
+    for index, block in enumerate(plan.blocks):
+        near = (blocks == index) & (distance < BAND * float(block.margin.max()))
+        scene = None if not near.any() else _border_photos(plan, index, places[near.numpy()], photo_storage)
+        if scene is None:
+            continue
+        rows, shown = near.nonzero()[:, 0], _shown_rows(tensors, plan, [view.camera for view in scene.train_views])
+        around = (shown & ~near).nonzero()[:, 0]
+        trainer = _trainer(tensors, rows, around, scene, out, plan, index, device)
+        log.info("%s: %d Gaussians near its borders are refined on %d photos", block.name, len(rows), len(scene.views))
+        for _ in trainer:
+            pass
+        for name, values in trainer.field.gaussians.tensors().items():
+            tensors[name][rows] = values.cpu()
+
+
+def _border_photos(plan: BlockPlan, index: int, points: np.ndarray, photo_storage: str) -> Scene | None:
+    """Return the block's scene with the training photos that show points [M, 3] near its borders; None for none."""
+    data = plan.data | {"views": list(plan.blocks[index].views)}
+    response = response_for_loading(plan.config_of(plan.blocks[index]), plan.response)
+    scene = shared_scene(plan, index, load_saved_scene(data, response=response, photo_storage=photo_storage))
+    views = tuple(view for view in scene.train_views if _share_in_view(view.camera, points) >= LEAST_SHARE)
+    if len(views) < 2:
+        return None
+    scene = replace(scene, views=views)
+    compensation = plan.shared.compensation
+    return scene if compensation is None else compensation.normalize_photos(scene, plan.response)
+
+
+def _share_in_view(camera: Camera, points: np.ndarray) -> float:
+    """Return the part of points [M, 3] in the field of view of a camera; occlusion is ignored."""
+    return float(camera.project(points).inside.mean()) if camera.is_pinhole else 1.0
+
+
+def _shown_rows(tensors: Mapping[str, Tensor], plan: BlockPlan, cameras: list[Camera]) -> Tensor:
+    """Return which of the merged Gaussians any of the cameras may see: a bool [N]."""
+    means, reach = tensors["means"], DEVIATIONS * tensors["log_scales"].amax(1, keepdim=True).exp()
+    low = torch.stack([part.amin(0) for part in (means - reach).split(BOX)]).double().numpy()
+    high = torch.stack([part.amax(0) for part in (means + reach).split(BOX)]).double().numpy()
+    shown = np.zeros(len(low), bool)
+    for camera in cameras:
+        shown |= boxes_in_view(plan.normalization.camera(camera), low, high) if camera.is_pinhole else True
+    return torch.from_numpy(shown).repeat_interleave(BOX)[: len(means)]
+
+
+def _trainer(
+    tensors: Mapping[str, Tensor],
+    rows: Tensor,
+    around: Tensor,
+    scene: Scene,
+    out: Path,
+    plan: BlockPlan,
+    index: int,
+    device: torch.device,
+) -> Trainer:
+    """Return the trainer of some rows of the merged scene, near the end of the block's training."""
+    config = RunFolder(folder_of(out, plan, index)).read_config()
+    config = override_config(config, {"mcmc.noise_lr": 0.0, "mcmc.seed_fraction": 0.0, "plan.keep": []})
+    gaussians = Gaussians(**{name: values[rows] for name, values in tensors.items()})
+    response = response_for_training(scene, config)
+    field = assemble_field(gaussians, config, response, plan.shared.base_time, plan.normalization)
+    trainer = Trainer(scene, config, field.to(device))
+    others = {name: values[around].to(device) for name, values in tensors.items()}
+    trainer.optimizer.trained_rows = len(rows)
+    trainer.field.gaussians.surround(others, trainer.optimizer)
+    trainer.iteration = trainer.first_iteration = round((1 - PART) * trainer.total)
+    return trainer

@@ -1,0 +1,93 @@
+"""Refining borders: what is trained, what stays, and what it gains."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.survey import write_survey
+from sehdr_warp.blocks.block_plan import make_block_plan
+from sehdr_warp.blocks.job import folder_of, train_block
+from sehdr_warp.blocks.refine import BAND, refine_borders
+from sehdr_warp.blocks.seams import measure_seams
+from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
+from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.runs.load_arguments import LoadArguments
+from sehdr_warp.runs.open import load_saved_scene
+from sehdr_warp.runs.run import load_run
+from sehdr_warp.training.launch import installed_versions
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    """A run folder with two blocks of few steps, and their plan."""
+    folder = tmp_path_factory.mktemp("town")
+    write_survey(folder / "town", views=32, size=48, gaussians=6000)
+    data: LoadArguments = {"path": str(folder / "town"), "exposure_index": None, "max_size": None, "holdout": None}
+    fields = {"response.name": "srgb", "schedule.iterations": 150, "loss.light_prior": False}
+    config = override_config(Config(), fields | {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0})
+    plan = make_block_plan(data, config, torch.device("cpu"), 2)
+    assert plan is not None
+    (folder / "run").mkdir()
+    plan.write(folder / "run")
+    for index in (0, 1):
+        assert train_block(folder / "run", index, "cpu", "auto", installed_versions()).error is None
+    return folder / "run", plan
+
+
+def merged_rows(out, plan):
+    """Return tensors [N, ...] of the Gaussians in the cores, and their blocks [N]."""
+    parts, owners = [], []
+    for index in (0, 1):
+        run = load_run(folder_of(out, plan, index))
+        gaussians = run.field.gaussians.tensors()
+        places = run.field.normalization.scene_points(gaussians["means"].numpy())
+        inside = torch.from_numpy(plan.division.block_of(places) == index)
+        rows = {name: values[inside].clone() for name, values in gaussians.items()}
+        rows["means"] = torch.from_numpy(plan.normalization.points(places[inside.numpy()]).astype(np.float32))
+        rows["log_scales"] += np.log(run.field.normalization.unit / plan.normalization.unit)
+        parts.append(rows)
+        owners.append(torch.full((int(inside.sum()),), index))
+    return {name: torch.cat([rows[name] for rows in parts]) for name in PARAMETER_NAMES}, torch.cat(owners)
+
+
+def test_only_gaussians_near_borders_change_and_the_border_gets_better(town):
+    out, plan = town
+    before, blocks = merged_rows(out, plan)
+    after = {name: values.clone() for name, values in before.items()}
+    refine_borders(after, blocks, out, plan, torch.device("cpu"), "auto")
+
+    places = plan.normalization.scene_points(before["means"].numpy())
+    far = plan.division.border_distance(places) > BAND * plan.division.margins.max()
+    changed = (after["harmonics_dc"] != before["harmonics_dc"]).flatten(1).any(1).numpy()
+    assert far.any() and not changed[far].any()
+    assert changed[~far].mean() > 0.5
+
+    run = load_run(folder_of(out, plan, 0))
+    run.field.normalization = plan.normalization
+    names = [entry for entry in plan.exposure_times if int(entry[-5:]) % 8 == 4]
+    views = load_saved_scene(plan.data | {"views": names}, response="srgb").views
+    errors = []
+    for tensors in (before, after):
+        run.field.gaussians = Gaussians(**tensors)
+        errors.append(measure_seams(run, views, plan.division).border)
+    assert errors[1] > errors[0] + 0.2
+
+
+def test_the_rows_around_trained_gaussians_are_rendered_and_stay(town):
+    """They hide what is behind them, and Adam has no moments for them."""
+    out, plan = town
+    tensors, blocks = merged_rows(out, plan)
+    gaussians = Gaussians(**{name: values[blocks == 0] for name, values in tensors.items()})
+    gaussians.surround({name: values[blocks == 1] for name, values in tensors.items()})
+    count = int((blocks == 0).sum())
+    assert gaussians.count == count and gaussians.row_count == len(blocks)
+    with gaussians.all_rows(_NoOptimizer()):
+        assert torch.equal(gaussians.means, tensors["means"])
+    assert len(gaussians.tensors()["means"]) == count
+
+
+class _NoOptimizer:
+    """An optimizer without parameters."""
+
+    param_groups, state = [], {}
