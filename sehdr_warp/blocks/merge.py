@@ -8,6 +8,7 @@ neighbours in space are neighbours in memory, so that a part of the scene is a f
 
 import logging
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -76,7 +77,14 @@ def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage
         raise InputError(out, "no Gaussian of any block is in its core", "train again, with --overwrite")
     counts = torch.tensor([len(block.evidence.weight_sum) for block in blocks])
     owners = torch.arange(len(blocks)).repeat_interleave(counts)
-    refine_borders(tensors, owners, out, plan, device, photo_storage)
+    refines = can_refine(device, blocks)
+    if refines:
+        refine_borders(tensors, owners, out, plan, device, photo_storage)
+    else:
+        remedy = f"`sehdr-warp train --resume --out {out}` on a machine with one refines them"
+        log.warning(
+            "borders are not refined, because blocks were trained on a GPU and this machine has none; %s", remedy
+        )
     parts = [vars(block.evidence) for block in blocks]
     evidence = Evidence(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
     iterations = max(block.values["iteration"] for block in blocks)
@@ -102,13 +110,19 @@ def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage
     folder.lock()
     try:
         folder.begin_described(description, info, config, None, state)
-        folder.write_summary(_summary(blocks, iterations, seconds, len(tensors["means"])))
+        summary = _summary(blocks, iterations, seconds, len(tensors["means"]))
+        folder.write_summary(summary | {"borders_refined": refines})
         assert folder.checkpoint_hash is not None
         write_confidence(folder, evidence, folder.checkpoint_hash)
     finally:
         folder.unlock()
     log.info("merged %d Gaussians of %d blocks", len(tensors["means"]), len(blocks))
     return folder
+
+
+def can_refine(device: torch.device, blocks: Sequence[TrainedBlock]) -> bool:
+    """Return whether a device can refine borders in reasonable time: a CPU only what CPUs have trained."""
+    return device.type != "cpu" or not any(block.summary.get("peak_gpu_memory_bytes") for block in blocks)
 
 
 def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:

@@ -81,7 +81,7 @@ def train_in_blocks(
         with writing(out):
             make_parents(out / FILE)
         plan.write(out)
-    if resume and _is_merged(out, plan):
+    if resume and _is_merged(out, plan, device):
         log.info("%s: all blocks are trained and merged", out)
         return load_run(out, device=device)
     jobs = {"photo_storage": photo_storage, "slurm": slurm, "slurm_device": slurm_device}
@@ -117,10 +117,12 @@ def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
     return False
 
 
-def _is_merged(out: Path, plan: BlockPlan) -> bool:
-    """Return whether all blocks are trained, and the merged run is newer than each."""
+def _is_merged(out: Path, plan: BlockPlan, device: torch.device) -> bool:
+    """Return whether all blocks are trained, and the merged run is newer and has refined borders if they can be."""
     folders = [folder_of(out, plan, index) for index in range(len(plan.blocks))]
     if not all(is_finished(folder) for folder in (out, *folders)):
+        return False
+    if device.type != "cpu" and not RunFolder(out).read_summary().get("borders_refined"):
         return False
     merged, *blocks = (RunFolder(folder).confidence.stat().st_mtime_ns for folder in (out, *folders))
     return merged > max(blocks)

@@ -53,9 +53,11 @@ def run_view(args: View) -> None:
 
     @cache
     def photos(index: int) -> dict:
-        if not isinstance(watch.scenes[index].run, Run):
+        run = watch.scenes[index].run
+        run = run.reference or run  # Of a merged scene the first one.
+        if not isinstance(run, Run):
             raise InputError(args.runs[index], "is a file of Gaussians, without photos", "view the run it came from")
-        return {view.name: view for view in load_run_scene(watch.scenes[index].run, args.data).views}
+        return {view.name: view for view in load_run_scene(run, args.data).views}
 
     return_memory()
     watch.start()

@@ -37,6 +37,8 @@ class ViewerScene:
         version: Counts replacements.
     """
 
+    run: Any
+
     def __init__(self, run: Any, name: str, clipped: Tensor | None = None):
         """Show a run under a name."""
         self.run, self.name, self.clipped = run, name, clipped

@@ -1,5 +1,7 @@
 """Merging: which Gaussians of a trained block go into the merged run."""
 
+import logging
+
 import numpy as np
 import pytest
 import torch
@@ -60,3 +62,20 @@ def test_a_gaussian_that_reaches_far_into_another_block_is_left_out(trained, mar
         folder.write_checkpoint(checkpoint.tensors, checkpoint.values, keep=1)
         write_confidence(folder, evidence, folder.checkpoint_hash)
         folder.unlock()
+
+
+def test_a_cpu_leaves_the_borders_of_blocks_from_gpus_and_says_so(trained, caplog):
+    """As where a login node without a GPU merges; it would take hours."""
+    out, plan = trained
+    folder = RunWriter(folder_of(out, plan, 0))
+    summary = folder.read_summary()
+    folder.write_summary(summary | {"peak_gpu_memory_bytes": 10**9})
+    try:
+        with caplog.at_level(logging.WARNING):
+            merge_blocks(out, plan, torch.device("cpu"))
+    finally:
+        folder.write_summary(summary)
+    assert "borders are not refined" in caplog.text and "--resume" in caplog.text
+    assert load_run(out).summary()["borders_refined"] is False
+    merge_blocks(out, plan, torch.device("cpu"))
+    assert load_run(out).summary()["borders_refined"] is True
