@@ -19,7 +19,7 @@ class CameraTensors:
         height: Pixels.
         world_to_camera: [4, 4].
         intrinsics: [4] fx, fy, cx, cy.
-        position: [3] world coordinates.
+        position: [3] in the coordinates that world_to_camera maps; for a training, normalized ones.
         directions: [H, W, 3] unit vectors along which the pixels look, world axes; None for a pinhole.
     """
 

@@ -30,8 +30,8 @@ class Gaussians(nn.Module):
     """N anisotropic 3D Gaussians with a view-dependent color.
 
     Attributes:
-        means: [N, 3] world coordinates.
-        log_scales: [N, 3] natural logarithms of the standard deviations, world units.
+        means: [N, 3] centers, in the normalized coordinates of the field (scene/normalization.py).
+        log_scales: [N, 3] natural logarithms of the standard deviations, in the same units.
         quaternions: [N, 4] rotations (w, x, y, z) of any length but zero.
         opacity_logits: [N]; the opacity is their sigmoid.
         harmonics_dc: [N, 1, 3] real spherical harmonics of degree 0; the color model says what their sum means.

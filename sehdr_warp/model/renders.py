@@ -36,7 +36,7 @@ class RenderedView:
     Attributes:
         hdr: [H, W, 3] float32 scene-linear radiance, >= 0, not multiplied by an exposure time.
         alpha: [H, W] coverage in [0, 1].
-        depth: [H, W] mean distance along the camera's axis if alpha is above 0.001, else 0; world units.
+        depth: [H, W] mean distance along the camera's axis if alpha is above 0.001, else 0; scene units.
     """
 
     hdr: Tensor
@@ -51,7 +51,7 @@ class DirectionalRender:
     Attributes:
         hdr: [H, W, 3] as in RenderedView.
         alpha: [H, W] as in RenderedView.
-        distance: [H, W] mean distance if alpha is above 0.001, else 0; world units.
+        distance: [H, W] mean distance if alpha is above 0.001, else 0; scene units.
         confidence: [H, W] in [0, 1], as from render_confidence; None if it was not measured.
         clipped: [H, W] in [0, 1], the mean of the shares that render_directions() was called with, weighted by light;
             None without shares.

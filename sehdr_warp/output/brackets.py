@@ -238,8 +238,9 @@ class BracketWriter:
     views: list[dict] = field(default_factory=list)
 
     def files(self) -> list[Path]:
-        """Return the paths of the EXR files."""
-        names = dict.fromkeys(each["file"] for view in self.views for each in view["exposures"])
+        """Return the paths of the EXR files and of the photos beside them."""
+        entries = [entry for view in self.views for entry in view["exposures"]]
+        names = dict.fromkeys(entry[kind] for kind in ("file", "ldr_file") for entry in entries if kind in entry)
         return [self.out / name for name in names]
 
     def write(self, name: str, radiance: np.ndarray, camera: Camera | None) -> None:

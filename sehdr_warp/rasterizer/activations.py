@@ -61,9 +61,9 @@ def opacity_penalty(
 ) -> Tensor:
     """Return `weight` times the sum of the opacities that count over the number of Gaussians, a scalar.
 
-    Gaussians in view count, and those that were in view since they were added or copied. Of the others, Adam would know
-    no gradient but this one, and fade them by several times its rate until a photo shows them: where few photos show a
-    place, they would be gone by then.
+    Gaussians in view count, and those that were in view since they were added or copied. For the others the
+    penalty would be Adam's only gradient, which fades them at several times its rate until a photo shows them: where
+    few photos show a place, they would be gone by then.
 
     Args:
         opacities: [N] opacities, float32 or float64.

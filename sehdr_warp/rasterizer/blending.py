@@ -69,14 +69,14 @@ def blend(
     image = rows.new_empty(lists.height, lists.width, rows.shape[1])
     transmittance = rows.new_empty(image.shape[:2])
     backend = blend_on_cuda if rows.device.type == "cuda" else blend_on_cpu
-    # The backward pass keeps some of these, but it must not keep the results of the node that keeps it: so detach them.
+    # Detached: the autograd node owns the backward function, which must not refer to the node's own results.
     row_backward = backend(rows, lists, packed, image.detach(), transmittance.detach(), alpha_threshold, deterministic)
 
     def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
         gathered, channels = row_backward(grad_image, grad_transmittance), grad_image.shape[2]
         sizes = channels, 3, 2, gathered.shape[1] - channels - 5
-        grad_features, grad_conics, grad_means2d, others = gathered.split_with_sizes(sizes, 1)
-        return grad_means2d, grad_features, grad_conics, others.select(1, 0)
+        grad_features, grad_conics, grad_means2d, opacity_and_padding = gathered.split_with_sizes(sizes, 1)
+        return grad_means2d, grad_features, grad_conics, opacity_and_padding.select(1, 0)
 
     return with_gradient(BlendResult(image, transmittance, backward), means2d, features, conics, opacities)
 

@@ -34,9 +34,10 @@ class GradientMemory:
     Attributes:
         zeros: all of it.
         of_splats: by means2d and features, and if the CUDA graph begins with 2D Gaussians, by conics and opacities;
-            empty once they were returned, as torch copies the gradient of a leaf that something else refers to.
+            emptied when they are returned, because torch takes a leaf's gradient without a copy only if nothing else
+            refers to it.
         of_gaussians: by the projection's inputs; None if they are not needed.
-        addresses: what the projection's adjoint takes: of the gradients by conics, opacities and inputs.
+        addresses: of the gradients by conics, opacities and each input of the projection, 0 if not needed.
         features: address of a copy of the features' gradient that is contiguous, 0 if there is none.
     """
 
@@ -70,7 +71,7 @@ class CapturedBackward:
     ) -> None:
         """Pack the launches."""
         self._blend, rows = blend.on_fixed_memory()
-        self._device, self._like = rows.device, rows
+        self._device, self._like = rows.device, rows.new_empty(0)
         (count, columns), channels = rows.shape, blend.channels
         self._means2d = _Place((count, 2), (columns, 1), channels + 3)
         self._features = _Place((count, channels), (columns, 1), 0)
@@ -97,9 +98,8 @@ class CapturedBackward:
         """Return memory for one backward pass.
 
         needed: which gradients by the projection's inputs are needed; empty if the CUDA graph does not project.
-        copies_features: return a contiguous gradient by features, as torch can make the gradient of a leaf without a
-            copy of its own.
-        zeros: of a backward pass of the blend, whose memory it then is.
+        copies_features: return a contiguous gradient by features, which torch can use as a leaf's without a copy.
+        zeros: memory that a backward pass of the blend has filled; by default new zeros.
         """
         if zeros is None:
             zeros = self._like.new_zeros(self._size)

@@ -52,7 +52,7 @@ class _Signature(NamedTuple):
 def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
     """Return the CUDA graphs of calls like this one; None if there are none yet, or the call cannot be captured.
 
-    tensors, options: as their user passed them. If calls like this one are known, they fit.
+    tensors, options: as their user passed them. If calls like this one are known, they were checked before.
     """
     try:
         if not on_gpu(tensors[0]):
@@ -70,7 +70,7 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     """Return the CUDA graphs of calls like this one, an empty pool at first; None if the call cannot be captured.
 
     Args:
-        tensors: as GraphPool.replay() takes them, of one device.
+        tensors: as GraphPool.lease() takes them, of one device.
         options: of the image.
     """
     first = tensors[0]
@@ -255,7 +255,7 @@ class _Lease:
 
     def blend_backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
         memory, self._next = self._next or self._allocate(), None
-        self._between = memory if self._needed else None
+        self._between = memory if any(self._needed) else None
         return self.graph.backward.blend(memory, grad_image, grad_transmittance)
 
     def project_backward(
@@ -263,7 +263,7 @@ class _Lease:
     ) -> Gradients:
         grad_means2d, zeros, grad_depths, _ = upstream
         memory, self._between = self._between, None
-        if memory is None or memory.zeros is not zeros:  # Only if passes overlap, or the image has no gradient.
+        if memory is None or memory.zeros is not zeros:  # Passes overlap, or nothing reached the image.
             memory = self._allocate(zeros)
         return self.graph.backward.project(memory, grad_means2d, grad_depths)
 

@@ -123,7 +123,7 @@ class _Evaluation(torch.autograd.Function):
             (constant, rest, means, camera_position),
             torch.empty_like(means),
         )
-        # A GPU waits for memory: what the backward pass needs of 48 numbers a Gaussian are 9, made while they are here.
+        # A GPU is bound by memory: with a stored 3 x 3 Jacobian the backward pass need not read 48 coefficients again.
         with_jacobian = writes_jacobian(means.device) and any(ctx.needs_input_grad[3:])
         mean_jacobian = means.new_empty(len(means) if with_jacobian else 0, 3, 3)
         if writes_jacobian(means.device):

@@ -85,8 +85,8 @@ def projection_parameters(options: RenderOptions) -> tuple:
 
 Gradients = Sequence[Tensor | None]
 ProjectionAdjoint = Callable[[Sequence[Tensor], Tensor, Gradients, Sequence[bool]], Gradients]
-"""Takes inputs, the last output, the gradients by all outputs (None for 0) and which of those by the inputs are needed;
-returns these, None for the others."""
+"""Takes the inputs, the last output, a gradient for each output (None for 0), and which inputs need one; returns a
+gradient for each input, None where none is needed."""
 
 
 def launch_projection(

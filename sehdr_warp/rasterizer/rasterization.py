@@ -202,7 +202,7 @@ def check_shapes(
 
 
 def _project(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool | None) -> "_Projection":
-    """Project to one camera. On a GPU, calls that repeat are replayed as CUDA graphs, which also render.
+    """Project to one camera. On a GPU, a repeated call replays a CUDA graph, which holds the whole render.
 
     pool: CUDA graphs of calls like this one (graph_cache.py); None if it is to be launched.
     """
@@ -226,6 +226,7 @@ def _render(projection: _Projection, means2d: Tensor, tensors: Sequence[Tensor],
     """Render what _project() returned for these tensors, as a function of means2d [N, 2]."""
     features = tensors[FEATURES]
     if isinstance(projection, ReplayedRender):
+        # The replay does not read it: it leads the gradients to features and depths.
         blended = torch.cat([features, projection.depths[:, None]], 1) if options.depth else features
         image, transmittance = with_gradient(projection.result, means2d, blended, projection.link)
         if projection.fits():  # Called last, because it waits for the GPU.
@@ -278,7 +279,7 @@ def render_projected(
     if options.depth:
         features = torch.cat([features, depths[:, None]], 1)
     features = features.contiguous()
-    # In place on memory that the projection's graph has saved: as data, so that it is not a change of a saved tensor.
+    # extents.data: pack_splats() writes to it in place, which torch's check of saved tensors must not see.
     inputs = RasterInputs(projected._replace(extents=extents.data), features)
     pool = get_or_create_pool(flatten(inputs), options) if replays and store_absolute is None else None
     replayed = None if pool is None else pool.lease(flatten(inputs), options)
@@ -325,8 +326,8 @@ def list_splats(
 ) -> tuple[TileLists, PackedSplats]:
     """Return the tile lists of 2D Gaussians and their packed form, as blend() takes them.
 
-    blocks: make lists without an order of emission, as block kernels whose gradients are atomic sums need them. A GPU
-    gets them unless options.deterministic, whose block kernels sum in the order of emission.
+    blocks: leave out the order of emission, which atomic sums of gradients do not need. A GPU does unless
+    options.deterministic, whose block kernels sum in that order.
     """
     width, height, threshold = options.width, options.height, options.alpha_threshold
     keep_emit_order = not blocks and (inputs.features.device.type == "cpu" or options.deterministic)

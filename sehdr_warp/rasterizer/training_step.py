@@ -66,7 +66,7 @@ def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
 
 
 def differentiate(loss: Tensor) -> None:
-    """Call loss.backward() with a shared 1, by which the backward functions that know it do not multiply."""
+    """Call loss.backward() with a shared upstream 1; backward functions that recognize it skip the multiplication."""
     _ByOne.apply(loss).backward()
 
 

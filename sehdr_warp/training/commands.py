@@ -179,7 +179,7 @@ def _train(args: Train, ranks=None) -> None:
 
             ranks.request_photos(PhotoRequest(data, {"response": options.name, **selection}))
         scene = load_saved_scene(data, response=options.name, **selection)
-        if plan_only or output.out is None:
+        if plan_only:
             _print_plan(args, scene, config, device)
             return
         from ..console import run_with_progress
@@ -202,7 +202,7 @@ def _train(args: Train, ranks=None) -> None:
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
         with serve_training(trainer, str(output.out)) if output.view else nullcontext(trainer) as steps:
-            run_with_progress(steps, trainer.total)
+            run_with_progress(steps, trainer.total)  # Iterating the trainer trains.
     photos = len(trainer.scene.train_views)
     options = {name: data.get(name) for name in LOAD_OPTIONS} | configs.named_fields(args.fields)
     words = option_words(options | {"response": args.scene.response, "preset": args.training.preset})

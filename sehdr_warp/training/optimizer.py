@@ -19,8 +19,8 @@ from ..rasterizer.training_step import check_finite, finiteness
 from ..runs.checkpoint import under
 from ..runs.config import Config
 
-# Higher harmonics are 3/4 of all parameters and the Adam step is bandwidth-bound, so on a GPU only every second part of
-# them is updated per step.
+# Higher harmonics are 3/4 of all parameters and the Adam step is bandwidth-bound, so on a GPU each step updates
+# half of them: every second block of coefficients, in turn.
 SH_UPDATE_INTERVAL = 2
 SAMPLES_PER_WINDOW = 10  # Of the moving average; consecutive iterations differ too little to be worth the time
 WINDOWS = 5  # Windows before the end at which the average begins; older samples would weigh less than 1 %

@@ -3,6 +3,11 @@
 Read `Trainer.__iter__` for the loop and `Trainer.step` for a step: gradient step, densification, moving average. The
 gradient step (forward, loss, backward, optimizer) is in gradient_step.py; run_output.py evaluates, logs and saves, and
 training_state.py lists what a checkpoint holds.
+
+The calls of a step: step() -> GradientStep.run() -> compute_gradients() -> RadianceField.render_train_view() ->
+rasterize() (kernels project, tiles, blend_cuda or blend_cpu) -> data_loss() -> differentiate() -> apply_gradients() ->
+guarded_step() -> Adam.step() (kernels training_step). create_trainer() writes the checkpoint of iteration 0 before the
+first step, RunOutput.after_step() the later ones.
 """
 
 import logging
@@ -216,10 +221,10 @@ class Trainer:
             self.strategy.prepare(gaussians.row_count, self.device)
 
         # Gradient step; as a CUDA graph if a step with this key has been launched before. Small counts use other
-        # kernels: a sort in a single pass, and an exact learned response.
+        # kernels: an exact learned response, and a sort in a single pass.
         small = gaussians.row_count < EXACT_BELOW, gaussians.row_count <= MAX_SINGLE_SORT
         graph_key = (options.degree, options.needs_means2d_grad, options.opacity_weight > 0, *small)
-        # Display colors are rendered at the photo's exposure by a branch of the host, so that time must be a number.
+        # Display colors compare the exposure time with the base time on the host, so it must be a number there.
         fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
         if fixed_time and self.capacity.has_counts and self.graphs.is_ready(views, graph_key):
             self._device_index.fill_(index)

@@ -89,9 +89,10 @@ def test_white_is_an_exposure_that_the_file_states(tmp_path):
 
 
 def test_folders_by_exposure_hold_sequences(tmp_path):
-    render_views(
+    listed = render_views(
         AnalyticRun(), tmp_path, cameras="orbit", count=3, evs=[-2, 0], group_by="exposure", ldr_brackets="png"
     )
+    assert sorted(str(file.relative_to(tmp_path)) for file in listed) == tree(tmp_path)
     names = [f"orbit_{i:03d}" for i in range(3)]
     for folder, suffix in (("brackets", "exr"), ("brackets_ldr", "png")):
         file_names = [f"{label}/{name}.{suffix}" for label in ("b0_ev-2.0", "b1_ev+0.0") for name in names]

@@ -112,7 +112,7 @@ class PackedLaunch:
                 if value is not None:
                     self._set(index, value)
                 elif hasattr(arrays[index], "data"):
-                    arrays[index].data = 0
+                    arrays[index].data = arrays[index].shape[0] = 0
                 packed[index] = value
 
     def _label(self, index: int) -> str:
