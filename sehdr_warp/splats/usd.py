@@ -21,6 +21,7 @@ _BASE_TIME, _WORLD_MATRIX = "sehdr:baseExposureTime", "sehdr:worldMatrix"
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _BIAS = 0.5 / HARMONIC_0
 _FAINTEST = 1 / 255  # Opacity below which programs draw nothing of a Gaussian
+_FAINT = 0.05  # Less opacity does not count for the extent: a single haze as large as a town would hide the scene in it
 
 
 def pxr(module: str) -> Any:
@@ -173,9 +174,14 @@ def _quaternions(values: np.ndarray):
 
 
 def _extent(gaussians: GaussianArrays) -> np.ndarray:
-    """Return corners [2, 3] of the box that viewers clip by and frame: all that programs draw of the Gaussians."""
+    """Return corners [2, 3] of the box that viewers cull by and frame.
+
+    It holds what programs draw of the Gaussians but the faint ones, or of all if all are faint.
+    """
     from scipy.spatial.transform import Rotation
 
+    counted = gaussians.opacities >= _FAINT
+    gaussians = gaussians.rows(counted) if counted.any() else gaussians
     rotations = Rotation.from_quat(gaussians.unit_quaternions, scalar_first=True).as_matrix()
     variances = np.einsum("nij,nj->ni", rotations**2, np.exp(2 * gaussians.log_scales.astype(np.float64)))
     deviations = np.sqrt(2 * np.log(np.maximum(gaussians.opacities.astype(np.float64) / _FAINTEST, 1)))

@@ -60,20 +60,24 @@ def test_ply_has_the_names_and_order_of_the_reference_release(tmp_path):
 
 
 def test_usd_states_the_extent_of_what_is_drawn(tmp_path):
-    """Along its own axes, down to an opacity of 1/255: what viewers frame and clip by."""
+    """Along its own axes, down to an opacity of 1/255: what viewers frame and cull by. Faint Gaussians do not count."""
     Usd = pytest.importorskip("pxr.Usd")
     written = gaussians(2, color_model="linear")
     turned = np.float32([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])  # A quarter about Z: the long axis is X.
     values = {
-        "means": np.float32([[0, 0, 0], [9, 0, 0]]), "log_scales": np.log(np.float32([[0.1, 2, 0.3]] * 2)),
-        "quaternions": np.stack([turned, turned]), "opacity_logits": np.float32([0, -7]),
+        "means": np.float32([[0, 0, 0], [9, 0, 0]]), "log_scales": np.log(np.float32([[0.1, 2, 0.3], [300, 300, 300]])),
+        "quaternions": np.stack([turned, turned]), "opacity_logits": np.float32([0, -3.5]),
     }  # fmt: skip
     write_gaussians(tmp_path / "a.usdc", replace(written, **values))
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
-    low, high = np.array(stage.GetDefaultPrim().GetAttribute("extent").Get())
     reach = np.sqrt(2 * np.log(255 * 0.5)) * np.array([2, 0.1, 0.3])
-    np.testing.assert_allclose(low, -reach, rtol=1e-5)
-    np.testing.assert_allclose(high, [9, reach[1], reach[2]], rtol=1e-5)  # The faint one is nowhere drawn.
+    extent = np.array(stage.GetDefaultPrim().GetAttribute("extent").Get())
+    np.testing.assert_allclose(extent, [-reach, reach], rtol=1e-5)
+
+    values["opacity_logits"] = np.float32([-3.5, -3.5])
+    write_gaussians(tmp_path / "b.usdc", replace(written, **values))
+    stage = Usd.Stage.Open(str(tmp_path / "b.usdc"))
+    assert np.ptp(np.array(stage.GetDefaultPrim().GetAttribute("extent").Get()), axis=0).min() > 600, "all are faint"
 
 
 def test_usd_is_of_the_schema_and_tagged(tmp_path):
