@@ -56,8 +56,8 @@ def refine_borders(
         scene = None if not near.any() else _border_photos(plan, index, places[near.numpy()], photo_storage)
         if scene is None:
             continue
-        rows, shown = near.nonzero()[:, 0], _shown_rows(tensors, plan, [view.camera for view in scene.train_views])
-        around = (shown & ~near).nonzero()[:, 0]
+        rows, visible = near.nonzero()[:, 0], _visible_rows(tensors, plan, [view.camera for view in scene.train_views])
+        around = (visible & ~near).nonzero()[:, 0]
         trainer = _trainer(tensors, rows, around, scene, out, plan, index, device)
         log.info("%s: %d Gaussians near its borders are refined on %d photos", block.name, len(rows), len(scene.views))
         for _ in trainer:
@@ -84,15 +84,15 @@ def _share_in_view(camera: Camera, points: np.ndarray) -> float:
     return float(camera.project(points).inside.mean()) if camera.is_pinhole else 1.0
 
 
-def _shown_rows(tensors: Mapping[str, Tensor], plan: BlockPlan, cameras: list[Camera]) -> Tensor:
+def _visible_rows(tensors: Mapping[str, Tensor], plan: BlockPlan, cameras: list[Camera]) -> Tensor:
     """Return which of the merged Gaussians any of the cameras may see: a bool [N]."""
     means, reach = tensors["means"], DEVIATIONS * tensors["log_scales"].amax(1, keepdim=True).exp()
     low = torch.stack([part.amin(0) for part in (means - reach).split(BOX)]).double().numpy()
     high = torch.stack([part.amax(0) for part in (means + reach).split(BOX)]).double().numpy()
-    shown = np.zeros(len(low), bool)
+    visible = np.zeros(len(low), bool)
     for camera in cameras:
-        shown |= boxes_in_view(plan.normalization.camera(camera), low, high) if camera.is_pinhole else True
-    return torch.from_numpy(shown).repeat_interleave(BOX)[: len(means)]
+        visible |= boxes_in_view(plan.normalization.camera(camera), low, high) if camera.is_pinhole else True
+    return torch.from_numpy(visible).repeat_interleave(BOX)[: len(means)]
 
 
 def _trainer(

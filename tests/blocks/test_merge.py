@@ -6,32 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.survey import write_survey
-from sehdr_warp.blocks.block_plan import make_block_plan
-from sehdr_warp.blocks.job import folder_of, train_block
+from sehdr_warp.blocks.job import folder_of
 from sehdr_warp.blocks.merge import merge_blocks
-from sehdr_warp.runs.config import Config
-from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_writer import RunWriter, write_confidence
-from sehdr_warp.training.launch import installed_versions
 
-LITTLE = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_prior": False}
+from .two_blocks import train_two_blocks
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """The folder of two trained blocks, and their plan."""
     folder = tmp_path_factory.mktemp("trained")
-    write_survey(folder / "town", views=32, size=48, gaussians=6000)
-    data = {"path": str(folder / "town"), "exposure_index": None, "max_size": None, "holdout": None}
-    config = override_config(Config(), {"response.name": "srgb", "schedule.iterations": 20} | LITTLE)
-    plan = make_block_plan(data, config, torch.device("cpu"), 2)
-    assert plan is not None
-    (folder / "run").mkdir()
-    plan.write(folder / "run")
-    for index in (0, 1):
-        assert train_block(folder / "run", index, "cpu", "auto", installed_versions()).error is None
+    plan = train_two_blocks(folder, iterations=20)
     return folder / "run", plan
 
 
@@ -65,7 +52,7 @@ def test_a_gaussian_that_reaches_far_into_another_block_is_left_out(trained, mar
 
 
 def test_a_cpu_leaves_the_borders_of_blocks_from_gpus_and_says_so(trained, caplog):
-    """As where a login node without a GPU merges; it would take hours."""
+    """Refining would take hours where a login node without a GPU merges."""
     out, plan = trained
     folder = RunWriter(folder_of(out, plan, 0))
     summary = folder.read_summary()

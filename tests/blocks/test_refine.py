@@ -4,34 +4,21 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.survey import write_survey
-from sehdr_warp.blocks.block_plan import make_block_plan
-from sehdr_warp.blocks.job import folder_of, train_block
+from sehdr_warp.blocks.job import folder_of
 from sehdr_warp.blocks.refine import BAND, refine_borders
 from sehdr_warp.blocks.seams import measure_seams
 from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
-from sehdr_warp.runs.config import Config
-from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.runs.load_arguments import LoadArguments
 from sehdr_warp.runs.open import load_saved_scene
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.training.launch import installed_versions
+
+from .two_blocks import train_two_blocks
 
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory):
     """A run folder with two blocks of few steps, and their plan."""
     folder = tmp_path_factory.mktemp("town")
-    write_survey(folder / "town", views=32, size=48, gaussians=6000)
-    data: LoadArguments = {"path": str(folder / "town"), "exposure_index": None, "max_size": None, "holdout": None}
-    fields = {"response.name": "srgb", "schedule.iterations": 150, "loss.light_prior": False}
-    config = override_config(Config(), fields | {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0})
-    plan = make_block_plan(data, config, torch.device("cpu"), 2)
-    assert plan is not None
-    (folder / "run").mkdir()
-    plan.write(folder / "run")
-    for index in (0, 1):
-        assert train_block(folder / "run", index, "cpu", "auto", installed_versions()).error is None
+    plan = train_two_blocks(folder, iterations=150)
     return folder / "run", plan
 
 

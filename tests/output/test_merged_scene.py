@@ -44,8 +44,8 @@ def test_light_of_other_color_models_and_exposures_is_kept(tmp_path, run, color_
     merged, view = merge_scenes(run, other), run.cameras[1].camera
     assert merged.base_time == run.base_time == 1
     left = torch.as_tensor(other.render(view).alpha) > 0.5
-    seen, own = (torch.as_tensor(each.render(view).hdr)[left] for each in (merged, other))
-    torch.testing.assert_close(seen, own, rtol=0.02, atol=1e-4)
+    of_merged, own = (torch.as_tensor(each.render(view).hdr)[left] for each in (merged, other))
+    torch.testing.assert_close(of_merged, own, rtol=0.02, atol=1e-4)
     # Codes became light: sRGB's of 0.5 and the harmonic.
     light = ((0.5 + 0.5 * HARMONIC_0 + 0.055) / 1.055) ** 2.4
     fitted = torch.exp(HARMONIC_0 * merged.field.gaussians.harmonics_dc[:2])

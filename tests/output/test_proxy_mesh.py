@@ -235,7 +235,7 @@ class LampOnFloor(BallOnFloor):
 
 
 def test_a_lamp_of_the_scene_lights_the_floor_of_its_mesh(tmp_path, logged):
-    """As a lamp on a plane does, in Mitsuba; a mesh with the lamp as well would block most of it."""
+    """Mitsuba gives it the light that a plane gets; a mesh that contains the lamp blocks most of it."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     lamp = {"type": "sphere", "radius": RADIUS, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 5.0}}}

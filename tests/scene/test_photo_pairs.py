@@ -1,4 +1,4 @@
-"""Which pairs of photos are matched, and what happens to a photo of which none is likely."""
+"""Choosing pairs of photos to match, and matching a photo that has no likely one."""
 
 from pathlib import Path
 

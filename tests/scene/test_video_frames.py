@@ -1,4 +1,4 @@
-"""Which frames of a clip become photos, and where they are kept."""
+"""Choosing the frames of a clip that become photos, and storing them."""
 
 import logging
 from dataclasses import replace

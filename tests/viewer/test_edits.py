@@ -266,10 +266,10 @@ def test_another_run_is_merged_edited_and_taken_out_again(two_runs):
     status, facts = edit(two_runs, merge=[1], crop=f"sphere:{x},{y},{z},0.2")
     assert status == 200 and facts["gaussians"] == 1
     # What is refused leaves everything as it was.
-    shown = frame(two_runs, view)[0]
+    of_crop = frame(two_runs, view)[0]
     status, words = edit(two_runs, crop="sphere:99,0,0,1")
     assert status == 409 and "leave no Gaussian" in words and north.facts()["gaussians"] == 1
-    np.testing.assert_array_equal(frame(two_runs, view)[0], shown)
+    np.testing.assert_array_equal(frame(two_runs, view)[0], of_crop)
     assert edit(two_runs)[1]["gaussians"] == 2
     np.testing.assert_array_equal(frame(two_runs, view)[0], before)
 
