@@ -25,7 +25,7 @@ def absolute_gradient_kernel(dtype):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def absolute_gradient(
-        first: int,
+        range_start: int,
         tile_ranges: wp.array(dtype=wp.vec2i), gaussians: wp.array(dtype=wp.int32),
         emit_indices: wp.array(dtype=wp.int32),
         means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
@@ -34,7 +34,7 @@ def absolute_gradient_kernel(dtype):
         # outputs
         rows: wp.array(dtype=vec2),
     ):
-        tile_x_y = pixel_of_thread(first + wp.tid(), columns)
+        tile_x_y = pixel_of_thread(range_start + wp.tid(), columns)
         column = tile_x_y[1]
         row = tile_x_y[2]
         if column < width and row < height:

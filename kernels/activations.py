@@ -14,14 +14,14 @@ def exposures_kernel(dtype):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def activate_exposures(
-        first: int,
+        range_start: int,
         values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
     ):
-        place = first + wp.tid()
-        value = values[place]
+        index = range_start + wp.tid()
+        value = values[index]
         # Not clamped, which would make a number of what is none.
         clamped = wp.where(value > bound, bound, wp.where(value < -bound, -bound, value))
-        exposures[place] = wp.exp(clamped)
+        exposures[index] = wp.exp(clamped)
 
     return activate_exposures
 
@@ -33,15 +33,15 @@ def exposures_backward_kernel(dtype):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def activate_exposures_backward(
-        first: int,
+        range_start: int,
         values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
         exposure_gradients: wp.array2d(dtype=real), grad_values: wp.array(dtype=real),
     ):
-        place = first + wp.tid()
-        i = place // exposure_gradients.shape[1]
-        gradient = exposure_gradients[i, place - i * exposure_gradients.shape[1]] * exposures[place]
-        value = values[place]
-        grad_values[place] = wp.where(value >= bound or value <= -bound, real(0.0), gradient)
+        index = range_start + wp.tid()
+        i = index // exposure_gradients.shape[1]
+        gradient = exposure_gradients[i, index - i * exposure_gradients.shape[1]] * exposures[index]
+        value = values[index]
+        grad_values[index] = wp.where(value >= bound or value <= -bound, real(0.0), gradient)
 
     return activate_exposures_backward
 
@@ -58,11 +58,11 @@ def opacity_penalty_kernel(dtype):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def sum_opacities(
-        first: int,
+        range_start: int,
         opacities: wp.array(dtype=real), extents: wp.array2d(dtype=real), moments: wp.array(dtype=real), weight: real,
         active_count: wp.array(dtype=wp.int32), shares: wp.array(dtype=real),
     ):
-        thread = first + wp.tid()
+        thread = range_start + wp.tid()
         part = weight / real(opacities.shape[0])
         if active_count:
             part = weight / real(active_count[0])
@@ -90,12 +90,12 @@ def opacity_penalty_backward_kernel(dtype):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def sum_opacities_backward(
-        first: int,
+        range_start: int,
         extents: wp.array2d(dtype=real), moments: wp.array(dtype=real), weight: real,
         active_count: wp.array(dtype=wp.int32), penalty_gradient: wp.array(dtype=real),
         opacity_gradients: wp.array(dtype=real),
     ):
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         part = weight / real(opacity_gradients.shape[0])
         if active_count:
             part = weight / real(active_count[0])

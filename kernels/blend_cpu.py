@@ -112,14 +112,14 @@ def _options(dtype) -> dict:
 
 @cache
 def forward_kernel(dtype, channels: int, exp_squarings: int):
-    """Return blend_forward(), launched over tiles from `first` on; see the module's description.
+    """Return blend_forward(), launched over tiles from `range_start` on; see the module's description.
 
     exp_squarings: see row_functions
     tile_ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians
     means_opacities: [N] (x, y, opacity, half-height); conics_cutoffs: [N] (conic a, b, c, cutoff); features: [N, C]
     columns: tiles across; width, height: of the image; lane_offsets: one row, 0 to 7
     tile_transmittance, accumulated: scratch of [tiles, 32] rows and [tiles, C, 32] rows, 16 a half
-    last_contributor: [tiles, 32] rows, 1 + list place of the last Gaussian that contributes
+    last_contributor: [tiles, 32] rows, 1 + list position of the last Gaussian that contributes
     image: [H W, C]; final_transmittance: [H W], of all Gaussians together
     """
     row, broadcast, step, exponential, halves = row_functions(dtype, exp_squarings)
@@ -127,7 +127,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_forward(
-        first: int,
+        range_start: int,
         tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
         means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
         columns: int, width: int, height: int, alpha_threshold: real,
@@ -135,7 +135,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
         accumulated: wp.array3d(dtype=row), last_contributor: wp.array2d(dtype=row),
         image: wp.array2d(dtype=real), final_transmittance: wp.array(dtype=real),
     ):
-        tile = first + wp.tid()
+        tile = range_start + wp.tid()
         bounds = tile_ranges[tile]
         x0 = (tile % columns) * size
         y0 = (tile // columns) * size
@@ -218,7 +218,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
-        first: int,
+        range_start: int,
         tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
         emit_indices: wp.array(dtype=wp.int32),
         means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
@@ -228,7 +228,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
         grad_from_behind: wp.array2d(dtype=row), tile_grad_image: wp.array3d(dtype=row), weights: wp.array2d(dtype=row),
         slopes: wp.array2d(dtype=row), sums: wp.array2d(dtype=row), grad_intersections: wp.array2d(dtype=real),
     ):
-        tile = first + wp.tid()
+        tile = range_start + wp.tid()
         bounds = tile_ranges[tile]
         x0 = (tile % columns) * size
         y0 = (tile // columns) * size
@@ -267,7 +267,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
             y = xy_opacity[1] - real(y0) - real(0.5)
             top = wp.max(int(wp.ceil(y - xy_opacity[3])), 0)
             bottom = wp.min(int(wp.floor(y + xy_opacity[3])) + 1, size)
-            place = broadcast(real(k - bounds[0]) + real(0.5))
+            order = broadcast(real(k - bounds[0]) + real(0.5))
             target = emit_indices[k]
             for column in range(wp.static(channels + 6)):
                 sums[tile, column] = broadcast(real(0.0))
@@ -281,7 +281,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
                     p = in_x + dx * (-conic_cutoff[1] * dy) + broadcast(real(-0.5) * conic_cutoff[2] * dy * dy)
                     unclamped = exponential(wp.min(p, broadcast(real(0.0)))) * xy_opacity[2]
                     a = wp.min(unclamped, broadcast(real(ALPHA_MAX)))
-                    counts = wp.cw_mul(step(a - broadcast(alpha_threshold)), step(last_contributor[tile, at] - place))
+                    counts = wp.cw_mul(step(a - broadcast(alpha_threshold)), step(last_contributor[tile, at] - order))
                     inverse = wp.cw_div(ones, ones - a)
                     t = tile_transmittance[tile, at]
                     # As an addition: t * inverse would round each of many faint factors the same way.

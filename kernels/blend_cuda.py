@@ -45,9 +45,9 @@ def pad_rows_kernel(dtype, channels: int):
     quads = padded_channels(channels) // 4
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def pad_rows(first: int, features: wp.array2d(dtype=real), rows: wp.array(dtype=vec4)):
+    def pad_rows(range_start: int, features: wp.array2d(dtype=real), rows: wp.array(dtype=vec4)):
         """Copy features to rows [N quads] of four numbers, of which the last are filled with zeros."""
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         gaussian = i // wp.static(quads)
         begin = 4 * (i - gaussian * wp.static(quads))
         four = vec4()
@@ -126,7 +126,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
     tile_ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians; subtile_masks: [M] of
     find_tile_ranges(); means_opacities: [N] (x, y, opacity, -); conics_cutoffs: [N] (conic a, b, c, cutoff);
     features: [N padded_channels / 4] rows of four, flat
-    image: [H W] vectors of C; transmittance: [H W]; last_contributor: [H W] 1 + list place of the last Gaussian that
+    image: [H W] vectors of C; transmittance: [H W]; last_contributor: [H W] 1 + list position of the last Gaussian that
     contributes
     """
     g = geometry(dtype)
@@ -165,7 +165,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
 
         t = real(1.0)
         active_threshold = wp.where(inside, alpha_threshold, real(wp.inf))
-        last_place = real(0.0)
+        last_position = real(0.0)
         sums = vec_padded()
 
         bounds = tile_ranges[tile]
@@ -195,11 +195,11 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
             while queued < 32 and turn < turns:
                 start = turn * wp.static(32 * ROUNDS) + lane
                 for k in range(wp.static(ROUNDS)):
-                    place = start + k * 32
-                    hit = place < count and ((touched[k] >> subtile) & 1) == 1
+                    position = start + k * 32
+                    hit = position < count and ((touched[k] >> subtile) & 1) == 1
                     mask = votes(hit, lane)
                     slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
-                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], place + 1), hit)
+                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], position + 1), hit)
                     queued += wp.bit_count(mask)
                 turn += 1
                 for k in range(wp.static(ROUNDS)):
@@ -223,7 +223,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
             # The batch that was fetched before
             for group in range((ready + wp.static(UNROLL - 1)) // wp.static(UNROLL)):
                 alphas = vec_many()
-                places = vec_many()
+                positions = vec_many()
                 for k in range(wp.static(UNROLL)):
                     j = group * wp.static(UNROLL) + k
                     s = wp.tile_extract(batch_means, j)
@@ -233,13 +233,13 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                     a = s[2] * wp.exp(wp.min(dx * (q[0] * dx + q[1] * dy) + q[2] * dy * dy, real(0.0)))
                     a = wp.min(real(ALPHA_MAX), a)
                     alphas[k] = wp.where(a > active_threshold, a, real(0.0))
-                    places[k] = s[3]
+                    positions[k] = s[3]
                 following = real(t)
                 for k in range(wp.static(UNROLL)):
                     weight = alphas[k] * following
                     following = following - weight
                     on = following > real(TRANSMITTANCE_MIN)
-                    last_place = wp.where(on and alphas[k] > real(0.0), places[k], last_place)
+                    last_position = wp.where(on and alphas[k] > real(0.0), positions[k], last_position)
                     t = wp.where(on, following, t)
                     alphas[k] = wp.where(on, weight, real(0.0))
                 active_threshold = wp.where(following > real(TRANSMITTANCE_MIN), active_threshold, real(wp.inf))
@@ -274,6 +274,6 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                 colors[channel] = sums[channel]
             image[pixel] = colors
             transmittance[pixel] = t
-            last_contributor[pixel] = int(last_place)
+            last_contributor[pixel] = int(last_position)
 
     return blend_forward

@@ -130,7 +130,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
             own_last = last_contributor[pixel]
         furthest = wp.tile_max(wp.tile(own_last))
         count = furthest[0]
-        last_place = real(own_last)
+        last_position = real(own_last)
         t = transmittance[pixel]
         grad_pixel = grad_image[pixel]
         grad_from_behind = real(0.0)
@@ -167,11 +167,11 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
             while queued < 32 and turn < turns:
                 start = count - 1 - (turn * wp.static(32 * ROUNDS) + lane)
                 for k in range(wp.static(ROUNDS)):
-                    place = start - k * 32
-                    hit = place >= 0 and ((touched[k] >> subtile) & 1) == 1
+                    position = start - k * 32
+                    hit = position >= 0 and ((touched[k] >> subtile) & 1) == 1
                     mask = votes(hit, lane)
                     slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
-                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], place), hit)
+                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], position), hit)
                     queued += wp.bit_count(mask)
                 turn += 1
                 for k in range(wp.static(ROUNDS)):
@@ -207,7 +207,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                         dy = s[1] - y
                         unclamped = s[2] * wp.exp(wp.min(dx * (q[0] * dx + q[1] * dy) + q[2] * dy * dy, real(0.0)))
                         a = wp.min(real(ALPHA_MAX), unclamped)
-                        contributes = s[3] < last_place and a > alpha_threshold
+                        contributes = s[3] < last_position and a > alpha_threshold
                         alphas[k] = wp.where(contributes, a, real(0.0))
                         gains[k] = wp.where(contributes and unclamped < real(ALPHA_MAX), a, real(0.0))
                         feature_dot = real(0.0)
@@ -298,8 +298,8 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                         value = wp.tile_extract(staging, owner, part)
                         if owner < ready:
                             if wp.static(ordered):
-                                place_of = emit_indices[begin + entry[1]] * wp.static(gradient_columns) + part
-                                gradients[place_of] = gradients[place_of] + value
+                                index = emit_indices[begin + entry[1]] * wp.static(gradient_columns) + part
+                                gradients[index] = gradients[index] + value
                             else:
                                 wp.atomic_add(gradients, entry[0] * wp.static(gradient_columns) + part, value)
 

@@ -53,9 +53,9 @@ def _estimate_function(dtype):
         expected = real(0.0)
         precision = real(0.0)
         if estimates:
-            place = ((y * rows) // height * columns + (x * columns) // width) * 6 + channel
-            expected = real(wp.float32(estimates[place]))
-            precision = real(wp.float32(estimates[place + 3]))
+            cell = ((y * rows) // height * columns + (x * columns) // width) * 6 + channel
+            expected = real(wp.float32(estimates[cell]))
+            precision = real(wp.float32(estimates[cell + 3]))
         return expected, precision
 
     return estimate_of
@@ -68,7 +68,7 @@ def clipped_logarithms_kernel(dtype, code):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def clipped_logarithms(
-        first: int,
+        range_start: int,
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
         mask: wp.array(dtype=real), white_code: int, white: real, logarithms: wp.array(dtype=real),
     ):
@@ -76,7 +76,7 @@ def clipped_logarithms_kernel(dtype, code):
 
         A value is clipped if its code in photo index[0] is `white_code` and the mask [H W], if there is one, is not 0.
         """
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         clipped = int(codes[wp.int32(index[0]), i]) == white_code
         if mask:
             clipped = clipped and mask[i // 3] > real(0.0)
@@ -96,7 +96,7 @@ def clipped_light_kernel(dtype):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def clipped_light(
-        first: int,
+        range_start: int,
         image: wp.array(dtype=real), logarithms: wp.array(dtype=real), white: real, height: int, width: int,
         smoothness: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
         terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
@@ -106,7 +106,7 @@ def clipped_light_kernel(dtype):
         image: [H, W, 3], flat. Neighbors are the values of the same channel within REACH. terms: [H W 3]. slopes:
         derivatives by the values; may be None.
         """
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         v = logarithms[i]
         if v >= real(0.0):
             row = i // (3 * width)

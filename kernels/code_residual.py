@@ -30,7 +30,7 @@ def code_residual_kernel(dtype, code, mu_law: bool):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF | {"fuse_fp": False})
     def code_residual(
-        first: int,
+        range_start: int,
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
         table: wp.array(dtype=vec3), scale: real, gain: real,
         rendered: wp.array(dtype=real), slopes: wp.array(dtype=real), truth: wp.array(dtype=real),
@@ -41,7 +41,7 @@ def code_residual_kernel(dtype, code, mu_law: bool):
         mu-law, or encoded values. truth: values of the photo. rendered: truth plus the image's distance from the
         interval. slopes: derivatives of rendered by the image.
         """
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         row = table[int(codes[wp.int32(index[0]), i])]
         value = image[i]
         slope = real(1.0)

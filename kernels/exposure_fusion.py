@@ -32,12 +32,12 @@ def fusion_kernels(dtype) -> SimpleNamespace:
     @wp.func
     def largest_logit(
         outputs: reals2d, exposedness: reals2d,
-        channel: int, place: int, count: int, brackets: int,
+        channel: int, pixel: int, count: int, brackets: int,
     ) -> real:
         """Return the largest logit of one color's brackets, which softmax subtracts to stay finite."""
-        largest = outputs[channel, place] * exposedness[channel, place]
+        largest = outputs[channel, pixel] * exposedness[channel, pixel]
         for p in range(1, brackets):
-            largest = wp.max(largest, outputs[channel, p * count + place] * exposedness[channel, p * count + place])
+            largest = wp.max(largest, outputs[channel, p * count + pixel] * exposedness[channel, p * count + pixel])
         return largest
 
     @wp.kernel(module="unique", module_options=options)
@@ -65,17 +65,17 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         results: reals2d,
     ):
         """Write scale times the mean of the encoded brackets, weighted by the softmax of outputs * exposedness."""
-        place, channel = wp.tid()
+        pixel, channel = wp.tid()
         count = results.shape[0]
-        largest = largest_logit(outputs, exposedness, channel, place, count, brackets)
+        largest = largest_logit(outputs, exposedness, channel, pixel, count, brackets)
         total = real(0.0)
         weighted = real(0.0)
         for p in range(brackets):
-            q = p * count + place
+            q = p * count + pixel
             weight = wp.exp(outputs[channel, q] * exposedness[channel, q] - largest)
             total += weight
             weighted += weight * encoded[channel, q]
-        results[place, channel] = scale * weighted / total
+        results[pixel, channel] = scale * weighted / total
 
     @wp.kernel(module="unique", module_options=options)
     def mix_backward(
@@ -84,18 +84,18 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         results: reals2d, grad_results: reals2d, grad_exposedness: reals2d, grad_output: reals2d,
     ):
         """Write the gradients; grad_exposedness is that through the logits alone."""
-        place, channel = wp.tid()
+        pixel, channel = wp.tid()
         count = results.shape[0]
-        largest = largest_logit(outputs, exposedness, channel, place, count, brackets)
+        largest = largest_logit(outputs, exposedness, channel, pixel, count, brackets)
         total = real(0.0)
         for p in range(brackets):
-            q = p * count + place
+            q = p * count + pixel
             total += wp.exp(outputs[channel, q] * exposedness[channel, q] - largest)
-        gradient = grad_results[place, channel]
+        gradient = grad_results[pixel, channel]
         for p in range(brackets):
-            q = p * count + place
+            q = p * count + pixel
             weight = wp.exp(outputs[channel, q] * exposedness[channel, q] - largest) / total
-            grad_logit = gradient * weight * (scale * encoded[channel, q] - results[place, channel])
+            grad_logit = gradient * weight * (scale * encoded[channel, q] - results[pixel, channel])
             grad_exposedness[channel, q] = grad_logit * outputs[channel, q]
             grad_output[channel, q] = grad_logit * exposedness[channel, q]
 

@@ -22,9 +22,9 @@ def matrix(rows: int, columns: int, dtype):
 def pixel_of_thread(thread: int, columns: int) -> wp.vec3i:
     """Return tile, x and y of a thread: pixels go tile by tile, so that neighbors read the same list."""
     tile = thread // (TILE_SIZE * TILE_SIZE)
-    place = thread - tile * (TILE_SIZE * TILE_SIZE)
-    x = (tile % columns) * TILE_SIZE + place % TILE_SIZE
-    return wp.vec3i(tile, x, (tile // columns) * TILE_SIZE + place // TILE_SIZE)
+    pixel = thread - tile * (TILE_SIZE * TILE_SIZE)
+    x = (tile % columns) * TILE_SIZE + pixel % TILE_SIZE
+    return wp.vec3i(tile, x, (tile // columns) * TILE_SIZE + pixel // TILE_SIZE)
 
 
 WRITE_ROW = """

@@ -17,15 +17,15 @@ from .geometry import geometry, vector
 def harmonic_functions(dtype):
     """Return two functions: direction_of() and harmonic(), which is Y_k(x, y, z) of a unit direction.
 
-    direction_of() returns the unit direction from a camera to a place and the inverse of their distance. All four are 0
+    direction_of() returns the unit direction from a camera to a point and the inverse of their distance. All four are 0
     if the two coincide or if the distance is not finite.
     """
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
 
     @wp.func
-    def direction_of(place: vec3, camera: vec3) -> vec4:
-        offset = place - camera
+    def direction_of(point: vec3, camera: vec3) -> vec4:
+        offset = point - camera
         square = wp.dot(offset, offset)
         direction = vec4()
         if square > real(1.0e-30) and wp.isfinite(square):
@@ -150,11 +150,11 @@ def harmonics_kernel(dtype, degree: int):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def evaluate_harmonics(
-        first: int,
+        range_start: int,
         constant: wp.array2d(dtype=vec3), rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3),
         camera_position: wp.array(dtype=vec3), values: wp.array(dtype=vec3),
     ):
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         d = direction_of(means[i], camera_position[0])
         value = harmonic(0, d[0], d[1], d[2]) * constant[i, 0]
         for k in range(wp.static((degree + 1) * (degree + 1) - 1)):
@@ -177,13 +177,13 @@ def channels_kernel(dtype, degree: int, with_jacobian: bool):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def evaluate_channels(
-        first: int,
+        range_start: int,
         constant: wp.array3d(dtype=dtype), rest: wp.array3d(dtype=dtype), means: wp.array(dtype=vec3),
         camera_position: wp.array(dtype=vec3), values: wp.array2d(dtype=dtype), mean_jacobian: wp.array2d(dtype=vec3),
     ):
-        place = first + wp.tid()
-        i = place // 3
-        channel = place - 3 * i
+        index = range_start + wp.tid()
+        i = index // 3
+        channel = index - 3 * i
         d = direction_of(means[i], camera_position[0])
         value = harmonic(0, d[0], d[1], d[2]) * constant[i, 0, channel]
         weights = weight_vector()
@@ -225,10 +225,10 @@ def jacobian_backward_kernel(dtype):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def jacobian_backward(
-        first: int,
+        range_start: int,
         jacobian: wp.array2d(dtype=vec3), grad_colors: wp.array(dtype=vec3), grad_means: wp.array(dtype=vec3),
     ):
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         gradient = grad_colors[i]
         grad_mean = gradient[0] * jacobian[i, 0] + gradient[1] * jacobian[i, 1] + gradient[2] * jacobian[i, 2]
         grad_means[i] = without_nan(grad_mean, gradient)
@@ -252,12 +252,12 @@ def harmonics_backward_kernel(dtype, degree: int, coefficients: bool):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def harmonics_backward(
-        first: int,
+        range_start: int,
         rest: wp.array2d(dtype=vec3), means: wp.array(dtype=vec3), camera_position: wp.array(dtype=vec3),
         grad_colors: wp.array(dtype=vec3), grad_means: wp.array(dtype=vec3),
         grad_constant: wp.array2d(dtype=vec3), grad_rest: wp.array2d(dtype=vec3),
     ):
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         gradient = grad_colors[i]
         direction = direction_of(means[i], camera_position[0])
         x = direction[0]
@@ -285,12 +285,12 @@ def basis_kernel(dtype, degree: int):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def evaluate_basis(
-        first: int,
+        range_start: int,
         means: wp.array(dtype=vec3), positions: wp.array(dtype=vec3), basis: wp.array3d(dtype=dtype),
     ):
-        place = first + wp.tid()
-        view = place // means.shape[0]
-        i = place - view * means.shape[0]
+        index = range_start + wp.tid()
+        view = index // means.shape[0]
+        i = index - view * means.shape[0]
         d = direction_of(means[i], positions[view])
         for k in range(wp.static((degree + 1) * (degree + 1))):
             basis[view, k, i] = harmonic(k, d[0], d[1], d[2])
@@ -302,17 +302,17 @@ def basis_kernel(dtype, degree: int):
 def coefficient_gradient(dtype, count: int):
     """Return the function that computes one number of the gradient with respect to coefficients [N, count, 3].
 
-    place: index of the number in the flat gradient. start: index of the first coefficient; those beyond the basis
+    index: index of the number in the flat gradient. start: index of the first coefficient; those beyond the basis
     [V, K, N] have gradient 0. grad_colors: [V, N, 3].
     """
     real = dtype
 
     @wp.func
     def gradient_of(
-        place: int, start: int, basis: wp.array3d(dtype=real), grad_colors: wp.array3d(dtype=real)
+        index: int, start: int, basis: wp.array3d(dtype=real), grad_colors: wp.array3d(dtype=real)
     ) -> real:
-        i = place // wp.static(3 * count)
-        rest = place - i * wp.static(3 * count)
+        i = index // wp.static(3 * count)
+        rest = index - i * wp.static(3 * count)
         k = start + rest // 3
         gradient = real(0.0)
         if k < basis.shape[1]:
@@ -334,11 +334,11 @@ def coefficient_backward_kernel(dtype, count: int):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def coefficient_backward(
-        first: int,
+        range_start: int,
         basis: wp.array3d(dtype=dtype), grad_colors: wp.array3d(dtype=dtype), start: int,
         gradients: wp.array(dtype=dtype),
     ):
-        place = first + wp.tid()
-        gradients[place] = gradient_of(place, start, basis, grad_colors)
+        index = range_start + wp.tid()
+        gradients[index] = gradient_of(index, start, basis, grad_colors)
 
     return coefficient_backward

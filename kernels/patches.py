@@ -52,9 +52,9 @@ def patch_functions(radius: int) -> SimpleNamespace:
         First its row in the patch and where its sums begin there; those of what is k pixels behind are CHANNELS * k
         behind. Then its row, pixel and channel, which may be beyond the image.
         """
-        place = turn * wp.static(BLOCK_DIM) + thread
-        row = place // wp.static(COLUMNS * CHANNELS)
-        at = place - row * wp.static(COLUMNS * CHANNELS)
+        index = turn * wp.static(BLOCK_DIM) + thread
+        row = index // wp.static(COLUMNS * CHANNELS)
+        at = index - row * wp.static(COLUMNS * CHANNELS)
         pixel = at // wp.static(CHANNELS)
         return row, at, top + row, left + pixel, channel + at - pixel * wp.static(CHANNELS)
 

@@ -25,9 +25,9 @@ _patch = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
 
 
 @wp.func
-def color_at(photos: wp.array(dtype=wp.vec4ub), place: wp.int64) -> wp.vec4:
+def color_at(photos: wp.array(dtype=wp.vec4ub), index: wp.int64) -> wp.vec4:
     """Return the four codes of a pixel."""
-    code = photos[place]
+    code = photos[index]
     return wp.vec4(float(code[0]), float(code[1]), float(code[2]), float(code[3]))
 
 
@@ -53,10 +53,10 @@ def color_between(
 
 
 @wp.func
-def in_pixels(lens: wp.vec4, place: wp.vec3) -> wp.vec3:
+def in_pixels(lens: wp.vec4, point: wp.vec3) -> wp.vec3:
     """Column and row, from the middle of the first pixel, times the depth, and the depth."""
     return wp.vec3(
-        lens[0] * place[0] + (lens[2] - 0.5) * place[2], lens[1] * place[1] + (lens[3] - 0.5) * place[2], place[2]
+        lens[0] * point[0] + (lens[2] - 0.5) * point[2], lens[1] * point[1] + (lens[3] - 0.5) * point[2], point[2]
     )
 
 
@@ -93,7 +93,7 @@ def better_half(costs: costs8, count: int) -> float:
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def sweep(
-    first: int,
+    range_start: int,
     photos: wp.array(dtype=wp.vec4ub), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
     intrinsics: wp.array(dtype=wp.vec4), neighbors: wp.array2d(dtype=wp.int32), between: wp.array2d(dtype=wp.mat44),
     pixels: wp.array2d(dtype=wp.int32), depths: wp.array2d(dtype=wp.float32),
@@ -109,20 +109,20 @@ def sweep(
     its neighbor's. pixels: [N, 3] view, column, row, at least RADIUS from the border. depths: [N, D] along the view's
     axis.
     """
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     count = depths.shape[1]
     n = i / count
     view, column, row = pixels[n, 0], pixels[n, 1], pixels[n, 2]
     width, own = sizes[view, 0], intrinsics[view]
     depth = depths[n, i - n * count]
-    place = offsets[view] + wp.int64(row * width + column)
-    middle = color_at(photos, place)
+    index = offsets[view] + wp.int64(row * width + column)
+    middle = color_at(photos, index)
 
     weights = _patch()
     total = float(0.0)
     for y in range(wp.static(SIDE)):
         for x in range(wp.static(SIDE)):
-            color = color_at(photos, place + wp.int64((y - RADIUS) * width + x - RADIUS))
+            color = color_at(photos, index + wp.int64((y - RADIUS) * width + x - RADIUS))
             weight = wp.exp(difference(color, middle) * (-1.0 / (WHITE * SIMILARITY)))
             weights[y * wp.static(SIDE) + x] = weight
             total += weight
@@ -156,7 +156,7 @@ def sweep(
                         nearness = 1.0 / pixel[2]
                         u, v = pixel[0] * nearness, pixel[1] * nearness
                         color_there = color_between(photos, offset, size[0], size[1], u, v)
-                        color = color_at(photos, place + wp.int64((y - RADIUS) * width + x - RADIUS))
+                        color = color_at(photos, index + wp.int64((y - RADIUS) * width + x - RADIUS))
                         apart = wp.min(difference(color, color_there), WHITE * LARGEST)
                         unlike += weights[y * wp.static(SIDE) + x] * apart
                 best = in_order(best, neighbor_count, unlike / total)
@@ -166,7 +166,7 @@ def sweep(
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def trust_depths(
-    first: int,
+    range_start: int,
     costs: wp.array2d(dtype=wp.float32), planes: wp.array(dtype=wp.float32),
     worst: float, factor: float, slack: float, few: int, widest: float,
     depths: wp.array(dtype=wp.float32),
@@ -177,7 +177,7 @@ def trust_depths(
     they span fewer than `few` planes: the depth is then that of a parabola through the least and those beside it; or
     depths within a factor of `widest`: then the middle of these.
     """
-    n = first + wp.tid()
+    n = range_start + wp.tid()
     count = planes.shape[0]
     least = float(wp.inf)
     best = int(0)
@@ -209,7 +209,7 @@ def trust_depths(
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def place_matches(
-    first: int,
+    range_start: int,
     photos: wp.array(dtype=wp.vec4ub), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
     intrinsics: wp.array(dtype=wp.vec4), poses: wp.array(dtype=wp.mat44),
     pixels: wp.array2d(dtype=wp.int32), depths: wp.array(dtype=wp.float32),
@@ -219,7 +219,7 @@ def place_matches(
 
     poses: [V] from the views' axes to the world's. A footprint is what a pixel covers there. Photos as in sweep().
     """
-    n = first + wp.tid()
+    n = range_start + wp.tid()
     view, column, row = pixels[n, 0], pixels[n, 1], pixels[n, 2]
     lens, depth = intrinsics[view], depths[n]
     x = (float(column) + 0.5 - lens[2]) / lens[0]

@@ -48,16 +48,16 @@ def channels_of(codes: _codes, channel: int) -> _row:
 
 
 @wp.func
-def codes_at(photos: wp.array(dtype=wp.int32), offset: wp.int64, places: _row) -> _codes:
-    """Return colors at places of pixels, which floats represent exactly up to 16 million."""
+def codes_at(photos: wp.array(dtype=wp.int32), offset: wp.int64, indices: _row) -> _codes:
+    """Return colors at indices of pixels, which floats represent exactly up to 16 million."""
     result = _codes()
     for lane in range(wp.static(LANES)):
-        result[lane] = photos[offset + wp.int64(int(places[lane]))]
+        result[lane] = photos[offset + wp.int64(int(indices[lane]))]
     return result
 
 
 @wp.func
-def whole(x: _row) -> _row:
+def truncated(x: _row) -> _row:
     """Return the numbers of a row without their fractions."""
     result = _row()
     for lane in range(wp.static(LANES)):
@@ -73,7 +73,7 @@ def mixed(a: _row, b: _row, share: _row) -> _row:
 
 @wp.kernel(module="unique", module_options=OPTIONS)
 def sweep_rows(
-    first: int,
+    range_start: int,
     photos: wp.array(dtype=wp.int32), offsets: wp.array(dtype=wp.int64), sizes: wp.array2d(dtype=wp.int32),
     intrinsics: wp.array(dtype=wp.vec4), neighbors: wp.array2d(dtype=wp.int32), between: wp.array2d(dtype=wp.mat44),
     pixels: wp.array2d(dtype=wp.int32), depths: wp.array2d(dtype=wp.float32),
@@ -83,7 +83,7 @@ def sweep_rows(
 
     photos: the four codes of a pixel in one number, red lowest.
     """
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     count = depths.shape[1]
     rows = (count + wp.static(LANES - 1)) / wp.static(LANES)
     n = i / rows
@@ -156,15 +156,15 @@ def sweep_rows(
                     nearness = wp.cw_div(_row(1.0), safe * along[2] + _row(origin[2]))
                     x_there = wp.cw_mul(safe * along[0] + _row(origin[0]), nearness)
                     y_there = wp.cw_mul(safe * along[1] + _row(origin[1]), nearness)
-                    left = whole(x_there)
-                    top = whole(y_there)
+                    left = truncated(x_there)
+                    top = truncated(y_there)
                     a = x_there - left
                     b = y_there - top
-                    places = top * float(stride) + left
-                    codes = codes_at(photos, offset, places)
-                    after = codes_at(photos, offset + wp.int64(1), places)
-                    below = codes_at(photos, offset + wp.int64(stride), places)
-                    below_after = codes_at(photos, offset + wp.int64(stride + 1), places)
+                    indices = top * float(stride) + left
+                    codes = codes_at(photos, offset, indices)
+                    after = codes_at(photos, offset + wp.int64(1), indices)
+                    below = codes_at(photos, offset + wp.int64(stride), indices)
+                    below_after = codes_at(photos, offset + wp.int64(stride + 1), indices)
                     code = photos[corner + wp.int64(y * width + x)]
                     apart = _row()
                     for channel in range(3):

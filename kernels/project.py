@@ -57,7 +57,7 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
 
     @wp.kernel(module="unique", module_options={"enable_backward": True, "cpu_compiler_flags": cpu_flags()})
     def project(
-        first: int,
+        range_start: int,
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
         opacities: wp.array(dtype=real), world_to_camera: wp.array(dtype=mat44),
         intrinsics: wp.array(dtype=vec4),
@@ -67,7 +67,7 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
         means2d: wp.array(dtype=vec2), conics: wp.array(dtype=vec3), depths: wp.array(dtype=real),
         opacities2d: wp.array(dtype=real), extents: wp.array(dtype=vec2),
     ):
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         # In the adjoint: a culled Gaussian has no gradient, and 0 times an infinite derivative must not become one.
         if forward_extents:
             if forward_extents[i][0] <= real(0.0):

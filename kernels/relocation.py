@@ -19,7 +19,7 @@ _vec3 = vector(3, wp.float32)
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def share_opacities(
-    first: int,
+    range_start: int,
     copies: wp.array(dtype=wp.int32), sums: wp.array2d(dtype=wp.float64), least: float,
     logits: wp.array(dtype=wp.float32), log_scales: wp.array(dtype=_vec3),
 ):
@@ -28,18 +28,18 @@ def share_opacities(
     sums: row n - 1 times the powers of an opacity, from the first on, is the denominator for n = 1 + copies, at most
     the number of rows. least: lowest opacity.
     """
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     if copies[i] > 0:
         parts = wp.min(copies[i] + 1, sums.shape[0])
-        whole = wp.float64(1.0) / (wp.float64(1.0) + wp.exp(-wp.float64(logits[i])))
-        whole = wp.min(whole, wp.float64(OPAQUE))
-        part = wp.float64(1.0) - wp.pow(wp.float64(1.0) - whole, wp.float64(1.0) / wp.float64(parts))
+        opacity = wp.float64(1.0) / (wp.float64(1.0) + wp.exp(-wp.float64(logits[i])))
+        opacity = wp.min(opacity, wp.float64(OPAQUE))
+        part = wp.float64(1.0) - wp.pow(wp.float64(1.0) - opacity, wp.float64(1.0) / wp.float64(parts))
         power = wp.float64(1.0)
         total = wp.float64(0.0)
         for k in range(parts):
             power *= part
             total += sums[parts - 1, k] * power
-        shrink = wp.clamp(whole / total, wp.float64(SMALLEST), wp.float64(1.0))
+        shrink = wp.clamp(opacity / total, wp.float64(SMALLEST), wp.float64(1.0))
         part = wp.clamp(part, wp.float64(least), wp.float64(OPAQUE))
         logits[i] = wp.float32(wp.log(part / (wp.float64(1.0) - part)))
         smaller = wp.float32(wp.log(shrink))
@@ -48,35 +48,35 @@ def share_opacities(
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def number_places(
-    first: int,
-    dead: wp.array(dtype=wp.bool), numbers: wp.array(dtype=wp.int64), places: wp.array(dtype=wp.int32),
+    range_start: int,
+    dead: wp.array(dtype=wp.bool), numbers: wp.array(dtype=wp.int64), slots: wp.array(dtype=wp.int32),
 ):
-    """Assign numbers from 0 to the places to fill: dead Gaussians and then new rows behind them; -1 for living ones.
+    """Assign numbers from 0 to the slots to fill: dead Gaussians and then new rows behind them; -1 for living ones.
 
-    numbers: running count of the dead. Launched over the places.
+    numbers: running count of the dead. Launched over the rows.
     """
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     count = dead.shape[0]
-    place = int(-1)
+    slot = int(-1)
     if i >= count:
-        place = int(numbers[count - 1]) + i - count
+        slot = int(numbers[count - 1]) + i - count
     elif dead[i]:
-        place = int(numbers[i]) - 1
-    places[i] = place
+        slot = int(numbers[i]) - 1
+    slots[i] = slot
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def count_copies(
-    first: int,
+    range_start: int,
     sampled_rows: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), begin: wp.array(dtype=wp.int64),
     end: wp.array(dtype=wp.int64), copies: wp.array(dtype=wp.int32), changed: wp.array(dtype=wp.bool),
 ):
-    """Count how often each row was sampled for the places from begin[0] to end[0], and mark those rows in changed.
+    """Count how often each row was sampled for the slots from begin[0] to end[0], and mark those rows in changed.
 
     Nothing is counted if total[0], the sum of the weights of the draw, is 0. Launched over sampled_rows in one range,
     because several may choose the same row.
     """
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     if total[0] > wp.float64(0.0) and wp.int64(i) < end[0] - begin[0]:
         source = int(sampled_rows[i])
         wp.atomic_add(copies, source, 1)
@@ -95,33 +95,33 @@ def copy_row(sources: _rows, source: int, values: _rows, row: int):
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def copy_rows(
-    first: int,
-    places: wp.array(dtype=wp.int32), begin: wp.array(dtype=wp.int64), end: wp.array(dtype=wp.int64),
+    range_start: int,
+    slots: wp.array(dtype=wp.int32), begin: wp.array(dtype=wp.int64), end: wp.array(dtype=wp.int64),
     sampled_rows: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64),
-    given_a: _rows, given_b: _rows, given_c: _rows, given_d: _rows, given_e: _rows, given_f: _rows,
+    sources_a: _rows, sources_b: _rows, sources_c: _rows, sources_d: _rows, sources_e: _rows, sources_f: _rows,
     values_a: _rows, values_b: _rows, values_c: _rows, values_d: _rows, values_e: _rows, values_f: _rows,
     changed: wp.array(dtype=wp.bool),
 ):
-    """Fill rows whose place is begin[0] + k, below end[0], with source row k or, unless it is empty, sampled_rows[k].
+    """Fill rows whose slot is begin[0] + k, below end[0], with source row k or, unless it is empty, sampled_rows[k].
 
     With sampled_rows nothing is filled if total[0] is 0. Filled rows are marked in changed, unless it is empty. Sources
     may be the values themselves if no row is both read and written. One thread for each row.
     """
-    row = first + wp.tid()
-    place = wp.int64(places[row])
-    if place < begin[0] or place >= end[0]:
+    row = range_start + wp.tid()
+    slot = wp.int64(slots[row])
+    if slot < begin[0] or slot >= end[0]:
         return
-    source = int(place - begin[0])
+    source = int(slot - begin[0])
     if sampled_rows.shape[0] > 0:
         if not (total[0] > wp.float64(0.0)):
             return
         source = int(sampled_rows[source])
-    copy_row(given_a, source, values_a, row)
-    copy_row(given_b, source, values_b, row)
-    copy_row(given_c, source, values_c, row)
-    copy_row(given_d, source, values_d, row)
-    copy_row(given_e, source, values_e, row)
-    copy_row(given_f, source, values_f, row)
+    copy_row(sources_a, source, values_a, row)
+    copy_row(sources_b, source, values_b, row)
+    copy_row(sources_c, source, values_c, row)
+    copy_row(sources_d, source, values_d, row)
+    copy_row(sources_e, source, values_e, row)
+    copy_row(sources_f, source, values_f, row)
     if changed.shape[0] > 0:
         changed[row] = True
 
@@ -135,11 +135,11 @@ def clear_row(values: _rows, row: int):
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def clear_rows(
-    first: int,
+    range_start: int,
     which: wp.array(dtype=wp.bool), a: _rows, b: _rows, c: _rows, d: _rows, e: _rows, f: _rows,
 ):
     """Zeroes the rows that are marked. A thread for each."""
-    row = first + wp.tid()
+    row = range_start + wp.tid()
     if which[row]:
         clear_row(a, row)
         clear_row(b, row)

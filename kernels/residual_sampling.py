@@ -13,7 +13,7 @@ def error_weights_kernel(code):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def error_weights(
-        first: int,
+        range_start: int,
         rendered: wp.array(dtype=wp.vec3), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64), white: float,
         mask: wp.array(dtype=wp.float32), least: float, weights: wp.array(dtype=wp.float64),
     ):
@@ -22,7 +22,7 @@ def error_weights_kernel(code):
         Encoded values [H W] are clamped to [0, 1]. Differences are multiplied by the mask, if there is one; those not
         above `least` have weight 0.
         """
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         photo = wp.int32(index[0])
         color = rendered[i]
         error = float(0.0)
@@ -37,20 +37,20 @@ def error_weights_kernel(code):
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def sampled_pixels(
-    first: int,
-    places: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), width: int, view: int,
+    range_start: int,
+    indices: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.float64), width: int, view: int,
     across: float, down: float, columns: int, rows: int, border: int,
     pixels: wp.array2d(dtype=wp.int32), is_sample: wp.array(dtype=wp.bool),
 ):
-    """Convert places in a photo `width` pixels wide to pixels (view, column, row) of the same photo at another size.
+    """Convert pixel indices of a photo `width` wide to (view, column, row) of the same photo at another size.
 
     The other size is columns x rows, across and down times as large. Pixels are clamped to `border` from its edge.
     is_sample: whether a pixel was that far from the edge before and the total of the weights is above 0.
     """
-    k = first + wp.tid()
-    place = wp.int32(places[k])
-    row = place // width
-    column = int((float(place - row * width) + 0.5) * across)
+    k = range_start + wp.tid()
+    index = wp.int32(indices[k])
+    row = index // width
+    column = int((float(index - row * width) + 0.5) * across)
     row = int((float(row) + 0.5) * down)
     pixels[k, 0] = view
     pixels[k, 1] = wp.clamp(column, border, columns - border - 1)

@@ -18,7 +18,7 @@ def encode_kernel(dtype, tone: int):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def encode(
-        first: int,
+        range_start: int,
         exposures: wp.array(dtype=real),
         power_law: vec4, tone_numbers: vec5, clip: real, extension_slope: real,
         values: wp.array(dtype=real), slopes: wp.array(dtype=real),
@@ -28,7 +28,7 @@ def encode_kernel(dtype, tone: int):
         power_law: exponent, offset, slope and end of the toe. tone_numbers: Filmic's a, b, d, e, g or Knee's start and
         softness. clip: clip point, infinite for none. extension_slope: slope by log exposure beyond it.
         """
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         exposure = exposures[i]
         x = wp.clamp(exposure, real(0.0), clip)
         light = x

@@ -1,8 +1,8 @@
 """A launch's ranges worked through by a team of threads on the CPU, with nothing of it in the interpreter.
 
-Work names a CPU kernel and its packed parameters, which begin with `first`, and the ranges that are to be done. Each
-thread of the team keeps parameters of its own and takes the next range until none is left. The team is OpenMP's, as
-torch has loaded it; without one whoever calls is a team of one, and callers may come together.
+Work names a CPU kernel and its packed parameters, which begin with `range_start`, and the ranges that are to be done.
+Each thread of the team keeps parameters of its own and takes the next range until none is left. The team is OpenMP's,
+as torch has loaded it; without one whoever calls is a team of one, and callers may come together.
 """
 
 import ctypes
@@ -53,8 +53,8 @@ SHARE = f"""
             const int64_t taken = __atomic_fetch_add(&work.next, 1, __ATOMIC_RELAXED);
             if (taken >= work.count)
                 return;
-            const int32_t first = work.ranges[taken], count = work.ranges[taken + 1] - first;
-            *(int32_t*)parameters = first;
+            const int32_t range_start = work.ranges[taken], count = work.ranges[taken + 1] - range_start;
+            *(int32_t*)parameters = range_start;
             bounds.shape[0] = count;
             bounds.size = count;
             if (work.gradients)

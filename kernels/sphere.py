@@ -38,7 +38,7 @@ def projection_kernel(dtype, antialiased: bool):
 
     @wp.kernel(module="unique", module_options={"enable_backward": True, "cpu_compiler_flags": cpu_flags()})
     def project_to_sphere(
-        first: int,
+        range_start: int,
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
         opacities: wp.array(dtype=real), position: wp.array(dtype=vec3),
         near_plane: real, footprint: real, smoothing: real, alpha_threshold: real,
@@ -49,7 +49,7 @@ def projection_kernel(dtype, antialiased: bool):
     ):
         # The limits below that nothing usable reaches keep the adjoint of a square root from dividing by 0.
         tiny = real(1.0e-30)
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         # As in project.py: in the adjoint a culled Gaussian has no gradient.
         if forward_distances:
             if forward_distances[i] <= real(0.0):
@@ -139,16 +139,16 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def list_tiles(
-        first: int, order: wp.array(dtype=wp.int32), caps: wp.array(dtype=vec4), tile_caps: wp.array(dtype=vec4),
+        range_start: int, order: wp.array(dtype=wp.int32), caps: wp.array(dtype=vec4), tile_caps: wp.array(dtype=vec4),
         block_caps: wp.array(dtype=vec4), columns: int, rows: int, starts: wp.array(dtype=wp.int32),
         counts: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32), gaussians: wp.array(dtype=wp.int32),
     ):
         """Count the tiles that each Gaussian touches and, if there is memory, list them.
 
-        Intersections of the Gaussian at `place` in the order are written from starts[place] on.
+        Intersections of the Gaussian at `rank` in the order are written from starts[rank] on.
         """
-        place = first + wp.tid()
-        gaussian = order[place]
+        rank = range_start + wp.tid()
+        gaussian = order[rank]
         cap = caps[gaussian]
         count = int(0)
         if cap[3] > real(0.0):
@@ -161,14 +161,14 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
                         for column in range(left, wp.min(left + BLOCK_TILES, columns)):
                             if caps_meet(cap, tile_caps[row * columns + column]):
                                 if tiles.shape[0] > 0:
-                                    tiles[starts[place] + count] = row * columns + column
-                                    gaussians[starts[place] + count] = gaussian
+                                    tiles[starts[rank] + count] = row * columns + column
+                                    gaussians[starts[rank] + count] = gaussian
                                 count += 1
-        counts[place] = count
+        counts[rank] = count
 
     @wp.kernel(module="unique", module_options=options)
     def blend(
-        first: int,
+        range_start: int,
         tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
         directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
@@ -177,11 +177,11 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         image: wp.array(dtype=features_type), transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32),
     ):
         """Blend each pixel's list front to back. ends: one past the last intersection that a pixel shows."""
-        place = pixel_of_thread(first + wp.tid(), columns)
-        if place[1] < width and place[2] < height:
-            pixel = place[2] * width + place[1]
+        tile_x_y = pixel_of_thread(range_start + wp.tid(), columns)
+        if tile_x_y[1] < width and tile_x_y[2] < height:
+            pixel = tile_x_y[2] * width + tile_x_y[1]
             d = directions[pixel]
-            bounds = tile_ranges[place[0]]
+            bounds = tile_ranges[tile_x_y[0]]
             t = real(1.0)
             total = features_type()
             end = bounds[0]
@@ -208,7 +208,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def blend_backward(
-        first: int,
+        range_start: int,
         tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
         directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
@@ -219,14 +219,14 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         rows: wp.array2d(dtype=real),
     ):
         """Add to rows[emit_indices[k]] the gradients of cap direction, across, along (3 each), opacity, features."""
-        place = pixel_of_thread(first + wp.tid(), columns)
-        if place[1] < width and place[2] < height:
-            pixel = place[2] * width + place[1]
+        tile_x_y = pixel_of_thread(range_start + wp.tid(), columns)
+        if tile_x_y[1] < width and tile_x_y[2] < height:
+            pixel = tile_x_y[2] * width + tile_x_y[1]
             d = directions[pixel]
             grad_pixel = grad_image[pixel]
             t = transmittance[pixel]
             grad_from_behind = t * grad_transmittance[pixel]
-            begin = tile_ranges[place[0]][0]
+            begin = tile_ranges[tile_x_y[0]][0]
             k = ends[pixel]
             while k > begin:
                 k -= 1

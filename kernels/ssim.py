@@ -88,7 +88,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
     compare_options = NO_AUTODIFF | {"max_unroll": 8}
 
     @wp.func
-    def place_of(index: int, length: int):
+    def run_of_thread(index: int, length: int):
         """Return the row of a thread's run and its start there.
 
         The last run of a row overlaps the one before it and writes the same values again.
@@ -98,13 +98,13 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def blur_columns(
-        first: int,
+        range_start: int,
         a: wp.array2d(dtype=run), b: wp.array2d(dtype=run), weights: wp.array(dtype=real),
         length: int, channels: int,
         moments: wp.array3d(dtype=run),
     ):
         margin = radius * channels
-        y, i = place_of(first + wp.tid(), length)
+        y, i = run_of_thread(range_start + wp.tid(), length)
         s1 = run(real(0.0))
         d1 = run(real(0.0))
         s2 = run(real(0.0))
@@ -127,14 +127,14 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=compare_options)
     def compare(
-        first: int,
+        range_start: int,
         moments: wp.array3d(dtype=run), weights: wp.array(dtype=real),
         length: int, channels: int,
         a: wp.array2d(dtype=run), b: wp.array2d(dtype=run),
         distance_weight: real, dissimilarity_weight: real,
         similarity: wp.array2d(dtype=run), derivatives: wp.array3d(dtype=run),
     ):
-        y, i = place_of(first + wp.tid(), length)
+        y, i = run_of_thread(range_start + wp.tid(), length)
         ms = run(real(0.0))
         md = run(real(0.0))
         ss = run(real(0.0))
@@ -157,13 +157,13 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def blur_derivatives(
-        first: int,
+        range_start: int,
         derivatives: wp.array3d(dtype=run), weights: wp.array(dtype=real),
         length: int, channels: int,
         blurred: wp.array3d(dtype=run),
     ):
         margin = radius * channels
-        y, i = place_of(first + wp.tid(), length)
+        y, i = run_of_thread(range_start + wp.tid(), length)
         sd = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))
@@ -179,7 +179,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def gradient(
-        first: int,
+        range_start: int,
         blurred: wp.array3d(dtype=run), a: wp.array2d(dtype=run), b: wp.array2d(dtype=run),
         weights: wp.array(dtype=real),
         length: int, channels: int,
@@ -187,7 +187,7 @@ def ssim_kernels(dtype, lanes: int, distance: bool = False) -> SimpleNamespace:
         distance_weight: real, dissimilarity_weight: real,
         grad_a_rows: wp.array2d(dtype=run),
     ):
-        y, i = place_of(first + wp.tid(), length)
+        y, i = run_of_thread(range_start + wp.tid(), length)
         sd = run(real(0.0))
         ss = run(real(0.0))
         dd = run(real(0.0))

@@ -55,7 +55,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def pack_splats(
-        first: int,
+        range_start: int,
         means2d: vec2s, conics: wp.array(dtype=vec3), opacities: reals, features: reals2d,
         channels: int, alpha_threshold: real, columns: int, rows: int,
         extents: vec2s, means_opacities: vec4s, conics_cutoffs: vec4s, counts: int64s, padded: vec4s,
@@ -70,7 +70,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
         padded: [N quads], the features in rows of four numbers, of which the last are filled with zeros; or None.
         """
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         if padded:
             quads = (channels + 3) // 4
             for quad in range(quads):
@@ -110,11 +110,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(
-        first: int,
+        range_start: int,
         depths: reals, extents: vec2s, keys: reals, indices: wp.array(dtype=int),
     ):
         """Write keys that sort Gaussians nearest first and culled ones last, and their indices."""
-        i = first + wp.tid()
+        i = range_start + wp.tid()
         key = depths[i]
         if not (extents[i][0] > real(0.0)):
             key = real(wp.inf)
@@ -126,7 +126,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
         @wp.kernel(module="unique", module_options=options)
         def emit_intersections(
-            first: int,
+            range_start: int,
             order: ints, means_opacities: vec4s, conics_cutoffs: vec4s, extents: vec2s,
             depths: wp.array(dtype=wp.float32),
             columns: int, rows: int,
@@ -134,7 +134,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
             max_intersections: int,
             keys: wp.array(dtype=key), gaussians: ints, overflow: bools,
         ):
-            """Write the intersections of each Gaussian, which end at cumulative_counts[place].
+            """Write the intersections of each Gaussian, which end at cumulative_counts[rank].
 
             If fewer tiles are touched than were counted, or no Gaussian is left, further intersections up to
             `max_intersections` get tile columns * rows, which does not exist. overflow: [1], whether more were counted
@@ -143,20 +143,20 @@ def tile_kernels(dtype) -> SimpleNamespace:
             keys: tiles, of Gaussians in their order; or if by_depth, of Gaussians by index, tiles above DEPTH_BITS of
             the depth, whose bits order as positive numbers do. Without by_depth `depths` is None, with it `order`.
             """
-            place = first + wp.tid()
-            i = place
+            rank = range_start + wp.tid()
+            i = rank
             depth = key(0)
             if wp.static(by_depth):
                 depth_bits = wp.cast(depths[i], wp.int32) - wp.static(DEPTH_OFFSET)
                 depth = key(wp.clamp(depth_bits, 0, wp.static((1 << DEPTH_BITS) - 1)))
             else:
-                i = order[place]
+                i = order[rank]
             no_tile = key(columns * rows) << key(wp.static(bits))
             extent = extents[i]
             entry = int(0)
-            if place > 0:
-                entry = int(wp.min(cumulative_counts[place - 1], wp.int64(max_intersections)))
-            end = int(wp.min(cumulative_counts[place], wp.int64(max_intersections)))
+            if rank > 0:
+                entry = int(wp.min(cumulative_counts[rank - 1], wp.int64(max_intersections)))
+            end = int(wp.min(cumulative_counts[rank], wp.int64(max_intersections)))
             if extent[0] > real(0.0) and end > entry:
                 xy_opacity = means_opacities[i]
                 conic_cutoff = conics_cutoffs[i]
@@ -175,9 +175,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
                 gaussians[entry] = i
                 entry += 1
             count = cumulative_counts.shape[0]
-            if overflow and place == 0:
+            if overflow and rank == 0:
                 overflow[0] = cumulative_counts[count - 1] > wp.int64(max_intersections)
-            entry = int(wp.min(cumulative_counts[count - 1], wp.int64(max_intersections))) + place
+            entry = int(wp.min(cumulative_counts[count - 1], wp.int64(max_intersections))) + rank
             while entry < max_intersections:
                 keys[entry] = no_tile
                 gaussians[entry] = 0
@@ -187,20 +187,20 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def gather_intersections(
-        first: int,
+        range_start: int,
         order: ints, cumulative_counts: int64s, grad_intersections: reals2d,
         columns: int,
         rows: reals2d,
     ):
-        """Write rows[order[place]], the sum of Gaussian `place`'s rows of grad_intersections [M, columns]."""
-        place = first + wp.tid()
+        """Write rows[order[rank]], the sum of Gaussian `rank`'s rows of grad_intersections [M, columns]."""
+        rank = range_start + wp.tid()
         begin = int(0)
-        if place > 0:
-            begin = int(cumulative_counts[place - 1])
-        i = order[place]
+        if rank > 0:
+            begin = int(cumulative_counts[rank - 1])
+        i = order[rank]
         for column in range(columns):
             total = real(0.0)
-            for entry in range(begin, int(cumulative_counts[place])):
+            for entry in range(begin, int(cumulative_counts[rank])):
                 total += grad_intersections[entry, column]
             rows[i, column] = total
 
@@ -212,16 +212,16 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-def count_tiles(first: int, tiles: wp.array(dtype=wp.int32), size: int, counts: wp.array2d(dtype=wp.int32)):
+def count_tiles(range_start: int, tiles: wp.array(dtype=wp.int32), size: int, counts: wp.array2d(dtype=wp.int32)):
     """Add to counts[c, t] how many intersections of chunk c, which has `size`, are in tile t; launched over chunks."""
-    chunk = first + wp.tid()
+    chunk = range_start + wp.tid()
     for entry in range(chunk * size, wp.min((chunk + 1) * size, tiles.shape[0])):
         counts[chunk, tiles[entry]] = counts[chunk, tiles[entry]] + 1
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def place_intersections(
-    first: int,
+    range_start: int,
     tiles: wp.array(dtype=wp.int32), emitted: wp.array(dtype=wp.int32), size: int, starts: wp.array2d(dtype=wp.int32),
     gaussians: wp.array(dtype=wp.int32), emit_indices: wp.array(dtype=wp.int32),
 ):
@@ -230,7 +230,7 @@ def place_intersections(
     Those of a chunk in a tile are written from starts[chunk, tile] on, which is counted up. emitted: the Gaussians in
     the order of emission. emit_indices: [0] if none are requested.
     """
-    chunk = first + wp.tid()
+    chunk = range_start + wp.tid()
     for entry in range(chunk * size, wp.min((chunk + 1) * size, tiles.shape[0])):
         tile = tiles[entry]
         slot = starts[chunk, tile]
@@ -256,12 +256,12 @@ def tile_ranges_kernel(dtype, key, shift: int):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def find_tile_ranges(
-        first: int,
+        range_start: int,
         keys: wp.array(dtype=key), gaussians: wp.array(dtype=wp.int32), means_opacities: wp.array(dtype=vec4),
         conics_cutoffs: wp.array(dtype=vec4), columns: int, tiles: int,
         tile_ranges: wp.array(dtype=wp.int32), subtile_masks: wp.array(dtype=wp.uint8),
     ):
-        entry = first + wp.tid()
+        entry = range_start + wp.tid()
         tile = int(keys[entry] >> key(shift))
         before = int(-1)
         if entry > 0:

@@ -25,30 +25,30 @@ _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def check_finite(
-    loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), incomplete: wp.array(dtype=wp.bool),
+    loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), overflow: wp.array(dtype=wp.bool),
     step_counters: wp.array(dtype=wp.int64), intersections: wp.array(dtype=wp.int64),
     step_flags: wp.array(dtype=wp.float32),
 ):
     """Decide whether a step is skipped because its loss or a gradient is not finite; one thread.
 
-    step_flags: [2], 1 or 0: skipped, not skipped. norms: [K] of the gradients. incomplete: [1], or [0] if no step can
-    be. step_counters: [3] or [0], counts steps that are not finite and, with intersections ([1] or [0]), holds the most
-    intersections and counts the incomplete steps.
+    step_flags: [2], 1 or 0: skipped, not skipped. norms: [K] of the gradients. overflow: [1], whether there were more
+    intersections than memory, or [0] if there cannot be. step_counters: [3] or [0], counts steps that are not finite
+    and, with intersections ([1] or [0]), holds the most intersections and counts the steps with overflow.
     """
     finite = wp.isfinite(loss[0])
     for i in range(norms.shape[0]):
         finite = finite and wp.isfinite(norms[i])
-    whole = bool(True)
-    if incomplete.shape[0] > 0:
-        whole = not incomplete[0]
+    complete = bool(True)
+    if overflow.shape[0] > 0:
+        complete = not overflow[0]
     if step_counters.shape[0] > 0:
         if not finite:
             step_counters[0] = step_counters[0] + wp.int64(1)
         if intersections.shape[0] > 0:
             step_counters[1] = wp.max(step_counters[1], intersections[0])
-            if not whole:
+            if not complete:
                 step_counters[2] = step_counters[2] + wp.int64(1)
-    step_flags[0] = wp.where(finite and whole, 0.0, 1.0)
+    step_flags[0] = wp.where(finite and complete, 0.0, 1.0)
     step_flags[1] = 1.0 - step_flags[0]
 
 
@@ -92,84 +92,84 @@ def active_values(parameters: _floats, active_count: wp.array(dtype=wp.int32), w
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def update_by_adam(
-    first: int,
+    range_start: int,
     skipped: _floats, active_count: wp.array(dtype=wp.int32), width_a: int, width_b: int, width_c: int, width_d: int,
     first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
-    gradients_a: _floats, step_a: _floats, rate_a: _floats, parameters_a: _floats, means_a: _floats, squares_a: _floats,
-    gradients_b: _floats, step_b: _floats, rate_b: _floats, parameters_b: _floats, means_b: _floats, squares_b: _floats,
-    gradients_c: _floats, step_c: _floats, rate_c: _floats, parameters_c: _floats, means_c: _floats, squares_c: _floats,
-    gradients_d: _floats, step_d: _floats, rate_d: _floats, parameters_d: _floats, means_d: _floats, squares_d: _floats,
+    grad_a: _floats, step_a: _floats, rate_a: _floats, parameters_a: _floats, exp_avg_a: _floats, exp_avg_sq_a: _floats,
+    grad_b: _floats, step_b: _floats, rate_b: _floats, parameters_b: _floats, exp_avg_b: _floats, exp_avg_sq_b: _floats,
+    grad_c: _floats, step_c: _floats, rate_c: _floats, parameters_c: _floats, exp_avg_c: _floats, exp_avg_sq_c: _floats,
+    grad_d: _floats, step_d: _floats, rate_d: _floats, parameters_d: _floats, exp_avg_d: _floats, exp_avg_sq_d: _floats,
 ):
     """Update every number of PARAMETERS_PER_LAUNCH parameters by Adam, in place; none if skipped[0] is not 0.
 
     Launched over the longest parameter. step: [1], already counted up; rate: [1]; all of length 0 for an absent
-    parameter. *_decay_log: logarithms of the decays; *_gain: 1 - decay, not as float32 would round it. means, squares:
-    the moments. active_count, width_*: as of active_values().
+    parameter. *_decay_log: logarithms of the decays; *_gain: 1 - decay, not as float32 would round it. exp_avg,
+    exp_avg_sq: first and second moments. active_count, width_*: as of active_values().
     """
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     if skipped[0] == 0.0:
         if i < active_values(parameters_a, active_count, width_a):
             step_by_adam(
-                i, gradients_a[i], step_a[0], rate_a[0], first_gain, second_gain, first_decay_log, second_decay_log,
-                epsilon, parameters_a, means_a, squares_a,
+                i, grad_a[i], step_a[0], rate_a[0], first_gain, second_gain, first_decay_log, second_decay_log,
+                epsilon, parameters_a, exp_avg_a, exp_avg_sq_a,
             )  # fmt: skip
         if i < active_values(parameters_b, active_count, width_b):
             step_by_adam(
-                i, gradients_b[i], step_b[0], rate_b[0], first_gain, second_gain, first_decay_log, second_decay_log,
-                epsilon, parameters_b, means_b, squares_b,
+                i, grad_b[i], step_b[0], rate_b[0], first_gain, second_gain, first_decay_log, second_decay_log,
+                epsilon, parameters_b, exp_avg_b, exp_avg_sq_b,
             )  # fmt: skip
         if i < active_values(parameters_c, active_count, width_c):
             step_by_adam(
-                i, gradients_c[i], step_c[0], rate_c[0], first_gain, second_gain, first_decay_log, second_decay_log,
-                epsilon, parameters_c, means_c, squares_c,
+                i, grad_c[i], step_c[0], rate_c[0], first_gain, second_gain, first_decay_log, second_decay_log,
+                epsilon, parameters_c, exp_avg_c, exp_avg_sq_c,
             )  # fmt: skip
         if i < active_values(parameters_d, active_count, width_d):
             step_by_adam(
-                i, gradients_d[i], step_d[0], rate_d[0], first_gain, second_gain, first_decay_log, second_decay_log,
-                epsilon, parameters_d, means_d, squares_d,
+                i, grad_d[i], step_d[0], rate_d[0], first_gain, second_gain, first_decay_log, second_decay_log,
+                epsilon, parameters_d, exp_avg_d, exp_avg_sq_d,
             )  # fmt: skip
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def find_nonfinite(
-    first: int,
+    range_start: int,
     a: _floats, b: _floats, c: _floats, d: _floats, e: _floats, f: _floats,
     g: _floats, h: _floats, i: _floats, j: _floats, k: _floats, m: _floats,
     result: _floats,
 ):
     """Set result[0] to infinity if one of the numbers is not finite. Launched over the longest."""
-    place = first + wp.tid()
+    index = range_start + wp.tid()
     finite = bool(True)
-    if place < a.shape[0]:
-        finite = finite and wp.isfinite(a[place])
-    if place < b.shape[0]:
-        finite = finite and wp.isfinite(b[place])
-    if place < c.shape[0]:
-        finite = finite and wp.isfinite(c[place])
-    if place < d.shape[0]:
-        finite = finite and wp.isfinite(d[place])
-    if place < e.shape[0]:
-        finite = finite and wp.isfinite(e[place])
-    if place < f.shape[0]:
-        finite = finite and wp.isfinite(f[place])
-    if place < g.shape[0]:
-        finite = finite and wp.isfinite(g[place])
-    if place < h.shape[0]:
-        finite = finite and wp.isfinite(h[place])
-    if place < i.shape[0]:
-        finite = finite and wp.isfinite(i[place])
-    if place < j.shape[0]:
-        finite = finite and wp.isfinite(j[place])
-    if place < k.shape[0]:
-        finite = finite and wp.isfinite(k[place])
-    if place < m.shape[0]:
-        finite = finite and wp.isfinite(m[place])
+    if index < a.shape[0]:
+        finite = finite and wp.isfinite(a[index])
+    if index < b.shape[0]:
+        finite = finite and wp.isfinite(b[index])
+    if index < c.shape[0]:
+        finite = finite and wp.isfinite(c[index])
+    if index < d.shape[0]:
+        finite = finite and wp.isfinite(d[index])
+    if index < e.shape[0]:
+        finite = finite and wp.isfinite(e[index])
+    if index < f.shape[0]:
+        finite = finite and wp.isfinite(f[index])
+    if index < g.shape[0]:
+        finite = finite and wp.isfinite(g[index])
+    if index < h.shape[0]:
+        finite = finite and wp.isfinite(h[index])
+    if index < i.shape[0]:
+        finite = finite and wp.isfinite(i[index])
+    if index < j.shape[0]:
+        finite = finite and wp.isfinite(j[index])
+    if index < k.shape[0]:
+        finite = finite and wp.isfinite(k[index])
+    if index < m.shape[0]:
+        finite = finite and wp.isfinite(m[index])
     if not finite:
         result[0] = wp.inf
 
 
 @wp.func
-def place_in_turn(k: int, turn: int, turns: int) -> int:
+def index_in_turn(k: int, turn: int, turns: int) -> int:
     """Return the index of the k-th number that is updated in a turn; numbers take turns in blocks of SH_BLOCK."""
     return k + (k // wp.static(SH_BLOCK) * (turns - 1) + turn) * wp.static(SH_BLOCK)
 
@@ -186,7 +186,7 @@ def harmonics_adam_kernel(count: int):
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def update_harmonics_by_adam(
-        first: int,
+        range_start: int,
         basis: wp.array3d(dtype=wp.float32), grad_colors: wp.array3d(dtype=wp.float32), start: int, stride: int,
         turns: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
@@ -195,10 +195,10 @@ def harmonics_adam_kernel(count: int):
         parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
         second_moments: wp.array(dtype=wp.float32),
     ):
-        thread = first + wp.tid()
+        thread = range_start + wp.tid()
         turn = int(step[0]) % turns
         final = active_values(parameters, active_count, wp.static(3 * count)) - 1
-        if skipped[0] == 0.0 and place_in_turn(thread, turn, turns) <= final:
+        if skipped[0] == 0.0 and index_in_turn(thread, turn, turns) <= final:
             owners = whole_numbers()
             rows = whole_numbers()
             channels = whole_numbers()
@@ -207,7 +207,7 @@ def harmonics_adam_kernel(count: int):
             squares = numbers()
             values = numbers()
             for k in range(wp.static(VALUES_PER_THREAD)):
-                i = wp.min(place_in_turn(thread + k * stride, turn, turns), final)
+                i = wp.min(index_in_turn(thread + k * stride, turn, turns), final)
                 means[k] = first_moments[i]
                 squares[k] = second_moments[i]
                 values[k] = parameters[i]
@@ -227,7 +227,7 @@ def harmonics_adam_kernel(count: int):
             for k in range(wp.static(VALUES_PER_THREAD)):
                 mean = means[k] + first_gain * (gradients[k] - means[k])
                 square = squares[k] + second_gain * (gradients[k] * gradients[k] - squares[k])
-                i = place_in_turn(thread + k * stride, turn, turns)
+                i = index_in_turn(thread + k * stride, turn, turns)
                 if i <= final:
                     first_moments[i] = mean
                     second_moments[i] = square
@@ -238,7 +238,7 @@ def harmonics_adam_kernel(count: int):
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def add_gradient_statistics(
-    first: int,
+    range_start: int,
     gradients: wp.array(dtype=wp.vec2), radii: wp.array(dtype=wp.float32), usable: wp.array(dtype=wp.float32),
     half_width: float, half_height: float,
     gradient_sum: wp.array(dtype=wp.float32), visits: wp.array(dtype=wp.float32),
@@ -247,7 +247,7 @@ def add_gradient_statistics(
 
     Lengths are in units of half the image's sides. Nothing is added if usable[0] is 0.
     """
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     if radii[i] > 0.0 and usable[0] != 0.0:
         x = gradients[i][0] * half_width
         y = gradients[i][1] * half_height
@@ -262,7 +262,7 @@ def add_gradient_statistics(
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def add_position_noise(
-    first: int,
+    range_start: int,
     log_scales: wp.array(dtype=_vec3), quaternions: wp.array(dtype=_vec4),
     opacity_logits: wp.array(dtype=wp.float32),
     seed: int, strength: float, most_sizes: float, most_distance: float,
@@ -274,7 +274,7 @@ def add_position_noise(
     farther from the origin than most_distance, unless it is there already and comes nearer. Depends on seed and index
     alone.
     """
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[i]))
     above = SHARPNESS * (opacity - (1.0 - CENTRE))
     if above > NOISE_CUTOFF:

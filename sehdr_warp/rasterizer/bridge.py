@@ -78,9 +78,9 @@ class Program:
 
         Gradients reach the program's arguments and what it wrote; other tensors are constants.
 
-        A kernel whose first parameter is an integer `first` adds it to its thread index and writes only what belongs to
-        that index. On the CPU it then runs in parallel over ranges of indices, and so does its adjoint, unless that
-        adds to an input which indices share.
+        A kernel whose first parameter is an integer `range_start` adds it to its thread index and writes only what
+        belongs to that index. On the CPU it then runs in parallel over ranges of indices, and so does its adjoint,
+        unless that adds to an input which indices share.
 
         Args:
             kernel: a Warp kernel, with backward enabled.

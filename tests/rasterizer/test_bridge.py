@@ -18,9 +18,9 @@ def square_kernel(values: wp.array(dtype=wp.vec3), squared: wp.array(dtype=wp.ve
 
 @wp.kernel
 def scale_kernel(
-    first: int, values: wp.array(dtype=wp.vec3), gain: wp.array(dtype=wp.float32), scaled: wp.array(dtype=wp.vec3)
+    range_start: int, values: wp.array(dtype=wp.vec3), gain: wp.array(dtype=wp.float32), scaled: wp.array(dtype=wp.vec3)
 ):
-    i = first + wp.tid()
+    i = range_start + wp.tid()
     scaled[i] = gain[0] * values[i]
 
 

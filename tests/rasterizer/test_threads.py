@@ -12,8 +12,8 @@ from sehdr_warp.rasterizer.warp_launch.launching import launch
 
 
 @wp.kernel(enable_backward=True)
-def add_squares(first: int, values: wp.array[float], sums: wp.array[float]):
-    i = first + wp.tid()
+def add_squares(range_start: int, values: wp.array[float], sums: wp.array[float]):
+    i = range_start + wp.tid()
     sums[i] += values[i] * values[i]
 
 

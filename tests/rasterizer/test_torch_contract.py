@@ -21,8 +21,8 @@ WIDTH, HEIGHT = SIZE = 20, 14
 
 
 @wp.kernel
-def cube_kernel(first: int, values: wp.array(dtype=wp.float64), cubes: wp.array(dtype=wp.float64)):
-    i = first + wp.tid()
+def cube_kernel(range_start: int, values: wp.array(dtype=wp.float64), cubes: wp.array(dtype=wp.float64)):
+    i = range_start + wp.tid()
     cubes[i] = values[i] * values[i] * values[i]
 
 

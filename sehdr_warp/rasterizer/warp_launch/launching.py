@@ -36,13 +36,13 @@ def launch(
 ) -> None:
     """Launch a kernel or its adjoint over `dim` threads, without a tape and without a synchronisation.
 
-    A kernel whose first parameter is `first` adds it to its thread index and writes nothing that another index writes.
-    On the CPU such a kernel runs in parallel over ranges of indices.
+    A kernel whose first parameter is `range_start` adds it to its thread index and writes nothing that another index
+    writes. On the CPU such a kernel runs in parallel over ranges of indices.
 
     Args:
         kernel: a Warp kernel.
         dim: number of threads.
-        *arguments: the kernel's arguments (without `first`), with tensors of one device in the place of arrays. A
+        *arguments: the kernel's arguments (without `range_start`), with tensors of one device in the place of arrays. A
             vector or matrix type takes up the last one or two dimensions. A tensor with more dimensions than the
             kernel's array is passed flattened. None is an array that the kernel tests for.
         gradients: for each argument its gradient or None. If given, the adjoint is launched: it reads the gradients of
@@ -99,8 +99,8 @@ def fixed_launch(
 
 @cache
 def takes_range_start(kernel: Any) -> bool:
-    """Return whether the kernel's first parameter is `first`, the start of a range of thread indices."""
-    return kernel.adj.args[0].label == "first"
+    """Return whether the kernel's first parameter is `range_start`, the start of a range of thread indices."""
+    return kernel.adj.args[0].label == "range_start"
 
 
 _of_thread = threading.local()

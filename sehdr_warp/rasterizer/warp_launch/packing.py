@@ -72,7 +72,7 @@ class PackedLaunch:
             self.command.launch(stream)
 
     def launch_ranges(self, ranges: Tensor, values: list) -> None:
-        """Launch on the CPU in parallel over ranges, whose begin is the kernel's first parameter, `first`."""
+        """Launch on the CPU in parallel over ranges, whose begin is the kernel's first parameter, `range_start`."""
         self._pack(values)
         threads.run_ranges(self._function(), self.command.params[0], self.structures, ranges)
 
