@@ -24,6 +24,8 @@ class Synth:
     """Camera response: a name (srgb, gamma-2.2, hdr-nerf ...) or a file."""
     exposures: str | None = None
     """Times in seconds, such as 1/50,0.08,0.32; by default five, four times apart, around a well exposed one."""
+    glare: float = 0.0
+    """Veiling glare index of the lens in percent (ISO 9358); real lenses have 0.5 to 3."""
     noise: str | None = None
     """Sensor noise as FULL_WELL,READ_NOISE in electrons, such as 20000,5; by default none."""
     seed: int = 0
@@ -54,6 +56,8 @@ def run_synth(args: Synth) -> None:
     # Only truth is used of the set. A response as an object also stands beside photos whose light is known.
     scene = load_scene(args.truth, response=response_by_name("srgb"))
     times = times or exposure_ladder(scene, response)
-    write_photo_set(scene, args.out, response, times, noise=noise, seed=args.seed, overwrite=args.overwrite)
+    write_photo_set(
+        scene, args.out, response, times, glare=args.glare, noise=noise, seed=args.seed, overwrite=args.overwrite
+    )
     times_text = ", ".join(f"{time:.4g}" for time in times)
     print(f"{args.out}: {len(scene.views)} views at {times_text} s through {response.name}")

@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..files import atomic_folder, atomic_path, write_json
 from ..output.exr import write_exr
 from ..scene import Camera, Scene, View, codes_of
+from .glare import add_glare
 
 _MOST_SAMPLES, _STEPS_PER_STOP = 200_000, 16
 
@@ -48,7 +49,15 @@ class RadianceView:
     split: str
 
 
-def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise | None = None, seed: int = 0) -> Scene:
+def expose(
+    scene: Scene,
+    response,
+    exposure_time: float,
+    *,
+    glare: float = 0.0,
+    noise: SensorNoise | None = None,
+    seed: int = 0,
+) -> Scene:
     """Expose the truth of a scene: each photo becomes response.encode(hdr * exposure_time), rounded to 8 bits.
 
     Each point takes its new color from the training view whose old photo is nearest to the point's old color, which
@@ -58,18 +67,19 @@ def expose(scene: Scene, response, exposure_time: float, *, noise: SensorNoise |
         scene: every view has truth (View.hdr).
         response: encodes exposures.
         exposure_time: seconds.
+        glare: the lens's veiling glare index in percent, see add_glare(); truth stays without it.
         noise: applied to the exposure before the response, sampled for each view from (seed, its name).
         seed: of the noise.
 
     Raises:
-        InputError: for a view without truth or an impossible time.
+        InputError: for a view without truth or an impossible time, or as add_glare().
     """
     if not (math.isfinite(exposure_time) and exposure_time > 0):
         raise InputError(scene.name, f"exposure time {exposure_time:g} s is not positive and finite", "give seconds")
     views = []
     for view in scene.views:
         # Colors beyond Rec.709 have negative parts, which no sensor counts.
-        exposure = np.maximum(_truth(scene, view).astype(np.float64), 0) * exposure_time
+        exposure = add_glare(np.maximum(_truth(scene, view).astype(np.float64), 0), glare) * exposure_time
         if noise is not None:
             rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
             exposure = noisy(exposure, response.clip_exposure if response.clips else response.white, noise, rng)
@@ -144,13 +154,18 @@ def _recolor(scene: Scene, views: Sequence[View]) -> np.ndarray:
     return colors
 
 
-def write_photo_set(scene: Scene, out: Path, response, times: Sequence[float], *, noise=None, seed=0, overwrite=False):
+def write_photo_set(
+    scene: Scene, out: Path, response, times: Sequence[float], *, glare=0.0, noise=None, seed=0, overwrite=False
+):
     """Write an HDR-NeRF synthetic set of a scene with truth.
 
     It holds photos at each time (seconds), poses, truth, and points in the colors of the middle time. Noise is sampled
     anew for each time. Raises as expose and write_tables.
     """
-    exposed = [expose(scene, response, time, noise=noise, seed=seed * len(times) + k) for k, time in enumerate(times)]
+    exposed = [
+        expose(scene, response, time, glare=glare, noise=noise, seed=seed * len(times) + k)
+        for k, time in enumerate(times)
+    ]
     views = [RadianceView(view.name, view.camera, _truth(scene, view), view.split) for view in scene.views]
     points = (scene.points, exposed[len(times) // 2].point_colors) if len(scene.points) else None
     photos = [[view.image for view in photographed.views] for photographed in exposed]

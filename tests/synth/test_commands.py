@@ -97,6 +97,15 @@ def test_expose_takes_times_and_noise(truth, tmp_path):
     assert 0.5 / 255 < np.abs(clean.views[0].image - noisy.views[0].image).mean() < 0.2
 
 
+def test_expose_takes_glare_that_lifts_the_dark_and_leaves_the_truth(truth, tmp_path):
+    call("synth", truth, "--out", tmp_path / "clean", "--exposures", "0.5")
+    call("synth", truth, "--out", tmp_path / "veiled", "--exposures", "0.5", "--glare", "3")
+    for clean, veiled in zip(*(load(tmp_path / name).views for name in ("clean", "veiled")), strict=True):
+        np.testing.assert_array_equal(clean.hdr, veiled.hdr)
+        dark = clean.hdr.max(axis=2) < 0.03
+        assert dark.any() and (veiled.image[dark] > clean.image[dark] + 0.1).all()
+
+
 def test_expose_tells_what_was_repaired_in_a_response_file(truth, tmp_path, capfd):
     path = tmp_path / "camera.csv"
     path.write_text("0 0\n0.5 0.6\n0.5 0.8\n1 1\n")
@@ -109,6 +118,7 @@ def test_expose_refuses_in_a_line(truth, tmp_path, capfd):
     assert "--exposures" in refused(capfd, truth, "--out", out, "--exposures", "fast")
     assert "not an exposure above 0" in refused(capfd, truth, "--out", out, "--exposures", "0")
     assert "--noise" in refused(capfd, truth, "--out", out, "--noise", "100")
+    assert "veiling glare: index of 40 %; give 0 to 20" in refused(capfd, truth, "--out", out, "--glare", "40")
     assert "kodak" in refused(capfd, truth, "--out", out, "--response", "kodak")
     assert "not found" in refused(capfd, tmp_path / "none", "--out", out)
     assert not out.exists()
