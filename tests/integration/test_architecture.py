@@ -15,28 +15,13 @@ PACKAGE = ROOT / "sehdr_warp"
 # What each package may import of the others: training -> runs -> model -> response -> rasterizer -> kernels, and below
 # them all what any package may use.
 ANY = {
-    "errors",
-    "quiet",
-    "arguments",
-    "files",
-    "own_files",
-    "console",
-    "sandbox",
-    "parallel",
-    "limits",
-    "caches",
-    "progress",
-    "subsets",
-}
+    "errors", "quiet", "arguments", "files", "own_files", "console", "sandbox", "parallel", "limits", "caches",
+    "progress", "subsets",
+}  # fmt: skip
 ALLOWED = {
-    "kernels": set(),
-    "errors": set(),
-    "quiet": set(),
+    **{name: set() for name in ("kernels", "errors", "quiet", "limits", "progress", "caches")},
     "sandbox": {"errors"},
     "parallel": {"limits"},
-    "limits": set(),
-    "progress": set(),
-    "caches": set(),
     "files": {"errors", "own_files"},
     "own_files": {"errors"},
     "arguments": {"errors"},
@@ -48,32 +33,14 @@ ALLOWED = {
     "prior": ANY,
     "model": ANY | {"scene", "response", "rasterizer", "splats"},
     "output": ANY
-    | {
-        "runs",
-        "scene",
-        "response",
-        "splats",
-        "model.exposure",
-        "model.baking",
-        "model.lights",
-        "model.color_models",
-        "model.visibility",
-        "kernels.constants",
-    },
+    | {"runs", "scene", "response", "splats", "kernels.constants"}
+    | {"model.exposure", "model.baking", "model.lights", "model.color_models", "model.visibility"},
     "viewer": ANY | {"runs", "scene", "output", "splats", "model.lights"},
     "evaluation": ANY | {"runs", "scene", "rasterizer.ssim", "output.images", "output.charts"},
     "runs": ANY | {"scene", "response", "prior", "model", "splats", "output.notebook"},
     "training": ANY
-    | {
-        "runs",
-        "scene",
-        "response",
-        "model",
-        "rasterizer",
-        "splats",
-        "evaluation.metrics",
-        "evaluation.protocols",
-    },
+    | {"runs", "scene", "response", "model", "rasterizer", "splats"}
+    | {"evaluation.metrics", "evaluation.protocols"},
     "blocks": ANY | {"training", "runs", "scene", "response", "model", "splats", "evaluation.metrics", "process"},
     "synth": ANY | {"scene", "response", "output.exr", "output.images", "model.exposure"},
     "check": ANY | {"kernels.constants", "rasterizer", "runs.device"},
@@ -88,13 +55,23 @@ NOT_FIRST = {"as", "how", "of", "that", "those", "what", "when", "where", "wheth
 """Words that no docstring starts with."""
 
 
-def sources():
-    for folder in (PACKAGE, ROOT / "kernels"):
-        for path in sorted(folder.rglob("*.py")):
-            package = "kernels" if folder.name == "kernels" else path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-            if path.name == "commands.py":  # A part of the command line, wherever it lives: it may call any package.
-                package = "commands"
-            yield pytest.param(path, package, id=str(path.relative_to(ROOT)))
+def package_of(path):
+    """Name of a file's package; commands.py is a part of the command line, which may call any package."""
+    if path.name == "commands.py":
+        return "commands"
+    return "kernels" if path.parent == ROOT / "kernels" else path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+PATHS = sorted([*PACKAGE.rglob("*.py"), *(ROOT / "kernels").glob("*.py")])
+TREES = {path: ast.parse(path.read_text()) for path in PATHS}
+
+
+def nodes(kind):
+    """Each node of a kind in the sources, with `file:line`."""
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, kind):
+                yield node, f"{path.relative_to(ROOT)}:{node.lineno}"
 
 
 def imports(path, *, for_types=True):
@@ -104,12 +81,10 @@ def imports(path, *, for_types=True):
         if PACKAGE in path.parents
         else ("sehdr_warp", "kernels", path.name)
     )
-    tree = ast.parse(path.read_text())
+    body = TREES[path].body
     if not for_types:
-        tree.body = [
-            node for node in tree.body if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))
-        ]
-    for node in ast.walk(tree):
+        body = [node for node in body if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))]
+    for node in ast.walk(ast.Module(body)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -118,34 +93,32 @@ def imports(path, *, for_types=True):
             yield from (f"{stem}.{alias.name}" for alias in node.names)
 
 
-@pytest.mark.parametrize("path,package", list(sources()))
-def test_imports_go_down_the_line(path, package):
-    for name in imports(path):
-        top, *rest = name.split(".")
-        if top == "sehdr_warp" and package in ALLOWED and rest and rest[0] != package:
-            fits = any(".".join(rest).startswith(allowed) for allowed in ALLOWED[package]) or rest[0] == "__version__"
-            assert fits, f"{package} may not import {name}"
-        if top in ONLY_IN and package in ALLOWED:
-            assert package in ONLY_IN[top], f"{package} may not import {name}"
-
-
-@pytest.mark.parametrize("path,_", list(sources()))
-def test_docstrings_start_with_a_verb_or_a_noun(path, _):
+def test_imports_go_down_the_line():
     wrong = []
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            first, *_rest = (ast.get_docstring(node) or "-").split()
-            if first.lower() in NOT_FIRST:
-                wrong.append(f"{node.name} ({first} ...)")
-    assert not wrong, f"{path.relative_to(ROOT)}: start with a verb, as Return or Write, not {', '.join(wrong)}"
+    for path in PATHS:
+        if (package := package_of(path)) not in ALLOWED:
+            continue
+        for name in imports(path):
+            top, *rest = name.split(".")
+            if top == "sehdr_warp" and rest and rest[0] not in (package, "__version__"):
+                if not any(".".join(rest).startswith(allowed) for allowed in ALLOWED[package]):
+                    wrong.append((str(path), name))
+            elif top in ONLY_IN and package not in ONLY_IN[top]:
+                wrong.append((str(path), name))
+    assert not wrong, f"these files may not import these modules: {wrong}"
 
 
-@pytest.mark.parametrize("path,_", list(sources()))
-def test_no_call_unpacks_two_tuples(path, _):
+def test_docstrings_start_with_a_verb_or_a_noun():
+    documented = nodes(ast.FunctionDef | ast.ClassDef)
+    wrong = [where for node, where in documented if (ast.get_docstring(node) or "-").split()[0].lower() in NOT_FIRST]
+    assert not wrong, f"start with a verb, as Return or Write: {wrong}"
+
+
+def test_no_call_unpacks_two_tuples():
     """Nobody can tell which argument is which; name one tuple of arguments, or write them one by one."""
-    calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
-    wrong = [node.lineno for node in calls if sum(isinstance(each, ast.Starred) for each in node.args) > 1]
-    assert not wrong, f"{path.relative_to(ROOT)}, lines {wrong}: pass the arguments one by one, or as one list"
+    calls = nodes(ast.Call)
+    wrong = [where for call, where in calls if sum(isinstance(each, ast.Starred) for each in call.args) > 1]
+    assert not wrong, f"pass the arguments one by one, or as one list: {wrong}"
 
 
 def test_the_page_names_files_and_functions_that_exist():
@@ -157,7 +130,7 @@ def test_the_page_names_files_and_functions_that_exist():
     for file, functions in named.items():
         path = ROOT / file if file.startswith("kernels/") else PACKAGE / file
         assert path.is_file(), f"docs/architecture.md names {file}, which does not exist"
-        names = {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)}
+        names = {node.name for node in ast.walk(TREES[path]) if isinstance(node, ast.FunctionDef)}
         wrong = {function.rpartition(".")[2] for function in functions if not function.endswith(".py")} - names
         assert not wrong, f"docs/architecture.md names functions that {file} lacks: {wrong}"
 
@@ -166,9 +139,9 @@ def test_warp_internals_are_used_in_warp_launch_alone():
     """A minor release of Warp may change them; then one folder needs a look."""
     internals = {"adj", "hooks", "_shape_", "_wp_scalar_type_", "__ctype__"}
     for path in [*(PACKAGE / "rasterizer").glob("*.py"), *(ROOT / "kernels").glob("*.py")]:
-        nodes = [*ast.walk(ast.parse(path.read_text()))]
-        names = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
-        names |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+        tree = [*ast.walk(TREES[path])]
+        names = {node.attr for node in tree if isinstance(node, ast.Attribute)}
+        names |= {node.value for node in tree if isinstance(node, ast.Constant) and isinstance(node.value, str)}
         assert not names & internals, f"{path.name}: use internals of Warp in rasterizer/warp_launch"
         assert not any(name.startswith(("warp._", "warp.context", "warp.codegen")) for name in imports(path)), path
 
@@ -176,7 +149,7 @@ def test_warp_internals_are_used_in_warp_launch_alone():
 def test_no_files_import_each_other():
     """Nor by way of others, nor within functions; what a type checker alone imports is not run."""
     files = {}
-    for path in (PACKAGE / "__init__.py", *(parameter.values[0] for parameter in sources())):
+    for path in PATHS:
         parts = path.relative_to(PACKAGE if PACKAGE in path.parents else ROOT).with_suffix("").parts
         files[".".join(["sehdr_warp", *parts]).removesuffix(".__init__")] = path
 
@@ -197,14 +170,12 @@ def test_kernels_import_warp_only():
             assert any(name == top or name.startswith(top + ".") for top in allowed), f"{path.name} imports {name}"
 
 
-@pytest.mark.parametrize("path,_", list(sources()))
-def test_no_file_is_too_long_to_read_at_once(path, _):
-    assert len(path.read_text().splitlines()) <= LARGEST_FILE
+def test_no_file_is_too_long_to_read_at_once():
+    assert [str(path) for path in PATHS if len(path.read_text().splitlines()) > LARGEST_FILE] == []
 
 
 def test_every_file_says_what_it_is():
-    for path in [*PACKAGE.rglob("*.py"), *(ROOT / "kernels").glob("*.py")]:
-        assert ast.get_docstring(ast.parse(path.read_text())), f"{path} has no docstring"
+    assert [str(path) for path, tree in TREES.items() if not ast.get_docstring(tree)] == []
 
 
 @pytest.mark.parametrize("module", ["sehdr_warp", "sehdr_warp.cli", "sehdr_warp.scene", "sehdr_warp.runs.config_files"])
