@@ -37,10 +37,10 @@ from sehdr_warp.model.gaussians import PARAMETER_NAMES
 from sehdr_warp.process import calm_threads
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import config_from_dict, load_config, override_config
-from sehdr_warp.runs.load_arguments import LoadArguments
 from sehdr_warp.runs.open import load_saved_scene
 from sehdr_warp.runs.run import Run, load_run
 from sehdr_warp.runs.run_writer import RunWriter
+from sehdr_warp.runs.values import LoadArguments
 from sehdr_warp.scene import Camera, View
 from sehdr_warp.training.train import create_trainer
 

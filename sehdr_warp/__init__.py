@@ -42,7 +42,7 @@ _HOMES = {
     "runs.run": ("Run", "Splats", "load_run", "load_splats"),
     "training.train": ("create_trainer", "train"),
     "training.trainer": ("Trainer",),
-    "training.training_progress": ("TrainingProgress",),
+    "training.training_state": ("TrainingProgress",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)  # noqa: PLE0605 # pyright: ignore[reportUnsupportedDunderAll]

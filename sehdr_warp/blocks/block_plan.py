@@ -21,9 +21,8 @@ from ..files import read_json, refuse_links, write_json
 from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_from_dict, field_and_problem, override_config
-from ..runs.load_arguments import LoadArguments
 from ..runs.open import load_saved_scene
-from ..runs.values import DataValues, GainValues, NormalizationValues
+from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationValues
 from ..scene import Scene, View
 from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.normalization import Normalization, normalization_of

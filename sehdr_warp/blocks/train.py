@@ -11,11 +11,11 @@ import torch
 from ..errors import InputError
 from ..files import make_parents, refuse_links, writing
 from ..runs.config import Config
-from ..runs.load_arguments import LoadArguments
 from ..runs.open import load_saved_scene, response_for_loading
 from ..runs.run import Run, load_run
 from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter
+from ..runs.values import LoadArguments
 from .block_plan import FILE, BlockPlan, make_block_plan
 from .job import FOLDER, folder_of, is_finished
 from .jobs import run_blocks

@@ -16,11 +16,10 @@ from ..rasterizer.activations import opacity_penalty
 from ..response import Response
 from ..scene import Camera
 from ..scene.normalization import Normalization
-from .camera_tensors import CameraTensors
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
-from .renders import DirectionalRender, RenderedView, TrainRender
+from .renders import CameraTensors, DirectionalRender, RenderedView, TrainRender
 
 _DECODED_AT_ONCE = 1 << 19  # Pixels
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, SehdrError, missing
 from .device import pick_device
-from .load_arguments import LOAD_OPTIONS, LoadArguments
+from .values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     from ..response import Response

@@ -30,9 +30,9 @@ from .checkpoint import PICTURE, Checkpoint, under
 from .config import Config
 from .device import pick_device
 from .light_estimates import light_estimates
-from .load_arguments import LoadArguments
 from .run_folder import CameraEntry, RunFolder
 from .run_writer import write_confidence
+from .values import LoadArguments
 
 log = logging.getLogger(__name__)
 

@@ -26,9 +26,8 @@ from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.gravity import find_up
 from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
 from .config import Config
-from .load_arguments import LoadArguments
 from .run_folder import EVIDENCE_TENSORS, NEW, READY, RunFolder, confidence_metadata, describe_scene
-from .values import FORMAT, read_object, require_readable
+from .values import FORMAT, LoadArguments, read_object, require_readable
 
 _LOCK = ".lock"
 _NEW_NAMES = re.compile(

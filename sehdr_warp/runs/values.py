@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
@@ -42,8 +42,30 @@ class Values(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
 
 
+class LoadArguments(TypedDict, total=False):
+    """Arguments of load_scene() that a run saves in run.json, so that its photos can be loaded again.
+
+    Attributes:
+        path: Where the photos are: a folder, a video, or "embedded"; None or left out if that is not known.
+        exposure_index: As in load_scene().
+        max_size: As in load_scene().
+        holdout: As in load_scene().
+        views: Names of the views to read, if only some are.
+    """
+
+    path: str | None
+    exposure_index: int | None
+    max_size: int | None
+    holdout: int | None
+    views: list[str]
+
+
+LOAD_OPTIONS = ("exposure_index", "max_size", "holdout")
+"""Names of LoadArguments that are options of the command line."""
+
+
 class DataValues(Values):
-    """LoadArguments (load_arguments.py), as run.json holds them."""
+    """LoadArguments, as run.json holds them."""
 
     path: Text | None = None
     exposure_index: _Photos | None = None

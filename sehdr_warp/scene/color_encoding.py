@@ -19,8 +19,7 @@ from PIL import Image
 
 from ..errors import InputError
 from .heif import read_items
-from .icc import read_profile, xyz_to_rec709
-from .icc_table import IccTable, KnownColors
+from .icc import IccTable, KnownColors, read_profile, xyz_to_rec709
 from .images import PILLOW_ERRORS, EncodedImage, exif_of
 from .primaries import REC709, matrix_to_rec709, srgb_to_linear
 from .srgb_codes import encoded_in_bands

@@ -16,7 +16,6 @@ from ..progress import track_progress
 from .camera import Camera
 from .color_encoding import DEVIATION, ColorEncoding
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
-from .float_table import FloatTable
 from .gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
 from .hdr_files import hdr_size, read_hdr, read_light
 from .images import EncodedImage
@@ -27,7 +26,7 @@ from .names import unique_names
 from .photo_file import PhotoKeeper
 from .photos import fitted_lens, read_photo, truth_notes, unusable_notes
 from .primaries import linear_to_srgb
-from .srgb_codes import bands_of
+from .srgb_codes import FloatTable, bands_of
 from .types import Scene, View, codes_of
 from .video_color import codes_in_rec709
 from .wide_camera import solid_angles

@@ -26,8 +26,7 @@ from ..parallel import preserve_signals, run_interruptibly
 from ..progress import Stage, stage, track_progress
 from ..subsets import first_names
 from .cached_folder import cached_folder
-from .colmap_model import SparseModel, read_model
-from .colmap_rows import counted_rows
+from .colmap_model import SparseModel, counted_rows, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from .photo_pairs import likely_pairs, pairs_with
 from .photos import read_photo, unusable_notes

@@ -13,8 +13,7 @@ from PIL import Image
 
 from ..parallel import run_interruptibly
 from ..progress import stage, track_progress
-from .colmap_model import ModelImage, SparseModel, read_points
-from .colmap_rows import counted_rows
+from .colmap_model import ModelImage, SparseModel, counted_rows, read_points
 from .dataparser import PointCloud
 from .images import open_image
 from .lens import Lens

@@ -21,8 +21,8 @@ from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
-from ..runs.load_arguments import LOAD_OPTIONS, LoadArguments
 from ..runs.open import load_saved_scene
+from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     from ..runs.run_writer import RunWriter
@@ -161,7 +161,7 @@ def _run_as_rank(words: list[str]) -> None:
 
 def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, or print a plan, on this rank."""
-    from .hdr_truth import check_dataset_truth
+    from .scene_facts import check_dataset_truth
 
     plan_only, output = args.training.plan_only, args.output
     # What can be refused is refused before the photos are read, which may take minutes.

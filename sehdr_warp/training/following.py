@@ -12,10 +12,10 @@ from ..errors import InputError, SehdrError
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
-from ..runs.load_arguments import LoadArguments
 from ..runs.open import load_saved_scene
 from ..runs.run import exposure_compensation, field_from_checkpoint
 from ..runs.run_folder import describe_scene, scene_difference
+from ..runs.values import LoadArguments
 from ..scene import Scene, View
 from ..scene.exposure_compensation import ExposureCompensation
 from .initialization import sizes_of

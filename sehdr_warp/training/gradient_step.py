@@ -17,11 +17,10 @@ from ..rasterizer import HarmonicsGradients, Rendering
 from ..rasterizer.training_step import differentiate
 from ..runs.config import Config
 from ..scene import Scene
-from .hdr_truth import largest_hdr_truth
 from .losses import compares_exposures, data_loss, extra_images
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
-from .scene_facts import share_in_view
+from .scene_facts import largest_hdr_truth, share_in_view
 from .step_graphs import GraphCapacity
 from .strategies import Strategy
 from .targets import TrainingView

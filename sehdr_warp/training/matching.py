@@ -22,11 +22,11 @@ from ..rasterizer.residual_sampling import sample_residual_pixels
 from ..response import Response
 from ..scene import Camera, View, codes_of
 from ..splats.arrays import HARMONIC_0
-from .clipped_start import TOLERANCE, expected_excess
 from .strategies import Proposals
 from .strategies.mcmc import MAX_DISTANCE
 from .targets import TrainingView
 
+WHITE_TOLERANCE = 1e-4  # Of values of the harmonics' constant part that are compared with that of white
 LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels
 PLANES = 48, 256  # Smallest and largest number of depths to try; within these they are a pixel of parallax apart
 WORST_COST = 0.05  # Largest mean difference of encoded colors of a match
@@ -299,7 +299,7 @@ def seed_gaussians(
     if target.estimates is not None:
         times = field.base_time / float(view.exposure_time)
         excess = expected_excess(target.estimates, pixels[:, 1:].long(), matcher.size(index), times)
-        is_white = start >= starts[-1] - TOLERANCE
+        is_white = start >= starts[-1] - WHITE_TOLERANCE
         start = field.color_model.brighten(start, torch.where(is_white, excess, 0))
     rest = field.gaussians.harmonics_rest
     nearer = (MAX_DISTANCE / matches.points.norm(dim=1)).clamp_max(1.0)
@@ -322,3 +322,25 @@ def _start_values(model: ColorModel, response: Response, device: torch.device) -
     """Return [256, 3] start values of the harmonics' constant part for each 8-bit code."""
     levels = np.arange(256, dtype=np.float32)[:, None].repeat(3, 1) / np.float32(255)
     return torch.from_numpy(model.start(levels, response)).to(device)
+
+
+def expected_excess(estimate: Tensor, pixels: Tensor, size: tuple[int, int], times: float = 1.0) -> Tensor:
+    """Return [N, 3] the logarithm, at least 0, of the expected light over white at a photo's pixels.
+
+    It is 0 where nothing is known. Does not wait for the device.
+
+    Args:
+        estimate: ClippedLight.log_light [h, w, 6] of the photo.
+        pixels: [N, 2] int64 column and row; others than the photo has count as the nearest.
+        size: Width and height of the photo.
+        times: The exposure time whose white is meant, over that of the photo.
+    """
+    x, y = ((pixels[:, axis] + 0.5) / size[axis] for axis in (0, 1))
+    light, root = estimates_at(estimate, x, y).float().split(3, dim=1)
+    return torch.where(root > 0, (light + math.log(times)).clamp_min(0), 0)
+
+
+def estimates_at(estimates: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return estimates [h, w, C] at image positions x, y [N] in [0, 1), the nearest beyond."""
+    rows, columns = estimates.shape[:2]
+    return estimates[(y * rows).long().clamp(0, rows - 1), (x * columns).long().clamp(0, columns - 1)]

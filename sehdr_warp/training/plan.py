@@ -17,9 +17,8 @@ from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.read_folders import FEWEST_PHOTOS
 from .cost import CPU_GAUSSIAN, CPU_PIXEL, START_SECONDS, exchange_seconds, step_seconds
-from .hdr_truth import largest_hdr_truth
 from .initialization import base_time, start_count
-from .scene_facts import SceneFacts, measure_scene
+from .scene_facts import SceneFacts, largest_hdr_truth, measure_scene
 from .strategies import mcmc_cap
 
 STEPS_PER_PHOTO = 75

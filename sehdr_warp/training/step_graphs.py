@@ -14,8 +14,8 @@ import torch
 from ..errors import SehdrError
 from ..rasterizer import CudaGraphRunner
 from ..rasterizer.memory import failed_allocation
-from .photo_stream import PhotoStream
 from .targets import ViewStack
+from .training_views import PhotoStream
 
 HEADROOM = 1.25  # Capacity as a multiple of the largest count; the photos of a scene differ by a factor of up to 1.32
 MIN_HEADROOM = 1.08  # After densification, a capacity below this multiple of the expected count is replaced

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..model.camera_tensors import CameraTensors
+from ..model.renders import CameraTensors
 from ..rasterizer.code_residual import code_tensor
 from ..response import Response
 from ..scene import View

@@ -13,20 +13,19 @@ from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
 from ..runs.device import pick_device
-from ..runs.load_arguments import LoadArguments
 from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
+from ..runs.values import LoadArguments
 from ..scene import Scene
 from ..scene.normalization import normalization_of
-from .clipped_start import brighten_clipped
 from .compensation import SharedDecisions, prepare_photos
 from .following import send_training, several_ranks_notes
-from .hdr_truth import check_scene_truth
-from .initialization import make_field, response_for_training, sizes_of
+from .initialization import brighten_clipped, make_field, response_for_training, sizes_of
 from .machine import Stopwatch, summary_writer
 from .plan import apply_plan
 from .ranks import Ranks
 from .run_output import RunOutput
+from .scene_facts import check_scene_truth
 from .trainer import Trainer
 from .training_state import TrainingState, load_state, state_of
 

@@ -36,14 +36,13 @@ from .initialization import make_matcher, sizes_of
 from .machine import interruptible, torch_settings
 from .matching import Matcher, seed_gaussians
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
-from .photo_stream import PhotoStream
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .step_graphs import GraphCapacity, StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
 from .targets import ViewStack
-from .training_progress import Pace, TrainingProgress
-from .training_views import PhotoOrder, TrainingViews, has_wide_views
+from .training_state import Pace, TrainingProgress
+from .training_views import PhotoOrder, PhotoStream, TrainingViews, has_wide_views
 
 log = logging.getLogger(__name__)
 

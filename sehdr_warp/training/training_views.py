@@ -1,21 +1,36 @@
-"""The training views: the order in which steps take them, and the form in which they lie on the device."""
+"""The training views: the order in which steps take them, and the form in which they lie on the device.
 
+If the device has no memory for all photos, steps read theirs from one of a few slots. A thread copies the next photo,
+from memory or a mapped file, to pinned memory and from there to the device on a stream of its own, while the step
+before it runs.
+"""
+
+import logging
 import operator
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..errors import InputError
 from ..model.radiance_field import RadianceField
+from ..model.renders import CameraTensors
 from ..rasterizer.code_residual import CodeScale
 from ..runs.config import Config
 from ..runs.light_estimates import ClippedLight, light_estimates
 from ..scene import Scene, View
-from .losses import INTERVALS_FROM, compares_exposures
-from .photo_stream import PhotoStream, make_view_source
+from .losses import INTERVALS_FROM, Target, compares_exposures, select_view
 from .targets import PhotoSource, TrainingView, ViewStack
+
+log = logging.getLogger(__name__)
+
+SLOTS = 3  # One is read, one is filled, and one may still be read by a step that has not finished
+SHARE = 0.4  # Largest fraction of the device's free memory for photos; stacking them takes as much again for a while
 
 
 def has_wide_views(scene: Scene, config: Config) -> bool:
@@ -64,6 +79,159 @@ class PhotoOrder:
         self._remaining = [operator.index(photo) for photo in remaining]
         if not all(0 <= photo < self._count for photo in self._remaining):
             raise ValueError(f"the order of the photos names others than the {self._count} there are")
+
+
+def fits_device(source: PhotoSource, device: torch.device) -> bool:
+    """Return whether all photos may stay on a GPU."""
+    return source.bytes <= SHARE * torch.cuda.mem_get_info(device)[0]
+
+
+def make_view_source(
+    source: PhotoSource, where: str, use_cuda_graph: bool
+) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
+    """Return the views of a source in the form that steps take, captured as CUDA graphs or not.
+
+    `where` is the value of schedule.photo_cache.
+    """
+    device = torch.device(source.device)
+    if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
+        return source
+    if where in ("memory", "disk") or (where == "auto" and not fits_device(source, device)):
+        log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, device)
+        return _stream_or_source(source) if use_cuda_graph else source
+    views = list(source)
+    # Only captured steps need all photos in one tensor.
+    return (ViewStack.of(views) if use_cuda_graph else None) or views
+
+
+def _stream_or_source(source: PhotoSource) -> "PhotoStream | PhotoSource":
+    """Return a PhotoStream, or the source itself if its photos cannot share slots."""
+    try:
+        return PhotoStream(source)
+    except ValueError as error:
+        log.info("%s: they are copied one by one, and steps are not captured as CUDA graphs", error)
+        return source
+
+
+class PhotoStream:
+    """A replacement of ViewStack with SLOTS photos on the device.
+
+    Call bring() for a view before at() returns it, and release() once the kernels that read it are launched. [i] is a
+    copy of view i.
+    """
+
+    def __init__(self, source: PhotoSource):
+        """Allocate the slots; raises ValueError if views differ in size, or only some have HDR truth."""
+        views, self._source = source.views, source
+        first = source[0]
+        kinds = {(v.camera.width, v.camera.height, source.truth and v.hdr is not None) for v in views}
+        if len(kinds) > 1 or first.camera.directions is not None:
+            raise ValueError(
+                "photos differ in size, only some have HDR truth, or some are panoramas: no stack holds them"
+            )
+        self._device = first.target.codes.device
+        self._cuda = self._device.type == "cuda"
+        masked = any(view.mask is not None for view in views)
+        shapes = {"codes": first.target.codes, "exposure_truth": first.target.exposure_truth}
+        shapes["estimates"] = first.target.estimates
+        shapes["mask"] = torch.empty(first.camera.height, first.camera.width, 1) if masked else None
+        self._parts = {name: like for name, like in shapes.items() if like is not None}
+        self._slots = {name: self._allocate(like, SLOTS, self._device) for name, like in self._parts.items()}
+        self._pinned = (
+            {name: self._allocate(like, SLOTS, "cpu") for name, like in self._parts.items()} if self._cuda else {}
+        )
+        # Cameras of all views, without photos.
+        blank = Target(first.target.codes[:0, :0], first.target.scale)
+        cameras = [TrainingView(CameraTensors.of(v.camera, self._device), v.exposure_time, blank) for v in views]
+        stack = ViewStack.of(cameras)
+        assert stack is not None
+        self._cameras = stack
+        self._place = torch.zeros(1, dtype=torch.int64, device=self._device)
+        self._slot_views: list[int | None] = [None] * SLOTS
+        self._filling: list[Future | None] = [None] * SLOTS
+        self._current = 0
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="sehdr-warp photos")
+        if self._cuda:
+            self._stream = torch.cuda.Stream(self._device)
+            self._filled, self._free = ([torch.cuda.Event() for _ in range(SLOTS)] for _ in range(2))
+
+    def _allocate(self, like: Tensor, count: int, device: Any) -> Tensor:
+        """Allocate `count` slots like a tensor."""
+        pinned = self._cuda and torch.device(device).type == "cpu"
+        return torch.zeros((count, *like.shape), dtype=like.dtype, device=device, pin_memory=pinned)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self._source)
+
+    def __getitem__(self, index: int) -> TrainingView:
+        """Return a copy of a view on the device."""
+        return self._source[index]
+
+    @property
+    def times(self) -> Tensor | float:
+        """Exposure times, as in ViewStack."""
+        return self._cameras.times
+
+    def at(self, index: Tensor) -> TrainingView:
+        """Return the view whose number is in index [1], as in ViewStack; bring() must have been called for it."""
+        view = self._cameras.at(index)
+        parts = {name: select_view(slots, self._place) for name, slots in self._slots.items() if name != "codes"}
+        return replace(view, target=replace(view.target, codes=self._slots["codes"], index=self._place, **parts))
+
+    def bring(self, index: int) -> None:
+        """Make a view available to the kernels that are launched next."""
+        self._fetch(index)
+        self._current = slot = self._slot_views.index(index)
+        filling = self._filling[slot]
+        assert filling is not None
+        filling.result()
+        if self._cuda:
+            torch.cuda.current_stream(self._device).wait_event(self._filled[slot])
+        self._place.fill_(slot)
+
+    def release(self, following: int | None) -> None:
+        """Mark the view of bring() as read by launched kernels, and start to fetch the one that follows."""
+        if self._cuda:
+            self._free[self._current].record(torch.cuda.current_stream(self._device))
+        if following is not None:
+            self._fetch(following)
+
+    def _fetch(self, index: int) -> None:
+        """Start to fill a slot with a view unless one holds it."""
+        if index not in self._slot_views:
+            slot = (self._current + 1) % SLOTS
+            self._slot_views[slot] = index
+            self._filling[slot] = self._thread.submit(self._fill, slot, index)
+
+    def _fill(self, slot: int, index: int) -> None:
+        """Copy a view to its slot; runs on the thread."""
+        for name, array in self._arrays(index).items():
+            if not self._cuda:
+                self._slots[name][slot].copy_(array)
+                continue
+            self._filled[slot].synchronize()  # The previous copy from pinned memory is done.
+            self._pinned[name][slot].copy_(array)
+        if self._cuda:
+            with torch.cuda.stream(self._stream):
+                self._stream.wait_event(self._free[slot])
+                for name, slots in self._slots.items():
+                    slots[slot].copy_(self._pinned[name][slot], non_blocking=True)
+                self._filled[slot].record(self._stream)
+
+    def _arrays(self, index: int) -> dict[str, Tensor]:
+        """Return a photo's codes, HDR truth as exposure, and mask, on the CPU."""
+        view, codes = self._source.views[index], self._source.codes(index)
+        arrays = {"codes": torch.from_numpy(codes.view(np.int16) if codes.dtype == np.uint16 else codes)}
+        if "exposure_truth" in self._parts:
+            assert view.hdr is not None
+            arrays["exposure_truth"] = torch.from_numpy(np.asarray(view.hdr, np.float32)) * self._source.base_time
+        if self._source.estimates is not None:
+            arrays["estimates"] = self._source.estimates[index]
+        if "mask" in self._parts:  # A view without a mask counts everywhere.
+            whole = np.ones(view.codes.shape[:2], np.float32) if view.mask is None else view.mask
+            arrays["mask"] = torch.from_numpy(np.asarray(whole, np.float32))[..., None]
+        return arrays
 
 
 class TrainingViews:

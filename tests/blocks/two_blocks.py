@@ -9,7 +9,7 @@ from sehdr_warp.blocks.block_plan import BlockPlan, make_block_plan
 from sehdr_warp.blocks.job import train_block
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.runs.load_arguments import LoadArguments
+from sehdr_warp.runs.values import LoadArguments
 from sehdr_warp.training.launch import installed_versions
 
 LITTLE = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_prior": False}

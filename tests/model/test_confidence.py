@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model.camera_tensors import CameraTensors
 from sehdr_warp.model.confidence import (
     CLIPPED_STOPS,
     HALF_CONFIDENCE_PIXELS,
@@ -18,6 +17,7 @@ from sehdr_warp.model.confidence import (
 )
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
+from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, View, codes_of
 

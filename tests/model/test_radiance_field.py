@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model.camera_tensors import CameraTensors
 from sehdr_warp.model.exposure import exposure_times
 from sehdr_warp.model.fusion import NeuralExposureFusion
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
+from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.model.camera_tensors import CameraTensors
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
+from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.response import Response, ToneMapper, response_by_name
 from sehdr_warp.response.learned import EXACT_BELOW
 from sehdr_warp.scene import Camera

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 
-from sehdr_warp.scene.colmap_rows import COUNT_ROWS, counted_rows
+from sehdr_warp.scene.colmap_model import COUNT_ROWS, counted_rows
 
 
 def test_rows_are_counted_while_they_are_written(tmp_path):
