@@ -17,7 +17,16 @@ from ..files import atomic_folder, atomic_path, write_json
 from ..model.exposure import Exposure, Items, read_exposures
 from ..scene import Camera
 from .colorspace import color_space, from_rec709
-from .exr import Part, check_finite, exr_header, rgb_channels, stored_pixel_type, write_exr, write_multipart_exr
+from .exr import (
+    PAST_HALF,
+    Part,
+    check_finite,
+    exr_header,
+    rgb_channels,
+    stored_pixel_type,
+    write_exr,
+    write_multipart_exr,
+)
 from .images import exposure_exif, quantize, safe_names, write_picture
 
 log = logging.getLogger(__name__)
@@ -254,12 +263,13 @@ class BracketWriter:
         pixels = [linear * exposure.time for exposure in options.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
         pixel = stored_pixel_type(pixels, options.pixel)
-        if pixel != options.pixel:
+        reason = {"sehdr:pixelType": PAST_HALF} if pixel != options.pixel else {}
+        if reason:
             log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)
         parts, entries = [], []
         for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
             label = f"b{index}_{exposure.label}"
-            header = options.header.of(name, exposure.time, camera, ev=repr(exposure.ev))
+            header = options.header.of(name, exposure.time, camera, ev=repr(exposure.ev)) | reason
             parts.append(Part(rgb_channels(image), header, label))
             place = f"{name}/{name}_{label}" if options.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if options.multipart else f"{place}.exr"

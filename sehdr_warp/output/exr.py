@@ -85,6 +85,10 @@ def rgb_channels(image: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True))
 
 
+PAST_HALF = "float, since half would overflow 65504"
+"""Value of `sehdr:pixelType` where half was asked for."""
+
+
 def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
     """Return the type that holds all values unclipped: `pixel`, or "float" if half would overflow."""
     if pixel not in _TYPES:
@@ -132,7 +136,7 @@ def write_multipart_exr(
             "type": OpenEXR.scanlineimage,
             "software": f"sehdr-warp {__version__}",
             "sehdr:version": __version__,
-            "sehdr:pixelType": pixel_type if pixel_type == pixel else "float, since half would overflow 65504",
+            "sehdr:pixelType": pixel_type if pixel_type == pixel else PAST_HALF,
             **part.header,
         }
         types = {name: np.float32 if _is_depth(name) else _TYPES[pixel_type] for name in part.channels}
