@@ -4,6 +4,7 @@ Attributes: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..3(K-1)-1 (all coefficie
 blue), opacity (logit), scale_0..2 (logarithm), rot_0..3 (w x y z). The color model and the base exposure time are
 `comment sehdr:...` lines of the header; a file without them holds display colors. Two more habits are read: the
 smoothing filter of Mip-Splatting (filter_3D), and the comment `SplatRenderMode: mip` of gsplat, nerfstudio and Brush.
+So are 8-bit colors in place of f_dc (red, green, blue), as nerfstudio writes them on demand.
 """
 
 import io
@@ -18,7 +19,15 @@ import numpy as np
 from ..errors import InputError
 from ..files import atomic_path, plain_size
 from ..limits import available_memory
-from .arrays import LONGEST_TIME, SHORTEST_TIME, GaussianArrays, degree_of, read_matrix, warn_of_compensation
+from .arrays import (
+    HARMONIC_0,
+    LONGEST_TIME,
+    SHORTEST_TIME,
+    GaussianArrays,
+    degree_of,
+    read_matrix,
+    warn_of_compensation,
+)
 from .compressed_ply import unpack_ply
 
 log = logging.getLogger(__name__)
@@ -27,6 +36,7 @@ _FLAT = np.log(1e-6)  # Third log size of 2D Gaussian Splatting's files, which h
 _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
 _GROUPS = ("x y z", "scale_0 scale_1 scale_2", "rot_0 rot_1 rot_2 rot_3", "opacity", "f_dc_0 f_dc_1 f_dc_2")
+_RGB = ("red", "green", "blue")
 _MOST_HEADER = 1 << 16
 _MEMORY_PER_BYTE = 2.5
 """Bytes of memory for each byte of a file: its columns as arrays, once by property and once by Gaussian, and checks."""
@@ -77,7 +87,8 @@ def read_ply(path: Path) -> GaussianArrays:
             shared = {"base_time": facts.base_time, "world_matrix": facts.world_matrix}
             return GaussianArrays(**arguments, **shared, compensated=facts.compensated)
         flat = "scale_2" not in names and {"scale_0", "scale_1", "rot_3"} <= names
-        present = names | {"scale_2"} if flat else names
+        rgb = not names & {"f_dc_0", "f_dc_1", "f_dc_2"} and all(_is_byte(vertex, name) for name in _RGB)
+        present = names | ({"scale_2"} if flat else set()) | (set(_GROUPS[-1].split()) if rgb else set())
         missing = [name for group in _GROUPS for name in group.split() if name not in present]
         if missing:
             raise InputError(path, _without(missing, names), "export 3D Gaussians as an uncompressed PLY")
@@ -94,6 +105,8 @@ def read_ply(path: Path) -> GaussianArrays:
             columns[1] = np.concatenate([columns[1], thin], axis=1)
     except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise InputError(path, f"cannot be read as PLY ({error!s:.120})", _DAMAGED) from None
+    if rgb:
+        columns[4] = (_columns([_column(vertex, name) for name in _RGB]) / 255 - 0.5) / np.float32(HARMONIC_0)
     means, log_scales, quaternions, opacity, constant, higher, smoothing = columns
     if flat:
         log.info("%s: its Gaussians have two sizes (2D Gaussian Splatting), and are read as flat ones", path)
@@ -139,6 +152,10 @@ def _smooth(log_scales: np.ndarray, logits: np.ndarray, smoothing: np.ndarray) -
     with np.errstate(divide="ignore"):
         opacities = ratio / (1 + np.exp(-logits.astype(np.float64)))
         return (0.5 * np.log(wide)).astype(np.float32), np.log(opacities / (1 - opacities)).astype(np.float32)
+
+
+def _is_byte(vertex: Any, name: str) -> bool:
+    return any(each.name == name and each.val_dtype == "u1" for each in vertex.properties)
 
 
 def _column(vertex: Any, name: str) -> np.ndarray:

@@ -5,6 +5,7 @@ Stored coordinates are x right, y up, z back; Gaussians here have the axes of PL
 """
 
 import gzip
+import logging
 import struct
 import zlib
 from pathlib import Path
@@ -16,9 +17,10 @@ from ..files import atomic_path, read_bytes
 from .arrays import MAX_DEGREE, GaussianArrays, warn_of_compensation
 from .packing import from_smallest_three, logits, morton_order, smallest_three
 
+log = logging.getLogger(__name__)
 _MAGIC, _VERSION = 0x5053474E, 3
 _HEADER = struct.Struct("<IIIBBBB")
-_ANTIALIASED = 1  # Flag of opacity compensation
+_ANTIALIASED, _EXTENDED = 1, 2  # Flags: of opacity compensation; of extensions behind the Gaussians
 _COLOR_SCALE = 0.15  # Of the constant harmonic before it becomes a byte
 _MOST = 50_000_000  # Gaussians of a file that is read
 _LARGEST = 2.0**23  # Of a coordinate: 24 bits with a sign
@@ -104,6 +106,8 @@ def read_spz(path: Path) -> GaussianArrays:
         compensated=bool(flags & _ANTIALIASED),
     )
     warn_of_compensation(path, gaussians.compensated, "its header says antialiased")
+    if flags & _EXTENDED:
+        log.warning("%s: its extensions are not read; one of them may state other axes than SPZ's", path)
     turned = gaussians.transformed(np.linalg.inv(_TO_FILE))
     return GaussianArrays(**{**vars(turned), "world_matrix": None})
 

@@ -10,10 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, write_gaussians
-from sehdr_warp.splats.arrays import GaussianArrays
+from sehdr_warp.splats.arrays import HARMONIC_0, GaussianArrays
 
 from .ply_names import DEGREE_0_NAMES
 
@@ -87,6 +88,29 @@ def test_gaussians_of_two_sizes_are_flat(tmp_path, caplog):
         read = read_gaussians(tmp_path / "a.ply")
     np.testing.assert_allclose(np.exp(read.log_scales), [[0.002, 0.02, 1e-6]] * 3, rtol=1e-5)
     assert "have two sizes (2D Gaussian Splatting)" in caplog.text
+
+
+def test_colors_of_eight_bits(tmp_path):
+    """UnityGaussianSplatting issue 176: `ns-export gaussian-splat --ply-color-mode rgb` writes red, green and blue."""
+    names = [name for name in DEGREE_0_NAMES if not name.startswith("f_dc")]
+    table = np.zeros(2, [*((name, "<f4") for name in names), *((name, "u1") for name in ("red", "green", "blue"))])
+    table["rot_0"], table["red"], table["blue"] = 1, [255, 128], [51, 204]
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "a.ply"))
+    read = read_gaussians(tmp_path / "a.ply")
+    shown = read.harmonics[:, 0] * HARMONIC_0 + 0.5
+    np.testing.assert_allclose(shown, np.array([[255, 0, 51], [128, 0, 204]]) / 255, atol=1e-6)
+    assert read.degree == 0 and read.color_model == "display"
+
+
+def test_extensions_of_spz_are_named(tmp_path, caplog):
+    """One of them states other axes; spz issue 84 and pull request 82."""
+    write_gaussians(tmp_path / "a.spz", arrays())
+    data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    data[14] |= 2  # A flag says that extensions lie behind the Gaussians.
+    extension = struct.pack("<III", 0xADBE0003, 4, 5)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(bytes(data) + extension))
+    np.testing.assert_array_equal(read_gaussians(tmp_path / "b.spz").means, read_gaussians(tmp_path / "a.spz").means)
+    assert "b.spz: its extensions are not read" in caplog.text and "a.spz" not in caplog.text
 
 
 def test_sog_in_pieces_and_in_a_folder(tmp_path):
