@@ -6,8 +6,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from PIL import Image
+
 from ..errors import InputError
 from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
+from .xmp import xmp_of, xmp_values
 
 SHORTEST, LONGEST = 1e-12, 1e12
 """Seconds: what an exposure time may be."""
@@ -20,6 +23,11 @@ _ISO_TAGS = (34855, 34866, 34867, 34865)
 """PhotographicSensitivity, and what holds the ISO speed above its 16 bits: RecommendedExposureIndex, ISOSpeed,
 StandardOutputSensitivity (EXIF 2.3)."""
 _LARGEST_SHORT = 65535
+_IN_XMP = {
+    _EXPOSURE_TIME: "exif:ExposureTime", _SHUTTER_APEX: "exif:ShutterSpeedValue", _F_NUMBER: "exif:FNumber",
+    _APERTURE_APEX: "exif:ApertureValue", 34855: "exif:ISOSpeedRatings", 34867: "exifEX:PhotographicSensitivity",
+}  # fmt: skip
+"""Names of tags in XMP, where editors copy them: PNG and WebP files often have XMP alone."""
 
 
 class ExifExposure(NamedTuple):
@@ -39,7 +47,8 @@ class ExifExposure(NamedTuple):
 def exif_exposure(path: Path) -> ExifExposure:
     """Read the exposure that a photo states; None for what it does not state, or states as a value that cannot be.
 
-    Times and f-numbers are also read from their APEX tags, from the first IFD, and from text with commas or fractions.
+    Times and f-numbers are also read from their APEX tags, from the first IFD, from XMP, and from text with commas or
+    fractions.
 
     Raises:
         InputError: if the file is not an image.
@@ -53,7 +62,7 @@ def exif_exposure(path: Path) -> ExifExposure:
             return ExifExposure(*raw_exposure(path))
         with open_image(path) as image:
             first = exif_of(image)
-            tables = first.get_ifd(_EXIF_IFD), first
+            tables = first.get_ifd(_EXIF_IFD), first, _xmp_table(image)
             numbers = {tag: _of_tag(tables, tag) for tag in (_EXPOSURE_TIME, _SHUTTER_APEX, _F_NUMBER, _APERTURE_APEX)}
             speeds = [_of_tag(tables, tag) for tag in _ISO_TAGS]
     except PILLOW_ERRORS:
@@ -94,8 +103,17 @@ def are_camera_jpegs(sources: Sequence[Path | None]) -> bool:
     return 2 * sum(bool(exposure.time or exposure.f_number) for exposure in exposures) > len(sources)
 
 
+def _xmp_table(image: Image.Image) -> dict[int, list[str]]:
+    """Return what the XMP of an image states by the numbers of EXIF's tags."""
+    try:
+        xmp = xmp_of(image)
+    except ValueError:
+        return {}
+    return {tag: xmp_values(xmp, name) for tag, name in _IN_XMP.items()} if xmp else {}
+
+
 def _of_tag(tables: Iterable[Any], tag: int) -> float | None:
-    """Return the first usable number of a tag in EXIF's own table or, as some tools write it, the first one."""
+    """Return the first usable number of a tag in EXIF's own table or, as some tools write it, another one."""
     for table in tables:
         value = table.get(tag)
         for item in value if isinstance(value, tuple | list) else [value]:

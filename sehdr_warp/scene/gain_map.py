@@ -12,7 +12,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -31,6 +30,7 @@ from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, wit
 from .images import PILLOW_ERRORS, EncodedImage, exif_of, open_image, orientation_of, turn_upright
 from .linear_photos import linear_codes
 from .primaries import srgb_to_linear
+from .xmp import xmp_of, xmp_text
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -41,7 +41,6 @@ _HEAD_BYTES = 1 << 18  # In which a file names a second picture: behind EXIF and
 _ISO_JPEG = b"urn:iso:std:iso:ts:21496:-1\0"
 _HDRGM = "http://ns.adobe.com/hdr-gain-map/1.0/"
 _APPLE_AUX = "urn:com:apple:photo:2020:aux:hdrgainmap"
-_MOST_XMP = 1 << 22  # Bytes that describe a gain map; phones write about a thousand
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,7 @@ def _of_jpeg(path: Path) -> GainMap | None:
         photo, exif, own = image.size, exif_of(image), encoding_of(image)
         for second in _further_pictures(image, path):
             iso = next((data for _, data in getattr(second, "applist", ()) if data.startswith(_ISO_JPEG)), None)
-            xmp = _with_usual_prefix(_text(second.info.get("xmp", b"")))
+            xmp = _with_usual_prefix(xmp_of(second))
             if iso is not None and len(iso) > len(_ISO_JPEG) + 4:
                 make = parameters_of_iso(iso[len(_ISO_JPEG) :])
             elif "hdrgm:" in xmp:
@@ -206,7 +205,7 @@ def _further_pictures(image: Image.Image, path: Path) -> Iterator[Image.Image]:
             yield image
         return
     items = []
-    for text in re.findall(r"<\w+:Item\b[^>]*>", _text(image.info.get("xmp", b""))):
+    for text in re.findall(r"<\w+:Item\b[^>]*>", xmp_of(image)):
         attributes = dict(re.findall(r'\b\w+:(\w+)\s*=\s*["\']([^"\']*)["\']', text))
         length = int(attributes.get("Length") or 0)
         items.append((attributes.get("Semantic"), length, length + int(attributes.get("Padding") or 0)))
@@ -237,7 +236,7 @@ def _of_items(path: Path) -> GainMap | None:
     for number, item in items.items.items():
         kinds = [data[4:].split(b"\0")[0].decode("latin-1") for name, data in item.properties if name == "auxC"]
         if _APPLE_AUX in kinds:
-            xmp = "".join(_text(item_bytes(path, items.items[n])) for n in _described_by(items, number))
+            xmp = "".join(xmp_text(item_bytes(path, items.items[n])) for n in _described_by(items, number))
             return _gain_map_of(parameters_of_apple(xmp, exif), _item_pixels(path, items, number, photo))
     return None
 
@@ -281,13 +280,6 @@ def _with_usual_prefix(xmp: str) -> str:
     """Return XMP whose names of Adobe's gain map begin with `hdrgm:`, whatever prefix it binds to their namespace."""
     bound = re.search(rf"""xmlns:(\w{{1,40}})\s*=\s*["']{re.escape(_HDRGM)}["']""", xmp)
     return xmp if bound is None or bound[1] == "hdrgm" else re.sub(rf"\b{bound[1]}:", "hdrgm:", xmp)
-
-
-def _text(data: Any) -> str:
-    """Return XMP as text. Raises ValueError for more than a gain map needs."""
-    if len(data) > _MOST_XMP:
-        raise ValueError(f"{len(data)} bytes of XMP")
-    return data.decode("utf-8", "replace") if isinstance(data, bytes) else str(data)
 
 
 def _between(own: ColorEncoding | None, alternate: ColorEncoding | None) -> np.ndarray | None:

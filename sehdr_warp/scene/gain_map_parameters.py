@@ -1,12 +1,13 @@
 """Read metadata of gain maps: Ultra HDR's XMP, ISO 21496-1's binary metadata, and Apple's maker note."""
 
 import io
-import re
 import struct
 from dataclasses import dataclass
 from typing import Any
 
 from PIL import TiffImagePlugin
+
+from .xmp import xmp_values
 
 MOST_STOPS = 16.0  # Between white and the largest light; encoders state 1 to 6
 
@@ -30,7 +31,7 @@ def parameters_of_xmp(xmp: str) -> GainMapParameters:
     """Return the parameters of Ultra HDR's XMP (hdrgm 1.0)."""
 
     def values(name: str) -> list[str]:
-        return _xmp_values(xmp, f"hdrgm:{name}")
+        return xmp_values(xmp, f"hdrgm:{name}")
 
     def numbers(name: str, default: float) -> tuple[float, ...]:
         floats = tuple(float(value) for value in values(name))
@@ -45,18 +46,6 @@ def parameters_of_xmp(xmp: str) -> GainMapParameters:
         headroom=numbers("HDRCapacityMax", 1.0)[0],
         base_is_hdr=[value.lower() for value in values("BaseRenditionIsHDR")[:1]] == ["true"],
     )
-
-
-def _xmp_values(xmp: str, name: str) -> list[str]:
-    """Return what an XMP element or attribute such as `hdrgm:Gamma` states: one value, or those of its sequence.
-
-    Takes time in proportion to the length of `xmp`, whatever it holds.
-    """
-    if start := re.search(rf"<{name}(?:\s[^<>]*)?(?<!/)>", xmp):
-        body, closed, _ = xmp[start.end() :].partition(f"</{name}>")
-        if closed:
-            return re.findall(r"<rdf:li[^<>]*>([^<]*)</rdf:li>", body) or [body.strip()]
-    return re.findall(rf"""\b{name}\s*=\s*["']([^"']*)["']""", xmp)[-1:]
 
 
 def parameters_of_iso(data: bytes) -> GainMapParameters:
@@ -95,7 +84,7 @@ def parameters_of_apple(xmp: str, exif: Any) -> GainMapParameters:
 
     Raises ValueError if neither states it.
     """
-    if headroom_text := _xmp_values(xmp, "HDRGainMap:HDRGainMapHeadroom"):
+    if headroom_text := xmp_values(xmp, "HDRGainMap:HDRGainMapHeadroom"):
         headroom = float(headroom_text[0])
     else:
         note = _apple_note(exif.get_ifd(0x8769).get(0x927C, b""))

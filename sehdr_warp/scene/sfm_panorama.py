@@ -3,14 +3,15 @@
 import json
 import logging
 import math
-import re
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from ..errors import InputError
 from ..parallel import run_interruptibly
 from ..progress import stage, track_progress
 from .colmap_model import ModelImage, SparseModel, counted_rows, read_points
@@ -33,14 +34,17 @@ from .sfm import (
 )
 from .types import View, encoded_values
 from .wide_camera import FACE_ANGLE, face_rotations, faces_of
+from .xmp import xmp_of, xmp_values
 
 _log = logging.getLogger("sehdr_warp.scene")
 
 _FACE_SIDE = 600  # Pixels of a cut view at most
 _SEAM = 3.0  # Times their usual difference, by which the outer columns of a panorama may differ
+_CHANCE = 0.8  # Of their difference by chance; 140 views of 20 panoramas have 0.46 at most, no seam 0.85 and more
 _JUDGED = 5
+_LEAST_SHARE = 0.99  # Of the columns of a whole panorama
+_WHOLE = "export whole panoramas (360 x 180 degrees)"
 _SKEW = 2  # Pixels by which a panorama may differ from 2:1
-_PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w+)")
 
 
 def are_panoramas(photos: Sequence[Path]) -> bool:
@@ -48,36 +52,59 @@ def are_panoramas(photos: Sequence[Path]) -> bool:
 
     They are if all are twice as wide as high, and some say so in their metadata (GPano), or their left and right ends
     fit together.
+
+    Raises:
+        InputError: if the metadata of one say that it is a panorama of a part of the sphere.
     """
+    judged = photos[:: max(1, len(photos) // _JUDGED)][:_JUDGED]
+    projections = {kind for photo in judged if (kind := _projection_of(photo))}
     for photo in photos:
         width, height = photo_sizes(photo)[1]
         if abs(width - 2 * height) > _SKEW:
+            if projections == {"equirectangular"}:
+                problem = f"says that it is a panorama (GPano), and is {width} x {height}, not twice as wide as high"
+                raise InputError(photo, problem, _WHOLE)
             return False
-    judged = photos[:: max(1, len(photos) // _JUDGED)][:_JUDGED]
-    projections = {kind for photo in judged if (kind := _projection_of(photo))}
     if projections:
         return projections == {"equirectangular"}
-    return float(np.median([_seam(photo) for photo in judged])) < _SEAM
+    return all(np.median([_seam(photo) for photo in judged], axis=0) < (_SEAM, _CHANCE))
 
 
 def _projection_of(photo: Path) -> str | None:
-    """Return the projection that a photo's XMP states, in lower case."""
+    """Return the projection that a photo's XMP states, in lower case.
+
+    Raises:
+        InputError: if it states that the photo shows a part of a sphere.
+    """
     if kind_of(photo) != "encoded":
         return None
     with open_image(photo) as image:
-        xmp = image.info.get("xmp", b"")
-    match = _PROJECTION.search(xmp if isinstance(xmp, bytes) else str(xmp).encode())
-    return match[1].decode().lower() if match else None
+        xmp = xmp_of(image)
+
+    def values(name: str) -> list[str]:
+        return xmp_values(xmp, f"GPano:{name}")
+
+    projection = next(iter(values("ProjectionType")), "").lower()
+    # A reduced copy keeps the numbers of the original, so their quotient counts.
+    cropped, full = ((*values(f"{name}WidthPixels"), "0")[0] for name in ("CroppedAreaImage", "FullPano"))
+    with suppress(ValueError):
+        if projection == "equirectangular" and 0 < int(cropped) < _LEAST_SHARE * int(full):
+            problem = f"shows a part of a panorama: {cropped} of {full} columns (GPano)"
+            raise InputError(photo, problem, _WHOLE)
+    return projection or None
 
 
-def _seam(photo: Path) -> float:
-    """Return how much the outer columns of a photo differ, relative to neighboring columns within it."""
+def _seam(photo: Path) -> tuple[float, float]:
+    """Return how much the outer columns of a photo differ, relative to neighboring columns and to chance.
+
+    The second number is relative to the difference from the other column upside down: ends that are even from top to
+    bottom, such as a white background or the black around the circles of two fisheye lenses, fit by chance.
+    """
     image = encoded_values(read_photo(photo, oriented=True).pixels)
-    inside = np.abs(np.diff(image[:, :: max(1, image.shape[1] // 64)], axis=1)).mean()
     next_to = np.abs(np.diff(image, axis=1)).mean()
     ends = np.abs(image[:, 0] - image[:, -1]).mean()
-    # In a picture that is flat everywhere the ends fit, too.
-    return float(ends / max(next_to, 1e-3)) if inside > 1e-3 else 0.0
+    by_chance = np.abs(image[:, 0] - image[::-1, -1]).mean()
+    return float(ends / max(next_to, 1e-3)), float((ends + 1e-3) / (by_chance + 1e-3))
 
 
 def reconstruct_panoramas(photos: Sequence[Path], cache: Path | str | None = None) -> Reconstruction:

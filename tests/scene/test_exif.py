@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from PIL.TiffImagePlugin import IFDRational
 
 from sehdr_warp.scene.exif import ExifExposure, exif_exposure, parse_number
@@ -45,6 +46,25 @@ def test_exposures(tmp_path, case):
 def test_tags_in_the_first_table(tmp_path):
     exposure = exif_exposure(photo(tmp_path / "a.tif", {}, first={TIME: 0.25, NUMBER: 4.0}))
     assert exposure[::2] == pytest.approx((0.25, 4.0))
+
+
+XMP = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description exif:ExposureTime="1/60" exif:FNumber="28/10">'
+    "<exif:ISOSpeedRatings><rdf:Seq><rdf:li>400</rdf:li></rdf:Seq></exif:ISOSpeedRatings></rdf:Description></x:xmpmeta>"
+)
+
+
+def test_exposures_in_xmp_alone_and_beside_exif(tmp_path):
+    text = PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", XMP)
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png", pnginfo=text)
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.webp", xmp=XMP.encode())
+    for name in ("a.png", "a.webp"):
+        assert exif_exposure(tmp_path / name) == pytest.approx((1 / 60, 400, 2.8))
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[TIME] = 0.25
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif, xmp=XMP.encode())
+    assert exif_exposure(tmp_path / "a.jpg").time == 0.25
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,12 @@
 """Bare panoramas: recognized, and placed by structure from motion."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.sfm_panorama import are_panoramas
 
@@ -44,6 +47,32 @@ def test_stated_projections_win(tmp_path):
         text = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><a GPano:ProjectionType="{kind}"/></x:xmpmeta>'
         cut.save(tmp_path / f"{kind}.jpg", xmp=text.encode())
         assert are_panoramas([tmp_path / f"{kind}.jpg"]) == expected
+
+
+def test_ends_that_are_even_are_no_seam(tmp_path):
+    rows, columns = np.mgrid[:64, :128]
+    object_before_white = (np.abs(rows - 32) < 20) & (np.abs(columns - 64) < 40)
+    two_circles = np.minimum(np.hypot(rows - 32, columns - 32), np.hypot(rows - 32, columns - 96)) < 31
+    for inside, outside in ((object_before_white, 250), (two_circles, 0)):
+        noise = np.random.default_rng(3).integers(0, 255, (64, 128, 3), np.uint8)
+        Image.fromarray(np.where(inside[..., None], noise, outside).astype(np.uint8)).save(tmp_path / "a.png")
+        assert not are_panoramas([tmp_path / "a.png"])
+
+
+@pytest.mark.parametrize(
+    ("size", "cropped", "expected"),
+    [((128, 64), 300, "shows a part of a panorama: 300 of 512"), ((128, 50), 512, "is 128 x 50"), ((128, 64), 512, "")],
+)
+def test_parts_of_panoramas_are_refused(tmp_path, size, cropped, expected):
+    """A reduced copy of a whole panorama keeps the numbers of the original."""
+    text = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description GPano:ProjectionType="equirectangular"'
+        f' GPano:CroppedAreaImageWidthPixels="{cropped}"><GPano:FullPanoWidthPixels>512</GPano:FullPanoWidthPixels>'
+        "</rdf:Description></x:xmpmeta>"
+    )
+    Image.new("RGB", size).save(tmp_path / "a.jpg", xmp=text.encode())
+    with pytest.raises(InputError, match=expected) if expected else nullcontext():
+        assert are_panoramas([tmp_path / "a.jpg"])
 
 
 def test_bare_panoramas_are_placed(tmp_path):
