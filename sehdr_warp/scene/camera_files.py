@@ -15,9 +15,10 @@ from .camera import Camera, whole_number
 from .colmap_model import find_model, read_model
 from .dataparser import pose_from_camera_to_world
 from .exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
+from .frame_lens import frame_lens
 from .images import MAX_PIXELS
 from .names import natural_key
-from .read_transforms import frame_lens, frame_pose, frames_of, pose_from_opengl
+from .read_transforms import frame_pose, frames_of, pose_from_opengl
 
 log = logging.getLogger(__name__)
 _DATAPARSER = "dataparser_transforms.json"

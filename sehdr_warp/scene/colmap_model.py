@@ -1,5 +1,6 @@
 """Reader of COLMAP's sparse models, binary and text (https://colmap.github.io/format.html), safe for hostile files."""
 
+import logging
 import os
 import struct
 import subprocess
@@ -18,6 +19,7 @@ from .dataparser import NO_POINTS, PointCloud, pose_from_quaternion
 from .lens import CAMERA_MODELS, Lens
 from .names import is_system_file
 
+_log = logging.getLogger("sehdr_warp.scene")
 # pycolmap is not used here: it hangs on a damaged count and accepts a truncated file as a whole one.
 MAX_NAME_BYTES = 4096
 _DEEPEST = 3  # Levels of folders below a set in which a model is looked for
@@ -202,10 +204,12 @@ def read_ply_points(path: Path) -> PointCloud:
 
 
 def _checked_points(points: np.ndarray, colors: np.ndarray, path: Path) -> PointCloud:
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
-        raise InputError(path, f"point {int(np.argmax(bad))} is at {points[np.argmax(bad)].tolist()}", _REMEDY)
-    return PointCloud(points, colors.astype(np.float32))
+    good = np.isfinite(points).all(axis=1)
+    if not good.all():
+        _log.warning(
+            "%s: %d of %d points are not finite and are left out", path, len(points) - int(good.sum()), len(points)
+        )
+    return PointCloud(points[good], colors[good].astype(np.float32))
 
 
 class _Bytes:

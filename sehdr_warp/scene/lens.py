@@ -28,6 +28,7 @@ _NEUTRAL_AT_ZERO = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPE
 _SPHERE = "EQUIRECTANGULAR"
 _SKEW = 0.01  # Part of its width by which a panorama may differ from twice its height
 _MAX_SIDE = 1 << 16
+_LEAST_FOCAL = 0.02  # Of the longer side; the widest fisheye lenses have 0.13
 _BAND_VALUES = 1 << 20  # Values that are averaged at one time: 4 MB, which caches hold
 
 
@@ -69,6 +70,9 @@ class Lens:
             remedy = "export whole panoramas (360 x 180 degrees)"
         elif min(self.focal) <= 0:
             problem = f"focal lengths {self.focal} are not positive"
+        elif max(self.focal) < _LEAST_FOCAL * max(self.width, self.height):
+            problem = f"focal lengths {self.focal} are too short for {self.width} x {self.height} pixels"
+            remedy = "state focal lengths and principal point in pixels"
         if problem:
             raise InputError(self.source, problem, remedy)
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from ..errors import InputError, did_you_mean, missing
 from ..files import has_file
 from ..subsets import first_names
+from .camera_checks import check_cameras
 from .colmap_model import find_model
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
 from .exposure import choose_exposure, stated_times, with_exposure_times
@@ -80,12 +81,14 @@ def parse_dataset(
             untimed = [replace(record, exposure_time=None, time_known=True) for record in records]
             records, times_known, time_notes = _with_times(untimed, kind, folder)
             dataset = replace(dataset, times_known=times_known)
+    records, camera_notes = check_cameras(records, dataset.cloud)
     records, split_notes = _with_splits(records, dataset, holdout)
     training = sum(record.split == "train" for record in records)
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
-    notes = (*dataset.notes, *mask_notes, *truth_notes, *exposure_notes, *photo_notes, *time_notes, *split_notes)
+    notes = (*dataset.notes, *mask_notes, *truth_notes, *exposure_notes, *photo_notes, *time_notes)
+    notes = (*notes, *camera_notes, *split_notes)
     if not is_embedded(path) and dataset.format != "video":
         notes = (*notes, *unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]))
     return replace(dataset, records=tuple(records), notes=notes, name=name)

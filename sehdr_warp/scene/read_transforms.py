@@ -1,9 +1,6 @@
 """Readers of transforms.json and related layouts (nerfstudio, instant-ngp, Blender, HDR-NeRF's synthetic sets)."""
 
-import math
 import re
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
@@ -16,15 +13,18 @@ from ..subsets import first_names
 from .colmap_model import find_model, read_ply_points, read_points
 from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
+from .frame_lens import frame_lens
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
-from .lens import Lens
 from .names import distinct, find_image, renamed_note, sibling
-from .photos import photo_sizes, unusable_notes
+from .photos import unusable_notes
 
 _REMEDY = "correct the file or export it again"
 _INCOMPLETE = "copy the whole set"
-_FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "FISHEYE")
-_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
+_UNREAD = (
+    "rolling_shutter", "transform_matrix_end", "fisheye_crop_radius", "depth_file_path", "depth_path", "mask_color",
+    "white_transparent", "black_transparent",
+)  # fmt: skip
+"""Fields of nerfstudio and instant-ngp that change what a photo shows or what is known of it."""
 
 
 def read_transforms(folder: Path) -> DataparserOutputs:
@@ -48,7 +48,7 @@ def read_transforms(folder: Path) -> DataparserOutputs:
     notes = read.notes(folder)
     records, repeated = distinct(read.records)
     records, unmasked = _without_missing_masks(records)
-    notes += [*repeated, *missing, *unmasked]
+    notes += [*repeated, *missing, *unmasked, *read.unread_note()]
     in_splits = [record for record in records if record.split]
     if 0 < len(in_splits) < len(records):
         count = len(records) - len(in_splits)
@@ -66,6 +66,8 @@ class _Frames:
         photos: names and photos of the frames that have one.
         unusable: errors of poses, whose frames are left out.
         untimed: errors of exposure times, which are left out.
+        unread: fields of _UNREAD that the files state.
+        moments: values of the frames' `time`, by which the scene moves.
     """
 
     records: list[ImageRecord] = field(default_factory=list)
@@ -73,15 +75,20 @@ class _Frames:
     photos: list[tuple[str, Path]] = field(default_factory=list)
     unusable: list[InputError] = field(default_factory=list)
     untimed: list[InputError] = field(default_factory=list)
+    unread: set[str] = field(default_factory=set)
+    moments: set[str] = field(default_factory=set)
 
     def add_file(self, folder: Path, path: Path, values: dict, split: str | None) -> None:
         """Add the frames of a file; `split` is that of all of them, None if the file states it by frame."""
         frames = frames_of(values, path)
         splits = _named_splits(values, frames)
         for name, frame in frames:
+            fields = values | frame
+            self.unread |= {key for key in _UNREAD if np.any(fields.get(key))}
+            self.moments.add(repr(fields.get("time")))
             image = _frame_image(folder, name, path)
             try:
-                pose = frame_pose(frame, path, name)
+                pose = frame_pose(frame, path, name, mitsuba=fields.get("from_mitsuba") is True)
             except InputError as error:
                 self.unusable.append(error)
                 continue
@@ -97,6 +104,13 @@ class _Frames:
                 self.untimed.append(error)
                 seconds = None
             self.records.append(replace(record, world_to_camera=pose, exposure_time=seconds))
+
+    def unread_note(self) -> list[str]:
+        """Return a note on fields that are not read, and on scenes that move."""
+        notes = [f"fields of the frames that are not read: {', '.join(sorted(self.unread))}"] if self.unread else []
+        if len(self.moments) > 1:
+            notes.append(f"frames state {len(self.moments)} moments (time): what moves is not modeled")
+        return notes
 
     def notes(self, folder: Path) -> list[str]:
         """Return notes on the frames that cannot be used; raise InputError if too few can."""
@@ -249,14 +263,17 @@ def _matrix(values) -> np.ndarray:
         return np.zeros(0)
 
 
-def frame_pose(frame: dict, path: Path, name: str) -> np.ndarray:
-    """Return world_to_camera [4, 4] of a frame's transform_matrix.
+def frame_pose(frame: dict, path: Path, name: str, *, mitsuba: bool = False) -> np.ndarray:
+    """Return world_to_camera [4, 4] of a frame's transform_matrix; `mitsuba` if its x axis is left and z is ahead.
 
     Raises:
         InputError: if it is not a pose.
     """
     matrix = _matrix(frame.get("transform_matrix"))
-    return pose_from_opengl(matrix.reshape(4, 4) if matrix.shape == (16,) else matrix, path, name)
+    matrix = matrix.reshape(4, 4) if matrix.shape == (16,) else matrix
+    if mitsuba and matrix.ndim == 2:
+        matrix[:3, (0, 2)] *= -1
+    return pose_from_opengl(matrix, path, name)
 
 
 def pose_from_opengl(matrix: np.ndarray, path: Path, name: str) -> np.ndarray:
@@ -264,73 +281,6 @@ def pose_from_opengl(matrix: np.ndarray, path: Path, name: str) -> np.ndarray:
     if matrix.shape in ((4, 4), (3, 4)):
         matrix[:3, 1:3] *= -1  # From x right, y up, -z forward to y down, z forward.
     return pose_from_camera_to_world(matrix, path, name)
-
-
-def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Lens:
-    """Return the lens of a frame, whose values win over the file's; the photo's size counts if neither states one.
-
-    Raises:
-        InputError: if values are missing or not possible.
-    """
-    fields = values | frame
-
-    def number(key: str, absent: Any = None) -> Any:
-        value = fields.get(key)
-        if value is None:
-            return absent
-        with suppress(ValueError):
-            value = float(value) if isinstance(value, str) else value
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
-            raise InputError(path, f"{key} = {value!r:.40} is not a finite number", _REMEDY)
-        return float(value)
-
-    def focal(key: str, angle_key: str, length: float) -> Any:
-        # instant-ngp's x_fov and y_fov are in degrees.
-        angle = number(angle_key) or math.radians(number(f"{angle_key[-1]}_fov", 0.0))
-        return number(key, 0.5 * length / math.tan(0.5 * angle) if 1e-9 < angle < math.pi else None)
-
-    width, height = number("w"), number("h")
-    if width is None or height is None:
-        if image is None:
-            raise InputError(path, "states no image size", "add w and h")
-        width, height = photo_sizes(image)[0]
-    if str(fields.get("camera_model")).upper() in ("EQUIRECTANGULAR", "SPHERICAL"):
-        return Lens("EQUIRECTANGULAR", int(width), int(height), (width, height), path)
-    model, bent = _distortion(fields, number, path)
-    fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
-    if fx is None and fy is None:
-        raise InputError(path, "states no focal length", "add camera_angle_x (radians, below pi) or fl_x (pixels)")
-    center = number("cx", width / 2), number("cy", height / 2)
-    pinhole: tuple[Any, ...] = fy if fx is None else fx, fx if fy is None else fy, *center
-    return Lens(model, int(width), int(height), (*pinhole, *bent), path)
-
-
-def _distortion(fields: dict, number: Callable[..., Any], path: Path) -> tuple[str, tuple[float, ...]]:
-    """Return the lens model of a frame and its parameters behind focal lengths and center.
-
-    Args:
-        fields: of the frame and the file.
-        number: returns the number of a field, or its second argument if there is none.
-        path: the file.
-
-    Raises:
-        InputError: for a model that is not supported, or parameters whose meaning the model does not say.
-    """
-    k1, k2, k3, k4, k5, k6, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))
-    model = str(fields.get("camera_model") or "OPENCV").upper()
-    if model in _FISHEYE or fields.get("is_fisheye") is True:
-        return "OPENCV_FISHEYE", (k1, k2, k3, k4)
-    if model not in _PERSPECTIVE:
-        problem = f"camera_model {fields['camera_model']!r:.40} is not supported"
-        raise InputError(path, problem, "use OPENCV, OPENCV_FISHEYE, PINHOLE or EQUIRECTANGULAR")
-    if model != "FULL_OPENCV" and (k4 or k5 or k6):
-        # nerfstudio counts k4 as one more term of the polynomial, OpenCV and COLMAP as the first of a quotient.
-        name, value = next(pair for pair in (("k4", k4), ("k5", k5), ("k6", k6)) if pair[1])
-        problem = f"{name} = {value} of camera_model {model} has no one meaning"
-        raise InputError(path, problem, "state camera_model FULL_OPENCV for OpenCV's, or undistort the images first")
-    if k3 or k4 or k5 or k6:
-        return "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, k5, k6)
-    return "OPENCV", (k1, k2, p1, p2)
 
 
 def _points(folder: Path, path: Path, values: dict) -> PointCloud:
@@ -344,6 +294,9 @@ def _points(folder: Path, path: Path, values: dict) -> PointCloud:
         if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
             raise InputError(path, "applied_transform is not a finite 3 x 4 matrix", _REMEDY)
         points = points @ matrix[:3, :3].T + matrix[:3, 3]
+    scale = values.get("applied_scale")
+    if isinstance(scale, int | float) and 0 < scale < np.inf:
+        points = points * float(scale)
     return PointCloud(points, colors)
 
 

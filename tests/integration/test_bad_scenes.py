@@ -82,7 +82,6 @@ COLMAP_TEXT = {
     "infinite focal length": ("cameras.txt", lambda text: text.replace(" 50 ", " inf "), "cameras.txt"),
     "other size": ("cameras.txt", lambda text: text.replace(" 64 48 ", " 63 48 "), "64 x 48"),
     "unknown model": ("cameras.txt", lambda text: text.replace("PINHOLE", "PERSPEX"), "PERSPEX"),
-    "point NaN": ("points3D.txt", lambda text: re.sub(r"(?m)^1 \S+", "1 nan", text), "points3D.txt"),
     "point in words": ("points3D.txt", lambda text: re.sub(r"(?m)^1 \S+", "1 far", text), "points3D.txt"),
 }
 

@@ -131,9 +131,47 @@ def test_nerfstudio_points_move_with_the_poses(tmp_path):
     assert {tuple(p) for p in points} == {(-i / 3 + 5, i, -0.25) for i in range(5)}
 
 
+def test_points_have_the_scale_that_was_applied_to_the_poses(tmp_path):
+    write_blender(tmp_path, applied_transform=np.eye(4)[:3].tolist(), applied_scale=0.5)
+    write_colmap(tmp_path / "colmap")
+    assert {tuple(p) for p in load(tmp_path).points} == {(i / 2, -i / 6, 0.125) for i in range(5)}
+
+
+def test_distortion_as_a_list(tmp_path):
+    bent = {"k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002}
+    write_blender(tmp_path / "a", 2, **bent)
+    write_blender(tmp_path / "b", 2)
+    frames = json.loads((tmp_path / "b" / "transforms.json").read_text())["frames"]
+    params = [bent.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    _edit(tmp_path / "b", frames=[frame | {"distortion_params": params} for frame in frames])
+    lenses = [read_transforms(tmp_path / name).records[1].lens for name in "ab"]
+    assert lenses[0].params == lenses[1].params and lenses[0].model == "OPENCV"
+
+
+def test_poses_of_mitsuba_have_x_to_the_left_and_z_ahead(tmp_path):
+    write_blender(tmp_path, 3)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    for frame in frames:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1, 1, -1, 1])).tolist()
+    _edit(tmp_path, frames=frames, from_mitsuba=True)
+    for record, pose in zip(read_transforms(tmp_path).records, arc_poses(3), strict=True):
+        np.testing.assert_allclose(record.world_to_camera, pose, atol=1e-12)
+
+
+def test_fields_that_are_not_read_are_named(tmp_path):
+    write_blender(tmp_path, 3, fisheye_crop_radius=12, rolling_shutter=[0, 0, 0, 0])
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    _edit(tmp_path, frames=[frame | {"time": i / 2, "depth_file_path": "d.png"} for i, frame in enumerate(frames)])
+    notes = read_transforms(tmp_path).notes
+    assert "fields of the frames that are not read: depth_file_path, fisheye_crop_radius" in notes
+    assert "frames state 3 moments (time): what moves is not modeled" in notes
+
+
 @pytest.mark.parametrize(
     "fields, message",
     [
+        ({"orthographic": True}, "states a lens by orthographic"),
+        ({"fl_x": 0.6, "fl_y": 0.6}, "too short for 40 x 30 pixels; state focal lengths and principal point in pixels"),
         ({"frames": []}, "has no frames"),
         ({"frames": [{"file_path": "../up.png"}]}, r"contains '\.\.'"),
         ({"camera_angle_x": "wide"}, "camera_angle_x = 'wide'"),
