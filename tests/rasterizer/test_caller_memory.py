@@ -1,0 +1,51 @@
+"""Copies between a CUDA graph's memory and its callers', by addresses."""
+
+import pytest
+import torch
+
+from sehdr_warp.rasterizer.caller_memory import CallerMemory
+
+from .emulated_graphs import emulate
+
+DEVICE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+
+
+@pytest.fixture(autouse=True)
+def without_a_gpu(monkeypatch):
+    if DEVICE.type == "cpu":
+        emulate(monkeypatch)
+
+
+def numbers(*shape):
+    return torch.rand(shape, device=DEVICE)
+
+
+def test_inputs_are_read_and_outputs_written_where_the_caller_has_them():
+    callers, fixed = CallerMemory(DEVICE), [numbers(5, 3), numbers(7), numbers(4, 4)]
+    for _ in range(2):
+        inputs, outputs = [torch.rand_like(tensor) for tensor in fixed], [numbers(7), numbers(4, 4)]
+        zeros = numbers(9)
+        callers.set(inputs, outputs, zeros)
+        callers.read(fixed)
+        assert all(map(torch.equal, fixed, inputs))
+        callers.write(fixed[1:], 6)
+        assert all(map(torch.equal, outputs, fixed[1:]))
+        assert not zeros[:6].any() and zeros[6:].all()
+
+
+def test_nothing_is_copied_before_a_caller_is_known_and_zeros_can_be_left_out():
+    callers, fixed = CallerMemory(DEVICE), [numbers(3)]
+    before = fixed[0].clone()
+    callers.read(fixed)
+    callers.write(fixed, 100)
+    assert torch.equal(fixed[0], before)
+    output = torch.zeros_like(before)
+    callers.set([before], [output], None)
+    callers.read(fixed)
+    callers.write(fixed, 100)
+    assert torch.equal(output, before)
+
+
+def test_more_numbers_than_one_launch_has_threads_are_refused():
+    with pytest.raises(RuntimeError, match="too many for one launch"):
+        CallerMemory(DEVICE).read([numbers(1).expand(1 << 30)])
