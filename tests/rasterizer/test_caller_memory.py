@@ -49,3 +49,13 @@ def test_nothing_is_copied_before_a_caller_is_known_and_zeros_can_be_left_out():
 def test_more_numbers_than_one_launch_has_threads_are_refused():
     with pytest.raises(RuntimeError, match="too many for one launch"):
         CallerMemory(DEVICE).read([numbers(1).expand(1 << 30)])
+
+
+def test_a_call_with_fewer_tensors_than_the_last_one_has_its_zeros():
+    for count in (5, 2, 3):
+        callers, fixed = CallerMemory(DEVICE), [numbers(7) for _ in range(count)]
+        outputs, zeros = [numbers(7) for _ in fixed], numbers(6)
+        callers.set([], outputs, zeros)
+        callers.read([])
+        callers.write(fixed, 6)
+        assert all(map(torch.equal, outputs, fixed)) and not zeros.any()
