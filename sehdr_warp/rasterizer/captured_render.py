@@ -158,13 +158,16 @@ class CapturedRender:
 
         outputs: contiguous, to write what follows image and transmittance to. By default they are new tensors.
         """
+        if self._count.value < 0:  # The last call ended before its count was read, for example by lack of memory.
+            self._stream.synchronize()
         self._count.value = -1
         if not self._copies:
             return self._launch(tensors)
         known = len(self._outputs) - len(outputs)
         results = [*map(torch.empty_like, self._outputs[:known]), *outputs]
         gradients = None if self._gradients_like is None else torch.empty_like(self._gradients_like)
-        self._callers.set([tensor.contiguous() for tensor in tensors], results, gradients)
+        inputs = [tensor.contiguous() for tensor in tensors]  # Copies must live until the graph is launched.
+        self._callers.set(inputs, results, gradients)
         self._runner.replay()
         image, transmittance, *others = results
         return Replay(image, transmittance, others, gradients)

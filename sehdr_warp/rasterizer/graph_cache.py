@@ -55,7 +55,8 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
     tensors, options: as their user passed them. If calls like this one are known, they were checked before.
     """
     try:
-        if not on_gpu(tensors[0]):
+        # 640.0 equals 640, and is refused where arguments are checked.
+        if not on_gpu(tensors[0]) or type(options.width) is not int or type(options.height) is not int:
             return None
         pool = _pools.get(_signature(tensors, options))
     except (AttributeError, TypeError, RuntimeError):

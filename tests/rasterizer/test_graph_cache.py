@@ -1,9 +1,13 @@
 """Calls of rasterize() that are replayed: what they return is what launched calls do, and stays."""
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.rasterizer import block_blending, captured_backward, captured_render, graph_cache, rasterize, tile_lists
+from sehdr_warp.rasterizer.memory import OutOfMemory
 from sehdr_warp.rasterizer.render_options import RenderOptions
 
 from .emulated_graphs import emulate
@@ -255,3 +259,36 @@ def test_only_calls_whose_arguments_were_checked_are_known():
         wrong = [change(t) if k == place else t for k, t in enumerate(scene.arguments)]
         with pytest.raises((ValueError, TypeError), match="means|features|intrinsics"):
             rasterize(*wrong)
+
+
+def test_sizes_that_equal_those_of_known_calls_are_checked_as_well():
+    scene = scene_of(count=5)
+    *tensors, width, height = scene.arguments
+    for _ in range(CALLS):
+        rasterize(*scene.arguments)
+    for wrong in ((float(width), height), (width, float(height))):
+        with pytest.raises(TypeError, match="expected a whole number"):
+            rasterize(*tensors, *wrong)
+    assert rasterize(*tensors, np.int64(width), height).image.shape[:2] == (height, width)
+
+
+def test_a_graph_whose_count_was_not_read_is_waited_for(monkeypatch):
+    scene, order = scene_of(), []
+
+    def end_before_the_count():
+        count_intersections()
+        graph._count.value = -1  # As if the GPU had not counted yet.
+        graph._stream = SimpleNamespace(synchronize=lambda: order.append("wait"), query=lambda: False)
+        raise torch.OutOfMemoryError("no memory")
+
+    with torch.no_grad():
+        for _ in range(CALLS):
+            image = rasterize(*scene.arguments).image
+        (graph,) = next(iter(graph_cache._pools.values())).idle
+        replay, count_intersections = graph._runner.replay, graph.count_intersections
+        monkeypatch.setattr(graph._runner, "replay", lambda: order.append("replay") or replay())
+        with monkeypatch.context() as patch, pytest.raises(OutOfMemory):
+            patch.setattr(graph, "count_intersections", end_before_the_count)
+            rasterize(*scene.arguments)
+        assert torch.equal(rasterize(*scene.arguments).image, image)
+    assert order == ["replay", "wait", "replay"]
