@@ -79,7 +79,7 @@ def test_result_is_a_weighted_mean_of_the_encoded_brackets(name, evaluation):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("sigma", [1e-30, 1e-6, 0.2, 1e6, 1e30])
+@pytest.mark.parametrize("sigma", [1e-30, 0.2, 1e30])
 @pytest.mark.parametrize("output_bias", [0.0, 1e4, -1e4])
 @pytest.mark.parametrize("evaluation", ["exact", "forward"])
 def test_extremes_stay_finite(device, dtype, sigma, output_bias, evaluation):

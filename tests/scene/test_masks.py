@@ -54,9 +54,8 @@ def masks_said(scene):
         "Masks/{}.png",
     ],
 )
-@pytest.mark.parametrize("layout", [write_colmap, write_llff])
-def test_names_of_masks(tmp_path, layout, name):
-    layout(tmp_path)
+def test_names_of_masks(tmp_path, name):
+    write_colmap(tmp_path)
     for i in range(6):
         write_mask(tmp_path / name.format(f"{i:03d}"))
     scene = load(tmp_path, holdout=0)

@@ -42,8 +42,17 @@ def test_models_are_found_where_people_keep_them(tmp_path, place):
     assert find_model(tmp_path) == tmp_path / place and load(tmp_path).format == "colmap"
 
 
-@pytest.mark.parametrize("place", [".", "model", "undistorted/sparse", "Sparse/0"])
-@pytest.mark.parametrize("photos", ["images", "Images", "input", "."])
+@pytest.mark.parametrize(
+    "place, photos",
+    [
+        (".", "images"),
+        (".", "Images"),
+        ("model", "images"),
+        ("model", "input"),
+        ("Sparse/0", "images"),
+        ("Sparse/0", "."),
+    ],
+)
 def test_models_and_photos_are_found_in_other_folders_by_the_names_of_the_photos(tmp_path, place, photos):
     write_colmap(tmp_path, name="{:03d}.png")
     model = (tmp_path / "sparse" / "0").rename(tmp_path / "before")
