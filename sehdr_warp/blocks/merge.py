@@ -8,7 +8,6 @@ neighbours in space are neighbours in memory, so that a part of the scene is a f
 
 import logging
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,7 +76,8 @@ def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage
         raise InputError(out, "no Gaussian of any block is in its core", "train again, with --overwrite")
     counts = torch.tensor([len(block.evidence.weight_sum) for block in blocks])
     owners = torch.arange(len(blocks)).repeat_interleave(counts)
-    refines = can_refine(device, blocks)
+    # A CPU refines in reasonable time what CPUs have trained.
+    refines = device.type != "cpu" or not any(block.summary.get("peak_gpu_memory_bytes") for block in blocks)
     if refines:
         refine_borders(tensors, owners, out, plan, device, photo_storage)
     else:
@@ -118,11 +118,6 @@ def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage
         folder.unlock()
     log.info("merged %d Gaussians of %d blocks", len(tensors["means"]), len(blocks))
     return folder
-
-
-def can_refine(device: torch.device, blocks: Sequence[TrainedBlock]) -> bool:
-    """Return whether a device can refine borders in reasonable time: a CPU only what CPUs have trained."""
-    return device.type != "cpu" or not any(block.summary.get("peak_gpu_memory_bytes") for block in blocks)
 
 
 def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:

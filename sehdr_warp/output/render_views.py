@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -125,7 +125,9 @@ def render_views(
         raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
     stored_pixel_type((), pixel)
     exposure = exposure_of_white(run, reference_white)
-    display_transform = _display_transform(run, ocio, view)
+    if (ocio is None) != (view is None):
+        raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
+    display_transform = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
     aovs = read_aovs(aovs) if aovs else ()
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
@@ -213,15 +215,6 @@ class _HdrWriter:
         parts += data_parts(self.aovs, ViewData(self.run, camera, camera_in_file, rendered.alpha, depth), attributes)
         if write_multipart_exr(self.folder / f"{name}.exr", parts, pixel=self.pixel) != self.pixel:
             log.info("%s: holds values above 65504, which half cannot; written as float", name)
-
-
-def _display_transform(
-    run: "RenderableScene", ocio: str | None, view: str | None
-) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return the function that encodes previews through OpenColorIO; None without a config."""
-    if (ocio is None) != (view is None):
-        raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
-    return None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
 
 
 def _camera_files(
@@ -313,7 +306,11 @@ def select_cameras(
             others = choices.replace(f"{text}, ", "")
             raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
     elif text in PATHS:
-        path = default_path(run, count, up) if text == "orbit" else _interpolated_path(run, count)
+        if text == "orbit":
+            path = default_path(run, count, up)
+        else:
+            photos = training_cameras(run)
+            path = [film_camera(each, photos) for each in interpolate(photos, count)]
         digits = max(3, len(str(count - 1)))
         return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
     else:
@@ -328,12 +325,6 @@ def select_cameras(
             if not views:
                 raise SehdrError(f"{cameras}: has no camera {camera!r}{did_you_mean(camera, names)}")
     return list(zip(safe_names([name for name, _ in views]), [camera for _, camera in views], strict=True))
-
-
-def _interpolated_path(run: "RenderableScene", count: int) -> list[Camera]:
-    """Return a path through the training cameras."""
-    photos = training_cameras(run)
-    return [film_camera(camera, photos) for camera in interpolate(photos, count)]
 
 
 def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:

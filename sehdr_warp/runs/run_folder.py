@@ -215,10 +215,9 @@ class RunFolder:
 
     def read_metrics(self) -> list[dict]:
         """Return the evaluations during the training, see MetricsValues; lines that a kill cut are left out."""
-        return self._read(self.metrics, lambda path: list(read_metrics_lines(path))) if self._has_metrics() else []
-
-    def _has_metrics(self) -> bool:
-        return self.metrics.is_file() and self.metrics.stat().st_size > 0
+        if not self.metrics.is_file() or self.metrics.stat().st_size == 0:
+            return []
+        return self._read(self.metrics, lambda path: list(read_metrics_lines(path)))
 
     def newest_checkpoint(self, parts: tuple[str, ...] = ("",)) -> Checkpoint | None:
         """Return the newest sound checkpoint, None if there is none at all.

@@ -102,7 +102,8 @@ class RunWriter(RunFolder):
             self.require()
         else:
             self.require("choose another folder for the run; --overwrite replaces runs alone")
-        if not {"format", "base_time", "response"} <= self._read(self.info_file, _read_own).keys():
+        info = self._read(self.info_file, lambda path: read_object(path, _CHOOSE_OTHER))
+        if not {"format", "base_time", "response"} <= info.keys():
             raise InputError(self.info_file, "is not that of a run of sehdr-warp", _CHOOSE_OTHER)
         with self._lock_held():  # Only to see that no other training holds it.
             return resume
@@ -280,10 +281,6 @@ def _refuse_foreign(folder: Path) -> None:
     for path in sorted(folder.rglob("*")):
         if not _NEW_NAMES.fullmatch(path.relative_to(folder).as_posix()):
             raise InputError(path, "is in the place of a new run, but is not of one", "move it away")
-
-
-def _read_own(path: Path) -> dict:
-    return read_object(path, _CHOOSE_OTHER)
 
 
 def _identity(file: Path) -> tuple[int, int] | None:

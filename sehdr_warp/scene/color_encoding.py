@@ -81,7 +81,10 @@ class ColorEncoding:
             channels are clipped.
         """
         clipped = pixels == np.iinfo(pixels.dtype).max
-        light = self._decode(pixels) if self.table is None else self._light_by_table(pixels)
+        if self.table is None:
+            light = self._decode(pixels)
+        else:
+            light = self._known_colors.light(pixels) if pixels.dtype == np.uint8 else self._convert(pixels)
         if above is not None:
             light, clipped = np.where(above > 0, above, light), clipped & (above == 0)
         if self.to_rec709 is not None:
@@ -99,10 +102,6 @@ class ColorEncoding:
         if len(decoders) == 1:
             return decoders[0][pixels]
         return np.stack([decoder[pixels[..., channel]] for channel, decoder in enumerate(decoders)], axis=-1)
-
-    def _light_by_table(self, pixels: np.ndarray) -> np.ndarray:
-        """Return [H, W, 3] float32 linear Rec.709 of codes by the profile's table."""
-        return self._known_colors.light(pixels) if pixels.dtype == np.uint8 else self._convert(pixels)
 
     def _convert(self, pixels: np.ndarray) -> np.ndarray:
         assert self.table is not None

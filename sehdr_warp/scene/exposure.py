@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..files import has_file, read_bytes
 from ..subsets import first_names
 from .dataparser import ImageRecord
-from .exif import LONGEST, SHORTEST, ExifExposure, exif_exposure, parse_number
+from .exif import LONGEST, SHORTEST, exif_exposure, parse_number
 from .images import PHOTO_SUFFIXES
 from .names import Listing, bases_of, fold_name
 
@@ -240,12 +240,9 @@ def _exif_times(records: list[ImageRecord]) -> tuple[list[float | None], list[st
             notes.append(f"{name} is not stated for all photos and was not counted")
         elif len(set(values)) > 1:
             factors = [
-                f * _ratio(exposure, field, values[0]) ** power for f, exposure in zip(factors, exposures, strict=True)
+                f * ((getattr(exposure, field) or values[0]) / values[0]) ** power
+                for f, exposure in zip(factors, exposures, strict=True)
             ]
             span = f"{min(values):g} to {max(values):g}"
             notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}")
     return [e.time and e.time * f for e, f in zip(exposures, factors, strict=True)], notes
-
-
-def _ratio(exposure: ExifExposure, field: str, first: float) -> float:
-    return (getattr(exposure, field) or first) / first

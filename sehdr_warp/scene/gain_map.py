@@ -130,7 +130,9 @@ def read_gain_map(path: Path, *, oriented: bool = False, problems: dict[Path, st
     try:
         if not _is_marked(path):
             return None
-        gain_map = _of_jpeg(path) if _is_jpeg(path) else _of_items(path)
+        with path.open("rb") as file:
+            is_jpeg = file.read(2) == b"\xff\xd8"
+        gain_map = _of_jpeg(path) if is_jpeg else _of_items(path)
         if gain_map is not None and oriented:
             with open_image(path) as image:
                 gain_map = replace(gain_map, encoded=turn_upright(gain_map.encoded, orientation_of(image)))
@@ -166,11 +168,6 @@ def _is_marked(path: Path) -> bool:
     if head[:2] == b"\xff\xd8":
         return b"MPF\0" in head or b"GainMap" in head
     return head[4:8] == b"ftyp" and (b"tmap" in head or b"auxC" in head)
-
-
-def _is_jpeg(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(2) == b"\xff\xd8"
 
 
 def _of_jpeg(path: Path) -> GainMap | None:

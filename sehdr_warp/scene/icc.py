@@ -123,7 +123,10 @@ def read_profile(data: bytes) -> IccProfile:
             space = profile.connection_space.strip()
             return IccProfile(name, colors, None, (), cicp, read_table(table, space, _curve))
         curves = tuple(_curve(tags[tag]) for tag in (b"rTRC", b"gTRC", b"bTRC")) if b"rTRC" in tags else ()
-        to_xyz = np.stack([_xyz(tags[tag]) for tag in (b"rXYZ", b"gXYZ", b"bXYZ")], axis=1) if curves else np.eye(3)
+        to_xyz = np.eye(3)
+        if curves:
+            columns = [struct.unpack_from(">3i", tags[tag], 8) for tag in (b"rXYZ", b"gXYZ", b"bXYZ")]
+            to_xyz = np.stack(columns, axis=1) / 65536
     except (KeyError, struct.error, IndexError, ValueError, OverflowError):
         raise ValueError("is damaged") from None
     if not curves and cicp is None:
@@ -147,10 +150,6 @@ def _tags(data: bytes) -> dict[bytes, bytes]:
         raise ValueError
     entries = (struct.unpack_from(">4sII", data, 132 + 12 * i) for i in range(count))
     return {tag: data[offset : offset + size] for tag, offset, size in entries}
-
-
-def _xyz(tag: bytes) -> np.ndarray:
-    return np.array(struct.unpack_from(">3i", tag, 8)) / 65536
 
 
 def _curve(tag: bytes) -> np.ndarray:

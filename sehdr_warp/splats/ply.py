@@ -91,7 +91,9 @@ def read_ply(path: Path) -> GaussianArrays:
         present = names | ({"scale_2"} if flat else set()) | (set(_GROUPS[-1].split()) if rgb else set())
         missing = [name for group in _GROUPS for name in group.split() if name not in present]
         if missing:
-            raise InputError(path, _without(missing, names), "export 3D Gaussians as an uncompressed PLY")
+            is_cloud = "red" in names and len(missing) > 6
+            problem = "is a point cloud, not Gaussians" if is_cloud else f"has no {', '.join(missing[:4])}"
+            raise InputError(path, problem, "export 3D Gaussians as an uncompressed PLY")
         whole = [p.name for p in vertex.properties if p.name in " ".join(_GROUPS).split() and p.val_dtype[0] != "f"]
         if whole:
             raise InputError(path, f"its {whole[0]} is of whole numbers", "export 3D Gaussians as an uncompressed PLY")
@@ -99,14 +101,16 @@ def read_ply(path: Path) -> GaussianArrays:
         degree_of(1 + len(rest) / 3, path)
         filtered = ["filter_3D"] if "filter_3D" in names else []
         groups = (*(group.split() for group in _GROUPS), rest, filtered)
-        columns = [_columns([_column(vertex, name) for name in group if name in names]) for group in groups]
+        stored = [[np.asarray(vertex[name], np.float32) for name in group if name in names] for group in groups]
+        columns = [np.stack(group, axis=1) if group else np.zeros(0, np.float32) for group in stored]
         if flat:
             thin = np.full((len(columns[0]), 1), _FLAT, np.float32)
             columns[1] = np.concatenate([columns[1], thin], axis=1)
     except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise InputError(path, f"cannot be read as PLY ({error!s:.120})", _DAMAGED) from None
     if rgb:
-        columns[4] = (_columns([_column(vertex, name) for name in _RGB]) / 255 - 0.5) / np.float32(HARMONIC_0)
+        colors = np.stack([np.asarray(vertex[name], np.float32) for name in _RGB], axis=1)
+        columns[4] = (colors / 255 - 0.5) / np.float32(HARMONIC_0)
     means, log_scales, quaternions, opacity, constant, higher, smoothing = columns
     if flat:
         log.info("%s: its Gaussians have two sizes (2D Gaussian Splatting), and are read as flat ones", path)
@@ -158,14 +162,6 @@ def _is_byte(vertex: Any, name: str) -> bool:
     return any(each.name == name and each.val_dtype == "u1" for each in vertex.properties)
 
 
-def _column(vertex: Any, name: str) -> np.ndarray:
-    return np.asarray(vertex[name], np.float32)
-
-
-def _columns(columns: list[np.ndarray]) -> np.ndarray:
-    return np.stack(columns, axis=1) if columns else np.zeros(0, np.float32)
-
-
 def _check_header(path: Path) -> None:
     """Refuse a file that claims more than it can hold, before anything is read.
 
@@ -175,20 +171,15 @@ def _check_header(path: Path) -> None:
     header = read_start.partition(b"end_header")[0]
     if not header.startswith(b"ply") or size == len(header):
         raise InputError(path, "is not a PLY file", _DAMAGED)
-    _require_memory(path, path.stat().st_size)
+    if (needed := _MEMORY_PER_BYTE * path.stat().st_size) > (free := available_memory()):
+        problem = f"takes about {needed / 1e9:.3g} GB of memory to read, and {free / 1e9:.3g} GB are free"
+        raise InputError(path, problem, "use a smaller file, or a machine with more memory")
     claimed = [int(number) for number in re.findall(rb"^element\s+\S+\s+(\d{1,19})\s*$", header, re.MULTILINE)]
     smallest = len(re.findall(rb"^property\s", header, re.MULTILINE)) if len(claimed) == 1 else 1
     if sum(claimed) * smallest > path.stat().st_size:
         raise InputError(
             path, f"claims {sum(claimed)} elements, more than its {path.stat().st_size} bytes hold", _DAMAGED
         )
-
-
-def _require_memory(path: Path, size: int) -> None:
-    """Raise InputError for a file whose Gaussians this machine has no memory for."""
-    if (needed := _MEMORY_PER_BYTE * size) > (free := available_memory()):
-        problem = f"takes about {needed / 1e9:.3g} GB of memory to read, and {free / 1e9:.3g} GB are free"
-        raise InputError(path, problem, "use a smaller file, or a machine with more memory")
 
 
 def _start(path: Path) -> bytes:
@@ -200,12 +191,6 @@ def _start(path: Path) -> bytes:
         raise InputError(path, "file not found", "check the name") from None
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
-
-
-def _without(missing: list[str], names: set[str]) -> str:
-    if "red" in names and len(missing) > 6:
-        return "is a point cloud, not Gaussians"
-    return f"has no {', '.join(missing[:4])}"
 
 
 class _Facts(NamedTuple):

@@ -37,7 +37,8 @@ def write_sog(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     """Write a .sog file; arguments as in write_gaussians."""
     with atomic_path(path, overwrite) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, content in sog_files(gaussians):
-            archive.writestr(_entry(name), content)
+            # The date is the same in every file, and pictures are compressed already.
+            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
 
 
 def sog_files(gaussians: GaussianArrays) -> Iterator[tuple[str, str | bytes]]:
@@ -216,8 +217,3 @@ def _picture(read: Callable[[str, int], bytes], name: str, most: int) -> np.ndar
         if image.width * image.height > most:
             raise ValueError(f"{name} has {image.width} x {image.height} pixels")
         return np.asarray(image.convert("RGBA"))
-
-
-def _entry(name: str) -> zipfile.ZipInfo:
-    """Return an entry whose date is the same in every file; pictures are compressed already."""
-    return zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))

@@ -152,20 +152,13 @@ def start_points(
         matches = _match_points(get_matcher(), number - len(points), config.seed)
         points, colors = (np.concatenate(both) for both in zip((points, colors), matches, strict=True))
         _log.info("%d points matched between the photos", len(matches[0]))
-    points = within_reach(points)
+    # Points beyond MAX_DISTANCE move to it: from cameras within the unit ball the direction changes by under a degree.
+    distances = np.linalg.norm(points, axis=1, keepdims=True)
+    points = points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distances, 1e-12))
     if len(points) < FEWEST_POINTS:
         random = random_points(scene, max(number, FEWEST_RANDOM), rng)
         points, colors = (np.concatenate(both) for both in zip((points, colors), random, strict=True))
     return points, colors
-
-
-def within_reach(points: np.ndarray) -> np.ndarray:
-    """Return points [N, 3] of normalized coordinates, with those beyond MAX_DISTANCE moved to it along their direction.
-
-    From cameras within the unit ball the direction of such a point changes by less than a degree.
-    """
-    distances = np.linalg.norm(points, axis=1, keepdims=True)
-    return points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distances, 1e-12))
 
 
 def match_points(

@@ -137,7 +137,8 @@ def ldr_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor:
     image = compared_image(render, target)
     codes, scale, index, weight = target.codes, target.scale, target.index, config.ssim_weight
     smooths_clipped = scale.compares_exposures and config.clipping
-    clipped = clipped_weights(config, target) if smooths_clipped else ClippedWeights()
+    estimate_weight = 0.0 if target.estimates is None else config.clipped_estimate
+    clipped = ClippedWeights(config.clipped_smoothness, estimate_weight) if smooths_clipped else ClippedWeights()
     if target.mask is None and weight:
         # The common case: the terms below in one launch, and with one gradient.
         return photo_loss(
@@ -162,12 +163,6 @@ def compared_image(render: TrainRender, target: Target) -> Tensor:
     image = render.photo_exposure if target.scale.compares_exposures else render.encoded
     assert image is not None
     return image
-
-
-def clipped_weights(config: LossConfig, target: Target) -> ClippedWeights:
-    """Return the weights of the terms for clipped light; without estimates, the second is 0."""
-    estimate_weight = 0.0 if target.estimates is None else config.clipped_estimate
-    return ClippedWeights(config.clipped_smoothness, estimate_weight)
 
 
 def compares_exposures(config: LossConfig, field: RadianceField) -> bool:

@@ -40,7 +40,6 @@ from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .step_graphs import GraphCapacity, StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
-from .targets import ViewStack
 from .training_state import Pace, TrainingProgress
 from .training_views import PhotoOrder, PhotoStream, TrainingViews, has_wide_views
 
@@ -215,7 +214,10 @@ class Trainer:
         set_means_rate(self.optimizer, means_lr)
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
             self._reserve_rows()
-        step, options = self.gradient_step, self._step_options()
+        # The opacity penalty ends with the refinements.
+        opacity_weight = 0.0 if self.strategy.schedule.is_over(self.iteration) else self.config.loss.opacity_weight
+        options = StepOptions(self.degree, opacity_weight, self.strategy.needs_gradients(self.iteration))
+        step = self.gradient_step
         if options.needs_means2d_grad:
             self.strategy.prepare(gaussians.row_count, self.device)
 
@@ -229,7 +231,11 @@ class Trainer:
             self._device_index.fill_(index)
             if isinstance(views, PhotoStream):
                 views.bring(index)
-            compute = partial(self._compute_at_index, views, options, self.capacity.capacity())
+            capacity = self.capacity.capacity()
+
+            def compute() -> Gradients:
+                return step.compute_gradients(views.at(self._device_index), options, capacity)
+
             self._result = self.graphs.run(graph_key, step.run, compute, step.apply_gradients, self.iteration)
             if isinstance(views, PhotoStream):
                 views.release(self.order.peek())
@@ -248,16 +254,6 @@ class Trainer:
             self.check(wait=False)
         if self.came_to(COMPARE_EVERY):
             self.gather()
-
-    def _step_options(self) -> StepOptions:
-        """Return the options of this iteration's gradient step; no opacity penalty once no refinement follows."""
-        refines = not self.strategy.schedule.is_over(self.iteration)
-        opacity_weight = self.config.loss.opacity_weight if refines else 0.0
-        return StepOptions(self.degree, opacity_weight, self.strategy.needs_gradients(self.iteration))
-
-    def _compute_at_index(self, views: ViewStack | PhotoStream, options: StepOptions, capacity: int) -> Gradients:
-        """Compute gradients of the view whose index is on the device, with a fixed intersection capacity."""
-        return self.gradient_step.compute_gradients(views.at(self._device_index), options, capacity)
 
     def _densify(self) -> None:
         """Refine the Gaussians if that is due; on several ranks, rank 0 does and the others receive the result."""

@@ -81,11 +81,6 @@ class PhotoOrder:
             raise ValueError(f"the order of the photos names others than the {self._count} there are")
 
 
-def fits_device(source: PhotoSource, device: torch.device) -> bool:
-    """Return whether all photos may stay on a GPU."""
-    return source.bytes <= SHARE * torch.cuda.mem_get_info(device)[0]
-
-
 def make_view_source(
     source: PhotoSource, where: str, use_cuda_graph: bool
 ) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
@@ -96,21 +91,16 @@ def make_view_source(
     device = torch.device(source.device)
     if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
         return source
-    if where in ("memory", "disk") or (where == "auto" and not fits_device(source, device)):
+    if where in ("memory", "disk") or (where == "auto" and source.bytes > SHARE * torch.cuda.mem_get_info(device)[0]):
         log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, device)
-        return _stream_or_source(source) if use_cuda_graph else source
+        try:
+            return PhotoStream(source) if use_cuda_graph else source
+        except ValueError as error:
+            log.info("%s: they are copied one by one, and steps are not captured as CUDA graphs", error)
+            return source
     views = list(source)
     # Only captured steps need all photos in one tensor.
     return (ViewStack.of(views) if use_cuda_graph else None) or views
-
-
-def _stream_or_source(source: PhotoSource) -> "PhotoStream | PhotoSource":
-    """Return a PhotoStream, or the source itself if its photos cannot share slots."""
-    try:
-        return PhotoStream(source)
-    except ValueError as error:
-        log.info("%s: they are copied one by one, and steps are not captured as CUDA graphs", error)
-        return source
 
 
 class PhotoStream:

@@ -159,7 +159,7 @@ class Connections:
         end = time.monotonic() + _ROOM_WAIT
         with self._changed:
             while (
-                by_others := self._taken_by_others(connection)
+                by_others := sum(each.reserved_bytes for each in self._open.values() if each is not connection)
             ) and by_others + connection.reserved_bytes + size > MOST_BYTES:
                 now = time.monotonic()
                 if now > end:
@@ -170,6 +170,3 @@ class Connections:
                     stalled.since = now  # Its thread takes a moment to end.
                 self._changed.wait(SHORT_STALL / 2)
             connection.reserved_bytes += size
-
-    def _taken_by_others(self, connection: Connection) -> int:
-        return sum(each.reserved_bytes for each in self._open.values() if each is not connection)

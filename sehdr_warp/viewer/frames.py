@@ -48,14 +48,10 @@ class ViewerScene:
         self._start_edits()
 
     def _start_edits(self) -> None:
-        """Forget edits, because another scene is shown."""
+        """Forget edits, lights and gains, because another scene is shown."""
         self.opacities, self.visible_count = EditedOpacities(), None
         self._edits: SplatEdits | None = None
         self._merged: tuple[ViewerScene, ...] = ()
-        self._start_lights()
-
-    def _start_lights(self) -> None:
-        """Forget lights and gains, because another scene is shown."""
         self.light_gains, self._lights = LightGains(), None
         self._stops: dict[int, float] = {}
 
