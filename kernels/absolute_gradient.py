@@ -9,8 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
-from .constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, NO_AUTODIFF, TRANSMITTANCE_MIN
 from .geometry import geometry, pixel_of_thread
 
 

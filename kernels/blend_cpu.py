@@ -29,8 +29,7 @@ from functools import cache
 
 import warp as wp
 
-from .compile_options import FUSED, NO_AUTODIFF, cpu_flags
-from .constants import ALPHA_MAX, TILE_SIZE, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, FUSED, NO_AUTODIFF, TILE_SIZE, TRANSMITTANCE_MIN, cpu_flags
 from .geometry import vector
 
 LANES = 8  # Pixels in a row: a register of AVX2. Rows of 16 are wider than most Gaussians

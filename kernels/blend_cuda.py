@@ -21,8 +21,7 @@ from functools import cache
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
-from .constants import ALPHA_MAX, SUBTILE, TILE_SIZE, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, NO_AUTODIFF, SUBTILE, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import geometry, vector
 
 BLOCK_DIM = 32

@@ -20,8 +20,7 @@ from .blend_cuda import (
     module_options,
     padded_channels,
 )
-from .compile_options import NO_AUTODIFF
-from .constants import ALPHA_MAX, SUBTILE, TILE_SIZE
+from .constants import ALPHA_MAX, NO_AUTODIFF, SUBTILE, TILE_SIZE
 from .geometry import geometry, vector
 
 ROWS = 4  # of pixels of one warp

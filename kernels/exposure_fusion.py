@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 
 POINTS_PER_THREAD = 64  # Of one hidden unit's gradients, summed before the atomics
 

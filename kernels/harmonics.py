@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 from .geometry import geometry, vector
 
 

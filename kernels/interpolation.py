@@ -6,7 +6,7 @@ function is constant, above the last one a straight line.
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 from .geometry import vector
 
 COPIES = 128

@@ -7,7 +7,7 @@ bright thing is then compared by itself, and not together with the wall that ano
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 
 RADIUS = wp.constant(2)
 """Patches are 5 x 5 pixels."""

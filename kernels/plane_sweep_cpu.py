@@ -5,7 +5,7 @@ Where a neighbor shows a pixel of the patch is linear in the depth, before the d
 
 import warp as wp
 
-from .compile_options import FUSED, NO_AUTODIFF, cpu_flags
+from .constants import FUSED, NO_AUTODIFF, cpu_flags
 from .geometry import vector
 from .plane_sweep import (
     LARGEST,

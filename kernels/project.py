@@ -13,8 +13,7 @@ from functools import cache
 
 import warp as wp
 
-from .compile_options import cpu_flags
-from .constants import FRUSTUM_MARGIN, LOG_SCALE_MAX
+from .constants import FRUSTUM_MARGIN, LOG_SCALE_MAX, cpu_flags
 from .geometry import geometry, matrix
 
 

@@ -7,7 +7,7 @@ makes them together as opaque as the one was, and a size that makes up for the s
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 from .geometry import vector
 
 AT_ONCE = 6  # Tensors whose rows one launch copies or clears

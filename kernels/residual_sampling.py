@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 
 
 @cache

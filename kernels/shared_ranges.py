@@ -9,7 +9,7 @@ import ctypes
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 
 LARGEST = 4096
 """Bytes of a kernel's parameters."""

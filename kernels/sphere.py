@@ -18,8 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF, cpu_flags
-from .constants import ALPHA_MAX, LOG_SCALE_MAX, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, LOG_SCALE_MAX, NO_AUTODIFF, TRANSMITTANCE_MIN, cpu_flags
 from .geometry import geometry, pixel_of_thread, vector
 
 # Tiles along the side of a block: the pairs of Gaussians and blocks are few, and so are the tiles of a block.

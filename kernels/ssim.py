@@ -19,7 +19,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 from .geometry import vector
 
 RADIUS = 5

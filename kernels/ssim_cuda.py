@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 from .geometry import vector
 from .patches import BLOCK_DIM, CHANNELS, ROWS, TURNS, patch_functions
 from .ssim import RADIUS, comparison

@@ -14,8 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
-from .constants import SUBTILE, TILE_SIZE
+from .constants import NO_AUTODIFF, SUBTILE, TILE_SIZE
 from .geometry import geometry
 
 DEPTH_BITS = 30

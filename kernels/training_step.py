@@ -8,8 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
-from .constants import LOG_SCALE_MAX
+from .constants import LOG_SCALE_MAX, NO_AUTODIFF
 from .geometry import geometry, vector
 
 SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995

@@ -113,7 +113,7 @@ def _evaluate_run(options: Evaluate) -> dict[str, Any]:
 
 def _evaluate_pictures(options: Evaluate, truth_path: str) -> dict[str, Any]:
     from ..scene import load_scene
-    from ..scene.parse import parse_dataset
+    from ..scene.load import parse_dataset
     from .folder import evaluate_folder
 
     max_size = options.pictures.max_size

@@ -2,8 +2,7 @@
 
 from .camera import Camera, look_at
 from .camera_files import load_cameras
-from .load import load_scene
-from .parse import embedded_folder, embedded_scenes, is_embedded, parse_dataset
+from .load import embedded_folder, embedded_scenes, is_embedded, load_scene, parse_dataset
 from .preprocess import preprocess
 from .types import Scene, View, codes_of, encoded_values
 

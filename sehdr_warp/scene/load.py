@@ -1,21 +1,53 @@
 """Load a scene: parse a data folder of any layout, choose the response, preprocess the photos."""
 
-from collections.abc import Collection, Sequence
+import os
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from ..errors import InputError
-from .exposure import exposures_note
+from ..errors import InputError, did_you_mean, missing
+from ..files import has_file
+from ..subsets import first_names
+from .camera_checks import check_cameras
+from .colmap_model import find_model
+from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
+from .exposure import choose_exposure, exposures_note, stated_times, with_exposure_times
+from .hdr_files import exr_exposure_time
+from .linear_photos import follow_times, log_averages, middle_grey_time
+from .masks import assign_masks
 from .names import unique_names
-from .parse import parse_dataset
+from .photos import usable_photos
 from .preprocess import preprocess
+from .read_folders import (
+    find_photos,
+    image_folder,
+    is_hdr_gs,
+    model_fits,
+    place_photos,
+    read_colmap,
+    read_hdr_gs,
+    read_hdr_nerf_real,
+    read_llff,
+)
+from .read_opensfm import find_reconstruction, read_opensfm
+from .read_transforms import read_hdr_nerf, read_transforms
 from .response_choice import check_response, choose_response
+from .truth_files import assign_truth
 from .types import Scene
+from .unused_files import ARCHIVE_SUFFIXES, unused_notes
+from .video import UNSTITCHED_SUFFIXES, is_video
+from .video_frames import read_video
 
 if TYPE_CHECKING:
     from ..response import Response
+
+_MARK = "transforms_train.json"  # A file of every embedded scene
+_HOLDOUT = 8  # Every eighth view is held out, as LLFF, Mip-NeRF 360 and 3DGS do
+_WITH_TRUTH = ("colmap", "transforms", "opensfm", "llff", "photos")  # Layouts that do not say where truth lies
+_FEWEST_FOR_TEST = 5  # In smaller sets no view is held out
 
 
 def load_scene(
@@ -95,3 +127,198 @@ def load_scene(
         records = [record for name, record in zip(names, dataset.records, strict=True) if name in used]
         scene = replace(scene, notes=(*scene.notes, *exposures_note(records)))
     return replace(scene, chosen_by=choice.chosen_by, color_matrix=choice.color_matrix, light_known=light_known)
+
+
+def parse_dataset(
+    path: Path | str,
+    *,
+    exposure_index: int | None = None,
+    holdout: int | None = None,
+    cache: Path | str | None = None,
+    check: Callable[[DataparserOutputs], None] | None = None,
+) -> DataparserOutputs:
+    """Parse cameras, files, exposure times and splits of a data folder; of photos only headers are read.
+
+    Everything that can refuse a set is checked before structure from motion, which takes minutes. check() is called
+    with the kind of the photos known and cameras not yet found; it may raise InputError. Other arguments and errors are
+    those of load_scene().
+    """
+    if holdout is not None and holdout < 0:
+        raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
+    folder = _folder(path)
+    dataset = read_video(folder, cache) if is_video(folder) else _read(folder)
+    name = str(path) if is_embedded(path) else folder.resolve().name
+    folder = folder if folder.is_dir() else dataset.folder
+    if not dataset.records:
+        raise InputError(folder, "has no views", "check the data folder")
+    records, mask_notes = assign_masks(dataset.records, folder)
+    records, truth_notes = assign_truth(records, folder) if dataset.format in _WITH_TRUTH else (records, [])
+    all_records = records
+    records, exposure_notes = choose_exposure(records, exposure_index, folder)
+    records, kind, photo_notes = usable_photos(records)
+    records, times_known, time_notes = _with_times(records, kind, folder)
+    dataset = replace(dataset, kind=kind, records=tuple(records), folder=folder, times_known=times_known)
+    if check is not None:
+        check(dataset)
+    unplaced: list[str] = []
+    if records and records[0].lens is UNPLACED:
+        dataset, records, unplaced = place_photos(dataset, records, folder, kind, cache)
+        if unplaced:  # Their times are not to be told of, nor the others' relative to theirs.
+            untimed = [replace(record, exposure_time=None, time_known=True) for record in records]
+            records, times_known, time_notes = _with_times(untimed, kind, folder)
+            dataset = replace(dataset, times_known=times_known)
+    records, camera_notes = check_cameras(records, dataset.cloud)
+    records, split_notes = _with_splits(records, dataset, holdout)
+    training = sum(record.split == "train" for record in records)
+    if training < 2:
+        counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
+        raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
+    notes = (*dataset.notes, *mask_notes, *truth_notes, *exposure_notes, *photo_notes, *time_notes)
+    notes = (*notes, *camera_notes, *split_notes)
+    if not is_embedded(path) and dataset.format != "video":
+        notes = (*notes, *unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]))
+    return replace(dataset, records=tuple(records), notes=notes, name=name)
+
+
+def _with_times(records: list[ImageRecord], kind: str, folder: Path) -> tuple[list[ImageRecord], bool, list[str]]:
+    """Return the photos with an exposure time each, whether times are known, and notes."""
+    if kind != "float":
+        return with_exposure_times(records, folder)
+    averages = log_averages([record.image for record in records])
+    time, exposures = middle_grey_time(averages.values()), _float_exposures(records, averages, folder)
+    timed = []
+    for index, record in enumerate(records):
+        factor = exposures.times[index] / exposures.times[0] if exposures.times else 1.0
+        truth = record.hdr or record.image
+        timed.append(replace(record, exposure_time=time * factor, hdr=truth, light_scale=1 / factor))
+    return timed, True, exposures.notes
+
+
+class _FloatExposures(NamedTuple):
+    """Exposure times by which the values of float images are divided; none if the values are light."""
+
+    times: list[float]
+    notes: list[str]
+
+
+def _float_exposures(records: list[ImageRecord], averages: Mapping[int, float], folder: Path) -> _FloatExposures:
+    """Return the times of float images: those of the set or exposures.json, else expTime of the headers.
+
+    Times that the user states count if the images' brightness follows them: a set of light may list those of photos.
+    """
+    stated, notes = stated_times(records, folder)
+    times = [exr_exposure_time(record.image) if time is None else time for record, time in zip(records, stated)]
+    known = [time for time in times if time is not None]
+    if len(known) < len(times) or max(known) < min(known) * 1.001:
+        return _FloatExposures([], [*notes, "float images: their values are taken as light, at no exposure"])
+    span = f"{min(known):g} to {max(known):g} s"
+    if None in stated:
+        return _FloatExposures(known, [*notes, f"float images: their values are light times expTime, {span}"])
+    if follow_times(averages, known):
+        return _FloatExposures(known, [*notes, f"float images: their values are light times the stated times, {span}"])
+    note = f"float images: their values are taken as light, because they do not follow the stated times, {span}"
+    return _FloatExposures([], [*notes, note])
+
+
+def _folder(path: Path | str) -> Path:
+    if is_embedded(path):
+        return embedded_folder(str(path))
+    folder = Path(path)
+    if is_video(folder):
+        return folder
+    try:
+        empty = not any(folder.iterdir())
+    except FileNotFoundError:
+        raise missing(folder, "not found", "give a folder of photos, or 'embedded'") from None
+    except NotADirectoryError:
+        problem, remedy = "is not a folder", "give the folder that holds the photos"
+        if folder.suffix.lower() in UNSTITCHED_SUFFIXES:
+            problem, remedy = "holds the pictures of two lenses", "export it as one equirectangular MP4"
+        elif folder.suffix.lower() in ARCHIVE_SUFFIXES:
+            problem, remedy = "is an archive", "unpack it, and give the folder with its photos"
+        raise InputError(folder, problem, remedy) from None
+    except OSError as error:
+        raise InputError(folder, f"cannot be read ({error.strerror or error})", "check its rights") from None
+    if empty:
+        raise InputError(folder, "folder is empty", "put the photos there")
+    return folder
+
+
+def _read(folder: Path) -> DataparserOutputs:
+    """Parse by the first layout that fits, the most specific one first."""
+
+    def has(*names: str) -> bool:
+        return all(has_file(folder / name) for name in names)
+
+    model = find_model(folder, anywhere=True)
+    beside = model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None
+    readers = (
+        (has("transforms_train.json", "exposure_train.json"), read_hdr_nerf),
+        (has("poses_bounds_exps.npy"), read_hdr_nerf_real),
+        (is_hdr_gs(folder), read_hdr_gs),
+        (beside, read_colmap),
+        (has("transforms.json") or has("transforms_train.json"), read_transforms),
+        (model is not None and model_fits(folder, model), read_colmap),
+        (find_reconstruction(folder) is not None, read_opensfm),
+        (has("poses_bounds.npy"), read_llff),
+    )
+    return next((reader for fits, reader in readers if fits), find_photos)(folder)
+
+
+def _with_splits(
+    records: list[ImageRecord], dataset: DataparserOutputs, holdout: int | None
+) -> tuple[list[ImageRecord], tuple[str, ...]]:
+    """Return the photos with a split each, and a note if the set does not state it."""
+    if holdout is None and any(record.split for record in records):
+        return [replace(record, split=record.split or "train") for record in records], ()
+    held_out = _held_out(len(records), holdout, dataset.holdout)
+    records = [replace(record, split="test" if i in held_out else "train") for i, record in enumerate(records)]
+    if not held_out:
+        return records, ("no views are held out for testing",)
+    names = [name for name, record in zip(unique_names(records), records, strict=True) if record.split == "test"]
+    names_text = first_names(names, 5)
+    are = "is" if len(names) == 1 else "are"
+    return records, (f"{len(names)} of {len(records)} views {are} held out for testing: {names_text}",)
+
+
+def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -> set[int]:
+    """Return the indices of test views: the published protocol's, or the middle of each block, never the last view."""
+    if step == 0 or count < _FEWEST_FOR_TEST:
+        return set()
+    if published is not None:
+        every, offset = step or published[0], published[1]
+        return set(range(min(offset, every - 1), count, every))
+    step = step or _HOLDOUT
+    return set(range(step // 2, count - 1, step)) or {count // 2}
+
+
+def is_embedded(path: Path | str) -> bool:
+    """Return whether this names an embedded scene, known or not, rather than a folder."""
+    return str(path) == "embedded" or str(path).startswith("embedded:")
+
+
+def embedded_scenes() -> tuple[str, ...]:
+    """List the names that load_scene("embedded:NAME") finds: room, and others of a checkout or $SEHDR_SCENES."""
+    return tuple(sorted({path.parent.name for place in _places() for path in place.glob(f"*/{_MARK}")}))
+
+
+def embedded_folder(path: str) -> Path:
+    """Return the folder of `embedded` or `embedded:NAME`.
+
+    Raises:
+        InputError: if it is not here.
+    """
+    name = str(path).partition(":")[2] or "room"
+    if name in embedded_scenes():
+        return next(place / name for place in _places() if (place / name / _MARK).is_file())
+    scenes = embedded_scenes()
+    present = ", ".join(f"embedded:{each}" for each in scenes)
+    problem = f"is not here{did_you_mean(name, scenes)}; present are {present}"
+    raise InputError(path, problem, "get the repository's scenes/ and name it in SEHDR_SCENES")
+
+
+def _places() -> list[Path]:
+    """List the folders of scenes: in the package, in $SEHDR_SCENES, and in scenes/ beside a checkout's package."""
+    package = Path(str(resources.files("sehdr_warp")))
+    scenes_folder = os.environ.get("SEHDR_SCENES")
+    return [package / "embedded", *([Path(scenes_folder)] if scenes_folder else []), package.parent / "scenes"]

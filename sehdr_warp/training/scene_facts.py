@@ -211,8 +211,8 @@ def check_dataset_truth(data: LoadArguments, config: Config) -> None:
 
     `data` names the photos, `config` is the config before the plan.
     """
+    from ..scene.load import parse_dataset
     from ..scene.names import unique_names
-    from ..scene.parse import parse_dataset
 
     # A plan removes the loss between brackets and truth that is missing.
     removed = config.plan.enabled and not config.loss.hdr_weight

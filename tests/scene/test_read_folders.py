@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene.parse import parse_dataset
+from sehdr_warp.scene.load import parse_dataset
 from sehdr_warp.scene.read_folders import find_photos
 from sehdr_warp.scene.unused_files import unused_notes
 from tests.make_scenes import load, pattern, write_blender, write_colmap, write_ply

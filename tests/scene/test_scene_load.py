@@ -20,8 +20,8 @@ from sehdr_warp.scene.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.dataparser import ImageRecord, PointCloud
 from sehdr_warp.scene.exposure import shutter
 from sehdr_warp.scene.lens import Lens
+from sehdr_warp.scene.load import _held_out
 from sehdr_warp.scene.names import natural_key, unique_names
-from sehdr_warp.scene.parse import _held_out
 from sehdr_warp.scene.sfm import MOST_ERROR, Reconstruction, image_name, reconstruct
 from tests.make_scenes import load, write_blender, write_colmap, write_ply
 
@@ -55,7 +55,7 @@ def test_exposures_of_photos_that_are_left_out_are_not_told_of(tmp_path, monkeyp
         records = [replace(r, lens=lens, world_to_camera=np.eye(4)) for r in records if r.view != "005"]
         return dataset, records, ["005.jpg"]
 
-    monkeypatch.setattr("sehdr_warp.scene.parse.place_photos", place_all_but_the_last)
+    monkeypatch.setattr("sehdr_warp.scene.load.place_photos", place_all_but_the_last)
     notes = " ".join(load(photos).notes)
     assert "exposures differ" not in notes and "ISO" not in notes
     damaged = tmp_path / "model" / "images" / "005.jpg"

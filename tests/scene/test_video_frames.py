@@ -54,7 +54,7 @@ def test_a_clip_within_rec709_is_converted_and_another_keeps_its_primaries(tmp_p
         lens = Lens("SIMPLE_PINHOLE", 128, 96, (100.0, 64.0, 48.0), folder)
         return dataset, [replace(record, lens=lens) for record in records], []
 
-    monkeypatch.setattr("sehdr_warp.scene.parse.place_photos", place)
+    monkeypatch.setattr("sehdr_warp.scene.load.place_photos", place)
     response = response_by_name("colour:ITU-R BT.2100 HLG")
     to_rec709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
     lights, frames = [], []

@@ -136,7 +136,7 @@ def test_embedded_scenes_have_truth_and_a_well_exposed_photo(name):
 
 def test_scenes_lie_in_the_package_beside_it_or_where_the_environment_says(tmp_path, monkeypatch):
     assert {*embedded_scenes()} == {"room", *RECIPES}
-    monkeypatch.setattr("sehdr_warp.scene.parse.resources.files", lambda package: tmp_path / "site" / package)
+    monkeypatch.setattr("sehdr_warp.scene.load.resources.files", lambda package: tmp_path / "site" / package)
     assert embedded_scenes() == ()
     with pytest.raises(InputError, match="embedded:study: is not here; .* get the repository's scenes/"):
         load("embedded:study")

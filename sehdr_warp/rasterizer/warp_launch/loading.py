@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from ...kernels.compile_options import FUSED
+from ...kernels.constants import FUSED
 from ...quiet import silent_stderr
 from ..memory import check_room_to_compile
 from . import kernel_cache
