@@ -5,7 +5,7 @@ One thread copies one number. An address of 0 is a tensor that the caller does n
 
 import warp as wp
 
-from .compile_options import NO_AUTODIFF
+from .constants import NO_AUTODIFF
 
 INPUTS, OUTPUTS = 7, 5
 """Largest numbers of tensors that a graph reads and writes. The table has the addresses of inputs, then of outputs,
