@@ -100,16 +100,11 @@ class BlockBackward:
         )
         return FixedBackward(fixed, gathered)
 
-    @property
-    def columns(self) -> int:
-        """Columns of the gradients by Gaussian."""
+    def _zeros(self) -> Tensor:
         columns = self.channels + 6
         if blend_cuda_backward.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
             columns = blend_cuda.padded_channels(columns)
-        return columns
-
-    def _zeros(self) -> Tensor:
-        return self.transmittance.new_zeros(len(self.features), self.columns)
+        return self.transmittance.new_zeros(len(self.features), columns)
 
     @property
     def _cuda(self) -> bool:

@@ -48,44 +48,14 @@ class GradientMemory:
     features: int
 
 
-class GradientLayout:
-    """Places of the gradients of blend and projection in one tensor.
-
-    It begins with a row for each Gaussian, which the blend adds to: features, conic, x, y, opacity, and columns that
-    pad the row. A copy of the features' gradient follows, and if the CUDA graph projects, the gradients by the
-    projection's inputs.
-
-    Args:
-        blend: of the render.
-        gaussians: inputs of the projection; none if the CUDA graph begins with 2D Gaussians.
-
-    Attributes:
-        size: of all, in numbers.
-        like: a tensor of this size without its memory.
-    """
-
-    def __init__(self, blend: BlockBackward, gaussians: Sequence[Tensor]) -> None:
-        """Lay out the gradients."""
-        count, columns, channels = len(blend.features), blend.columns, blend.channels
-        self.means2d = _Place((count, 2), (columns, 1), channels + 3)
-        self.features = _Place((count, channels), (columns, 1), 0)
-        self.conics = _Place((count, 3), (columns, 1), channels)
-        self.opacities = _Place((count,), (columns,), channels + 5)
-        self.features_copy = _Place((count, channels), (channels, 1), _aligned(count * columns))
-        self.size = self.features_copy.begin + count * channels
-        self.gaussians: list[_Place] = []
-        for tensor in gaussians:
-            place = _Place(tensor.shape, tensor.stride(), _aligned(self.size))
-            self.gaussians.append(place)
-            self.size = place.begin + tensor.numel()
-        self.like = blend.transmittance.new_empty(1).expand(self.size)
-
-
 class CapturedBackward:
     """The backward passes of blend and projection.
 
+    Their gradients share one tensor. It begins with a row for each Gaussian, which the blend adds to: features, conic,
+    x, y, opacity, and columns that pad the row. A copy of the features' gradient follows, and if the CUDA graph
+    projects, the gradients by the projection's inputs.
+
     Args:
-        layout: of the gradients.
         blend: of the captured render.
         gaussians: inputs of the projection on the graph's memory; none if the graph begins with 2D Gaussians.
         options: of the image.
@@ -97,22 +67,31 @@ class CapturedBackward:
     """
 
     def __init__(
-        self,
-        layout: GradientLayout,
-        blend: BlockBackward,
-        gaussians: Sequence[Tensor],
-        options: RenderOptions,
-        projected: ProjectedGaussians,
+        self, blend: BlockBackward, gaussians: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians
     ) -> None:
         """Pack the launches."""
-        self._layout, self.link = layout, layout.like if gaussians else None
         self._blend, rows = blend.on_fixed_memory()
-        self._device = rows.device
-        copy = rows.new_empty(layout.features_copy.shape)
-        kernel = copy_features_kernel(warp_scalar(rows.dtype))
-        self._copy_features = fixed_launch(kernel, copy.shape, rows, copy, whole=(rows, copy))
+        self._device, self._like = rows.device, rows.new_empty(0)
+        (count, columns), channels = rows.shape, blend.channels
+        self._means2d = _Place((count, 2), (columns, 1), channels + 3)
+        self._features = _Place((count, channels), (columns, 1), 0)
+        self._conics = _Place((count, 3), (columns, 1), channels)
+        self._opacities = _Place((count,), (columns,), channels + 5)
+        self._features_copy = _Place((count, channels), (channels, 1), _aligned(rows.numel()))
+        copy = rows.new_empty(count, channels)
+        self._copy_features = fixed_launch(
+            copy_features_kernel(warp_scalar(rows.dtype)), copy.shape, rows, copy, whole=(rows, copy)
+        )
+        self._size = self._features_copy.begin + copy.numel()
+        self._of_gaussians: list[_Place] = []
+        for tensor in gaussians:
+            place = _Place(tensor.shape, tensor.stride(), _aligned(self._size))
+            self._of_gaussians.append(place)
+            self._size = place.begin + tensor.numel()
+        self.link: Tensor | None = None
         if gaussians:
-            like = rows.as_strided(*layout.conics), rows.as_strided(*layout.opacities)
+            self.link = rows.new_empty(1).expand(self._size)
+            like = rows.as_strided(*self._conics), rows.as_strided(*self._opacities)
             self._project = _fixed_projection_backward(gaussians, options, projected, *like)
 
     def allocate(self, needed: Sequence[bool], *, copies_features: bool, zeros: Tensor | None = None) -> GradientMemory:
@@ -120,23 +99,21 @@ class CapturedBackward:
 
         needed: which gradients by the projection's inputs are needed; empty if the CUDA graph does not project.
         copies_features: return a contiguous gradient by features, which torch can use as a leaf's without a copy.
-        zeros: GradientMemory.zeros if they are there already; by default new zeros.
+        zeros: memory that a backward pass of the blend has filled; by default new zeros.
         """
-        layout = self._layout
         if zeros is None:
-            zeros = torch.zeros_like(layout.like)
+            zeros = self._like.new_zeros(self._size)
         first, size = zeros.data_ptr(), zeros.element_size()
-        features = layout.features_copy if copies_features else layout.features
-        of_splats = [zeros.as_strided(*layout.means2d), zeros.as_strided(*features)]
+        features = self._features_copy if copies_features else self._features
+        of_splats = [zeros.as_strided(*self._means2d), zeros.as_strided(*features)]
         if self.link is None:
-            of_splats += zeros.as_strided(*layout.conics), zeros.as_strided(*layout.opacities)
-        places = [place if need else None for place, need in zip(layout.gaussians, needed, strict=True)]
-        rows = layout.conics, layout.opacities
+            of_splats += zeros.as_strided(*self._conics), zeros.as_strided(*self._opacities)
+        places = [place if need else None for place, need in zip(self._of_gaussians, needed, strict=True)]
         return GradientMemory(
             zeros,
             of_splats,
             [None if place is None else zeros.as_strided(*place) for place in places],
-            [0 if place is None else first + size * place.begin for place in (*rows, *places)],
+            [0 if place is None else first + size * place.begin for place in (self._conics, self._opacities, *places)],
             first + size * features.begin if copies_features else 0,
         )
 

@@ -134,38 +134,33 @@ class ReplayedRender:
     def render(self, tensors: Sequence[Tensor]) -> None:
         """Render from the seven tensors of a call; means2d, depths and link are differentiable functions of them."""
         if not self._pool.differentiable:
-            (self.means2d, self.depths, self.extents), self.link = self._replay(tensors, (), ()), None
+            (self.means2d, self.depths, self.extents), self.link = self._replay(tensors, ()), None
             return
         means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
         gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
-        needed, link = [tensor.requires_grad for tensor in gaussians], self._lease.graph.backward.link
+        link = self._lease.graph.backward.link
         assert link is not None, "the CUDA graph begins with 2D Gaussians"
 
         def project() -> tuple[Tensor, ...]:
-            means2d, depths, extents = self._replay(tensors, (), needed, copies_features=_is_trained(features))
+            means2d, depths, extents = self._replay(tensors, ())
             return means2d, link.detach(), depths, extents
 
         outputs = with_projection_gradient(gaussians, project, self._lease.project_backward)
         self.means2d, self.link, self.depths, self.extents = outputs
+        needed = [tensor.requires_grad for tensor in gaussians]
+        self._lease.prepare(needed, copies_features=features.is_leaf and features.requires_grad)
 
     def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> None:
         """Render from flatten() of RasterInputs; write the extents that are left, see pack_splats()."""
         with torch.no_grad():
-            self._replay(tensors, (extents,), (), copies_features=_is_trained(tensors[-1]))
-
-    def _replay(
-        self,
-        tensors: Sequence[Tensor],
-        outputs: Sequence[Tensor],
-        needed: Sequence[bool],
-        *,
-        copies_features: bool = False,
-    ) -> Sequence[Tensor]:
-        """Replay the CUDA graph and prepare a backward pass, with options of CapturedBackward.allocate()."""
-        image, transmittance, others, gradients = self._lease.graph.replay(tensors, outputs)
-        self.result = BlendResult(image, transmittance, self._lease.blend_backward)
+            self._replay(tensors, (extents,))
         if self._pool.differentiable:
-            self._lease.prepare(needed, gradients, copies_features=copies_features)
+            features = tensors[-1]
+            self._lease.prepare((), copies_features=features.is_leaf and features.requires_grad)
+
+    def _replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> Sequence[Tensor]:
+        image, transmittance, *others = self._lease.graph.replay(tensors, outputs)
+        self.result = BlendResult(image, transmittance, self._lease.blend_backward)
         return others
 
     def fits(self) -> bool:
@@ -179,11 +174,6 @@ class ReplayedRender:
             return True
         self._pool.grow(self.intersections)
         return False
-
-
-def _is_trained(tensor: Tensor) -> bool:
-    """Return whether torch keeps the tensor's gradient, and so would copy one that is not contiguous."""
-    return tensor.is_leaf and tensor.requires_grad
 
 
 @dataclass
@@ -255,11 +245,11 @@ class _Lease:
         self._next: GradientMemory | None = None  # Of the next backward pass of the blend.
         self._between: GradientMemory | None = None  # Of the last one, until that of the projection.
 
-    def prepare(self, needed: Sequence[bool], gradients: Tensor | None, *, copies_features: bool) -> None:
-        """Prepare a backward pass; see CapturedBackward.allocate() and Replay.gradients."""
+    def prepare(self, needed: Sequence[bool], *, copies_features: bool) -> None:
+        """Prepare a backward pass; see CapturedBackward.allocate()."""
         self._needed, self._copies_features = needed, copies_features
-        if gradients is not None:
-            self._next = self._allocate(gradients)
+        if self.graph.count <= MAX_SINGLE_SORT:  # With more of them memory is worth more than the host's time.
+            self._next = self._allocate()
 
     def _allocate(self, zeros: Tensor | None = None) -> GradientMemory:
         return self.graph.backward.allocate(self._needed, copies_features=self._copies_features, zeros=zeros)

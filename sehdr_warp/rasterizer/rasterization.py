@@ -281,8 +281,7 @@ def render_projected(
     features = features.contiguous()
     # extents.data: pack_splats() writes to it in place, which torch's check of saved tensors must not see.
     inputs = RasterInputs(projected._replace(extents=extents.data), features)
-    replays = replays and store_absolute is None and extents.is_contiguous()
-    pool = get_or_create_pool(flatten(inputs), options) if replays else None
+    pool = get_or_create_pool(flatten(inputs), options) if replays and store_absolute is None else None
     replayed = None if pool is None else pool.lease(flatten(inputs), options)
     if replayed is not None:
         replayed.render_projected(flatten(inputs), extents.data)
