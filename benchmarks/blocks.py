@@ -48,11 +48,8 @@ from .results import new_result
 from .survey import write_survey
 from .timing import forget_peaks
 
-log = logging.getLogger(__name__)
-
 AT_ONCE = 2  # Blocks that train at once
 WARM_UP = 30  # Steps of a training before the first that is timed, in which kernels are compiled
-PROGRESS = 200  # Steps of the whole between lines of its log
 FRAMES = 20
 SIZE = 1920, 1080  # Pixels of the pictures of copies
 DRAFT = 480, 270  # Of the page's pictures while it moves
@@ -242,16 +239,10 @@ def _one_visible(device: torch.device) -> Iterator[None]:
 
 
 def _train_whole(data: LoadArguments, config: Mapping[str, Any], out: Path, device: str) -> None:
-    """Train the whole survey, in a process of its own; its log has the time of steps."""
+    """Train the whole survey, in a process of its own."""
     logging.basicConfig(filename=out.with_suffix(".log"), level=logging.INFO, format="%(asctime)s %(message)s")
     scene = load_saved_scene(data, response="srgb")
-    trainer = create_trainer(scene, out, config_from_dict(dict(config), "config"), device=device, overwrite=True)
-    before = trainer.seconds
-    for progress in trainer:
-        if progress.iteration % PROGRESS == 0:
-            step_ms = 1e3 * (progress.seconds - before) / PROGRESS
-            before = progress.seconds
-            log.info("iteration %d: %.2f ms a step, %d Gaussians", progress.iteration, step_ms, progress.gaussians)
+    create_trainer(scene, out, config_from_dict(dict(config), "config"), device=device, overwrite=True).train()
 
 
 def _train_blocks(
