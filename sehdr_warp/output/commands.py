@@ -3,9 +3,9 @@
 import json
 import logging
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from tyro.conf import Positional
 
@@ -13,12 +13,24 @@ from ..arguments import parse_numbers, require_positive
 from ..errors import InputError, UsageError
 from ..files import check_absent
 from ..runs.open import load_run_scene_with_confidence, open_run, open_scene
-from .options import WorldOptions, changed_flags
 
 log = logging.getLogger(__name__)
 
 _PICTURE_VIEWS, _FILM_VIEWS = 60, 144  # Of a path without --count
 _MOST_STOPS = 30
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """Coordinates of the files."""
+
+    axes: Literal["upright", "scene"] = "upright"
+    """upright: +Y is up (in PLY -Y, as its viewers expect), the subject is in the middle. scene: the photos' own
+    coordinates."""
+    up: str | None = None
+    """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
+    scale: float | None = None
+    """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
 
 
 @dataclass(frozen=True)
@@ -330,3 +342,9 @@ def run_report(args: Report) -> None:
     scene = load_run_scene_with_confidence(run, args.data)
     for path in write_report(run, scene, args.out, overwrite=args.overwrite, evaluation=evaluate(run, scene)):
         print(path)
+
+
+def changed_flags(options: Any) -> list[str]:
+    """Return the flags of a dataclass of options whose values are not the default."""
+    names = [field.name for field in fields(options) if getattr(options, field.name) != field.default]
+    return ["--" + name.replace("_", "-") for name in names]

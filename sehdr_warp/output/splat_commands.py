@@ -8,7 +8,7 @@ from tyro.conf import Positional
 
 from ..errors import UsageError
 from ..runs.open import load_run_scene, open_run, open_scene
-from .options import WorldOptions, changed_flags
+from .commands import WorldOptions, changed_flags
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene, Run, Splats

@@ -1,10 +1,14 @@
-"""Clients of requests, the paths that they ask for, and the answer to a request that is refused."""
+"""Clients of requests, the paths that they ask for, refused requests, and scenes as a client's save renders them."""
 
 import ipaddress
 import re
+from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
+from typing import Any
 
 from .connections import Connection, Connections
+from .frames import ViewerScene
 
 
 class Refusal(Exception):
@@ -48,3 +52,28 @@ def is_local(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost" or host.endswith(".localhost")
+
+
+class SavedRun:
+    """A run for a save: every picture is made on the renderer, and the save ends if its client leaves.
+
+    Attributes:
+        client: Whom the save is for.
+    """
+
+    def __init__(self, on_renderer: Callable[[Client, Callable[[], Any], int], Any], run: ViewerScene, client: Client):
+        """Set the run, and what calls a function on the renderer, see Viewer.on_renderer."""
+        self._on_renderer, self._run, self.client = on_renderer, run, client
+
+    def render(self, camera: Any) -> Any:
+        """Render a camera."""
+        return self._on_renderer(self.client, partial(self._run.render, camera), camera.width * camera.height)
+
+    def render_confidence(self, camera: Any) -> Any:
+        """Render confidence."""
+        render = partial(self._run.render_confidence, camera)
+        return self._on_renderer(self.client, render, camera.width * camera.height)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the run."""
+        return getattr(self._run, name)

@@ -28,12 +28,11 @@ from ..output.images import quantize
 from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
-from .clients import Client, Refusal, is_local, own_path
+from .clients import Client, Refusal, SavedRun, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, orient
 from .frames import ViewerScene, camera_file, camera_of, frame_bytes
 from .renderer import Renderer
-from .saved_run import SavedRun
 
 log = logging.getLogger(__name__)
 PORTS_TRIED = 50

@@ -10,10 +10,9 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.model.lights import Light, LightShape
-from sehdr_warp.output.commands import Lights, run_lights
+from sehdr_warp.output.commands import Lights, WorldOptions, run_lights
 from sehdr_warp.output.environment_map import write_environment_map
 from sehdr_warp.output.lights import lights_table, write_lights
-from sehdr_warp.output.options import WorldOptions
 from sehdr_warp.output.world_transform import WorldTransform, world_transform
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
