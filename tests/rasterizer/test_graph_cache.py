@@ -173,6 +173,23 @@ def test_without_gradients_pictures_stay_too(one_sort, most_copied, channels, mo
     assert_alike([image / k for k, image in enumerate(images, 1)], [truth] * 8)
 
 
+@pytest.mark.parametrize("differentiable", [False, True])
+@pytest.mark.parametrize("options", [{}, {"depth": True}])
+def test_renders_neither_use_nor_change_memory_that_was_freed(options, differentiable):
+    scene, others = scene_of(), []
+    *tensors, width, height = scene.arguments
+    for call in range(4 * CALLS):
+        with torch.set_grad_enabled(differentiable):
+            moved = [tensor * (1.0 - 1e-3 * call) for tensor in tensors[:5]]
+            rendering = rasterize(*moved, *tensors[5:], width, height, **options)
+        assert all(bool(other.isnan().all()) for other in others)
+        assert_alike([rendering.image.detach()], [launched(*moved, *tensors[5:], width, height, **options).image])
+        images = rendering.image, rendering.transmittance
+        others = [torch.full_like(like, torch.nan) for like in (*tensors, *images) for _ in range(4)]
+        del moved, rendering, images
+    assert recordings()
+
+
 def test_of_many_gaussians_one_render_is_held(monkeypatch):
     monkeypatch.setattr(graph_cache, "MAX_SINGLE_SORT", 0)
     scene = scene_of()
