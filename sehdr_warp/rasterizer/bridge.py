@@ -30,12 +30,12 @@ from .warp_launch.threads import single_range
 P = ParamSpec("P")
 
 
-class _Place(int):
+class _TensorIndex(int):
     """Index of a tensor among those of a program."""
 
 
 class _Launch(NamedTuple):
-    """A launch that the backward pass repeats as its adjoint; tensors are given by their places."""
+    """A launch that the backward pass repeats as its adjoint; tensors stand as their indices."""
 
     kernel: Any
     dim: int | Sequence[int]
@@ -55,11 +55,11 @@ class Program:
         self.device = tensors[0].device
         self._differentiable, self._launches = differentiable, list[_Launch]()
         self._tensors: list[Tensor] = []
-        self._places: dict[int, _Place] = {}
+        self._indices: dict[int, _TensorIndex] = {}
         self._written: set[int] = set()
         self._constant: set[int] = set()
         for tensor in tensors:
-            self._place(tensor)
+            self._index_of(tensor)
 
     def empty_output(
         self, shape: Sequence[int], dtype: torch.dtype = torch.float32, *, differentiable: bool = True
@@ -67,10 +67,10 @@ class Program:
         """Allocate a tensor for one launch to write to. A vector type's components are its last dimension."""
         tensor = torch.empty(tuple(shape), dtype=dtype, device=self.device)
         if self._differentiable:
-            place = self._place(tensor)
-            self._written.add(place)
+            index = self._index_of(tensor)
+            self._written.add(index)
             if not differentiable or not dtype.is_floating_point:
-                self._constant.add(place)
+                self._constant.add(index)
         return tensor
 
     def launch(self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
@@ -96,16 +96,16 @@ class Program:
         check_dimensions(kernel, arguments)
         launch(kernel, dim, *arguments)
         if self._differentiable:
-            places = [[self._place(v) if isinstance(v, Tensor) else v for v in part] for part in (inputs, outputs)]
-            self._launches.append(_Launch(kernel, dim, *places))
+            indices = [[self._index_of(v) if isinstance(v, Tensor) else v for v in part] for part in (inputs, outputs)]
+            self._launches.append(_Launch(kernel, dim, *indices))
 
-    def _place(self, tensor: Tensor) -> _Place:
-        """Return the tensor's place; one that is neither an argument nor written becomes a constant of the program."""
-        place = self._places.get(id(tensor))
-        if place is None:
-            place = self._places[id(tensor)] = _Place(len(self._tensors))
+    def _index_of(self, tensor: Tensor) -> _TensorIndex:
+        """Return the tensor's index; one that is neither an argument nor written becomes a constant of the program."""
+        index = self._indices.get(id(tensor))
+        if index is None:
+            index = self._indices[id(tensor)] = _TensorIndex(len(self._tensors))
             self._tensors.append(tensor)
-        return place
+        return index
 
 
 class _ProgramFunction(torch.autograd.Function):
@@ -117,20 +117,20 @@ class _ProgramFunction(torch.autograd.Function):
         outputs = result if isinstance(result, tuple) else (result,)
         launches = program._launches
         tensors_of_program = *tensors, *program._tensors[len(tensors) :]
-        places = [program._places.get(id(tensor), -1) for tensor in outputs]
-        if not program._written.issuperset(places):
+        indices = [program._indices.get(id(tensor), -1) for tensor in outputs]
+        if not program._written.issuperset(indices):
             raise TypeError(f"{body.__name__}() returns a tensor that program.empty_output() did not make")
         # Torch makes this node the origin of what it returns; saved as well, neither would ever be freed.
         returned = tuple(tensor.detach() for tensor in outputs)
         ctx.mark_non_differentiable(
-            *(t for t, place in zip(returned, places, strict=True) if place in program._constant)
+            *(t for t, index in zip(returned, indices, strict=True) if index in program._constant)
         )
         ctx.set_materialize_grads(False)
-        read = {value for each in launches for value in each.inputs if isinstance(value, _Place)}
-        ctx.save_for_backward(*(tensor if place in read else None for place, tensor in enumerate(tensors_of_program)))
-        ctx.launches, ctx.places = launches, places
+        read = {value for each in launches for value in each.inputs if isinstance(value, _TensorIndex)}
+        ctx.save_for_backward(*(tensor if index in read else None for index, tensor in enumerate(tensors_of_program)))
+        ctx.launches, ctx.indices = launches, indices
         ctx.argument_likes = [(tensor.shape, tensor.dtype) for tensor in plain]
-        ctx.between = (program._written - program._constant) & read
+        ctx.intermediates = (program._written - program._constant) & read
         return returned if isinstance(result, tuple) else returned[0]
 
     @staticmethod
@@ -140,26 +140,26 @@ class _ProgramFunction(torch.autograd.Function):
         device = next((gradient.device for gradient in upstream if gradient is not None), None)
         if device is None:
             return (None,) * (2 + len(needed))
-        gradients: dict[int, Any] = {place: torch.zeros_like(saved[place]) for place in ctx.between}
-        for place, (shape, dtype) in enumerate(ctx.argument_likes):
-            if needed[place]:
-                gradients[place] = torch.zeros(shape, dtype=dtype, device=device)
-        for place, gradient in zip(ctx.places, upstream, strict=True):
+        gradients: dict[int, Any] = {index: torch.zeros_like(saved[index]) for index in ctx.intermediates}
+        for index, (shape, dtype) in enumerate(ctx.argument_likes):
+            if needed[index]:
+                gradients[index] = torch.zeros(shape, dtype=dtype, device=device)
+        for index, gradient in zip(ctx.indices, upstream, strict=True):
             if gradient is None:
                 continue
-            if place in gradients:  # The adjoint of a later launch adds to it, and torch's own must stay as it is.
-                gradients[place] += gradient
+            if index in gradients:  # The adjoint of a later launch adds to it, and torch's own must stay as it is.
+                gradients[index] += gradient
             else:
-                gradients[place] = kernel_layout(gradient)  # pyright: ignore[reportArgumentType]
+                gradients[index] = kernel_layout(gradient)  # pyright: ignore[reportArgumentType]
         for each in reversed(ctx.launches):
             _launch_adjoint(each, saved, gradients)
-        return None, None, *(gradients.get(place) if need else None for place, need in enumerate(needed))
+        return None, None, *(gradients.get(index) if need else None for index, need in enumerate(needed))
 
 
 def _launch_adjoint(forward: _Launch, saved: Sequence[Tensor | None], gradients: dict[int, Any]) -> None:
     kernel, dim, inputs, outputs = forward
-    values: list[Any] = [saved[value] if isinstance(value, _Place) else value for value in inputs]
-    grad_values = [gradients.get(v) if isinstance(v, _Place) else None for v in (*inputs, *outputs)]
+    values: list[Any] = [saved[value] if isinstance(value, _TensorIndex) else value for value in inputs]
+    grad_values = [gradients.get(v) if isinstance(v, _TensorIndex) else None for v in (*inputs, *outputs)]
     if all(gradient is None for gradient in grad_values):
         return
     pairs = zip(values, grad_values, strict=False)
@@ -203,12 +203,12 @@ def _check_tensors(body: Callable[..., Any], tensors: Sequence[Any]) -> None:
     name = getattr(body, "__name__", "the operation")
     if not tensors:
         raise TypeError(f"{name}() got no tensor, expected at least one positional argument")
-    for place, value in enumerate(tensors):
+    for index, value in enumerate(tensors):
         if not isinstance(value, Tensor):
-            raise TypeError(f"{name}(): argument {place} is a {type(value).__name__}, expected a torch tensor")
+            raise TypeError(f"{name}(): argument {index} is a {type(value).__name__}, expected a torch tensor")
         if value.device != tensors[0].device:
             raise ValueError(
-                f"{name}(): argument {place} is on {value.device}, but argument 0 is on {tensors[0].device}"
+                f"{name}(): argument {index} is on {value.device}, but argument 0 is on {tensors[0].device}"
             )
     if tensors[0].device.type not in DEVICES:
         raise ValueError(f"{name}(): argument 0 is on {tensors[0].device}, expected the CPU or a CUDA device")

@@ -19,28 +19,28 @@ from .warp_launch.threads import torch_threads
 def check_finite(
     loss: Tensor,
     finite: Tensor,
-    incomplete: Tensor | None = None,
+    overflow: Tensor | None = None,
     step_counters: Tensor | None = None,
     intersections: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return two scalars, 1 or 0: whether a step is skipped, and whether it is made.
 
-    It is skipped if the loss or one of the values of `finite` is not finite, or if `incomplete` is true. loss: float32
-    scalar; finite: [K] float32, the result of finiteness(); incomplete: bool scalar.
+    It is skipped if the loss or one of the values of `finite` is not finite, or if `overflow` is true. loss: float32
+    scalar; finite: [K] float32, the result of finiteness(); overflow: bool scalar.
 
     step_counters: [3] int64, counts steps that are not finite; with intersections, an int64 scalar, it also holds the
-    most intersections and counts the incomplete steps.
+    most intersections and counts the steps with overflow.
     """
     step_flags = finite.new_empty(2)
-    if incomplete is None:
-        incomplete = torch.empty(0, dtype=torch.bool, device=finite.device)
+    if overflow is None:
+        overflow = torch.empty(0, dtype=torch.bool, device=finite.device)
     none = (
         torch.empty(0, dtype=torch.int64, device=finite.device)
         if step_counters is None or intersections is None
         else None
     )
     counters = (none if step_counters is None else step_counters), (none if intersections is None else intersections)
-    launch(kernels.check_finite, 1, loss.detach(), finite, incomplete, *counters, step_flags)
+    launch(kernels.check_finite, 1, loss.detach(), finite, overflow, *counters, step_flags)
     return step_flags[0], step_flags[1]
 
 

@@ -168,13 +168,13 @@ class GradientStep:
     def apply_gradients(self, gradients: Gradients) -> Tensor:
         """Update the parameters, unless the step is not finite; return its loss. Does not wait for the device."""
         rendering, loss, harmonics = gradients.rendering, gradients.loss, gradients.harmonics
-        incomplete = rendering.overflow
+        overflow = rendering.overflow
         if self._flat is not None:
-            loss, incomplete, harmonics = self._flat.distribute()
+            loss, overflow, harmonics = self._flat.distribute()
         applied = guarded_step(
             self._optimizer,
             loss,
-            incomplete,
+            overflow,
             harmonics,
             step_counters=self._capacity.step_counters,
             intersections=rendering.needed_intersections,

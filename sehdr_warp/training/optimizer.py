@@ -67,21 +67,21 @@ def set_means_rate(optimizer: Adam, rate: float) -> None:
 def guarded_step(
     optimizer: Adam,
     loss: Tensor,
-    incomplete: Tensor | None = None,
+    overflow: Tensor | None = None,
     harmonics: HarmonicsGradients | None = None,
     *,
     step_counters: Tensor | None = None,
     intersections: Tensor | None = None,
     active_count: Tensor | None = None,
 ) -> Tensor:
-    """Run one step of Adam, unless the loss or a gradient is not finite or the rendering was incomplete.
+    """Run one step of Adam, unless the loss or a gradient is not finite or there were more intersections than memory.
 
     The decision is applied on the device, without waiting for it.
 
     Args:
         optimizer: The optimizer.
         loss: Scalar loss.
-        incomplete: Scalar bool, whether the rendering lacked intersections.
+        overflow: Scalar bool, whether there were more intersections than memory.
         harmonics: Gradients of the harmonics in factored form.
         step_counters: As in check_finite().
         intersections: As in check_finite().
@@ -92,7 +92,7 @@ def guarded_step(
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.grad_colors]
-    skipped, applied = check_finite(loss, finiteness(gradients), incomplete, step_counters, intersections)
+    skipped, applied = check_finite(loss, finiteness(gradients), overflow, step_counters, intersections)
     optimizer.step(skipped, applied, harmonics, active_count)
     return applied
 
@@ -100,7 +100,7 @@ def guarded_step(
 class FlatGradients:
     """The gradients of all parameters of an optimizer in one buffer, which ranks exchange.
 
-    Behind them are two numbers of the step: its loss, and whether its rendering was incomplete.
+    Behind them are two numbers of the step: its loss, and whether there were more intersections than memory.
 
     Attributes:
         buffer: The buffer.
@@ -131,7 +131,7 @@ class FlatGradients:
         return all(old is new for old, new in zip(self.all, _parameters(optimizer), strict=True))
 
     @torch.no_grad()
-    def collect(self, loss: Tensor, incomplete: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
+    def collect(self, loss: Tensor, overflow: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
         """Move the parameters' gradients to the buffer, with the numbers of the step."""
         self._with_gradient = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
         gradients = [self.parameters[k].grad for k in self._with_gradient]
@@ -143,7 +143,7 @@ class FlatGradients:
             grad_colors[self._rank], positions[self._rank] = harmonics.grad_colors[0], harmonics.positions[0]
             self._degree = harmonics.degree
         self.numbers[0] = loss.detach()
-        self.numbers[1] = torch.zeros_like(loss) if incomplete is None else incomplete.to(loss.dtype)
+        self.numbers[1] = torch.zeros_like(loss) if overflow is None else overflow.to(loss.dtype)
         for k in self._with_gradient:
             self.parameters[k].grad = None
 
@@ -151,7 +151,7 @@ class FlatGradients:
         """Set the parameters' gradients to the buffer, after it was averaged over the ranks.
 
         Returns:
-            Loss, whether a rendering was incomplete ([] bool), and the factored gradients of the harmonics.
+            Loss, whether a rank had more intersections than memory ([] bool), and factored gradients of the harmonics.
         """
         for k in self._with_gradient:
             self.parameters[k].grad = self._views[k]

@@ -14,20 +14,20 @@ from sehdr_warp.training.train import create_trainer, train
 from .toy import QUICK, load_unscaled, toy_field
 
 
-@pytest.mark.parametrize("incomplete", [None, False, True])
+@pytest.mark.parametrize("overflow", [None, False, True])
 @pytest.mark.parametrize("bad", [False, True])
-def test_a_guarded_step_is_made_or_left_out_whole(device, incomplete, bad):
+def test_a_guarded_step_is_made_or_left_out_whole(device, overflow, bad):
     field = toy_field().to(device)
     optimizer = make_optimizer(field, load_config("default"))
     means = field.gaussians.means
     before = means.detach().clone()
     loss = (means * (nan if bad else 1.0)).sum()
     loss.backward()
-    flag = None if incomplete is None else torch.tensor(incomplete, device=device)
+    flag = None if overflow is None else torch.tensor(overflow, device=device)
     step_counters = torch.zeros(3, dtype=torch.int64, device=device)
     step = guarded_step(optimizer, loss, flag, step_counters=step_counters)
     assert step_counters.tolist() == [bad, 0, 0]
-    assert bool(step) == (not bad and not incomplete)
+    assert bool(step) == (not bad and not overflow)
     assert torch.equal(means, before) == (not bool(step))
     assert float(optimizer.state[means]["step"]) == float(step)
 

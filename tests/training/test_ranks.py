@@ -143,8 +143,8 @@ def test_gradients_go_through_one_buffer():
     flat.collect(torch.tensor(2.0), torch.tensor(True))
     assert flat.fits(optimizer) and field.gaussians.means.grad is None
     flat.buffer.mul_(0.5)
-    loss, incomplete, harmonics = flat.distribute()
-    assert harmonics is None and loss == 1 and bool(incomplete) and field.gaussians.quaternions.grad is None
+    loss, overflow, harmonics = flat.distribute()
+    assert harmonics is None and loss == 1 and bool(overflow) and field.gaussians.quaternions.grad is None
     for name, gradient in gradients.items():
         assert torch.equal(getattr(field.gaussians, name).grad, gradient / 2)
     field.gaussians.resize(70, optimizer)
