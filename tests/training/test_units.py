@@ -27,13 +27,18 @@ def moved(scene: Scene, scale: float, shift: np.ndarray) -> Scene:
     return replace(scene, views=tuple(views), points=scale * scene.points + shift)
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A run of the scene as it is."""
+    return train(toy_scene(), tmp_path_factory.mktemp("plain") / "run", CONFIG, device="cpu")
+
+
 @pytest.mark.parametrize(
     "scale, shift", [(16.0, np.zeros(3)), (0.01, np.zeros(3)), (1.0, np.array([500_000.0, 4_200_000.0, 100.0]))]
 )
-def test_unit_and_origin_do_not_matter(tmp_path, scale, shift):
+def test_unit_and_origin_do_not_matter(tmp_path, plain, scale, shift):
     scene = toy_scene()
     other = moved(scene, scale, shift)
-    plain = train(scene, tmp_path / "plain", CONFIG, device="cpu")
     run = train(other, tmp_path / "moved", CONFIG, device="cpu")
     for view, same in zip(scene.test_views, other.test_views, strict=True):
         one, two = plain.render(view.camera), run.render(same.camera)
