@@ -15,8 +15,7 @@ from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
 from .projection import RasterInputs
 from .render_options import MAX_INTERSECTIONS
-from .warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar
-from .warp_launch.sorting import sort_pairs
+from .warp_launch.launching import FixedLaunch, fixed_launch, launch, sort_pairs, warp_scalar
 from .warp_launch.threads import torch_threads
 
 MAX_SINGLE_SORT = 1 << 18

@@ -8,9 +8,8 @@ from torch import Tensor
 
 from ..model.radiance_field import RadianceField
 from ..model.renders import TrainRender
-from ..rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from ..rasterizer.code_residual import CodeScale, code_residual, code_values
-from ..rasterizer.photo_loss import photo_loss
+from ..rasterizer.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
 from ..rasterizer.ssim import image_distance, ssim
 from ..response import Response, ToneMapper
 from ..runs.config import LossConfig

@@ -11,7 +11,9 @@ TOPICS = {
     "compat/gsplat": {"against_gsplat", "simple_trainer"},
     "kernels": {"cuda_compilation"},
     "output": {"blender", "pictures"},
-    "rasterizer": {"blend_blocks", "culling", "extremes", "properties", "rasterize"},
+    "rasterizer": {
+        "blend_blocks", "clipped_light", "culling", "extremes", "properties", "rasterize", "residual_sampling",
+    },
     "response": {"responses"},
     "scene": {"hdr_colors", "scene_colmap", "scene_images", "scene_load", "scene_transforms"},
     "splats": {"compressed_files", "npm_parsers", "other_tools", "splat_files"},

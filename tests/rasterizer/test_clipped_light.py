@@ -7,8 +7,8 @@ import warp as wp
 
 from sehdr_warp.kernels.clipped_light import REACH
 from sehdr_warp.rasterizer import patches
-from sehdr_warp.rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from sehdr_warp.rasterizer.code_residual import code_tensor
+from sehdr_warp.rasterizer.photo_loss import ClippedWeights, clipped_light_energy
 
 from .scenes import relative_error
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.clipped_light import ClippedWeights, clipped_light_energy
 from sehdr_warp.rasterizer.code_residual import CodeScale, code_residual, code_tensor
-from sehdr_warp.rasterizer.photo_loss import photo_loss
+from sehdr_warp.rasterizer.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
 from sehdr_warp.rasterizer.ssim import image_distance
 
 from .scenes import relative_error

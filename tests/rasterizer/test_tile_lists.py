@@ -16,7 +16,7 @@ from sehdr_warp.rasterizer.tile_lists import (
     find_tile_ranges,
     order_intersections,
 )
-from sehdr_warp.rasterizer.warp_launch.sorting import sort_pairs
+from sehdr_warp.rasterizer.warp_launch.launching import sort_pairs
 
 from .scenes import packed, random_scene
 
