@@ -32,6 +32,10 @@ _ARGUMENTS = {
     "--crop": "crop",
     "--at": "at",
     "--beyond": "beyond",
+    "--camera": "camera",
+    "--cameras": "cameras",
+    "--ocio": "ocio",
+    "--schedule.use-cuda-graph=false": "schedule.use_cuda_graph = False",
 }
 """Python names of the flags in messages."""
 _shows_flags = False

@@ -248,4 +248,5 @@ def test_errors_name_arguments_in_python_and_flags_on_the_command_line():
     assert str(error) == python
     no_surface = SehdrError("there is no surface to mesh; take another --crop, up and --up=0,1,0 or --device cpu")
     assert str(no_surface).endswith('take another crop, up and up=0,1,0 or device="cpu"')
+    assert str(SehdrError("--camera a: is not in --cameras b")) == "camera a: is not in cameras b"
     assert str(UsageError("no flag --resume")) == "no flag --resume"

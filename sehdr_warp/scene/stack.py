@@ -46,7 +46,7 @@ def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list
         records = [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in files]
         records, times_known, notes = with_exposure_times(records, folder)
         if not times_known or not all(record.time_known for record in records):
-            raise InputError(folder, "its photos state no exposure times", "give --exposures or an exposures.json")
+            raise InputError(folder, "its photos state no exposure times", "give times, or an exposures.json")
         for note in notes:
             log.info(note)
         times = [record.seconds for record in records]
