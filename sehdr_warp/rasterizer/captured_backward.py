@@ -62,7 +62,7 @@ class CapturedBackward:
         projected: outputs of the projection on the graph's memory.
 
     Attributes:
-        link: takes the place of conics and opacities in the autograd graph, between blend and projection: its gradient
+        proxy: takes the place of conics and opacities in the autograd graph, between blend and projection: its gradient
             is GradientMemory.zeros. None if the CUDA graph does not project.
     """
 
@@ -88,9 +88,9 @@ class CapturedBackward:
             place = _Place(tensor.shape, tensor.stride(), _aligned(self._size))
             self._of_gaussians.append(place)
             self._size = place.begin + tensor.numel()
-        self.link: Tensor | None = None
+        self.proxy: Tensor | None = None
         if gaussians:
-            self.link = rows.new_empty(1).expand(self._size)
+            self.proxy = rows.new_empty(1).expand(self._size)
             like = rows.as_strided(*self._conics), rows.as_strided(*self._opacities)
             self._project = _fixed_projection_backward(gaussians, options, projected, *like)
 
@@ -106,7 +106,7 @@ class CapturedBackward:
         first, size = zeros.data_ptr(), zeros.element_size()
         features = self._features_copy if copies_features else self._features
         of_splats = [zeros.as_strided(*self._means2d), zeros.as_strided(*features)]
-        if self.link is None:
+        if self.proxy is None:
             of_splats += zeros.as_strided(*self._conics), zeros.as_strided(*self._opacities)
         places = [place if need else None for place, need in zip(self._of_gaussians, needed, strict=True)]
         return GradientMemory(
@@ -118,14 +118,14 @@ class CapturedBackward:
         )
 
     def blend(self, memory: GradientMemory, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        """Return the gradients by means2d, features, and either the link or conics and opacities."""
+        """Return the gradients by means2d, features, and either the proxy or conics and opacities."""
         stream, rows = warp_stream(self._device), memory.zeros.data_ptr()
         transmittance = 0 if grad_transmittance is None else grad_transmittance.data_ptr()
         self._blend.launch((), (grad_image.data_ptr(), transmittance, rows), stream)
         if memory.features:
             self._copy_features.launch((), (rows, memory.features), stream)
         gradients, memory.of_splats = memory.of_splats, ()
-        return gradients if self.link is None else (*gradients, memory.zeros)
+        return gradients if self.proxy is None else (*gradients, memory.zeros)
 
     def project(self, memory: GradientMemory, grad_means2d: Tensor | None, grad_depths: Tensor | None) -> Gradients:
         """Return the gradients by the projection's inputs.

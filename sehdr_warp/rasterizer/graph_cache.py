@@ -71,7 +71,7 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     """Return the CUDA graphs of calls like this one, an empty pool at first; None if the call cannot be captured.
 
     Args:
-        tensors: as GraphPool.lease() takes them, of one device.
+        tensors: as GraphPool.acquire() takes them, of one device.
         options: of the image.
     """
     first = tensors[0]
@@ -108,8 +108,8 @@ def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> _Signature:
 class ReplayedRender:
     """A render by a CUDA graph, which no other call uses for as long as the backward passes of this render exist.
 
-    They hold a lease of the graph. It ends when the autograd graph of the render is freed, or with this object for a
-    render without gradients.
+    They hold the graph until the autograd graph of the render is freed; a render without gradients holds it as long as
+    this object lives.
 
     Attributes:
         result: of the blend.
@@ -117,38 +117,38 @@ class ReplayedRender:
         means2d: [N, 2]; this and the next three if the CUDA graph began with 3D Gaussians.
         depths: [N].
         extents: [N, 2].
-        link: stands for conics and opacities in the autograd graph, see CapturedBackward.
+        proxy: stands for conics and opacities in the autograd graph, see CapturedBackward.
     """
 
     result: BlendResult
     means2d: Tensor
     depths: Tensor
     extents: Tensor
-    link: Tensor | None
+    proxy: Tensor | None
 
     def __init__(self, pool: "GraphPool", graph: "CapturedRender") -> None:
-        """Lease the CUDA graph."""
-        self._pool, self._lease = pool, _Lease(pool.idle, graph)
+        """Acquire the CUDA graph."""
+        self._pool, self._acquired = pool, _AcquiredGraph(pool.idle, graph)
         self.intersections = 0
 
     def render(self, tensors: Sequence[Tensor]) -> None:
-        """Render from the seven tensors of a call; means2d, depths and link are differentiable functions of them."""
+        """Render from the seven tensors of a call; means2d, depths and proxy are differentiable functions of them."""
         if not self._pool.differentiable:
-            (self.means2d, self.depths, self.extents), self.link = self._replay(tensors, ()), None
+            (self.means2d, self.depths, self.extents), self.proxy = self._replay(tensors, ()), None
             return
         means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
         gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
-        link = self._lease.graph.backward.link
-        assert link is not None, "the CUDA graph begins with 2D Gaussians"
+        proxy = self._acquired.graph.backward.proxy
+        assert proxy is not None, "the CUDA graph begins with 2D Gaussians"
 
         def project() -> tuple[Tensor, ...]:
             means2d, depths, extents = self._replay(tensors, ())
-            return means2d, link.detach(), depths, extents
+            return means2d, proxy.detach(), depths, extents
 
-        outputs = with_projection_gradient(gaussians, project, self._lease.project_backward)
-        self.means2d, self.link, self.depths, self.extents = outputs
+        outputs = with_projection_gradient(gaussians, project, self._acquired.project_backward)
+        self.means2d, self.proxy, self.depths, self.extents = outputs
         needed = [tensor.requires_grad for tensor in gaussians]
-        self._lease.prepare(needed, copies_features=features.is_leaf and features.requires_grad)
+        self._acquired.prepare(needed, copies_features=features.is_leaf and features.requires_grad)
 
     def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> None:
         """Render from flatten() of RasterInputs; write the extents that are left, see pack_splats()."""
@@ -156,11 +156,11 @@ class ReplayedRender:
             self._replay(tensors, (extents,))
         if self._pool.differentiable:
             features = tensors[-1]
-            self._lease.prepare((), copies_features=features.is_leaf and features.requires_grad)
+            self._acquired.prepare((), copies_features=features.is_leaf and features.requires_grad)
 
     def _replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> Sequence[Tensor]:
-        image, transmittance, *others = self._lease.graph.replay(tensors, outputs)
-        self.result = BlendResult(image, transmittance, self._lease.blend_backward)
+        image, transmittance, *others = self._acquired.graph.replay(tensors, outputs)
+        self.result = BlendResult(image, transmittance, self._acquired.blend_backward)
         return others
 
     def fits(self) -> bool:
@@ -168,7 +168,7 @@ class ReplayedRender:
 
         If not, the render is not to be used.
         """
-        graph = self._lease.graph
+        graph = self._acquired.graph
         self.intersections = graph.count_intersections()
         if self.intersections <= graph.max_intersections:
             return True
@@ -215,7 +215,7 @@ class GraphPool:
             self.captured = self.max_graphs
             return None
 
-    def lease(self, tensors: Sequence[Tensor], options: RenderOptions) -> ReplayedRender | None:
+    def acquire(self, tensors: Sequence[Tensor], options: RenderOptions) -> ReplayedRender | None:
         """Return a render by a CUDA graph that is to be made, or None if the call is to be launched instead.
 
         Args:
@@ -235,7 +235,7 @@ class GraphPool:
         self.intersections, self.captured, self.idle = max(intersections, self.intersections), 0, []
 
 
-class _Lease:
+class _AcquiredGraph:
     """Keeps a CUDA graph from other calls, and returns it to the idle ones when it is deleted."""
 
     def __init__(self, idle: list[CapturedRender], graph: CapturedRender) -> None:

@@ -186,7 +186,7 @@ def _of_jpeg(path: Path) -> GainMap | None:
                 continue
             profile = second.info.get("icc_profile")
             alternate = encoding_of_profile(bytes(profile)) if profile else None
-            return _gain_map_of(make, _pixels(second, photo), _between(own, alternate))
+            return _gain_map_of(make, _pixels(second, photo), _primaries_matrix(own, alternate))
     return None
 
 
@@ -229,7 +229,7 @@ def _of_items(path: Path) -> GainMap | None:
         if item.kind == "tmap" and len(to := inputs.get(number, ())) >= 2 and to[0] == items.primary:
             make = parameters_of_iso(item_bytes(path, item)[1:])
             alternate = encoding_of_boxes([data for name, data in item.properties if name == "colr"])
-            return _gain_map_of(make, _item_pixels(path, items, to[1], photo), _between(own, alternate))
+            return _gain_map_of(make, _item_pixels(path, items, to[1], photo), _primaries_matrix(own, alternate))
     for number, item in items.items.items():
         kinds = [data[4:].split(b"\0")[0].decode("latin-1") for name, data in item.properties if name == "auxC"]
         if _APPLE_AUX in kinds:
@@ -279,7 +279,7 @@ def _with_usual_prefix(xmp: str) -> str:
     return xmp if bound is None or bound[1] == "hdrgm" else re.sub(rf"\b{bound[1]}:", "hdrgm:", xmp)
 
 
-def _between(own: ColorEncoding | None, alternate: ColorEncoding | None) -> np.ndarray | None:
+def _primaries_matrix(own: ColorEncoding | None, alternate: ColorEncoding | None) -> np.ndarray | None:
     """Return [3, 3] from the primaries of a photo to those of its alternate rendition; None if they do not differ.
 
     An alternate rendition that states no primaries has the photo's.
@@ -292,11 +292,11 @@ def _between(own: ColorEncoding | None, alternate: ColorEncoding | None) -> np.n
 
 
 def _gain_map_of(
-    parameters: GainMapParameters, encoded: np.ndarray, between: np.ndarray | None = None
+    parameters: GainMapParameters, encoded: np.ndarray, primaries: np.ndarray | None = None
 ) -> GainMap | None:
     """Return the gain map of parameters and pixels; None if the photo itself is the HDR rendition.
 
-    `between` leads from the photo's primaries to those of the alternate rendition, where the metadata may apply gains.
+    `primaries` [3, 3] leads from the photo's to those of the alternate rendition, where the metadata may apply gains.
     Raises ValueError for parameters that cannot be.
     """
     if parameters.base_is_hdr:
@@ -318,7 +318,7 @@ def _gain_map_of(
         raise ValueError(f"gains from {low.tolist()} to {high.tolist()} stops")
     if not max(np.abs(numbers["base_offset"]).max(), np.abs(numbers["alternate_offset"]).max()) <= 1:
         raise ValueError("offsets above the light of white")
-    to_alternate = between if parameters.in_alternate_colors else None
+    to_alternate = primaries if parameters.in_alternate_colors else None
     gain_map = GainMap(encoded=encoded, headroom=0.0, to_alternate=to_alternate, **numbers)
     largest = replace(gain_map, encoded=encoded.max((0, 1), keepdims=True)).light(np.ones((1, 1, 3), np.float32))
     return replace(gain_map, headroom=math.log2(max(float(largest.max()), 2.0**-MOST_STOPS)))

@@ -64,7 +64,7 @@ def choose_frames(clip: Clip) -> FrameChoice:
     reference: np.ndarray | None = None
     before = 0.0  # Movement up to the reference
     total = 0
-    for number, frame in _without_hidden(decode(clip)):
+    for number, frame in _counted_frames(decode(clip)):
         total = number + 1
         if number % stride:
             continue
@@ -113,22 +113,22 @@ def frame_shift(first: np.ndarray, second: np.ndarray) -> float:
             spectra = [np.fft.rfft2((part - part.mean()) * window) for part in parts]
             cross = spectra[0] * spectra[1].conj()
             peak = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-9), s=(side, side))
-            place = np.array(np.unravel_index(int(peak.argmax()), peak.shape))
-            fine = place + [_between(peak, place, axis) for axis in (0, 1)]
-            place = np.where(fine > side / 2, fine - side, fine)
-            lengths.append(math.hypot(*place))
+            shift = np.array(np.unravel_index(int(peak.argmax()), peak.shape))
+            fine = shift + [_subpixel_offset(peak, shift, axis) for axis in (0, 1)]
+            shift = np.where(fine > side / 2, fine - side, fine)
+            lengths.append(math.hypot(*shift))
     return float(np.median(lengths)) / width
 
 
-def _between(peak: np.ndarray, place: np.ndarray, axis: int) -> float:
+def _subpixel_offset(peak: np.ndarray, pixel: np.ndarray, axis: int) -> float:
     """Return how far a maximum lies beside its pixel along an axis: that of a parabola, -0.5 to 0.5."""
-    line = np.roll(np.take(peak, place[1 - axis], axis=1 - axis), 1 - place[axis])
+    line = np.roll(np.take(peak, pixel[1 - axis], axis=1 - axis), 1 - pixel[axis])
     before, center, after = line[:3]
     bend = 2 * center - before - after
     return float(np.clip((after - before) / (2 * bend), -0.5, 0.5)) if bend > 0 else 0.0
 
 
-def _without_hidden(frames: Iterable[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
+def _counted_frames(frames: Iterable[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
     """Yield numbered frames as a stage; a clip does not state reliably how many it has."""
     with stage("looking at frames", 0, _log) as progress:
         for number, frame in frames:

@@ -110,7 +110,7 @@ def read_ply(path: Path) -> GaussianArrays:
         raise InputError(path, f"cannot be read as PLY ({error!s:.120})", _DAMAGED) from None
     if rgb:
         colors = np.stack([np.asarray(vertex[name], np.float32) for name in _RGB], axis=1)
-        columns[4] = (colors / 255 - 0.5) / np.float32(HARMONIC_0)
+        columns[4] = ((colors / 255 - 0.5) / np.float32(HARMONIC_0)).astype(np.float32)
     means, log_scales, quaternions, opacity, constant, higher, smoothing = columns
     if flat:
         log.info("%s: its Gaussians have two sizes (2D Gaussian Splatting), and are read as flat ones", path)

@@ -66,7 +66,7 @@ class Renderer:
         for thread in self._threads:
             thread.join()
 
-    def _next(self, small: bool) -> "_Picture | None":
+    def _next_picture(self, small: bool) -> "_Picture | None":
         """Return the picture whose turn it is, of small ones alone if asked for, and None if none waits."""
         fitting = [each for each in self._waiting if not small or 0 < each.pixels <= _SMALL]
         return min(fitting, default=None)
@@ -74,10 +74,10 @@ class Renderer:
     def _run(self, small: bool) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._next(small) or self._closed)
+                self._changed.wait_for(lambda: self._next_picture(small) or self._closed)
                 if self._closed:
                     return
-                picture = self._next(small)
+                picture = self._next_picture(small)
                 assert picture is not None
                 self._waiting.remove(picture)
             try:

@@ -231,15 +231,16 @@ def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
     assert [kind.take(lambda pairs: next(labels)) for _ in range(graph_cache.WARMUP_CALLS)] == [
         None
     ] * graph_cache.WARMUP_CALLS
-    leases = [
-        graph_cache._Lease(kind.idle, kind.take(lambda pairs: next(labels))) for _ in range(graph_cache.MAX_GRAPHS)
+    acquired = [
+        graph_cache._AcquiredGraph(kind.idle, kind.take(lambda pairs: next(labels)))
+        for _ in range(graph_cache.MAX_GRAPHS)
     ]
     assert kind.take(lambda pairs: next(labels)) is None, "all are held"
-    del leases[1]
+    del acquired[1]
     assert kind.take(lambda pairs: next(labels)) == "b"
     kind.grow(70)
     kind.grow(50)
-    del leases
+    del acquired
     assert kind.idle == [], "too small, they are let go"
     assert kind.take(lambda pairs: pairs) == 70
 
