@@ -70,7 +70,7 @@ assert_type(sw.write_proxy_mesh(run, "room.obj", resolution=80), Path)
 assert_type(sw.write_brackets("out", {"a": np.zeros((2, 2, 3))}, 0.01, cameras={"a": camera}), list[Path])
 assert_type(sw.evaluate(run, scene), dict[str, Any])
 assert_type(sw.evaluate_folder("pictures", scene), dict[str, Any])
-compared = sw.compare_runs([run, "other"])
+compared = sw.compare_runs([run, run])
 assert_type(len(compared), int)
 
 try:

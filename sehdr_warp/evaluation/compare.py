@@ -10,9 +10,12 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import SehdrError
+
+if TYPE_CHECKING:
+    from ..runs.run import Run
 
 COLUMNS = {
     "iterations": ("iterations", 0),
@@ -56,7 +59,7 @@ class ComparedRuns:
         return statistics.stdev(values) if len(values) == self.count > 1 else None
 
 
-def compare_runs(runs: Sequence[Any]) -> list[ComparedRuns]:
+def compare_runs(runs: "Sequence[Run]") -> list[ComparedRuns]:
     """Return the rows of a comparison, in the order of the runs.
 
     Runs of one scene whose configs differ by the seed alone share a row.

@@ -5,7 +5,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from .lights import LightRegion, count_lights, light_regions
 from .perceptual import BACKBONE, SMALLEST_EDGE, load_lpips
 from .protocols import PROTOCOLS, fit_scale, normalize, tone_map, tone_mapped_psnr
 from .ranking import DARKEST_CODE, ErrorRanking
+
+if TYPE_CHECKING:
+    from ..runs.run import Run
 
 PEAK_LUMINANCE = 1000.0
 """cd/m^2 at which PU21 shows the brightest value of a view's truth: the peak of a common HDR display."""
@@ -57,7 +60,7 @@ class Predictions(Protocol):
 class RunPredictions:
     """The predictions of a trained run."""
 
-    def __init__(self, run: Any):
+    def __init__(self, run: "Run"):
         """Take a Run."""
         self.run = run
         self.facts = {"train_seconds": run.train_seconds, "gaussians": run.gaussian_count, "iterations": run.iterations}
@@ -80,11 +83,11 @@ class RunPredictions:
 
 
 @torch.no_grad()
-def evaluate(run: Any, scene: Scene, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
+def evaluate(run: "Run", scene: Scene, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
 
     Args:
-        run: a Run.
+        run: a trained run.
         scene: at the exposure that was trained on. Without test views the training views are taken; "split" says so.
         lpips_weights: a folder, see load_lpips.
 
