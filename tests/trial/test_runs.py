@@ -76,9 +76,11 @@ RUN_FILES = ("config.json", "scene.json", "run.json", "plan.json", "summary.json
 RUN_FILES += ("confidence.safetensors", "orientation.json", "light_unit.json", "blocks.json")
 
 
+RESUME = "train --resume --out run --device cpu"
+
+
 @pytest.mark.parametrize("name", RUN_FILES)
-@pytest.mark.parametrize("kind", ["fifo", "zero", "folder"])
-@pytest.mark.parametrize("line", [RENDER, "compare run", "train --resume --out run --device cpu"])
+@pytest.mark.parametrize("line, kind", [(RENDER, "fifo"), (RENDER, "zero"), (RENDER, "folder"), (RESUME, "fifo")])
 def test_kinds_of_files_of_a_run(space, name, kind, line):
     put(space / "run" / name, kind)
     ended = tried(space, line, (1,))
@@ -251,21 +253,20 @@ def test_load_arguments_of_a_run(space, number):
     assert "root:" not in ended.err
 
 
-RUN_FILES = (
+LINKED_FILES = (
     "config.json", "scene.json", "run.json", "plan.json", "summary.json", "metrics.jsonl", "confidence.safetensors",
     "checkpoints", ".lock", "tensorboard", ".new", ".ready", "checkpoints/iteration_00000024/state.safetensors",
 )  # fmt: skip
 
 
 LOOKS = {
-    "render": "render run --out seen --device cpu", "export": "export run --out seen.ply",
-    "eval": "eval run --device cpu", "compare": "compare run", "report": "report run --out seen --device cpu",
-    "envmap": "envmap run --out seen.exr --size 32 --device cpu", "resume": "train --resume --out run --device cpu",
+    "render": "render run --out seen --device cpu", "compare": "compare run", "resume": RESUME,
     "overwrite": " ".join([*TRAIN, "--overwrite"]),
 }  # fmt: skip
+"""Commands that open a run in different ways; export, eval, report and envmap do as render does."""
 
 
-@pytest.mark.parametrize("name", RUN_FILES)
+@pytest.mark.parametrize("name", LINKED_FILES)
 @pytest.mark.parametrize("look", LOOKS)
 def test_links_in_a_sent_run(space, look, name):
     """Each to something of the user's with that name, which would do."""
