@@ -25,6 +25,7 @@ _log = logging.getLogger("sehdr_warp.scene")
 VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf",
 )  # fmt: skip
+_IN_ONE_FRAME = b"\1", b"\2", b"\4", b"\5", b"\6", b"\7"  # FFmpeg's AVStereo3DType of two pictures in a frame
 UNSTITCHED_SUFFIXES = (".insv", ".insp", ".360", ".lrv")
 """Pictures of two lenses of Insta360 and GoPro, before their own programs join them."""
 UNSTITCHED_REMEDY = "export them from the camera's program as equirectangular photos or one equirectangular MP4"
@@ -75,6 +76,11 @@ def open_clip(path: Path) -> Clip:
     with _container(path) as container:
         stream = _stream(container, path)
         frame = _first_frame(container, stream, path)
+        if (packed := frame.side_data.get("STEREO3D")) is not None and bytes(packed)[:1] in _IN_ONE_FRAME:
+            problem = "its frames hold the pictures of two lenses side by side or in turns of rows"
+            raise InputError(path, problem, "crop it to the picture of one lens, such as by FFmpeg")
+        if stream.metadata.get("alpha_mode") == "1" or any(part.is_alpha for part in frame.format.components):
+            _log.warning("%s: its transparency is not read, so what it hides counts as seen", path)
         width, height = frame.width, frame.height
         aspect = float(stream.sample_aspect_ratio or 1)
         aspect = aspect if 0.25 <= aspect <= 4 else 1.0

@@ -301,14 +301,15 @@ def test_clips_of_older_cameras(tmp_path, name, codec):
     assert is_video(tmp_path / name) and sum(1 for _ in decode(open_clip(tmp_path / name))) == 8
 
 
-def encode(path, streams):
-    """Write a clip of (codec, pixel format, frames [H, W, 3] uint8) streams at 30 frames a second."""
+def encode(path, streams, **metadata):
+    """Write a clip of (codec, pixel format, frames [H, W, 3] uint8) streams at 30 frames a second, with metadata."""
     av = pytest.importorskip("av")
     with av.open(str(path), "w") as container:
         opened = []
         for codec, layout, frames in streams:
             stream = container.add_stream(codec, rate=30)
             stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], layout
+            stream.metadata.update(metadata)
             if codec == "mpeg2video":
                 stream.options = {"flags": "+ilme+ildct", "qscale": "2"}
             opened.append((stream, layout, frames))
@@ -329,7 +330,7 @@ def bytes_of(count, **options):
 
 
 @pytest.mark.parametrize("layout", ["gray10le", "ya8", "yuv410p", "yuva420p", "yuv422p10le", "bgr0"])
-def test_every_layout_of_samples(tmp_path, layout):
+def test_every_layout_of_samples(tmp_path, layout, caplog):
     """Grey, a quarter of chroma, half of its height, transparency, RGB."""
     frames = bytes_of(1)
     clip = open_clip(encode(tmp_path / "a.mkv", [("ffv1", layout, frames)]))
@@ -338,6 +339,7 @@ def test_every_layout_of_samples(tmp_path, layout):
     assert decoded.shape == frames[0].shape
     error = decoded / float(np.iinfo(decoded.dtype).max) @ luma - frames[0] / 255 @ luma
     assert np.abs(error).mean() < 0.01
+    assert ("its transparency is not read" in caplog.text) == (layout in ("ya8", "yuva420p"))
 
 
 @pytest.mark.parametrize("thumbnail_first", [False, True])
@@ -359,6 +361,9 @@ def test_clips_of_two_lenses_are_named(tmp_path):
     (tmp_path / "a.insv").write_bytes(b"x")
     with pytest.raises(InputError, match="holds the pictures of two lenses; export it as one equirectangular MP4"):
         load_scene(tmp_path / "a.insv")
+    encode(tmp_path / "a.mkv", [("libx264", "yuv420p", bytes_of(2))], stereo_mode="left_right")
+    with pytest.raises(InputError, match="frames hold the pictures of two lenses"):
+        open_clip(tmp_path / "a.mkv")
 
 
 def test_frames_of_another_size_are_left_out(tmp_path, caplog):
