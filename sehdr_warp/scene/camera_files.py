@@ -145,5 +145,8 @@ def _of_colmap(folder: Path) -> list[tuple[str, Camera]]:
     source = find_model(folder)
     if source is None:
         raise InputError(folder, "holds no COLMAP model", "give cameras.bin or .txt and its kin, or a camera file")
-    images = sorted(read_model(source).images, key=lambda image: natural_key(image.name))
+    model = read_model(source)
+    if model.unusable:
+        raise model.unusable[0]
+    images = sorted(model.images, key=lambda image: natural_key(image.name))
     return [(Path(image.name).stem, image.lens.camera(image.world_to_camera)) for image in images]

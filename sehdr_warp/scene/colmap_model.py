@@ -51,10 +51,12 @@ class SparseModel:
     Attributes:
         images: in the file's order.
         cloud: its points.
+        unusable: errors of images whose poses cannot be, and which are not in `images`.
     """
 
     images: tuple[ModelImage, ...]
     cloud: PointCloud
+    unusable: tuple[InputError, ...] = ()
 
 
 def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:
@@ -141,7 +143,7 @@ def read_model(folder: Path) -> SparseModel:
         if number in cameras:
             raise InputError(camera_path, f"camera {number} is listed twice", _REMEDY)
         cameras[number] = Lens(*lens, source=camera_path)
-    images: dict[str, ModelImage] = {}
+    images: dict[str, ModelImage | InputError] = {}
     in_binary = _images_binary(image_path) if image_path.suffix == ".bin" else None
     for pose, number, name in in_binary or _image_records(image_path):
         if not name or len(os.fsencode(name)) > MAX_NAME_BYTES:
@@ -151,8 +153,14 @@ def read_model(folder: Path) -> SparseModel:
             raise InputError(image_path, f"image {name!r:.90} is listed twice", _REMEDY)
         if number not in cameras:
             raise InputError(image_path, f"image {name!r:.90} has camera {number}, which is not listed", _REMEDY)
-        images[name] = ModelImage(name, cameras[number], pose_from_quaternion(pose[:4], pose[4:], image_path, name))
-    return SparseModel(tuple(images.values()), read_points(folder))
+        try:
+            world_to_camera = pose_from_quaternion(pose[:4], pose[4:], image_path, name)
+            images[name] = ModelImage(name, cameras[number], world_to_camera)
+        except InputError as error:
+            images[name] = error
+    usable = tuple(image for image in images.values() if isinstance(image, ModelImage))
+    unusable = tuple(error for error in images.values() if isinstance(error, InputError))
+    return SparseModel(usable, read_points(folder), unusable)
 
 
 def _model_files(folder: Path) -> tuple[Path, Path]:

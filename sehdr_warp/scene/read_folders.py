@@ -30,7 +30,7 @@ from .names import (
     sibling,
     view_and_exposure,
 )
-from .photos import FEWEST_PHOTOS
+from .photos import FEWEST_PHOTOS, unusable_notes
 from .sfm import reconstruct
 from .sfm_panorama import are_panoramas, reconstruct_panoramas
 from .stack import refuse_stack
@@ -102,7 +102,8 @@ def read_colmap(folder: Path) -> DataparserOutputs:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         raise InputError(images, problem, _REMEDY)
     records, repeated = distinct(records)
-    notes = [*other_models(source), *renamed_note(photo_names), *repeated]
+    unusable = unusable_notes(model.unusable, len(model.images) + len(model.unusable))
+    notes = [*other_models(source), *unusable, *renamed_note(photo_names), *repeated]
     if absent:
         notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
     return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))
@@ -160,6 +161,8 @@ def _poses_by_view(folder: Path) -> tuple[PointCloud, dict[str, tuple]]:
 def _model(folder: Path) -> tuple[SparseModel, Path]:
     source = find_model(folder, anywhere=True) or folder / "sparse"
     model = read_model(source)
+    if not model.images and model.unusable:
+        raise model.unusable[0]
     if not model.images:
         raise InputError(source, "the model has no registered views", "run structure from motion again")
     return model, source

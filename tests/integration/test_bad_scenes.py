@@ -72,8 +72,11 @@ COLMAP_TEXT = {
     "images without entries": ("images.txt", lambda text: "# none\n", "no registered views"),
     "cameras truncated": ("cameras.txt", lambda text: text[:-12], "cameras.txt"),
     "not text": ("images.txt", lambda text: "\x00\xff\xfe" * 50, "images.txt"),
-    "pose NaN": ("images.txt", lambda text: re.sub(r"(?m)^1 \S+", "1 nan", text), "not finite"),
-    "zero quaternion": ("images.txt", lambda text: re.sub(r"(?m)^1( \S+){4}", "1 0 0 0 0", text), "quaternion"),
+    "poses NaN": (
+        "images.txt",
+        lambda text: re.sub(r"(?m)^(\d+)( \S+){4}(?=.*png)", r"\1 nan 0 0 0", text),
+        "not finite",
+    ),
     "leaves the folder": ("images.txt", lambda text: text.replace("000.png", "../../etc/passwd"), "'..'"),
     "leaves within": ("images.txt", lambda text: text.replace("000.png", "b/../../a.png"), "'..'"),
     "unknown camera": ("images.txt", lambda text: text.replace(" 1 000.png", " 9 000.png"), "camera 9"),
@@ -94,6 +97,16 @@ def test_colmap_text(data, capfd, case):
     path.write_text(change(before), encoding="latin-1")
     assert path.read_bytes() != before.encode()
     assert words in train_refused(capfd, data)
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "words"), [("nan 0 0 0", "is not finite"), ("0 0 0 0", "quaternion of '000.png'")]
+)
+def test_an_image_without_a_usable_pose_is_left_out(data, quaternion, words):
+    path = data / "sparse" / "0" / "images.txt"
+    path.write_text(re.sub(r"(?m)^1( \S+){4}", f"1 {quaternion}", path.read_text()))
+    scene = load_scene(data, response="srgb")
+    assert any("1 of 6 photos" in note and words in note for note in scene.notes) and len(scene.views) == 5
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "C:\\x.png"])
@@ -126,12 +139,10 @@ COLMAP_BINARY = {
     "huge track": ("points3D.bin", put(8 + 43, "<Q", 2**61), "count"),
     "unterminated name": ("images.bin", lambda c: c[: c.index(b"000.png")] + b"a" * 9000, "no end within"),
     "huge count of observations": ("images.bin", observations, "count"),
-    "zero quaternion": ("images.bin", put(12, "<4d", 0, 0, 0, 0), "quaternion"),
     "no images": ("images.bin", put(0, "<Q", 0), "no registered views"),
     "name leaves": ("images.bin", lambda content: content.replace(b"000.png", b"../etc/p"), "'..'"),
     "images are a pickle": ("images.bin", lambda content: b"\x80\x04\x95" + PICKLE * 9, "images.bin"),
     "unknown camera model": ("cameras.bin", put(12, "<i", 77), "77"),
-    "NaN pose": ("images.bin", put(12, "<d", float("nan")), "finite"),
 }
 
 
