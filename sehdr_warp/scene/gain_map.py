@@ -26,6 +26,7 @@ from .gain_map_parameters import (
     parameters_of_iso,
     parameters_of_xmp,
 )
+from .guided_enlargement import enlarge_guided
 from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, with_primary
 from .images import PILLOW_ERRORS, EncodedImage, exif_of, open_image, orientation_of, turn_upright
 from .linear_photos import linear_codes
@@ -70,14 +71,13 @@ class GainMap:
 
     def light(self, base: np.ndarray) -> np.ndarray:
         """Return the light [H, W, 3] float32 of a photo whose own light [H, W, 3] is in [0, 1], 1 at white."""
-        height, width = base.shape[:2]
+        guide = np.sqrt(base @ np.full(3, 1 / 3, np.float32))  # Even steps for the eye, about
+        planes = [np.clip(_at_size_of(guide, plane), 0, 1) for plane in np.moveaxis(self.encoded, 2, 0)]
         if self.to_alternate is not None:
             base = base @ self.to_alternate.T.astype(np.float32)
         result = np.empty(base.shape, np.float32)
         for channel in range(3):
-            plane = self.encoded[..., min(channel, self.encoded.shape[2] - 1)]
-            resized = Image.fromarray(plane).resize((width, height), Image.Resampling.BILINEAR)
-            share = np.clip(np.asarray(resized), 0, 1) ** np.float32(1 / self.gamma[channel])
+            share = planes[min(channel, len(planes) - 1)] ** np.float32(1 / self.gamma[channel])
             span = self.maximum[channel] - self.minimum[channel]
             gain = np.exp2(np.float32(self.minimum[channel]) + np.float32(span) * share)
             light = (base[..., channel] + np.float32(self.base_offset[channel])) * gain
@@ -85,6 +85,14 @@ class GainMap:
         if self.to_alternate is not None:
             result = result @ np.linalg.inv(self.to_alternate).T.astype(np.float32)
         return np.maximum(result, 0)
+
+
+def _at_size_of(guide: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Return a channel of a gain map at the size of its photo, of which `guide` is [H, W] codes in [0, 1]."""
+    if plane.shape[0] <= guide.shape[0] and plane.shape[1] <= guide.shape[1] and plane.shape != guide.shape:
+        return enlarge_guided(plane, guide)
+    height, width = guide.shape
+    return np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BILINEAR))
 
 
 def light_of(photo: EncodedImage, gain_map: GainMap | None, scale: float = 1.0) -> EncodedImage:

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
+from sehdr_warp.scene.gain_map import GainMap, has_gain_map, light_of, read_gain_map
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.primaries import matrix_to_rec709
 
@@ -93,6 +93,21 @@ def test_a_gain_map_of_three_channels(tmp_path):
     light, base, gain = pair(channels=3)
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [iso_segment(channels=3)])
     assert_light(decoded(tmp_path / "a.jpg"), light, channels=3)
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_a_small_gain_map_follows_the_edges_of_its_photo(factor):
+    """A window beside a wall: the gain of a pixel of the map that covers both is that of neither."""
+    light = np.full((60, 60, 3), 0.2, np.float32)
+    light[13:44, 16:47] = 40.0
+    gain = np.log2(np.maximum(light, 1)).mean(2) / 6
+    small = gain.reshape(60 // factor, factor, 60 // factor, factor).mean((1, 3)).astype(np.float32)
+    numbers = {name: np.full(3, value) for name, value in (("minimum", 0.0), ("maximum", 6.0), ("gamma", 1.0))}
+    offsets = {name: np.zeros(3) for name in ("base_offset", "alternate_offset")}
+    gain_map = GainMap(encoded=small[..., None], headroom=6.0, **numbers, **offsets)
+    error = np.abs(np.log2(gain_map.light(np.minimum(light, 1)) / light))
+    plain = np.asarray(Image.fromarray(small).resize((60, 60), Image.Resampling.BILINEAR))
+    assert error.mean() < 0.5 * 6 * np.abs(plain - gain).mean() and error[20:37, 23:40].max() < 0.02
 
 
 def colorful_pair():
