@@ -43,7 +43,8 @@ def add_glare(radiance: np.ndarray, index: float) -> np.ndarray:
     spread = _transfer(height, width, index / 100)
     light: np.ndarray = dctn(radiance.astype(np.float64), axes=(0, 1))  # pyright: ignore[reportAssignmentType]
     light *= spread[..., None]
-    return np.maximum(idctn(light, axes=(0, 1)), 0)  # Rounding leaves black pixels below 0.
+    scattered: np.ndarray = idctn(light, axes=(0, 1))  # pyright: ignore[reportAssignmentType]
+    return np.maximum(scattered, 0)  # Rounding leaves black pixels below 0.
 
 
 def _transfer(height: int, width: int, index: float) -> np.ndarray:
