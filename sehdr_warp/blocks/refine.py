@@ -71,17 +71,16 @@ def _border_photos(plan: BlockPlan, index: int, points: np.ndarray, photo_storag
     data = plan.data | {"views": list(plan.blocks[index].views)}
     response = response_for_loading(plan.config_of(plan.blocks[index]), plan.response)
     scene = shared_scene(plan, index, load_saved_scene(data, response=response, photo_storage=photo_storage))
-    views = tuple(view for view in scene.train_views if _share_in_view(view.camera, points) >= LEAST_SHARE)
+    views = tuple(
+        view
+        for view in scene.train_views  # Occlusion is ignored.
+        if not view.camera.is_pinhole or view.camera.project(points).inside.mean() >= LEAST_SHARE
+    )
     if len(views) < 2:
         return None
     scene = replace(scene, views=views)
     compensation = plan.shared.compensation
     return scene if compensation is None else compensation.normalize_photos(scene, plan.response)
-
-
-def _share_in_view(camera: Camera, points: np.ndarray) -> float:
-    """Return the part of points [M, 3] in the field of view of a camera; occlusion is ignored."""
-    return float(camera.project(points).inside.mean()) if camera.is_pinhole else 1.0
 
 
 def _visible_rows(tensors: Mapping[str, Tensor], plan: BlockPlan, cameras: list[Camera]) -> Tensor:

@@ -136,7 +136,7 @@ class Gaussians(nn.Module):
         self.reallocations += self._reserved is None
         for name in PARAMETER_NAMES:
             if self._reserved is None:
-                self._replace(name, partial(_with_rows, rows[name]), optimizer)
+                self._replace(name, partial(_append_rows, rows[name]), optimizer)
             else:
                 self._reserved.all_rows[name].detach()[count:total] = rows[name]
                 self._put(name, *self._reserved.first(name, total), optimizer)
@@ -321,7 +321,7 @@ class ReservedRows:
         return all_rows
 
 
-def _with_rows(added: Tensor, tensor: Tensor, is_moment: bool) -> Tensor:
+def _append_rows(added: Tensor, tensor: Tensor, is_moment: bool) -> Tensor:
     """Return a tensor [N, ...] followed by added rows, or by zeros if it is a moment."""
     return torch.cat([tensor, torch.zeros_like(added) if is_moment else added])
 

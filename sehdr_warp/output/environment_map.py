@@ -138,7 +138,12 @@ def write_environment_map(
     header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
     header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
-    data = rendered.data_channels(transform.scale)
+    data = {
+        "distance.Z": rendered.distance * transform.scale,
+        "confidence": rendered.confidence,
+        "clipped": rendered.clipped,
+    }
+    data = {name: values for name, values in data.items() if values is not None}
     parts = [Part(rgb_channels(hdr) | {"A": rendered.alpha}, header, "rgba"), Part(data, as_data(header), "data")]
     pixel_type = write_multipart_exr(path, parts, pixel=pixel, overwrite=overwrite)
     if pixel_type != pixel:
@@ -176,11 +181,6 @@ class RenderedMap:
     distance: np.ndarray
     confidence: np.ndarray | None
     clipped: np.ndarray | None
-
-    def data_channels(self, scale: float) -> dict[str, np.ndarray]:
-        """Return the channels of the file's part `data`; `scale` is the length of a scene unit in the file's units."""
-        channels = {"distance.Z": self.distance * scale, "confidence": self.confidence, "clipped": self.clipped}
-        return {name: values for name, values in channels.items() if values is not None}
 
 
 def render_map(

@@ -146,20 +146,15 @@ def _add_stream(container: Any, kind: Transfer, fps: float, width: int, height: 
     """Add the video stream of a film to a container of PyAV, and return it."""
     stream = container.add_stream(kind.codec, rate=Fraction(fps).limit_denominator(1001))
     stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
-    stream.options = _encoder_options(kind, min(width, height))
+    stream.options = kind.options
+    if kind.codec == "libx265" and min(width, height) < _X265_SMALLEST_SIDE:
+        stream.options = kind.options | {"x265-params": kind.options["x265-params"] + _X265_SMALL}
     context = stream.codec_context
     if kind.codec == "libx265":
         context.codec_tag = "hvc1"  # What Apple's players look for.
     context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
     context.color_range = 1
     return stream
-
-
-def _encoder_options(kind: Transfer, side: int) -> dict[str, str]:
-    """Return options of the encoder for pictures whose shorter side has this number of pixels."""
-    if kind.codec != "libx265" or side >= _X265_SMALLEST_SIDE:
-        return kind.options
-    return kind.options | {"x265-params": kind.options["x265-params"] + _X265_SMALL}
 
 
 def film_format(out: Path | str) -> str:

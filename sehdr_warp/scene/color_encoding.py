@@ -97,7 +97,11 @@ class ColorEncoding:
         """Return [H, W, 3] float32 light of codes by the curves, in the primaries of the codes."""
         levels = int(np.iinfo(pixels.dtype).max)
         if levels not in self._decoders:
-            self._decoders[levels] = _decoding_tables(self.curves or (_srgb_curve(_SAMPLES),), levels)
+            curves = self.curves or (_srgb_curve(_SAMPLES),)
+            curves = curves[:1] if all(curve is curves[0] for curve in curves) else curves[:3]
+            codes = np.linspace(0, 1, levels + 1)
+            tables = [np.interp(codes, np.linspace(0, 1, len(c)), c).astype(np.float32) for c in curves]
+            self._decoders[levels] = tables
         decoders = self._decoders[levels]
         if len(decoders) == 1:
             return decoders[0][pixels]
@@ -211,12 +215,6 @@ def _simplify(name: str, matrix: np.ndarray | None, curves: tuple[np.ndarray, ..
     if curves and all(np.abs(curve - _srgb_curve(len(curve))).max() < _SAME for curve in curves):
         curves = ()
     return ColorEncoding(name, matrix, curves)
-
-
-def _decoding_tables(curves: tuple[np.ndarray, ...], white: int) -> list[np.ndarray]:
-    codes = np.linspace(0, 1, white + 1)
-    count = 1 if all(curve is curves[0] for curve in curves) else 3
-    return [np.interp(codes, np.linspace(0, 1, len(c)), c).astype(np.float32) for c in curves[:count]]
 
 
 def _png_cicp(path: Path) -> tuple[int, int, int] | None:

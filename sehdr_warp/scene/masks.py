@@ -71,7 +71,12 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     notes, listing = [], Listing()
     for place, keys in files.items():
         # A mask of a photo that the set leaves out is named with that photo, not here.
-        strange = [file for file, key in keys.items() if file not in mask_files and not _is_photo(key, bases, listing)]
+        strange = [
+            file
+            for file, key in keys.items()
+            if file not in mask_files
+            and not any(listing.holds(f"{base}/{key}") or listing.holds_photo(f"{base}/{key}") for base in bases)
+        ]
         names = [file.relative_to(place).as_posix() for file in strange]
         if names:
             names_text = first_names(names)
@@ -223,8 +228,3 @@ def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list
         if place.is_dir() and not place.is_symlink() and _files_below(place):
             notes.append(f"{place.name}/ is not read: if it holds masks of the photos, name it masks/")
     return notes
-
-
-def _is_photo(key: str, bases: Sequence[Path], listing: Listing) -> bool:
-    """Return whether a photo of this name, with or without suffix, lies in one of the folders."""
-    return any(listing.holds(f"{base}/{key}") or listing.holds_photo(f"{base}/{key}") for base in bases)
