@@ -26,12 +26,8 @@ from .selection_scores import (
 from .table import TabulatedResponse
 
 # How likely it is beforehand that no formula made the photos, and the probability from which a formula is taken for the
-# truth (docs/response.md: set on half of the scenes and curves).
-NO_FORMULA, DECISIVE = 0.5, 0.25
-MEAN_WIDENING = 1.25
-"""Factor of the uncertainty of the posterior's mean. It is taken if no curve fits well, so the true one may lie outside
-of what is scored: for the 16 of 72 sets of docs/reports/response.md that take it, the posterior's own deviation is 0.38
-stops, the error 0.46, and 56 % lie within one deviation (69 % with the factor)."""
+# truth (set on the 72 sets of docs/reports/response.md).
+NO_FORMULA, DECISIVE = 0.5, 0.2
 UNSURE = 0.4  # Stops of uncertainty from which a note says that the response is a guess
 
 
@@ -40,8 +36,7 @@ class ResponseSelection:
     """The chosen response, by which score, and every candidate's scores, best first.
 
     uncertainty: stops; by how much curves that explain the photos as well differ from the chosen one: the root mean
-    square over codes 10 to 245 and over the posterior, after one scale for each curve; for the posterior's mean times
-    MEAN_WIDENING. NaN by "paper".
+    square over codes 10 to 245 and over the posterior, after one scale for each curve. NaN by "paper".
     """
 
     response: Response
@@ -78,7 +73,7 @@ def select_response(
         candidates: by default the responses with a formula.
         method: "posterior" judges edges (Lin et al. 2004), clipped pixels, the spread and smoothness of light, and
             a prior; it needs none of them. Without `candidates`, and for photos that are not a camera's own, a smooth
-            family of cameras' curves stands beside the formulae: a formula with a quarter of the posterior is taken;
+            family of cameras' curves stands beside the formulae: a formula with a fifth of the posterior is taken;
             else the posterior's mean of log exposure at each code, a table beside the candidates.
             "paper" is SeHDR, section 3.3: the curve that does best on one photo "by dynamic range and smoothness"; the
             paper gives no formula, ours is ResponseScore.paper_score.
@@ -121,6 +116,6 @@ def select_response(
     if takes_mean:
         best = TabulatedResponse("posterior mean", np.r_[0.0, np.exp(chances @ logs)[1:]], CODES)
     off = (logs - np.log(np.maximum(np.asarray(best.decode(CODES)), 1e-30)))[:, 10:246] / np.log(2)
-    width = math.sqrt(chances @ off.var(1)) * (MEAN_WIDENING if takes_mean else 1.0)
+    width = math.sqrt(chances @ off.var(1))
     uncertainty = width if method == "posterior" else math.nan
     return ResponseSelection(best, method, len(evidence.edges), tuple(scores[index] for index in order), uncertainty)

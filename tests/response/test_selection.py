@@ -36,6 +36,15 @@ def named(*names) -> list[Response]:
     return [response_by_name(name) for name in names]
 
 
+def shaded(light, seed) -> np.ndarray:
+    """Light whose mixed pixels are darker by up to a half, as in contact shadows and at the rims of curved surfaces."""
+    mixed = np.zeros(light.shape[:2], bool)
+    for axis in (0, 1):
+        before, after = np.roll(light, 1, axis), np.roll(light, -1, axis)
+        mixed |= ((light != before) & (light != after)).any(2)
+    return light * np.where(mixed, np.random.default_rng(seed).uniform(0.5, 1.0, mixed.shape), 1.0)[..., None]
+
+
 def test_papers_score_orders_by_range_and_smoothness():
     photo = photograph("srgb", mosaic())
     scores = select_response(photo, method="paper").scores
@@ -51,13 +60,13 @@ def test_papers_score_orders_by_range_and_smoothness():
 
 def test_candidates_are_compared_on_one_thread_of_torch(monkeypatch):
     """Between so many small operations further threads would spin."""
-    thread_counts, compare, before = set(), selection_scores._mixture_surprise, torch.get_num_threads()
+    thread_counts, compare, before = set(), selection_scores._line_surprise, torch.get_num_threads()
 
     def noted(*args):
         thread_counts.add(torch.get_num_threads())
         return compare(*args)
 
-    monkeypatch.setattr(selection_scores, "_mixture_surprise", noted)
+    monkeypatch.setattr(selection_scores, "_line_surprise", noted)
     torch.set_num_threads(2)
     try:
         select_response(photograph("srgb", mosaic()), named("srgb", "filmic"))
@@ -71,7 +80,7 @@ def test_thousands_of_edges_are_all_looked_at_and_count_as_few_facts_and_more_ar
     selection, again = (select_response(photos[:3], few, seed=seed) for seed in (0, 1))
     assert 3000 < selection.edge_count < select_response(photos, few).edge_count == 4000
     assert [score.posterior for score in selection.scores] == [score.posterior for score in again.scores]
-    assert edge_facts(1600) == 10 and edge_facts(selection.edge_count) == edge_facts(10**6) == 18.75
+    assert edge_facts(800) == 10 and edge_facts(selection.edge_count) == edge_facts(10**6) == 18.75
     for score in selection.scores:
         rest = score.highlights + score.span + score.density + score.prior
         assert score.posterior == pytest.approx(18.75 * score.edges + rest)
@@ -100,6 +109,19 @@ def test_arrays_and_codes_are_judged_alike():
 def test_what_cannot_be_judged_is_refused(image, options, words):
     with pytest.raises(SehdrError, match=f"select_response: .*{words}"):
         select_response(image, **options)
+
+
+@pytest.mark.parametrize("name", ["srgb", "hdr-nerf", "camera"])
+def test_shading_at_edges_does_not_mislead(name, monkeypatch):
+    """The line of an edge's sides misses its middle color under every curve then; their plane with black does not."""
+    exposure = min(response_by_name(name).clip_exposure, 3.0)
+    photos = [photograph(name, shaded(exposure * mosaic(seed), seed)) for seed in range(4)]
+    excess = []
+    for weight in (selection_scores.LINE_WEIGHT, 1e3):
+        monkeypatch.setattr(selection_scores, "LINE_WEIGHT", weight)
+        edges = {key: score.edges / max(weight, 1) for key, score in by_name(select_response(photos)).items()}
+        excess.append(edges[name] - min(edges.values()))
+    assert excess[0] < 0.01 < excess[1]
 
 
 @pytest.mark.parametrize("name", ["gamma-2.2", "srgb", "hdr-nerf", "filmic"])
