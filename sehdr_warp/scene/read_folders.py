@@ -285,6 +285,9 @@ def find_photos(folder: Path) -> DataparserOutputs:
     if model := find_model(folder, anywhere=True):
         place = model.relative_to(folder).as_posix()
         notes.append(f"the COLMAP model in {place} names none of these photos and is not used")
+    for place in ("sparse/0", "sparse"):
+        if not model and any((folder / place / f"images{end}").is_file() for end in (".bin", ".txt")):
+            notes.append(f"{place} is not read, because it has no cameras.bin or cameras.txt: cameras are found anew")
     if photos[0].parent == folder and (inner := [name for name in _folders_with_photos(folder) if name not in _OTHERS]):
         notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
     records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)

@@ -1,5 +1,7 @@
 """COLMAP sets against pycolmap; test_bad_scenes and fuzz hold what damaged or hostile ones get."""
 
+import shutil
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -76,6 +78,17 @@ def test_a_model_that_names_none_of_the_photos_is_not_used_and_named(tmp_path):
     dataset = find_photos(tmp_path)
     assert dataset.notes == ("the COLMAP model in old/sparse/0 names none of these photos and is not used",)
     assert not model_fits(tmp_path, tmp_path / "old" / "sparse" / "0")
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse"])
+def test_a_model_without_cameras_is_named(tmp_path, place):
+    write_colmap(tmp_path)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "model")
+    (tmp_path / place).mkdir(parents=True, exist_ok=True)
+    (tmp_path / "model" / "images.txt").rename(tmp_path / place / "images.txt")
+    shutil.rmtree(tmp_path / "model")
+    note = f"{place} is not read, because it has no cameras.bin or cameras.txt: cameras are found anew"
+    assert find_photos(tmp_path).notes == (note,)
 
 
 def test_of_models_under_other_names_the_largest_is_used(tmp_path):
