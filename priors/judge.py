@@ -17,10 +17,13 @@ from torch import Tensor
 from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import STOPS, LightNetwork, network_input
 
+from .families import LIT
 from .panoramas import Pack, pack_of_folder, read_pack
 from .photos import Camera, Photos
+from .rooms import LitRooms
 
 PHOTOS, BATCH, SIZE = 384, 32, 96
+LIT_ROOMS = 50  # Other ones than those of a training
 RIDGE = 10.0
 SETS = {
     "plain": {},
@@ -29,6 +32,7 @@ SETS = {
     "lights put in": {"light_share": 1.0},
     "overexposed": {"overexposed_share": 1.0},
     "pages": {"page_share": 1.0},
+    "lit rooms": {"darkest": LIT["darkest"]},
 }
 """Names of the sets of photos, and what is in them beside what the panoramas hold."""
 AREAS = (30, 300, 3000, 3 * SIZE**2)  # Most clipped values of a photo in a row of energies
@@ -49,7 +53,7 @@ def judge(
     """Return figures of each estimate on photos of unseen panoramas.
 
     Photos are plain (sRGB, no noise), by cameras, by cameras with lamps brighter than in the panoramas, with lamps,
-    windows and screens put in, overexposed, and with a white surface put in that is no lamp.
+    windows and screens put in, overexposed, with a white surface put in that is no lamp, and of rooms with lamps.
 
     The panoramas `chosen`, of the pack `learned` if it is another one, are those that constant and ridge are fitted on.
 
@@ -61,6 +65,8 @@ def judge(
     examples = _collect(network, learned or pack, chosen, seed + 100, device, plain=True)
     result = {}
     for name, shares in SETS.items():
+        if name == "lit rooms":
+            shares = shares | {"lit_rooms": LitRooms(LIT_ROOMS, device, seed + 1000)}
         photos = _collect(network, pack, unseen, seed, device, plain=name == "plain", **shares)
         constant = float(np.mean(list(examples["level"])))
         ridge = _ridge(examples["cues"], examples["level"])

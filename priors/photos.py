@@ -9,9 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .panoramas import Pack
+from .rooms import LitRooms
 
 SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
+SCALES, LARGEST = (1.0, 1.25, 2.0), 160  # Of a training: photos are averaged from these multiples, up to this size
 MOST_CLIPPED, LEAST_CLIPPED = 0.35, 5e-4  # Shares of the pixels of a photo that is not overexposed
+DARKEST = 9.0  # Most stops by which white is above the median of a photo of a panorama
 OVEREXPOSED = (0.1, 0.95)  # Shares of the pixels of an overexposed photo that clip
 ROOM_SHARE = 0.35  # Of the photos of a training
 CONTRAST = 0.35  # By how much the power may differ from 1 to which a panorama's light over its median is raised
@@ -52,8 +55,8 @@ LEVELS = 255
 class Photos:
     """A batch of simulated photos; [B, 3, S, S] each.
 
-    exposure: decoded, in units of white. clipped: 1 where the code is the largest, else 0. truth: log2 of the true
-    exposure over white where it is above, else 0.
+    exposure: decoded, in units of white. clipped: the share of each value whose code is the largest. truth: log2 of the
+    true exposure of that share over white, else 0.
     """
 
     exposure: Tensor
@@ -78,6 +81,9 @@ class Camera:
         overexposed_share: float = 0.0,
         page_share: float = 0.0,
         varied: bool = False,
+        lit_rooms: LitRooms | None = None,
+        darkest: float = DARKEST,
+        scales: tuple[float, ...] = (1.0,),
     ):
         """Copy panoramas, rooms and curves to the device.
 
@@ -93,8 +99,11 @@ class Camera:
             overexposed_share: share of the photos of which up to 95 % clip, unless they are plain.
             page_share: share of the photos with a white surface that is no lamp, unless they are plain.
             varied: whether panoramas have random contrasts and orders of channels, so that few of them teach more.
+            lit_rooms: rooms that are photographed in place of panoramas and of the pack's rooms.
+            scales: sizes at which photos are taken over those to which they are averaged; one for all photos of a call.
+            darkest: most stops by which white may be above the median of a photo that is not overexposed.
         """
-        self.varied = varied
+        self.varied, self.lit_rooms, self.darkest, self.scales = varied, lit_rooms, darkest, scales
         self.stretch_share, self.overexposed_share, self.page_share = stretch_share, overexposed_share, page_share
         self.light_share, self.overexposed_light_share = light_share, overexposed_light_share
         self.device, self.random = torch.device(device), np.random.default_rng(seed)
@@ -109,6 +118,14 @@ class Camera:
     def take(self, count: int, size: int | None = None, *, plain: bool = False) -> Photos:
         """Return `count` photos of one size; plain: by sRGB, without noise, JPEG, white balance and errors."""
         size = size or int(self.random.choice(SIZES))
+        if not plain and len(self.scales) > 1:
+            fine = max(size, min(8 * round(size * self.random.choice(self.scales) / 8), LARGEST))
+            return _averaged(self._take(count, fine, plain), size)
+        return self._take(count, size, plain)
+
+    def _take(self, count: int, size: int, plain: bool) -> Photos:
+        if self.lit_rooms is not None:
+            return self._expose(self.lit_rooms.take(count, size), plain)
         rooms = 0 if self.rooms is None else int(self.random.binomial(count, ROOM_SHARE))
         views = [self._panorama_views(count - rooms, size)]
         if rooms:
@@ -185,7 +202,7 @@ class Camera:
             share = torch.where(over, self._uniform(count, *OVEREXPOSED)[:, 0, 0, 0], share)
         ranks = ((1 - share) * (brightest.shape[1] - 1)).long()
         by_share = brightest.sort(1).values.gather(1, ranks[:, None])
-        by_middle = _median(brightest) * 2 ** self._uniform(count, 0.5, 9)[:, 0, 0]
+        by_middle = _median(brightest) * 2 ** self._uniform(count, 0.5, self.darkest)[:, 0, 0]
         most = brightest.sort(1).values[:, int((1 - LEAST_CLIPPED) * (brightest.shape[1] - 1)), None]
         first = (torch.rand(count, 1, generator=self.generator, device=self.device) < 0.5) | plain
         if not plain:
@@ -375,6 +392,18 @@ class Camera:
         decoded = torch.einsum("kc,bchw->bkhw", torch.linalg.inv(luma), blocks.reshape(count, 3, height, width))
         used = torch.rand(count, 1, 1, 1, generator=self.generator, device=self.device) < 0.6
         return torch.where(used, decoded.clamp(0, 1), encoded)
+
+
+def _averaged(photos: Photos, size: int) -> Photos:
+    """Return photos averaged to a smaller size: what clips in part has the mean light of that part as its truth."""
+    if photos.exposure.shape[-1] == size:
+        return photos
+    light = photos.clipped * torch.exp2(photos.truth)
+    exposure, share, light = (
+        F.interpolate(v, size=(size, size), mode="area") for v in (photos.exposure, photos.clipped, light)
+    )
+    truth = torch.where(share > 0, light / share.clamp_min(1e-9), 1.0).log2()
+    return Photos(exposure, share, truth)
 
 
 def _log_range(part: Tensor, low: float, high: float) -> Tensor:

@@ -19,10 +19,11 @@ from torch import Tensor
 from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import STOPS, LightNetwork, network_input
 
-from .families import Families
+from .families import LIT_ROOMS, Families
 from .judge import judge
 from .panoramas import Pack, read_pack
 from .photos import Photos
+from .rooms import LitRooms
 
 STEPS, BATCH = 6500, 48
 AT_ONCE = 4  # Batches that are simulated at one time
@@ -61,6 +62,7 @@ def train(
     device: str,
     begin: Path | None = None,
     rate: float = RATE,
+    lit_rooms: LitRooms | None = None,
 ) -> LightNetwork:
     """Return a network trained on some panoramas and the rooms: the average of its last weights.
 
@@ -72,11 +74,13 @@ def train(
         device: "cpu", "cuda:0" ...
         begin: weights to go on from; None: random ones.
         rate: the largest learning rate.
+        lit_rooms: rooms whose lamps are in view; None: LIT_ROOMS are rendered.
     """
     torch.manual_seed(seed)
     network = LightNetwork() if begin is None else copy.deepcopy(load_prior("cpu", begin).network)
     network = network.to(device).train()
-    families = Families(pack, device, chosen, rooms=True, seed=seed)
+    lit_rooms = lit_rooms or LitRooms(LIT_ROOMS, device, seed)
+    families = Families(pack, device, chosen, rooms=True, seed=seed, lit_rooms=lit_rooms)
     matrices, vectors = ([p for p in network.parameters() if (p.ndim > 1) is matrix] for matrix in (True, False))
     groups = [{"params": matrices, "weight_decay": WEIGHT_DECAY}, {"params": vectors, "weight_decay": 0.0}]
     optimizer = torch.optim.AdamW(groups, rate)
