@@ -25,23 +25,23 @@ _SETS = {
     "lights put in": "as camera, with lamps, windows and screens put in",
     "overexposed": "as camera, 10 to 95 % of the pixels at white",
     "pages": "as camera, with white surfaces put in that are no lamps, blank or printed",
-    "lit rooms": "rendered rooms and streets with lamps in view, other ones than in the training",
+    "lit rooms": "rendered rooms and streets with lamps in view, other ones than in a training",
 }
 _AREAS = {"30": "up to 30", "300": "31 to 300", "3000": "301 to 3000", "27648": "more"}
 _TEXT = """# The prior for light above white
 
 How well the network that comes with the package estimates clipped light ([Light above white](light.md)), on photos of
-seven panoramas that no training and no choice has used (`checked` in `priors/sources.toml`). Each row estimates the log2
-excess over white of clipped values: by nothing (*white*), by the mean of the training (*constant*), by a ridge regression
-on ten figures of the photo's histogram, and by the network. RMS counts all clipped values alike. The card beside the
-weights, `sehdr_warp/prior/clipped_light.md`, says how it was trained.
+ten panoramas that it was not trained on (`priors/sources.toml`). Each row estimates the log2 excess over white of
+clipped values: by nothing (*white*), by the mean of the training (*constant*), by a ridge regression on ten figures of
+the photo's histogram, and by a network that was trained like the one in the package on the other panoramas. RMS counts
+all clipped values alike. The card beside the weights, `sehdr_warp/prior/clipped_light.md`, says how it was trained.
 
 {tables}
 
 ![Estimates against the truth, and how often the truth lies within a deviation](images/{page}.png)
 
 The truth lies within one deviation for {within:.0%} of the clipped values; one factor for all deviations was fitted on
-photos of other panoramas. By quarters of the deviation:
+five of the ten panoramas. By quarters of the deviation:
 
 | mean deviation, stops | RMS, stops | within one deviation |
 | -: | -: | -: |
