@@ -70,10 +70,10 @@ class Reconstruction:
             notes.append(f"{len(unregistered)} of {len(photos)} photos could not be placed and were left out: {first}")
         if self.weak:
             first = first_names([photos[i].name for i in self.weak], 5)
-            notes.append(
-                f"{len(self.weak)} photos share few points with others, so their places are uncertain: {first}; "
-                "more photos in between help"
-            )
+            few = "1 photo shares few points with others, so its place is uncertain"
+            if len(self.weak) > 1:
+                few = f"{len(self.weak)} photos share few points with others, so their places are uncertain"
+            notes.append(f"{few}: {first}; more photos in between help")
         if self.error > MOST_ERROR:
             notes.append(
                 f"the cameras' places are uncertain: points miss their photos by {self.error:.1f} pixels in the mean; "

@@ -303,6 +303,8 @@ def test_poor_placement_is_named_with_its_photos():
     assert lost == "2 of 8 photos could not be placed and were left out: 6.jpg, 7.jpg"
     assert weak.startswith("2 photos share few points with others, so their places are uncertain: 2.jpg, 4.jpg;")
     assert "1.4 pixels" in error
+    _, weak, _ = Reconstruction(model, 1.4, (3,)).notes(photos)
+    assert weak.startswith("1 photo shares few points with others, so its place is uncertain: 3.jpg;")
 
 
 def test_embedded_scene_loads():
