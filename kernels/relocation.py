@@ -10,7 +10,7 @@ import warp as wp
 from .constants import NO_AUTODIFF
 from .geometry import vector
 
-AT_ONCE = 6  # Tensors whose rows one launch copies or clears
+AT_ONCE = 6  # Tensors whose rows one launch copies or scales
 OPAQUE = 1.0 - 1.0e-6  # Logits stay finite
 SMALLEST = 1.0e-3  # Times which a Gaussian may become smaller at once
 
@@ -127,23 +127,23 @@ def copy_rows(
 
 
 @wp.func
-def clear_row(values: _rows, row: int):
-    """Set a row of values to 0."""
+def scale_row(values: _rows, row: int, factor: float):
+    """Multiply a row of values by a factor; 0 also clears what is not finite."""
     for column in range(values.shape[1]):
-        values[row, column] = 0.0
+        values[row, column] = wp.where(factor == 0.0, 0.0, factor * values[row, column])
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-def clear_rows(
+def scale_rows(
     range_start: int,
-    which: wp.array(dtype=wp.bool), a: _rows, b: _rows, c: _rows, d: _rows, e: _rows, f: _rows,
+    which: wp.array(dtype=wp.bool), factor: float, a: _rows, b: _rows, c: _rows, d: _rows, e: _rows, f: _rows,
 ):
-    """Zeroes the rows that are marked. A thread for each."""
+    """Multiply the rows that are marked by a factor. A thread for each."""
     row = range_start + wp.tid()
     if which[row]:
-        clear_row(a, row)
-        clear_row(b, row)
-        clear_row(c, row)
-        clear_row(d, row)
-        clear_row(e, row)
-        clear_row(f, row)
+        scale_row(a, row, factor)
+        scale_row(b, row, factor)
+        scale_row(c, row, factor)
+        scale_row(d, row, factor)
+        scale_row(e, row, factor)
+        scale_row(f, row, factor)

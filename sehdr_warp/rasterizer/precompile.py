@@ -58,7 +58,7 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
         *(lists.gather_intersections, harmonics.harmonics_backward_kernel(real, 0, True)),
         *(training_step.check_finite, training_step.add_position_noise),
         *(relocation.number_places, relocation.count_copies, relocation.share_opacities, relocation.copy_rows),
-        *(relocation.clear_rows, residual_sampling.error_weights_kernel(wp.uint8), residual_sampling.sampled_pixels),
+        *(relocation.scale_rows, residual_sampling.error_weights_kernel(wp.uint8), residual_sampling.sampled_pixels),
     ]
 
 

@@ -80,10 +80,13 @@ def copy_rows(
 
 
 @torch.no_grad()
-def clear_rows(values: Sequence[Tensor], which: Tensor) -> None:
-    """Set the rows of values, [N, ...] contiguous float32 each, that `which` [N] bool marks to 0, in place."""
+def scale_rows(values: Sequence[Tensor], which: Tensor, factor: float) -> None:
+    """Multiply the rows of values, [N, ...] contiguous float32 each, that `which` [N] bool marks, in place.
+
+    A factor of 0 sets them to 0, also what is not finite.
+    """
     for start in range(0, len(values), kernels.AT_ONCE):
-        launch(kernels.clear_rows, len(which), which, *_rows(values[start : start + kernels.AT_ONCE]))
+        launch(kernels.scale_rows, len(which), which, factor, *_rows(values[start : start + kernels.AT_ONCE]))
 
 
 class SampledRows(NamedTuple):

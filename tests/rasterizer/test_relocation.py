@@ -5,11 +5,11 @@ import torch
 from sehdr_warp.rasterizer.relocation import (
     MOST_COPIES,
     SampledRows,
-    clear_rows,
     copy_rows,
     count_copies,
     number_places,
     relocation_sums,
+    scale_rows,
     share_opacities,
 )
 
@@ -79,8 +79,11 @@ def test_copies_are_counted_of_the_places_there_are(device):
         )
 
 
-def test_marked_rows_alone_are_cleared(device):
+def test_marked_rows_alone_are_scaled(device):
     which = torch.tensor([True, False, True], device=device)
     values = [torch.ones(3, *shape, device=device) for shape in ((), (3,), (15, 3), (0, 3), (4,), (1, 3), (2,))]
-    clear_rows(values, which)
-    assert all(not each[which].any() and each[1].all() for each in values)
+    scale_rows(values, which, 0.25)
+    assert all((each[which] == 0.25).all() and (each[1] == 1).all() for each in values)
+    values[1][0, 0] = torch.inf
+    scale_rows(values, which, 0.0)
+    assert all(not each[which].any() and (each[1] == 1).all() for each in values)

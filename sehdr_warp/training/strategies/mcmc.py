@@ -7,7 +7,14 @@ import torch
 from torch import Tensor
 
 from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, moments_of
-from ...rasterizer.relocation import SampledRows, clear_rows, copy_rows, count_copies, number_places, share_opacities
+from ...rasterizer.relocation import (
+    SampledRows,
+    copy_rows,
+    count_copies,
+    number_places,
+    scale_rows,
+    share_opacities,
+)
 from ...rasterizer.training_step import add_position_noise
 from ...runs.config import Config, McmcConfig
 from .base import SEED_STRIDE, Propose, Schedule, Strategy
@@ -18,6 +25,7 @@ MAX_NOISE_SIZES = 0.05
 """Noise moves a Gaussian by at most this many of its standard deviations per step (times a normal number)."""
 MAX_DISTANCE = 100.0
 """Noise moves no Gaussian farther than this from the origin, in normalized units (1.1 camera radii)."""
+SECOND_MOMENT_LEFT = 0.1  # Of a source's second moments, see reset_moments()
 
 
 @dataclass(frozen=True)
@@ -26,7 +34,7 @@ class RelocationSlots:
 
     Attributes:
         of_row: [N] int32, slot of each row in that order; negative for rows that stay.
-        changed: [N] bool, rows whose optimizer state is to be cleared, see moments_to_clear().
+        changed: [N] bool, rows whose optimizer state is to be reset, see reset_moments().
     """
 
     of_row: Tensor
@@ -92,19 +100,8 @@ class McmcStrategy(Strategy):
         self.relocate(gaussians, slots, opacities.masked_fill(dead, 0), seeded, dead_count, generator)
         if added > 0:
             self.sample_add(gaussians, slots, torch.maximum(dead_count, seeded), dead_count + added, added, generator)
-        clear_rows(self.moments_to_clear(gaussians, optimizer, growing=count < self.cap_max), slots.changed)
+        reset_moments(gaussians, optimizer, slots.changed)
         return added > 0
-
-    def moments_to_clear(self, gaussians: Gaussians, optimizer: Optimizer | None, growing: bool) -> list[Tensor]:
-        """Return Adam's moments that the sources of copies lose, [N, ...] each.
-
-        The authors clear both moments. Adam then moves a source by 3 to 6 times its rate for about 50 steps. While the
-        count grows, that parts sources from their copies. At the cap the same rows are sources again and again, and in
-        dense scenes they become floaters; so the second moments stay there.
-        """
-        names = ("exp_avg", "exp_avg_sq") if growing else ("exp_avg",)
-        states = [moments_of(optimizer, parameter) for parameter in gaussians.parameters()]
-        return [state[name] for state in states for name in names if name in state]
 
     def next_count(self, iteration: int, count: int) -> int:
         """Return the count after the refinement at an iteration.
@@ -216,6 +213,19 @@ class McmcStrategy(Strategy):
         parts = means.split(max(1, DISTANCES_AT_ONCE // len(cameras)))
         nearest = torch.cat([torch.cdist(part, cameras, compute_mode=exact).amin(1) for part in parts])
         return gaussians.log_scales.amax(1) > torch.log(self.options.prune_near_angle * nearest)
+
+
+def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tensor) -> None:
+    """Reset Adam's moments of the sources of copies, rows marked in `which` [N] bool.
+
+    The authors clear both moments. Adam then moves a source by 3 to 6 times its rate for about 50 steps, and where no
+    photo shows it, it fades as fast by the opacity penalty. In scenes with many refinements and Gaussians the rendering
+    collapses. If the second moments stay, sources and copies part too slowly. So a tenth stays.
+    """
+    states = [moments_of(optimizer, parameter) for parameter in gaussians.parameters()]
+    for name, factor in (("exp_avg", 0.0), ("exp_avg_sq", SECOND_MOMENT_LEFT)):
+        if moments := [state[name] for state in states if name in state]:
+            scale_rows(moments, which, factor)
 
 
 def mcmc_cap(config: Config, pixels: int) -> int:
