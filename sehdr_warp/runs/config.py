@@ -118,10 +118,10 @@ class LossConfig(_Table):
     """compare the base color with HDR truth in the linear loss, for views that have it"""
     anchor_weight: Weight = 0.0
     """learned response: weight of (f(1) - 1/2)^2, which fixes the scale of exposure (HDR-NeRF: 0.5)"""
-    opacity_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.003
-    """weight of the mean opacity, which lets unneeded Gaussians fade for mcmc to relocate (3DGS-MCMC: 0.01); it is 0
-    from the last relocation on and, where a photo shows less than a tenth of the scene, for new Gaussians until a
-    photo shows them; more leaves surfaces transparent"""
+    opacity_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
+    """weight of the mean opacity, which lets unneeded Gaussians fade for mcmc to relocate (3DGS-MCMC); it is 0 from the
+    last relocation on and, where a photo shows less than a tenth of the scene, for new Gaussians until a photo shows
+    them; more leaves surfaces transparent"""
 
     @property
     def uses_hdr(self) -> bool:

@@ -61,7 +61,7 @@ def test_presets_keep_the_densification_of_their_method(name):
     config = load_config(name)
     strategy_fields = config.densification.strategy, config.loss.opacity_weight
     relocates = name in ("default", "fast", "demo", "truth")
-    assert strategy_fields == (("mcmc", 0.003) if relocates else ("adc", 0.0))
+    assert strategy_fields == (("mcmc", 0.01) if relocates else ("adc", 0.0))
 
 
 @pytest.mark.parametrize("path,item", list(config_fields()), ids=[path for path, _ in config_fields()])
