@@ -232,7 +232,7 @@ def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
 def _check(cameras: Sequence[Camera], count: int) -> None:
     if not cameras:
         problem = "there are no training views, and a camera path follows theirs"
-        remedy = "give a file of cameras, or a file of Gaussians beside its cameras.json (export --cameras)"
+        remedy = "give a file of cameras, or a file of Gaussians beside its cameras.json (from export --cameras)"
         raise SehdrError(f"{problem}; {remedy}")
     if not 1 <= count <= _LONGEST:
         raise SehdrError(f"a camera path cannot have {count} views; ask for a count of 1 to {_LONGEST}")

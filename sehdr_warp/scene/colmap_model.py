@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_bytes, read_lines
+from ..parallel import preserve_signals
 from .dataparser import NO_POINTS, PointCloud, pose_from_quaternion
 from .lens import CAMERA_MODELS, Lens
 from .names import is_system_file
@@ -362,19 +363,23 @@ def counted_rows(database: Path, table: str, show: Callable[[int], None]) -> Ite
 
     Another process reads them: two copies of SQLite in one process, COLMAP's and Python's, break each other's locks.
     """
+    with preserve_signals():
+        import pycolmap
     words = (sys.executable, "-I", "-S", "-c", COUNT_ROWS, database.resolve().as_uri(), table)
-    try:
-        counter = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    except OSError:  # As where no more processes may be started: the work goes on without.
-        yield
-        return
+    with ExitStack() as stack:
+        stack.enter_context(pycolmap.Database.open(database))  # COLMAP waits for no lock; no later open needs one.
+        try:
+            counter = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        except OSError:  # As where no more processes may be started: the work goes on without.
+            yield
+            return
 
-    def read() -> None:
-        for line in counter.stdout or ():
-            show(int(line))
+        def read() -> None:
+            for line in counter.stdout or ():
+                show(int(line))
 
-    reader = threading.Thread(target=read, name="sehdr-warp counts", daemon=True)
-    with counter:
+        reader = threading.Thread(target=read, name="sehdr-warp counts", daemon=True)
+        stack.enter_context(counter)
         reader.start()
         try:
             yield

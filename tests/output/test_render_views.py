@@ -220,7 +220,7 @@ def test_interpolation_passes_through_its_cameras():
 
 
 def test_paths_need_cameras():
-    with pytest.raises(SehdrError, match=r"no training views.*export --cameras"):
+    with pytest.raises(SehdrError, match=r"no training views.*cameras.json"):
         interpolate([], 3)
     with pytest.raises(SehdrError, match="path cannot have 0 views"):
         orbit(arc(3, 30), 0, 1)
