@@ -23,6 +23,7 @@ _SOON = 3.0  # Seconds within which another Ctrl-C says nothing new
 _LIBRARIES = 400_000  # About as many objects as torch's and Warp's modules are
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of malloc.h
 _IMPORTS = "<frozen importlib._bootstrap>"  # File of the frames of an import
+_POOLS = os.path.join("concurrent", "futures", "thread.py")  # Of those of a thread pool
 _LONGEST_IMPORT = 10.0  # Seconds that a signal waits for an import, before it ends the process as it is
 _LOOK_EVERY = 0.02
 _interrupted = -_SOON
@@ -146,7 +147,7 @@ def is_interrupted() -> bool:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, unless it was raised a moment ago or modules are being imported."""
+    """Raise KeyboardInterrupt, unless it was raised a moment ago or has to wait (_postpone)."""
     global _interrupted
     if not is_interrupted() and not _postpone(number, frame):
         _interrupted = time.monotonic()
@@ -154,19 +155,20 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """Raise SystemExit, unless modules are being imported."""
+    """Raise SystemExit, unless it has to wait (_postpone)."""
     if not _postpone(number, frame):
         raise SystemExit(128 + number)
 
 
 def _postpone(number: int, frame: FrameType | None) -> bool:
-    """Return whether modules are being imported in `frame`; the signal then comes again once they are complete.
+    """Return whether what `frame` does must be completed first; the signal then comes again.
 
     An exception in the middle of an import can be lost, because native code clears it (torch does while it imports
-    NumPy), and leaves half a module, which fails later.
+    NumPy), and leaves half a module, which fails later. A thread that a pool is just starting would be forgotten, and
+    the end of the process would wait for it forever.
     """
     global _resender
-    if not _imports(frame):
+    if not _must_complete(frame):
         return False
     if _resender is None or not _resender.is_alive():
         _resender = threading.Thread(target=_resend, args=(number,), name="sehdr-warp signal", daemon=True)
@@ -177,21 +179,24 @@ def _postpone(number: int, frame: FrameType | None) -> bool:
     return True
 
 
-def _imports(frame: FrameType | None) -> bool:
-    """Return whether a frame, or one that called it, imports a module."""
-    while frame is not None and frame.f_code.co_filename != _IMPORTS:
+def _must_complete(frame: FrameType | None) -> bool:
+    """Return whether a frame, or one that called it, imports a module or gives work to a thread pool."""
+    while frame is not None:
+        code = frame.f_code
+        if code.co_filename == _IMPORTS or (code.co_name == "submit" and code.co_filename.endswith(_POOLS)):
+            return True
         frame = frame.f_back
-    return frame is not None
+    return False
 
 
 def _resend(number: int) -> None:
-    """Send a signal to the main thread when it imports nothing, or end the process after _LONGEST_IMPORT seconds."""
+    """Send a signal to the main thread when it may end, or end the process after _LONGEST_IMPORT seconds."""
     main = threading.main_thread().ident
     assert main is not None
     end = time.monotonic() + _LONGEST_IMPORT
     while time.monotonic() < end:
         time.sleep(_LOOK_EVERY)
-        if not _imports(sys._current_frames().get(main)):
+        if not _must_complete(sys._current_frames().get(main)):
             global _resender
             _resender = None  # The signal may come while the next module is imported, and has to wait again then.
             if hasattr(signal, "pthread_kill"):

@@ -109,6 +109,33 @@ def test_the_first_signal_waits_for_the_end_of_the_block_and_the_second_does_not
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_a_pool_starts_a_thread_ends_the_process(number):
+    """Else the pool forgets the thread, and the end of the process waits for it."""
+    program = f"""
+import os, signal, sys, threading, time
+from concurrent.futures import ThreadPoolExecutor
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from sehdr_warp import process
+process.prepare()
+start = threading.Thread.start
+def start_late(thread):
+    start(thread)
+    if thread.name.startswith("pool"):
+        os.kill(os.getpid(), {int(number)})
+        time.sleep(0.01)
+threading.Thread.start = start_late
+pool = ThreadPoolExecutor(1, thread_name_prefix="pool")
+try:
+    pool.submit(time.sleep, 0)
+    time.sleep(60)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+    child = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    assert child.returncode == 128 + number and not child.stderr
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("kind", ["complete", "that clears errors", "without an end"])
 def test_a_signal_waits_for_the_end_of_an_import(tmp_path, kind, number):
