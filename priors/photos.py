@@ -1,7 +1,6 @@
 """Photos of panoramas and rooms by random cameras, with the truth of what they clip; in torch, on any device."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -9,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .panoramas import Pack
+from .photo_values import Photos, averaged, dct, interpolate, inverse, log_range, lower_median
 from .rooms import LitRooms
 
 SIZES = (64, 80, 96, 128)  # Height and width of a batch's photos
@@ -49,19 +49,6 @@ TEXT_SHARE, PICTURE_SHARE = 0.6, 0.25  # Shares of these surfaces that are print
 LINE_PITCH = (0.02, 0.14)  # Distances of lines of text over the photo's width
 PLAIN_SHARES = (0.002, 0.01, 0.02, 0.05, 0.1, 0.2)  # Of the pixels of a plain photo that clip
 LEVELS = 255
-
-
-@dataclass(frozen=True)
-class Photos:
-    """A batch of simulated photos; [B, 3, S, S] each.
-
-    exposure: decoded, in units of white. clipped: the share of each value whose code is the largest. truth: log2 of the
-    true exposure of that share over white, else 0.
-    """
-
-    exposure: Tensor
-    clipped: Tensor
-    truth: Tensor
 
 
 class Camera:
@@ -113,14 +100,14 @@ class Camera:
         self.panoramas = torch.cat([panoramas, panoramas[..., :1]], 3).to(self.device)
         self.rooms = torch.from_numpy(pack.rooms).permute(0, 1, 4, 2, 3).to(self.device) if rooms else None
         self.curves = torch.from_numpy(pack.curves).to(self.device)
-        self.dct = _dct(8).to(self.device)
+        self.dct = dct(8).to(self.device)
 
     def take(self, count: int, size: int | None = None, *, plain: bool = False) -> Photos:
         """Return `count` photos of one size; plain: by sRGB, without noise, JPEG, white balance and errors."""
         size = size or int(self.random.choice(SIZES))
         if not plain and len(self.scales) > 1:
             fine = max(size, min(8 * round(size * self.random.choice(self.scales) / 8), LARGEST))
-            return _averaged(self._take(count, fine, plain), size)
+            return averaged(self._take(count, fine, plain), size)
         return self._take(count, size, plain)
 
     def _take(self, count: int, size: int, plain: bool) -> Photos:
@@ -166,7 +153,7 @@ class Camera:
         """Return views [B, 3, S, S] of other contrasts about their medians, and half of them of other colors."""
         count = len(views)
         brightest = views.amax(1, keepdim=True).clamp_min(1e-9)
-        median = _median(brightest.flatten(1))[..., None, None]
+        median = lower_median(brightest.flatten(1))[..., None, None]
         views = views * (brightest / median) ** self._uniform(count, -CONTRAST, CONTRAST)
         orders = np.stack([self.random.permutation(3) if self.random.random() < 0.5 else np.arange(3) for _ in views])
         return views.gather(1, torch.from_numpy(orders).to(self.device)[:, :, None, None].expand_as(views))
@@ -202,7 +189,7 @@ class Camera:
             share = torch.where(over, self._uniform(count, *OVEREXPOSED)[:, 0, 0, 0], share)
         ranks = ((1 - share) * (brightest.shape[1] - 1)).long()
         by_share = brightest.sort(1).values.gather(1, ranks[:, None])
-        by_middle = _median(brightest) * 2 ** self._uniform(count, 0.5, self.darkest)[:, 0, 0]
+        by_middle = lower_median(brightest) * 2 ** self._uniform(count, 0.5, self.darkest)[:, 0, 0]
         most = brightest.sort(1).values[:, int((1 - LEAST_CLIPPED) * (brightest.shape[1] - 1)), None]
         first = (torch.rand(count, 1, generator=self.generator, device=self.device) < 0.5) | plain
         if not plain:
@@ -221,12 +208,12 @@ class Camera:
             noisy = (noisy + noise * (strength * (noisy.clamp(0, 1) + 0.01)).sqrt()).clamp_min(0)
         chosen = np.zeros(count, int) if plain else self.random.integers(len(self.curves), size=count)
         curves = self.curves[torch.from_numpy(chosen).to(self.device)]
-        encoded = _interpolate(curves, noisy.clamp(0, 1))
+        encoded = interpolate(curves, noisy.clamp(0, 1))
         if not plain:
             encoded = self._jpeg(encoded)
         codes = torch.round(encoded * LEVELS)
         clipped = (codes >= LEVELS).float()
-        decoded = _inverse(curves, codes / LEVELS)
+        decoded = inverse(curves, codes / LEVELS)
         if not plain:
             decoded = decoded ** (2 ** self._uniform(count, -0.2, 0.2))
         return Photos(decoded, clipped, truth * clipped)
@@ -260,21 +247,21 @@ class Camera:
         steps = (torch.arange(size, device=self.device) + 0.5) / size
         light_share = torch.where(over, self.overexposed_light_share, self.light_share)[:, None, None, None]
         has_lights = self._uniform(count, 0, 1) < light_share
-        median = _median(radiance.amax(1).flatten(1)).clamp_min(1e-6)[..., None, None]
+        median = lower_median(radiance.amax(1).flatten(1)).clamp_min(1e-6)[..., None, None]
         ambient = radiance.mean((1, 2, 3), keepdim=True).clamp_min(1e-6)
         panel = self._uniform(count, 0, 1) < 0.5
         is_colored = ~panel & (self._uniform(count, 0, 1) < COLORED_SHARE)
         is_soft = ~panel & (self._uniform(count, 0, 1) < SOFT_SHARE)
         lamp_light = median * 2 ** self._uniform(count, *LAMP_STOPS)
         panel_light = median * 2 ** self._uniform(count, *PANEL_STOPS)
-        lamp_radius = _log_range(self._uniform(count, 0, 1), *LAMP_RADII)
-        half_width, half_height = (_log_range(self._uniform(count, 0, 1), *PANEL_SIZES) for _ in range(2))
+        lamp_radius = log_range(self._uniform(count, 0, 1), *LAMP_RADII)
+        half_width, half_height = (log_range(self._uniform(count, 0, 1), *PANEL_SIZES) for _ in range(2))
         half_width = torch.where(panel, half_width, lamp_radius * 2 ** self._uniform(count, -0.3, 3).clamp_min(0))
         half_height = torch.where(panel, half_height, lamp_radius)
         content = torch.where(panel, self._panel_content(radiance, steps), 1.0)
         light = torch.where(panel, panel_light, lamp_light)
         area = half_width * half_height
-        height = area.sqrt() * _log_range(self._uniform(count, 0, 1), *HEIGHTS)
+        height = area.sqrt() * log_range(self._uniform(count, 0, 1), *HEIGHTS)
         number = 1 + (self._uniform(count, 0, 1) ** 2 * MOST_LIGHTS)
         glow, lights, covered = 0.0, torch.zeros_like(radiance), torch.zeros_like(radiance[:, :1])
         for k in range(MOST_LIGHTS):
@@ -309,7 +296,7 @@ class Camera:
         cells = colors.gather(1, nearest[..., None].expand(-1, -1, 3)).permute(0, 2, 1).reshape(count, 3, size, size)
         kind = self._uniform(count, 0, 1)
         content = torch.where(kind < 0.4, other, torch.where(kind < 0.75, cells, torch.ones_like(other)))
-        period, phase = _log_range(self._uniform(count, 0, 1), 0.06, 0.4), self._uniform(count, 0, 1)
+        period, phase = log_range(self._uniform(count, 0, 1), 0.06, 0.4), self._uniform(count, 0, 1)
         bars = torch.maximum(*((steps.reshape(shape) / period + phase) % 1 for shape in ((1, 1, 1, -1), (1, 1, -1, 1))))
         has_bars = self._uniform(count, 0, 1) < 0.4
         return torch.where(has_bars & (bars > 0.9), 0.02 * content, content)
@@ -326,7 +313,7 @@ class Camera:
         used = self._uniform(count, 0, 1)[:, 0] < self.page_share
         inside = ((u.abs() < half_width) & (v.abs() < half_height) & used)[:, None]
         slope = self._uniform(count, -0.4, 0.4)[:, 0]
-        light = _log_range(self._uniform(count, 0, 1), *PAGE_LIGHT)
+        light = log_range(self._uniform(count, 0, 1), *PAGE_LIGHT)
         light = light * torch.exp(slope * u / half_width.clamp_min(0.1) + self._waves(u, v))[:, None]
         grain = torch.randn(exposure.shape, generator=self.generator, device=self.device)
         light = light * torch.exp(self._uniform(count, 0, 0.06) * grain)
@@ -339,7 +326,7 @@ class Camera:
         count, wave = len(u), torch.zeros_like(u)
         for _ in range(3):
             angle, phase = (self._uniform(count, 0, 2 * math.pi)[:, 0] for _ in range(2))
-            rate = _log_range(self._uniform(count, 0, 1)[:, 0], *WAVES)
+            rate = log_range(self._uniform(count, 0, 1)[:, 0], *WAVES)
             wave = wave + torch.sin(rate * (angle.cos() * u + angle.sin() * v) + phase) / 2
         return wave * self._uniform(count, 0, MOST_WAVE)[:, 0] * (self._uniform(count, 0, 1)[:, 0] < WAVE_SHARE)
 
@@ -364,7 +351,7 @@ class Camera:
 
         seed, margin = uniform(0, 100), uniform(0.75, 1)
         printed = (u.abs() < margin * half_width) & (v.abs() < margin * half_height)
-        pitch = _log_range(uniform(0, 1), *LINE_PITCH)
+        pitch = log_range(uniform(0, 1), *LINE_PITCH)
         row, column = torch.floor(v / pitch), u / (pitch * uniform(0.15, 0.6))
         in_line = torch.remainder(v / pitch, 1) < uniform(0.35, 0.7)
         letters = (noise(column.floor(), row) < uniform(0.4, 0.8)) & (noise((column / 6).floor(), row + 0.5) < 0.8)
@@ -373,7 +360,7 @@ class Camera:
         sizes = [uniform(0.1, 0.7) * half for half in (half_width, half_height)]
         picture = ((u - corner[0]).abs() < sizes[0]) & ((v - corner[1]).abs() < sizes[1])
         picture = picture & (uniform(0, 1) < PICTURE_SHARE)
-        ink = _log_range(uniform(0, 1), 0.03, 0.6)
+        ink = log_range(uniform(0, 1), 0.03, 0.6)
         return torch.where(printed & (text | picture), ink, 1.0)
 
     def _jpeg(self, encoded: Tensor) -> Tensor:
@@ -394,58 +381,8 @@ class Camera:
         return torch.where(used, decoded.clamp(0, 1), encoded)
 
 
-def _averaged(photos: Photos, size: int) -> Photos:
-    """Return photos averaged to a smaller size: what clips in part has the mean light of that part as its truth."""
-    if photos.exposure.shape[-1] == size:
-        return photos
-    light = photos.clipped * torch.exp2(photos.truth)
-    exposure, share, light = (
-        F.interpolate(v, size=(size, size), mode="area") for v in (photos.exposure, photos.clipped, light)
-    )
-    truth = torch.where(share > 0, light / share.clamp_min(1e-9), 1.0).log2()
-    return Photos(exposure, share, truth)
-
-
-def _log_range(part: Tensor, low: float, high: float) -> Tensor:
-    """Return the value at each part of a range, even in the logarithm."""
-    return low * (high / low) ** part
-
-
-def _median(values: Tensor) -> Tensor:
-    """Return [B, 1] the lower median of each row of values [B, N]; torch.median has no deterministic form on GPUs."""
-    return values.sort(1).values[:, (values.shape[1] - 1) // 2, None]
-
-
 def _smallness(above: Tensor) -> Tensor:
     """Return [B, 1, S, S] in [0, 1] for pixels above white: 1 in a small light, 0 in a large area."""
     wide = above.shape[-1] // LIGHT_WINDOW // 2 * 2 + 1
     around = F.avg_pool2d(above.float(), wide, stride=1, padding=wide // 2, count_include_pad=True)
     return (2 - around / (LIGHT_WINDOW**2 * MOST_LIGHT)).clamp(0, 1)
-
-
-def _interpolate(curves: Tensor, values: Tensor) -> Tensor:
-    """Return each curve [B, K], at even steps of the cube root of exposure, at values [B, ...] in [0, 1]."""
-    steps = curves.shape[1] - 1
-    place = values.flatten(1) ** (1 / 3) * steps
-    low = place.floor().long().clamp_max(steps - 1)
-    part = place - low
-    between = curves.gather(1, low) * (1 - part) + curves.gather(1, low + 1) * part
-    return between.reshape(values.shape)
-
-
-def _inverse(curves: Tensor, encoded: Tensor) -> Tensor:
-    """Return the exposures at which increasing curves [B, K] are encoded values [B, ...]."""
-    steps = curves.shape[1] - 1
-    flat = encoded.flatten(1).contiguous()
-    high = torch.searchsorted(curves.contiguous(), flat).clamp(1, steps)
-    low_value, high_value = curves.gather(1, high - 1), curves.gather(1, high)
-    part = ((flat - low_value) / (high_value - low_value).clamp_min(1e-9)).clamp(0, 1)
-    return (((high - 1 + part) / steps) ** 3).reshape(encoded.shape)
-
-
-def _dct(size: int) -> Tensor:
-    """Return the orthonormal matrix [size, size] of the cosine transform."""
-    k, i = torch.arange(size)[:, None], torch.arange(size)[None]
-    matrix = torch.cos(math.pi * (2 * i + 1) * k / (2 * size)) * math.sqrt(2 / size)
-    matrix[0] /= math.sqrt(2)
-    return matrix

@@ -52,7 +52,7 @@ class Things:
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays meet first: distance [B, R], normal [B, R, 3], index [B, R] of the thing."""
+    """First hits of rays: distance [B, R], normal [B, R, 3], index [B, R] of the thing."""
 
     distance: Tensor
     normal: Tensor

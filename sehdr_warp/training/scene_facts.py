@@ -1,4 +1,4 @@
-"""What a training must know of its scene: figures of photos and cameras for the plan, and the HDR truth."""
+"""Facts of a scene that a training needs: figures of photos and cameras for the plan, and the HDR truth."""
 
 import math
 from collections.abc import Sequence

@@ -8,7 +8,8 @@ from priors import rooms
 from priors.families import FAMILIES, Families
 from priors.pack import curves
 from priors.panoramas import Pack, from_rgbe, listed_sources, to_rgbe
-from priors.photos import Camera, _averaged
+from priors.photo_values import averaged
+from priors.photos import Camera
 
 
 @pytest.fixture
@@ -147,13 +148,13 @@ def test_lamps_that_are_put_in_are_often_colored_and_clip_some_channels_alone(tm
 
 def test_photos_that_are_averaged_keep_the_light_that_clips(pack):
     photos = Camera(pack, "cpu", np.array([0]), rooms=False, seed=3, overexposed_share=0.5).take(8, 64)
-    averaged = _averaged(photos, 48)
-    lights = [(p.clipped * torch.exp2(p.truth)).mean((1, 2, 3)) for p in (photos, averaged)]
+    smaller = averaged(photos, 48)
+    lights = [(p.clipped * torch.exp2(p.truth)).mean((1, 2, 3)) for p in (photos, smaller)]
     # Pixels of 4 / 3 cover others unevenly.
     torch.testing.assert_close(lights[0], lights[1], rtol=0.05, atol=1e-3)
-    part = (averaged.clipped > 0) & (averaged.clipped < 1)
-    assert part.any() and (averaged.exposure[averaged.clipped == 1] == 1).all()
-    assert (averaged.truth[averaged.clipped == 0] == 0).all() and (averaged.truth >= 0).all()
+    part = (smaller.clipped > 0) & (smaller.clipped < 1)
+    assert part.any() and (smaller.exposure[smaller.clipped == 1] == 1).all()
+    assert (smaller.truth[smaller.clipped == 0] == 0).all() and (smaller.truth >= 0).all()
 
 
 def test_varied_panoramas_have_other_contrasts_and_orders_of_channels(pack):

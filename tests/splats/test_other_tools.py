@@ -97,8 +97,8 @@ def test_colors_of_eight_bits(tmp_path):
     table["rot_0"], table["red"], table["blue"] = 1, [255, 128], [51, 204]
     PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "a.ply"))
     read = read_gaussians(tmp_path / "a.ply")
-    shown = read.harmonics[:, 0] * HARMONIC_0 + 0.5
-    np.testing.assert_allclose(shown, np.array([[255, 0, 51], [128, 0, 204]]) / 255, atol=1e-6)
+    colors = read.harmonics[:, 0] * HARMONIC_0 + 0.5
+    np.testing.assert_allclose(colors, np.array([[255, 0, 51], [128, 0, 204]]) / 255, atol=1e-6)
     assert read.degree == 0 and read.color_model == "display"
 
 
