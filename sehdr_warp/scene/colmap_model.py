@@ -25,7 +25,8 @@ _log = logging.getLogger("sehdr_warp.scene")
 MAX_NAME_BYTES = 4096
 _DEEPEST = 3  # Levels of folders below a set in which a model is looked for
 _MOST_PLACES = 1000  # Folders of a level that are looked at
-_NO_MODELS = {"distorted", "images", "input"}  # `distorted` is of photos before COLMAP undistorted them
+DISTORTED = "distorted"  # Folder in which 3DGS's convert.py puts the model of the photos in input/
+_NO_MODELS = {DISTORTED, "images", "input"}
 _REMEDY = "export the model again with COLMAP"
 _KINDS = ((".bin", ".bin"), (".txt", ".txt"), (".bin", ".txt"), (".txt", ".bin"))  # Of cameras and images
 
@@ -64,13 +65,12 @@ def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:
     """Return the folder that holds a model's cameras, or None.
 
     Looks for sparse/0, sparse, or a text export (sparse/txt, sparse_txt, sparse_txt/0) in the folder itself, then in
-    its colmap/ and dense/; `anywhere` also in the folder itself without sparse/ and in folders of it that are not sets.
+    its colmap/, dense/ and distorted/; `anywhere` also in the folder without sparse/ and in folders that are not sets.
     Of several models sparse/0, sparse/1 ... it is the one with the most images.
     """
     names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
-    places = (folder / above / name for above in (".", "colmap", "dense") for name in names)
-    first = next((place for place in places if _is_model(place)), None)
-    first = first or (_model_elsewhere(folder) if anywhere else None)
+    places = (folder / above / name for above in (".", "colmap", "dense", DISTORTED) for name in names)
+    first = next(filter(_is_model, places), None) or (_model_elsewhere(folder) if anywhere else None)
     if first is None or first.name != "0":
         return first
     models = _by_number(first.parent)

@@ -13,7 +13,7 @@ from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import UNPLACED, ImageRecord
 from .images import LDR_SUFFIXES, open_image, read_ldr
-from .names import Listing, bases_of, fold_name, folders_named, natural_key, without_mask_ending
+from .names import INVERTED_MASK, Listing, bases_of, fold_name, folders_named, natural_key, without_mask_mark
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
@@ -30,8 +30,9 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     Masks lie in `masks/` or `mask/` of the data folder, under the photo's path below the data folder or below the
     folder of all photos, with any picture suffix after or instead of the photo's (`masks/cam0/1.jpg.png`,
     `masks/cam0/1.png`), or under its file name alone if no two photos share that. An ending `_mask`, `-mask` or `.mask`
-    of the stem is ignored. Files with such an ending beside the photos are masks as well, and so are those of a folder
-    `masks/` or `mask/` there. In sets of several exposures, a mask named like the view serves all its exposures.
+    of the stem is ignored, and so is instant-ngp's `dynamic_mask_` before it. Files with such a name beside the photos
+    are masks as well, and so are those of a folder `masks/` or `mask/` there. In sets of several exposures, a mask
+    named like the view serves all its exposures.
     `mask.png` or `camera_mask.png` of the data folder is the mask of all photos of its shape that have none of their
     own, as of a tripod or a car's bonnet.
 
@@ -93,7 +94,8 @@ def read_mask(path: Path, *, oriented: bool = False, labeled: set[Path] | None =
 
     Masks of two values, one of which is 0, count as COLMAP counts them: every value above 0 keeps the pixel. This
     covers 0 and 1, label colors and palettes. So do masks of labels, such as 0, 1 and 2, whose values are at most 31
-    and which are stored without loss. Others are weights relative to white.
+    and which are stored without loss. Others are weights relative to white. Files whose names begin with INVERTED_MASK
+    leave out every pixel above 0.
 
     Args:
         path: the file.
@@ -107,6 +109,8 @@ def read_mask(path: Path, *, oriented: bool = False, labeled: set[Path] | None =
         InputError: as read_ldr raises it.
     """
     image = read_ldr(path, oriented=oriented, mask=True)
+    if path.name.lower().startswith(INVERTED_MASK):
+        return (image.pixels == 0).all(axis=2).astype(np.float32)
     # A few pixels that are not quite opaque do not make alpha the mask.
     if image.alpha is not None and (np.ptp(image.alpha) > _MATERIAL or (image.pixels == image.pixels[0, 0]).all()):
         values = image.alpha * np.float32(image.levels)
@@ -183,7 +187,7 @@ def _photo_keys(record: ImageRecord, bases: Sequence[Path], shared: Counter) -> 
 
 def _key(mask: Path, place: Path) -> str:
     """Return the path of a mask below its folder, without its suffix and an ending that only says what it is."""
-    return without_mask_ending(mask.relative_to(place).with_suffix("").as_posix())
+    return without_mask_mark(mask.relative_to(place).with_suffix("").as_posix())
 
 
 def _files_below(place: Path) -> list[Path]:
@@ -196,11 +200,11 @@ def _masks_beside(parent: Path) -> dict[str, Path]:
     if not parent.is_dir():
         return {}
     files = (file for file in parent.iterdir() if file.suffix.lower() in LDR_SUFFIXES)
-    masks = {fold_name(key): file for file in files if (key := without_mask_ending(file.stem)) != file.stem}
+    masks = {fold_name(key): file for file in files if (key := without_mask_mark(file.stem)) != file.stem}
     inner = (
         file for place in folders_named(parent, MASK_FOLDERS) for file in _files_below(place) if file.parent == place
     )
-    return {fold_name(without_mask_ending(file.stem)): file for file in inner} | masks
+    return {fold_name(without_mask_mark(file.stem)): file for file in inner} | masks
 
 
 def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list[str]:

@@ -15,6 +15,9 @@ from ..subsets import first_names
 from .dataparser import ImageRecord
 from .images import PHOTO_SUFFIXES
 
+INVERTED_MASK = "dynamic_mask_"
+"""How names of instant-ngp's masks begin, in which 0 keeps a pixel and every other value leaves it out."""
+
 
 def natural_key(name: str) -> tuple:
     """Return a sort key that puts img2 before img10."""
@@ -74,9 +77,9 @@ class Listing:
         return self._names[folder]
 
 
-def without_mask_ending(stem: str) -> str:
-    """Return a stem without the ending by which tools mark masks (`_mask`, `-mask`, `.mask`), if it has one."""
-    return re.sub(r"(?<=.)[_.-]masks?$", "", stem, flags=re.IGNORECASE)
+def without_mask_mark(stem: str) -> str:
+    """Return a stem, or a path without suffix, without what marks masks: `dynamic_mask_` before, or `_mask` behind."""
+    return re.sub(rf"(^|(?<=/)){INVERTED_MASK}(?=.)|(?<=.)[_.-]masks?$", "", stem, flags=re.IGNORECASE)
 
 
 def find_image(folder: Path, name: str, source: Path) -> Path | None:
@@ -217,7 +220,7 @@ def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """
     files = [file for file in folder.iterdir() if file.suffix.lower() in suffixes and not file.name.startswith(".")]
     names = {name for file in files for name in (file.name, file.stem)}
-    photos = (file for file in files if (key := without_mask_ending(file.stem)) == file.stem or key not in names)
+    photos = (file for file in files if (key := without_mask_mark(file.stem)) == file.stem or key not in names)
     return sorted((file for file in photos if file.is_file()), key=lambda file: natural_key(file.name))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_bytes, read_json, resolve_inside
 from ..subsets import first_names
-from .colmap_model import SparseModel, find_model, other_models, read_model
+from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model
 from .copies import copies_note, find_copies
 from .dataparser import NO_POINTS, UNPLACED, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
@@ -37,6 +37,7 @@ from .stack import refuse_stack
 from .unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from .video import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
 
+_INPUT = "input"  # Folder of photos of 3DGS's convert.py, which writes undistorted copies to images/
 _OTHERS = ("masks", "mask", "hdr", "exr")  # Folders of pictures that are not photos
 # From the full size to reduced copies.
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
@@ -112,8 +113,11 @@ def read_colmap(folder: Path) -> DataparserOutputs:
 def _images_of_model(source: Path, names: Sequence[str], folder: Path) -> Path | None:
     """Return the folder of images nearest above a model that holds one of the names, else the nearest, else None.
 
-    Photos and undistorted copies may lie in one set: `images` belongs to `sparse`, `dense/images` to `dense/sparse`.
+    Photos and undistorted copies may lie in one set: `images` belongs to `sparse`, `dense/images` to `dense/sparse`,
+    and `input` to `distorted/sparse`.
     """
+    if DISTORTED in source.relative_to(folder).parts and (folder / _INPUT).is_dir():
+        return folder / _INPUT
     above = [place for place in source.parents if place.is_relative_to(folder)]
     places = [place for place in map(image_folder, dict.fromkeys((*above, folder))) if place is not None]
     holds = (place for place in places if any(find_image(place, name, source) for name in names))
@@ -259,12 +263,12 @@ def _camera(row: np.ndarray, path: Path, name: str) -> tuple[Lens, np.ndarray]:
 
 
 def find_photos(folder: Path) -> DataparserOutputs:
-    """Parse bare photos of a folder, or its `images/`: records without cameras, which place_photos() adds.
+    """Parse bare photos of a folder, or its `images/` or `input/`: records without cameras, which place_photos() adds.
 
     Raises:
         InputError: if there are none, or too few.
     """
-    places = (place for place in (folder, folder / "images") if place.is_dir())
+    places = (place for place in (folder, folder / "images", folder / _INPUT) if place.is_dir())
     candidates = [list_images(place, PHOTO_SUFFIXES) for place in places]
     # A single picture beside `images/` is a cover.
     photos = next((each for each in candidates if len(each) > 1), next(filter(None, candidates), []))

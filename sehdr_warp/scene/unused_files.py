@@ -8,7 +8,7 @@ from ..subsets import first_names
 from .dataparser import ImageRecord
 from .heif import HEIF_SUFFIXES, heif_installed
 from .images import PHOTO_SUFFIXES
-from .names import bases_of, is_system_file, natural_key, without_mask_ending
+from .names import bases_of, is_system_file, natural_key, without_mask_mark
 
 # What tools write beside photos, and nobody takes for one.
 _QUIET = {
@@ -40,7 +40,7 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
     names = {name for file in files for name in (file.name, file.stem)}
     photos, others = [], []
     for file in files:
-        key = without_mask_ending(file.stem)
+        key = without_mask_mark(file.stem)
         if file in files_in_use or file.name in mentioned or (key != file.stem and key in names):
             continue
         suffix = file.suffix.lower()

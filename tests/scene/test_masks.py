@@ -9,7 +9,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.masks import mask_note, read_mask
-from sehdr_warp.scene.read_folders import read_llff
+from sehdr_warp.scene.read_folders import find_photos, read_llff
 from tests.make_scenes import (
     RadianceView,
     arc_poses,
@@ -61,6 +61,31 @@ def test_names_of_masks(tmp_path, name):
     scene = load(tmp_path, holdout=0)
     assert shares(scene) == [0.5] * 6
     assert masks_said(scene) == ["masks: 6 of 6 photos have one; they leave out 50.0 % of their pixels"]
+
+
+@pytest.mark.parametrize("name", ["images/dynamic_mask_{}.png", "masks/dynamic_mask_{}.png"])
+def test_masks_of_instant_ngp_leave_out_what_is_not_black(tmp_path, name):
+    write_colmap(tmp_path)
+    color = np.zeros((48, 64, 3), np.uint8)
+    color[:12, :, 2] = 1  # A quarter, by the faintest code of one channel
+    for i in range(6):
+        write_mask(tmp_path / name.format(f"{i:03d}"), color)
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == [0.75] * 6
+    assert not scene.views[0].mask[:12].any()
+    assert scene.views[0].mask[12:].all()
+    assert not any("in no view" in note for note in scene.notes)
+
+
+def test_masks_of_instant_ngp_are_not_bare_photos(tmp_path):
+    for i in range(6):
+        Image.new("RGB", (64, 48), (40 * i, 9, 9)).save(tmp_path / f"{i}.jpg")
+        write_mask(tmp_path / f"dynamic_mask_{i}.png")
+    write_mask(tmp_path / "dynamic_mask_of_nothing.png")  # Without its photo it is one.
+    assert [record.image.name for record in find_photos(tmp_path).records] == [
+        *(f"{i}.jpg" for i in range(6)),
+        "dynamic_mask_of_nothing.png",
+    ]
 
 
 def test_masks_of_photos_in_folders_of_same_names(tmp_path):

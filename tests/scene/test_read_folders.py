@@ -60,6 +60,11 @@ def test_photos_deep_in_an_export_are_found_for_the_user(tmp_path):
         parse_dataset(tmp_path / "work")
 
 
+def test_photos_as_3dgs_convert_expects_them(tmp_path):
+    photos(tmp_path / "input")
+    assert [record.image.parent.name for record in find_photos(tmp_path).records] == ["input"] * 4
+
+
 def test_photos_beside_the_model_in_dense(tmp_path):
     write_colmap(tmp_path / "dense")
     shutil.move(tmp_path / "dense" / "sparse" / "0", tmp_path / "model")

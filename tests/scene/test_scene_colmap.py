@@ -246,6 +246,29 @@ def test_photos_beside_undistorted_copies(tmp_path):
     assert view.source == tmp_path / "dense" / "images" / "000.png" and view.camera.width == 64
 
 
+@pytest.mark.parametrize("copies", [False, True])
+def test_what_3dgs_convert_leaves_before_it_undistorts(tmp_path, copies):
+    """Its convert.py keeps photos in input/ and their model in distorted/; images/ and sparse/0 may not be there."""
+    write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(50.0, 32.0, 24.0, 0.1))
+    (tmp_path / "images").rename(tmp_path / "input")
+    (tmp_path / "distorted").mkdir()
+    (tmp_path / "sparse").rename(tmp_path / "distorted" / "sparse")
+    if copies:  # Undistorted, of another size: the model is not theirs.
+        (tmp_path / "images").mkdir()
+        for i in range(6):
+            Image.fromarray(pattern(58, 44, i)).save(tmp_path / "images" / f"{i:03d}.png")
+    scene = load(tmp_path, holdout=0)
+    assert scene.format == "colmap" and len(scene.points) == 5
+    assert {view.source.parent.name for view in scene.views} == {"input"}
+
+
+def test_undistorted_copies_of_3dgs_convert_are_used_if_they_are_whole(tmp_path):
+    write_colmap(tmp_path)
+    shutil.copytree(tmp_path / "sparse", tmp_path / "distorted" / "sparse")
+    shutil.copytree(tmp_path / "images", tmp_path / "input")
+    assert {view.source.parent.name for view in load(tmp_path, holdout=0).views} == {"images"}
+
+
 def test_link_out_of_the_folder_is_refused(tmp_path):
     write_colmap(tmp_path / "set")
     secret = tmp_path / "secret.png"
