@@ -1,7 +1,7 @@
 """SPZ (Niantic), version 3: display colors in bytes, without a header for anything else.
 
 Stored coordinates are x right, y up, z back; Gaussians here have the axes of PLY, y down and z ahead. Colors end at
-1.44 times white. Versions 2 and 3 are read.
+1.44 times white. Versions 2 to 4 are read; 4, whose blocks are compressed by Zstandard, needs the extra `spz`.
 """
 
 import gzip
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, require_extra
 from ..files import atomic_path, read_bytes
 from .arrays import MAX_DEGREE, GaussianArrays, warn_of_compensation
 from .packing import from_smallest_three, logits, morton_order, smallest_three
@@ -20,6 +20,8 @@ from .packing import from_smallest_three, logits, morton_order, smallest_three
 log = logging.getLogger(__name__)
 _MAGIC, _VERSION = 0x5053474E, 3
 _HEADER = struct.Struct("<IIIBBBB")
+_STREAMS_AT = 16  # Of version 4: byte that states where the sizes of its streams begin
+_MOST_PER_BYTE = 10_000  # Bytes of a stream for each byte of the file: more is a false count
 _ANTIALIASED, _EXTENDED = 1, 2  # Flags: of opacity compensation; of extensions behind the Gaussians
 _COLOR_SCALE = 0.15  # Of the constant harmonic before it becomes a byte
 _MOST = 50_000_000  # Gaussians of a file that is read
@@ -62,30 +64,33 @@ def write_spz(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 
 
 def read_spz(path: Path) -> GaussianArrays:
-    """Read a .spz file of version 2 or 3."""
+    """Read a .spz file of version 2, 3 or 4."""
     data = read_bytes(path)
     unpack = None if data[:4] == struct.pack("<I", _MAGIC) else zlib.decompressobj(wbits=31)
     try:
         header = data[: _HEADER.size] if unpack is None else unpack.decompress(data, _HEADER.size)
-        magic, version, count, degree, fraction, flags, _ = _HEADER.unpack(header)
+        magic, version, count, degree, fraction, flags, streams = _HEADER.unpack(header)
     except (zlib.error, struct.error) as error:
         raise InputError(path, f"is damaged SPZ ({error!s:.80})", _DAMAGED) from None
-    if magic == _MAGIC and version not in (2, 3):
-        raise InputError(path, f"is SPZ of version {version}", "save it as version 2 or 3, or as PLY")
+    if magic == _MAGIC and version not in (2, 3, 4):
+        raise InputError(path, f"is SPZ of version {version}", "save it as version 2, 3 or 4, or as PLY")
     if magic == _MAGIC and degree > MAX_DEGREE:
         raise InputError(path, f"has harmonics of degree {degree}", f"export it with degree 0 to {MAX_DEGREE}")
     if magic != _MAGIC or not 0 < count <= _MOST or fraction > 24:
         raise InputError(path, "is not SPZ, or damaged", _DAMAGED)
     coefficients, turn = (degree + 1) ** 2 - 1, 3 if version == 2 else 4
-    row = 9 + 1 + 3 + 3 + turn + 3 * coefficients
+    widths = (9, 1, 3, 3, turn, 3 * coefficients)
+    size = count * sum(widths)
     try:
-        rest = data[_HEADER.size :] if unpack is None else unpack.decompress(unpack.unconsumed_tail, count * row)
+        if version == 4:
+            rest = _zstandard_streams(path, data, streams, [count * width for width in widths if width])
+        else:
+            rest = data[_HEADER.size :] if unpack is None else unpack.decompress(unpack.unconsumed_tail, size)
     except zlib.error as error:
         raise InputError(path, f"is damaged SPZ ({error!s:.80})", _DAMAGED) from None
-    if len(rest) < count * row:
-        raise InputError(path, f"ends after {len(rest)} of {count * row} bytes", _DAMAGED)
+    if len(rest) < size:
+        raise InputError(path, f"ends after {len(rest)} of {size} bytes", _DAMAGED)
     body = np.frombuffer(rest, np.uint8)
-    widths = (9, 1, 3, 3, turn, 3 * coefficients)
     edges = np.cumsum([0, *widths]) * count
     blocks = [body[a:b].reshape(count, -1) for a, b in zip(edges, edges[1:])]  # noqa: RUF007  NumPy's are indices
     positions, alphas, colors, scales, turns, higher = blocks
@@ -110,6 +115,31 @@ def read_spz(path: Path) -> GaussianArrays:
         log.warning("%s: its extensions are not read; one of them may state other axes than SPZ's", path)
     turned = gaussians.transformed(np.linalg.inv(_TO_FILE))
     return GaussianArrays(**{**vars(turned), "world_matrix": None})
+
+
+def _zstandard_streams(path: Path, data: bytes, streams: int, sizes: list[int]) -> bytes:
+    """Return the `streams` decompressed blocks of a file of version 4 behind each other, of `sizes` bytes.
+
+    Raises:
+        InputError: if they do not have these sizes.
+        SehdrError: without imagecodecs (the extra `spz`).
+    """
+    codec = require_extra("imagecodecs", f"{path}: SPZ of version 4 needs imagecodecs", "spz")
+    if streams != len(sizes):
+        raise InputError(path, f"has {streams} streams in place of {len(sizes)}", _DAMAGED)
+    blocks = []
+    try:
+        (start,) = struct.unpack_from("<I", data, _STREAMS_AT)
+        begin = start + 16 * streams
+        for index, size in enumerate(sizes):
+            packed, stated = struct.unpack_from("<QQ", data, start + 16 * index)
+            if stated != size or size > _MOST_PER_BYTE * len(data):
+                raise InputError(path, f"states {stated} bytes for stream {index}, of {size}", _DAMAGED)
+            blocks.append(codec.zstd_decode(data[begin : begin + packed], out=size))
+            begin += packed
+    except (struct.error, RuntimeError) as error:
+        raise InputError(path, f"is damaged SPZ ({error!s:.80})", _DAMAGED) from None
+    return b"".join(blocks)
 
 
 def _quaternions(turns: np.ndarray, version: int) -> np.ndarray:

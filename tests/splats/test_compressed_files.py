@@ -1,6 +1,10 @@
+import gzip
+import itertools
 import json
 import os
+import struct
 import subprocess
+import sys
 import warnings
 import zipfile
 from pathlib import Path
@@ -8,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sehdr_warp.errors import InputError
+from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.splats import LOSSY_SUFFIXES, GaussianArrays, check_suffix, read_gaussians, write_gaussians
 from sehdr_warp.splats.packing import codebook, from_smallest_three, morton_order, palette, smallest_three
 
@@ -108,8 +112,64 @@ def test_files_of_other_programs():
     assert np.abs(packed.harmonics[index][:, 1:] - plain.harmonics[:, 1:]).mean() < 0.02
     for name in ("raw", "v2", "v3"):
         assert read_gaussians(SHARED / f"pc_minimal-{name}.spz").count == 4
-    with pytest.raises(InputError, match="SPZ of version 4; save it as version 2 or 3, or as PLY"):
-        read_gaussians(SHARED / "pc_minimal-v4.spz")
+    pytest.importorskip("imagecodecs")
+    newest, before = (read_gaussians(SHARED / f"pc_minimal-v{version}.spz") for version in (4, 3))
+    np.testing.assert_array_equal(newest.means, before.means)
+    np.testing.assert_array_equal(newest.quaternions, before.quaternions)
+    np.testing.assert_array_equal(newest.harmonics, before.harmonics)
+
+
+def as_version_4(data, degree, extension=b""):
+    """Return version 4 of a SPZ file of version 3: Niantic's README states its layout."""
+    imagecodecs = pytest.importorskip("imagecodecs")
+    plain = gzip.decompress(data)
+    magic, _, count, _, fraction, flags, _ = struct.unpack("<IIIBBBB", plain[:16])
+    sizes = [count * width for width in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if width]
+    edges = np.cumsum([16, *sizes])
+    blocks = [imagecodecs.zstd_encode(plain[a:b]) for a, b in itertools.pairwise(edges)]
+    at = 32 + len(extension)
+    flags |= 2 * bool(extension)
+    head = struct.pack("<IIIBBBBI12x", magic, 4, count, degree, fraction, flags, len(blocks), at)
+    table = b"".join(struct.pack("<QQ", len(block), size) for block, size in zip(blocks, sizes, strict=True))
+    return head + extension + table + b"".join(blocks)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_version_4_of_spz_holds_what_version_3_does(tmp_path, degree, caplog):
+    write_gaussians(tmp_path / "3.spz", natural(degree=degree))
+    data = (tmp_path / "3.spz").read_bytes()
+    (tmp_path / "4.spz").write_bytes(as_version_4(data, degree))
+    (tmp_path / "e.spz").write_bytes(as_version_4(data, degree, struct.pack("<II4x", 0xADBE0002, 4)))
+    before, *newer = (read_gaussians(tmp_path / name) for name in ("3.spz", "4.spz", "e.spz"))
+    for field, values in vars(before).items():
+        for other in newer:
+            np.testing.assert_array_equal(getattr(other, field), values)
+    assert "e.spz: its extensions are not read" in caplog.text and "4.spz" not in caplog.text
+
+
+def test_damaged_files_of_version_4_are_one_line(tmp_path):
+    write_gaussians(tmp_path / "3.spz", natural())
+    data = as_version_4((tmp_path / "3.spz").read_bytes(), 3)
+    count, table = struct.pack("<I", 40_000_000), struct.pack("<I", 1 << 31)
+    for damaged, problem in {
+        data[:20]: "is damaged SPZ",
+        data[:-9]: "is damaged SPZ",
+        data[:15] + b"\5" + data[16:]: "has 5 streams in place of 6",
+        data[:8] + count + data[12:]: "states 5400 bytes for stream 0, of 360000000",
+        data[:16] + table + data[20:]: "is damaged SPZ",
+        data[:-40] + bytes(40): "is damaged SPZ",
+    }.items():
+        (tmp_path / "a.spz").write_bytes(damaged)
+        with pytest.raises(InputError, match=problem):
+            read_gaussians(tmp_path / "a.spz")
+
+
+def test_version_4_without_its_library_is_named(tmp_path, monkeypatch):
+    write_gaussians(tmp_path / "3.spz", natural())
+    (tmp_path / "a.spz").write_bytes(as_version_4((tmp_path / "3.spz").read_bytes(), 3))
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)
+    with pytest.raises(SehdrError, match=r"SPZ of version 4 needs imagecodecs; run `pip install 'sehdr-warp\[spz\]'`"):
+        read_gaussians(tmp_path / "a.spz")
 
 
 def test_linear_colors_are_refused(tmp_path):
