@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_harmonics
 from ..rasterizer.activations import opacity_penalty
+from ..rasterizer.graph_cache import without_replays
 from ..response import Response
 from ..scene import Camera
 from ..scene.normalization import Normalization
@@ -176,6 +177,7 @@ class RadianceField(nn.Module):
         return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure)
 
     @torch.no_grad()
+    @without_replays()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
         """Render the HDR view of a camera, with depth as a fourth channel of the same rasterization.
 
@@ -259,6 +261,7 @@ class RadianceField(nn.Module):
         return DirectionalRender(colors / self.base_time, alpha, distance, confidence, clipped)
 
     @torch.no_grad()
+    @without_replays()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
         """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base time."""
         tensors = self.camera_tensors(camera)
@@ -272,6 +275,7 @@ class RadianceField(nn.Module):
         return None if self.confidence is None else self.render_mean(camera, self.confidence)
 
     @torch.no_grad()
+    @without_replays()
     def render_mean(self, camera: Camera, values: Tensor) -> Tensor:
         """Render the mean [H, W] in [0, 1] of values [N] of the Gaussians, 0 if alpha is at most 0.001."""
         # Three channels like a training's features, so that no further kernel is compiled.
@@ -288,6 +292,7 @@ class RadianceField(nn.Module):
             return self.response.decode(self.color_model.colors(values).clamp(0, 1)) / self.base_time
         return self._exposures(values)[1] / self.base_time
 
+    @without_replays()
     def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:
         """Return [N, C]: for each Gaussian the sum over pixels of its blending weight times images [H, W, C].
 
@@ -321,15 +326,18 @@ class RadianceField(nn.Module):
         max_intersections: int | None = None,
         opacities: Tensor | None = None,
     ) -> Rendering:
-        """Rasterize features [N, C], with opacities [N] if the caller has already computed them."""
+        """Rasterize features [N, C].
+
+        opacities: [N]. Without them, gradients reach the features alone.
+        """
         gaussians = self.gaussians
-        opacities = gaussians.opacities() if opacities is None else opacities
+        shapes = gaussians.means, gaussians.log_scales, gaussians.quaternions
+        if opacities is None:
+            shapes, opacities = [tensor.detach() for tensor in shapes], gaussians.opacities().detach()
         if camera.directions is not None:
-            return self._rasterize_wide(camera, camera.directions, features, opacities)
+            return self._rasterize_wide(camera, camera.directions, shapes, features, opacities)
         return self.rasterizer(
-            gaussians.means,
-            gaussians.log_scales,
-            gaussians.quaternions,
+            *shapes,
             opacities,
             features,
             camera.world_to_camera,
@@ -342,14 +350,20 @@ class RadianceField(nn.Module):
         )
 
     def _rasterize_wide(
-        self, camera: CameraTensors, directions: Tensor, features: Tensor, opacities: Tensor
+        self,
+        camera: CameraTensors,
+        directions: Tensor,
+        shapes: Sequence[Tensor],
+        features: Tensor,
+        opacities: Tensor,
     ) -> Rendering:
-        """Rasterize features along a wide camera's directions; the result has no projected means."""
-        gaussians, focal = self.gaussians, float(camera.intrinsics[0])
+        """Rasterize features along a wide camera's directions; the result has no projected means.
+
+        shapes: means, log_scales and quaternions.
+        """
+        focal = float(camera.intrinsics[0])
         image, transmittance = rasterize_directions(
-            gaussians.means,
-            gaussians.log_scales,
-            gaussians.quaternions,
+            *shapes,
             opacities,
             features,
             camera.position,

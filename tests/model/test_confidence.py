@@ -18,6 +18,7 @@ from sehdr_warp.model.confidence import (
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.model.renders import CameraTensors
+from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, View, codes_of
 
@@ -78,6 +79,16 @@ def test_weighted_sums_are_those_of_the_blend(device):
         weights = model._rasterize(CameraTensors.of(CAMERA, device), alone).image[..., 0]
         torch.testing.assert_close(sums[index], (weights[..., None] * images).sum((0, 1)), rtol=1e-4, atol=1e-4)
     assert sums[2].abs().max() == 0 < sums[:2].min()
+
+
+def test_weighted_sums_differentiate_the_features_alone(monkeypatch):
+    model = field()
+    monkeypatch.setattr(
+        model, "rasterizer", lambda *tensors, **options: seen.extend(tensors) or rasterize(*tensors, **options)
+    )
+    seen = []
+    model.weighted_sums(CameraTensors.of(CAMERA, "cpu"), torch.ones(12, 20, 2))
+    assert [tensor.requires_grad for tensor in seen[:5]] == [False] * 4 + [True]
 
 
 def test_clipped_and_unseen_gaussians_are_doubted(device):

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.rasterizer import block_blending, captured_backward, captured_render, graph_cache, rasterize, tile_lists
 from sehdr_warp.rasterizer.memory import OutOfMemory
 from sehdr_warp.rasterizer.render_options import RenderOptions
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import Camera
 
 from .emulated_graphs import emulate
 from .scenes import random_like, random_scene, relative_error
@@ -253,6 +257,21 @@ def test_what_cannot_be_recorded_is_launched():
         raise torch.OutOfMemoryError("no memory")
 
     assert not any(pool.take(record) for _ in range(graph_cache.WARMUP_CALLS + 5)) and len(requests) == 1
+
+
+def test_renders_of_a_field_hold_no_graphs():
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -0.5, 2.0])
+    field = RadianceField(Gaussians.from_points(points, points, 0), response_by_name("srgb"), base_time=1.0).to(DEVICE)
+    camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, np.eye(4))
+    for _ in range(CALLS):
+        field.render(camera)
+        field.render_ldr(camera)
+        field.render_mean(camera, torch.ones(40, device=DEVICE))
+        field.weighted_sums(field.camera_tensors(camera), torch.ones(24, 32, 2, device=DEVICE))
+    assert not graph_cache._pools
+    for _ in range(CALLS):
+        field.render_train_view(field.camera_tensors(camera), 1.0)
+    assert recordings()
 
 
 def test_only_the_latest_kinds_are_remembered():
