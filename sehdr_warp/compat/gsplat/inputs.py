@@ -21,6 +21,14 @@ UNSUPPORTED = {
     "thin_prism_coeffs": None,
     "ftheta_coeffs": None,
     "viewmats_rs": None,
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "ut_params": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
 }
 """gsplat's arguments that have one value here."""
 
@@ -43,20 +51,24 @@ class View(NamedTuple):
     scales: Tensor | None
     covars: Tensor | None
     opacities: Tensor
-    colors: Tensor
+    colors: Tensor | None
+    extra_signals: Tensor | None
     viewmat: Tensor
     K: Tensor
     position: Tensor
     background: Tensor | None
 
-    def features(self, sh_degree: int | None, has_color: bool, rows: Tensor | None) -> Tensor:
-        """Return the colors [N, D] of the Gaussians (of `rows` if given), or [N, 0] without has_color."""
-        means, colors = (self.means, self.colors) if rows is None else (self.means[rows], self.colors[rows])
-        if not has_color:
-            return means.new_empty(len(means), 0)
-        if sh_degree is None:
-            return colors
-        return (spherical_harmonics(sh_degree, colors, means, self.position) + 0.5).clamp_min(0.0)
+    def features(self, sh_degree: int | None, rows: Tensor | None) -> list[Tensor]:
+        """Return the colors [N, D] and the extra signals [N, E] of the Gaussians (of `rows` if given), if there are."""
+
+        def of_rows(tensor: Tensor) -> Tensor:
+            return tensor if rows is None else tensor[rows]
+
+        features = [of_rows(tensor) for tensor in (self.colors, self.extra_signals) if tensor is not None]
+        if sh_degree is not None and self.colors is not None:
+            values = spherical_harmonics(sh_degree, features[0], of_rows(self.means), self.position)
+            features[0] = (values + 0.5).clamp_min(0.0)
+        return features
 
 
 class Inputs(NamedTuple):
@@ -67,11 +79,12 @@ class Inputs(NamedTuple):
     scales: Tensor | None
     covars: Tensor | None
     opacities: Tensor
-    colors: Tensor
+    colors: Tensor | None
+    extra_signals: Tensor | None
     viewmats: Tensor
     Ks: Tensor
     backgrounds: Tensor | None
-    colors_by_camera: bool
+    by_camera: tuple[bool, bool]
 
     @staticmethod
     def flattened(
@@ -80,19 +93,29 @@ class Inputs(NamedTuple):
         scales: Any,
         opacities: Any,
         colors: Any,
+        extra_signals: Any,
         viewmats: Any,
         Ks: Any,
         backgrounds: Any,
         covars: Any,
         sh_degree: int | None,
     ) -> "Inputs":
-        """Check the arguments' shapes, types and devices, and flatten their batch axes to one."""
+        """Check the arguments' shapes, types and devices, and flatten their batch axes to one.
+
+        colors and extra_signals may be None.
+        """
         batch = tuple(means.shape[:-2]) if isinstance(means, Tensor) else ()
         inner: tuple[int | str, ...] = ("N", "D")
         if sh_degree is not None:
             check_degree("sh_degree", integer("sh_degree", sh_degree, 0, 4))
             inner = ("N", "K", 3)
-        by_camera = isinstance(colors, Tensor) and colors.ndim == len(batch) + len(inner) + 1
+
+        def by_camera(features: Any, inner: tuple) -> bool:
+            return isinstance(features, Tensor) and features.ndim == len(batch) + len(inner) + 1
+
+        def feature_shape(features: Any, inner: tuple) -> tuple:
+            return *batch, *(("C",) if by_camera(features, inner) else ()), *inner
+
         shapes: dict[str, Any] = {"means": (means, (*batch, "N", 3))}
         if covars is None:
             shapes |= {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
@@ -102,12 +125,16 @@ class Inputs(NamedTuple):
             "opacities": (opacities, (*batch, "N")),
             "viewmats": (viewmats, (*batch, "C", 4, 4)),
             "Ks": (Ks, (*batch, "C", 3, 3)),
-            "colors": (colors, (*batch, *(("C",) if by_camera else ()), *inner)),
         }
+        if colors is not None:
+            shapes["colors"] = (colors, feature_shape(colors, inner))
+        if extra_signals is not None:
+            shapes["extra_signals"] = (extra_signals, feature_shape(extra_signals, ("N", "E")))
         if backgrounds is not None:
-            shapes["backgrounds"] = (backgrounds, (*batch, "C", 3 if sh_degree is not None else "D"))
+            features = [tensor for tensor in (colors, extra_signals) if isinstance(tensor, Tensor) and tensor.ndim]
+            shapes["backgrounds"] = (backgrounds, (*batch, "C", sum(tensor.shape[-1] for tensor in features)))
         check_tensors(**shapes)
-        if sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
+        if colors is not None and sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
             raise ValueError(
                 f"colors has shape {list(colors.shape)}, but sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} "
                 "coefficients"
@@ -120,11 +147,18 @@ class Inputs(NamedTuple):
                 return tensor
             return tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :])
 
-        values = means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds
-        return Inputs(*map(flat, values), by_camera)  # pyright: ignore[reportCallIssue]
+        values = means, quats, scales, covars, opacities, colors, extra_signals, viewmats, Ks, backgrounds
+        both = by_camera(colors, inner), by_camera(extra_signals, ("N", "E"))
+        return Inputs(*map(flat, values), both)  # pyright: ignore[reportCallIssue]
 
     def views(self) -> Iterator[View]:
         """Yield the inputs of each camera, batch by batch."""
+
+        def own(features: Tensor | None, batch: int, camera: int, by_camera: bool) -> Tensor | None:
+            if features is None:
+                return None
+            return features[batch, camera] if by_camera else features[batch]
+
         inverse, _ = torch.linalg.inv_ex(self.viewmats)  # Of a singular matrix not finite: it then shows nothing.
         for batch in range(len(self.means)):
             for camera in range(self.viewmats.shape[1]):
@@ -134,7 +168,8 @@ class Inputs(NamedTuple):
                     None if self.scales is None else self.scales[batch],
                     None if self.covars is None else self.covars[batch],
                     self.opacities[batch],
-                    self.colors[batch, camera] if self.colors_by_camera else self.colors[batch],
+                    own(self.colors, batch, camera, self.by_camera[0]),
+                    own(self.extra_signals, batch, camera, self.by_camera[1]),
                     self.viewmats[batch, camera],
                     self.Ks[batch, camera],
                     inverse[batch, camera, :3, 3],

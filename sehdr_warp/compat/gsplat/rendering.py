@@ -19,6 +19,7 @@ from .splats import JoinedSplats, make_meta
 RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RASTERIZE_MODES = "classic", "antialiased"
+DEFAULT_TILE_SIZE = 16
 
 
 @torch_operation
@@ -27,7 +28,7 @@ def rasterization(
     quats: Tensor | None,
     scales: Tensor | None,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -38,7 +39,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int | None = None,
     backgrounds: Tensor | None = None,
     render_mode: RenderMode = "RGB",
     sparse_grad: bool = False,
@@ -57,6 +58,15 @@ def rasterization(
     ftheta_coeffs: Any = None,
     rolling_shutter: Any = None,
     viewmats_rs: Tensor | None = None,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
+    lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None,
+    ut_params: Any = None,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Rasterize N Gaussians to the images of C cameras, with gsplat's arguments and results.
 
@@ -65,7 +75,8 @@ def rasterization(
         quats: [..., N, 4] (w, x, y, z); None with covars.
         scales: [..., N, 3]; None with covars.
         opacities: [..., N]; above 1 they saturate as in gsplat.
-        colors: [..., N, D] or [..., C, N, D]; with sh_degree coefficients [..., N, K, 3] or [..., C, N, K, 3].
+        colors: [..., N, D] or [..., C, N, D]; with sh_degree coefficients [..., N, K, 3] or [..., C, N, K, 3]. None if
+            only depths are rendered.
         viewmats: [..., C, 4, 4] world to camera.
         Ks: [..., C, 3, 3].
         width: of the images, pixels.
@@ -76,8 +87,8 @@ def rasterization(
         eps2d: variance in square pixels added to each 2D Gaussian.
         sh_degree: 0 to 3, of the harmonics; None for plain colors.
         packed: return the visible Gaussians alone in the third result.
-        tile_size: of the third result's intersections; rendering has its own.
-        backgrounds: [..., C, D].
+        tile_size: of the third result's intersections, 16 by default; rendering has its own.
+        backgrounds: [..., C, D], with extra_signals [..., C, D + E].
         render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED".
         sparse_grad: must be False.
         absgrad: the backward pass writes meta["means2d"].absgrad, the sums over pixels of absolute gradients.
@@ -95,6 +106,16 @@ def rasterization(
         ftheta_coeffs: must be None.
         rolling_shutter: must be None or gsplat's GLOBAL.
         viewmats_rs: must be None.
+        return_normals: must be False.
+        global_z_order: must be True.
+        rays: must be None.
+        lidar_coeffs: must be None.
+        external_distortion_coeffs: must be None.
+        ut_params: must be None.
+        extra_signals: [..., N, E] or [..., C, N, E], blended to the third result's "render_extra_signals"
+            [..., C, H, W, E].
+        extra_signals_sh_degree: must be None.
+        renderer_config: must be None.
 
     Returns:
         Colors [..., C, H, W, D], with depths as one more channel ("RGB+D": blended, "RGB+ED": expected) or as the only
@@ -117,11 +138,17 @@ def rasterization(
     real("eps2d", eps2d, is_not_negative, "a number from 0")
     if covars is not None:
         quats = scales = None
-    inputs = Inputs.flattened(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, sh_degree)
-    size = integer("width", width, 1, MAX_SIDE), integer("height", height, 1, MAX_SIDE)
-    tile_size = integer("tile_size", tile_size, 1, MAX_SIDE)
-    culling = Culling(max(near_plane, 0.0), far_plane, radius_clip)
     antialiased, has_depth, has_color = rasterize_mode == "antialiased", "D" in render_mode, "RGB" in render_mode
+    if colors is None and has_color:
+        raise TypeError(f"colors is None, and render_mode {render_mode!r} renders them")
+    if not has_color:
+        colors = sh_degree = backgrounds = None
+    inputs = Inputs.flattened(
+        means, quats, scales, opacities, colors, extra_signals, viewmats, Ks, backgrounds, covars, sh_degree
+    )
+    size = integer("width", width, 1, MAX_SIDE), integer("height", height, 1, MAX_SIDE)
+    tile_size = integer("tile_size", DEFAULT_TILE_SIZE if tile_size is None else tile_size, 1, MAX_SIDE)
+    culling = Culling(max(near_plane, 0.0), far_plane, radius_clip)
     with oom_context(means.device, lambda: (means.shape[-2], *size)):
         views = list(inputs.views())
         projected = [
@@ -139,16 +166,17 @@ def rasterization(
         means2d = splats.all.means2d
         if absgrad and means2d.requires_grad:
             means2d.absgrad = torch.zeros_like(means2d)  # pyright: ignore[reportAttributeAccessIssue]
-        images, alphas = [], []
+        images, alphas, extras = [], [], []
         for place, view in enumerate(views):
             mine = splats.of_view(place)
-            features = view.features(sh_degree, has_color, mine.gaussian_ids)
+            features = view.features(sh_degree, mine.gaussian_ids)
             if has_depth:
-                features = torch.cat([features, mine.projected.depths[:, None]], 1)
+                features.append(mine.projected.depths[:, None])
+            features = torch.cat(features, 1) if len(features) > 1 else features[0]
             store = _store(splats, mine.rows) if absgrad and means2d.requires_grad else None
             rendering = render_projected(mine.projected, features, RenderOptions(*size), store_absolute=store)
             image, transmittance = rendering.image, rendering.transmittance
-            if view.background is not None and has_color:
+            if view.background is not None:
                 behind = view.background
                 behind = torch.cat([behind, behind.new_zeros(1)]) if has_depth else behind
                 image = image + transmittance[..., None] * behind
@@ -156,10 +184,17 @@ def rasterization(
             if "E" in render_mode:
                 expected = image[..., -1:] / alpha.clamp_min(1e-10)
                 image = torch.cat([image[..., :-1], expected], -1)
+            if extra_signals is not None:
+                channels = image.shape[-1] - has_depth - extra_signals.shape[-1], extra_signals.shape[-1], has_depth
+                color, extra, depth = image.split_with_sizes(channels, -1)
+                image = torch.cat([color, depth], -1)
+                extras.append(extra)
             images.append(image)
             alphas.append(alpha)
     shape = *batch, cameras
     meta = make_meta(splats, shape, size, tile_size)
+    if extras:
+        meta["render_extra_signals"] = torch.stack(extras).unflatten(0, shape)
     return torch.stack(images).unflatten(0, shape), torch.stack(alphas).unflatten(0, shape), meta
 
 

@@ -104,15 +104,19 @@ class DefaultStrategy(Strategy):
         step: int,
         info: dict[str, Any],
         packed: bool = False,
+        scene: Any = None,
     ) -> None:
-        """Collect the gradients of the 2D means and, in its turn, densify, prune and reset. packed: as rendered."""
+        """Collect the gradients of the 2D means and, in its turn, densify, prune and reset.
+
+        packed: as rendered. scene: a gsplat 1.6 Scene, whose methods on_duplicate() and the like are called.
+        """
         if step >= self.refine_stop_iter:
             return
         self._collect(params, state, info, packed)
         in_turn = step > self.refine_start_iter and step % self.refine_every == 0
         if in_turn and step % self.reset_every >= self.pause_refine_after_reset:
-            duplicated, split = self._grow(params, optimizers, state, step)
-            pruned = self._prune(params, optimizers, state, step)
+            duplicated, split = self._grow(params, optimizers, state, step, scene)
+            pruned = self._prune(params, optimizers, state, step, scene)
             if self.verbose:
                 print(
                     f"Step {step}: {duplicated} Gaussians duplicated, {split} split, {pruned} pruned; "
@@ -147,7 +151,7 @@ class DefaultStrategy(Strategy):
             parts = radii / max(info["width"], info["height"])
             state["radii"].scatter_reduce_(0, rows, parts.to(state["radii"].dtype), "amax")
 
-    def _grow(self, params: Parameters, optimizers: Optimizers, state: State, step: int) -> tuple[int, int]:
+    def _grow(self, params: Parameters, optimizers: Optimizers, state: State, step: int, scene: Any) -> tuple[int, int]:
         high = state["grad2d"] / state["count"].clamp_min(1) > self.grow_grad2d
         small = params["scales"].exp().amax(-1) <= self.grow_scale3d * state["scene_scale"]
         copied, split = high & small, high & ~small
@@ -163,6 +167,10 @@ class DefaultStrategy(Strategy):
         }
         sources = torch.cat([copied_rows, split_rows, split_rows])
         change_rows(params, optimizers, state, ~split, appended, sources)
+        if scene is not None:
+            scene.on_duplicate(copied_rows)
+            copies = torch.arange(len(copied_rows), device=split.device) + len(split)
+            scene.on_split(split_rows, torch.cat([(~split).nonzero()[:, 0], copies]))
         return len(copied_rows), len(split_rows)
 
     def _split(self, params: Parameters, rows: Tensor) -> dict[str, Tensor]:
@@ -180,7 +188,7 @@ class DefaultStrategy(Strategy):
             values["opacities"] = torch.cat([halves, halves])
         return values
 
-    def _prune(self, params: Parameters, optimizers: Optimizers, state: State, step: int) -> int:
+    def _prune(self, params: Parameters, optimizers: Optimizers, state: State, step: int, scene: Any) -> int:
         removed = params["opacities"].flatten().sigmoid() < self.prune_opa
         if step > self.reset_every:
             large = params["scales"].exp().amax(-1) > self.prune_scale3d * state["scene_scale"]
@@ -190,6 +198,8 @@ class DefaultStrategy(Strategy):
         count = int(removed.sum())
         if count:
             change_rows(params, optimizers, state, ~removed)
+            if scene is not None:
+                scene.on_remove(removed)
         return count
 
 
@@ -205,6 +215,9 @@ class MCMCStrategy(Strategy):
         refine_every: iterations between changes.
         min_opacity: Gaussians with no larger opacity are moved.
         verbose: print what changed.
+        noise_injection_stop_iter: first iteration without noise; -1 for none.
+        noise_opacity_t: opacity at which the noise is half of that of a transparent Gaussian.
+        noise_opacity_k: how fast the noise fades with the opacity there.
     """
 
     cap_max: int = 1_000_000
@@ -214,6 +227,9 @@ class MCMCStrategy(Strategy):
     refine_every: int = 100
     min_opacity: float = 0.005
     verbose: bool = False
+    noise_injection_stop_iter: int = -1
+    noise_opacity_t: float = 0.005
+    noise_opacity_k: float = 100.0
 
     def initialize_state(self) -> State:
         """Return the state that the steps take; it is empty."""
@@ -228,16 +244,21 @@ class MCMCStrategy(Strategy):
         step: int,
         info: dict[str, Any],
         lr: float,
+        scene: Any = None,
     ) -> None:
-        """Move and add Gaussians in their turn, and add noise. lr: learning rate of the means."""
+        """Move and add Gaussians in their turn, and add noise.
+
+        lr: learning rate of the means. scene: a gsplat 1.6 Scene, whose methods on_relocate() and the like are called.
+        """
         if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
-            moved = self._relocate(params, optimizers)
-            added = self._add(params, optimizers)
+            moved = self._relocate(params, optimizers, scene)
+            added = self._add(params, optimizers, scene)
             if self.verbose:
                 print(f"Step {step}: {moved} Gaussians moved, {added} added; {len(params['means'])} now.")
-        self._add_noise(params, lr * self.noise_lr)
+        if self.noise_injection_stop_iter < 0 or step < self.noise_injection_stop_iter:
+            self._add_noise(params, lr * self.noise_lr)
 
-    def _relocate(self, params: Parameters, optimizers: Optimizers) -> int:
+    def _relocate(self, params: Parameters, optimizers: Optimizers, scene: Any) -> int:
         opacities = params["opacities"].detach().flatten().sigmoid()
         dead = opacities <= self.min_opacity
         targets, alive = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
@@ -249,9 +270,11 @@ class MCMCStrategy(Strategy):
         for value in values.values():
             value[targets] = value[sources]
         write_rows(params, optimizers, values, sources)
+        if scene is not None:
+            scene.on_relocate(targets, sources)
         return len(targets)
 
-    def _add(self, params: Parameters, optimizers: Optimizers) -> int:
+    def _add(self, params: Parameters, optimizers: Optimizers, scene: Any) -> int:
         count = len(params["means"])
         added = max(0, min(self.cap_max, int(1.05 * count)) - count)
         if not added:
@@ -260,6 +283,8 @@ class MCMCStrategy(Strategy):
         self._share(params, sources)
         single = torch.ones(count, dtype=torch.bool, device=sources.device)
         change_rows(params, optimizers, {}, single, {name: v.detach()[sources] for name, v in params.items()})
+        if scene is not None:
+            scene.on_sample_add(sources)
         return added
 
     def _share(self, params: Parameters, sources: Tensor) -> None:
@@ -275,10 +300,10 @@ class MCMCStrategy(Strategy):
         params["scales"].detach()[rows] = sizes.log()
 
     def _add_noise(self, params: Parameters, strength: float) -> None:
-        """Add noise with each Gaussian's covariance, which fades for opacities above some hundredths (equation 8)."""
+        """Add noise with each Gaussian's covariance, which fades above the opacity noise_opacity_t (equation 8)."""
         means, opacities = params["means"].detach(), params["opacities"].detach().flatten().sigmoid()
         axes = rotation_matrices(params["quats"].detach()) * params["scales"].detach().exp()[:, None, :]
-        fade = torch.sigmoid(100 * ((1 - opacities) - 0.995))
+        fade = torch.sigmoid(self.noise_opacity_k * (self.noise_opacity_t - opacities))
         noise = torch.randn_like(means) * (fade * strength)[:, None]
         means += (axes @ (axes.transpose(1, 2) @ noise[:, :, None]))[..., 0]
 

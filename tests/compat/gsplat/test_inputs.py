@@ -25,6 +25,9 @@ from .scenes import COUNT, HEIGHT, WIDTH, gradients, scene
         ({"sh_degree": 4}, "sh_degree 4 is not supported, expected 0 to 3"),
         ({"sh_degree": 2}, "colors has shape .* but sh_degree 2 needs 9 coefficients"),
         ({"backgrounds": torch.zeros(2, 4)}, "backgrounds has shape"),
+        ({"global_z_order": False}, "global_z_order = False is not supported, expected True"),
+        ({"rays": torch.zeros(2, 30, 40, 6)}, r"rays = a tensor of shape \[2, 30, 40, 6\] is not supported"),
+        ({"extra_signals": torch.zeros(3, 1)}, r"extra_signals has shape \[3, 1\], expected \[N, E\] with N = 200"),
         ({"far": 3}, "unexpected keyword argument 'far'"),
     ],
 )

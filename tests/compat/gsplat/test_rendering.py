@@ -1,5 +1,6 @@
 """gsplat's rasterization(), made of ours: images, gradients, batches, and splatfacto's call."""
 
+import pytest
 import torch
 
 from sehdr_warp.compat.gsplat import quat_scale_to_covar_preci, rasterization
@@ -119,6 +120,31 @@ def test_colors_of_each_camera(device):
         torch.testing.assert_close(colors[camera], one[camera])
         one, _, _ = rasterization(*leaves[:4], coefficients[camera, :, 0], **place._asdict())
         torch.testing.assert_close(plain[camera], one[camera])
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_extra_signals_and_depths_without_colors(packed, device):
+    leaves, place = scene(device, coefficients=4)
+    shapes = leaves[:4]
+    each = torch.rand(2, COUNT, 2, generator=torch.Generator().manual_seed(4)).to(device)
+    behind = torch.rand(2, 5, generator=torch.Generator().manual_seed(5)).to(device)
+    options = {"packed": packed, "render_mode": "RGB+ED", "sh_degree": 1}
+    plain, _, info = rasterization(*leaves, **place._asdict(), **options, backgrounds=behind[:, :3])
+    assert "render_extra_signals" not in info
+    colors, alphas, info = rasterization(*leaves, **place._asdict(), **options, backgrounds=behind, extra_signals=each)
+    torch.testing.assert_close(colors, plain)
+    extra, _, _ = rasterization(*shapes, each, **place._asdict(), backgrounds=behind[:, 3:])
+    torch.testing.assert_close(info["render_extra_signals"], extra)
+    depths, same, info = rasterization(
+        *shapes, None, **place._asdict(), packed=packed, render_mode="ED", extra_signals=each[0], tile_size=None
+    )
+    torch.testing.assert_close(depths, colors[..., 3:])
+    torch.testing.assert_close(same, alphas)
+    extra, _, _ = rasterization(*shapes, each[0], **place._asdict())
+    torch.testing.assert_close(info["render_extra_signals"], extra)
+    assert info["tile_size"] == 16
+    with pytest.raises(TypeError, match="colors is None, and render_mode 'RGB' renders them"):
+        rasterization(*shapes, None, **place._asdict())
 
 
 def test_splatfactos_call(device):

@@ -29,6 +29,28 @@ def model(device="cpu", count=COUNT):
     return params, optimizers, place, photos
 
 
+class Scene:
+    """What GaussianScene of gsplat 1.6 makes of the rows of a tensor when Gaussians change."""
+
+    def __init__(self, rows):
+        self.rows = rows
+
+    def on_duplicate(self, sel):
+        self.rows = torch.cat([self.rows, self.rows[sel]])
+
+    def on_split(self, sel, rest):
+        self.rows = torch.cat([self.rows[rest], self.rows[sel], self.rows[sel]])
+
+    def on_remove(self, remove_mask):
+        self.rows = self.rows[~remove_mask]
+
+    def on_relocate(self, dead_indices, sampled_indices):
+        self.rows[dead_indices] = self.rows[sampled_indices]
+
+    def on_sample_add(self, sampled_indices):
+        self.rows = torch.cat([self.rows, self.rows[sampled_indices]])
+
+
 STRATEGIES = {
     "default": DefaultStrategy(refine_start_iter=10, refine_every=10, reset_every=1000, grow_grad2d=1e-5),
     "absgrad": DefaultStrategy(
@@ -49,6 +71,8 @@ def test_a_training_as_gsplats_simple_trainer_makes_one(name, packed, device):
     is_default = isinstance(strategy, DefaultStrategy)
     state = strategy.initialize_state(scene_scale=1.0) if is_default else strategy.initialize_state()
     losses, counts = [], []
+    scene = Scene(torch.arange(float(COUNT), device=device))
+    params["origins"] = torch.nn.Parameter(scene.rows.clone(), requires_grad=False)
     for step in range(60):
         colors, alphas, info = rasterization(
             means=params["means"], quats=params["quats"], scales=torch.exp(params["scales"]),
@@ -65,9 +89,10 @@ def test_a_training_as_gsplats_simple_trainer_makes_one(name, packed, device):
             optimizer.zero_grad(set_to_none=True)
         arguments = {"params": params, "optimizers": optimizers, "state": state, "step": step, "info": info}
         if isinstance(strategy, DefaultStrategy):
-            strategy.step_post_backward(**arguments, packed=packed)
+            strategy.step_post_backward(**arguments, packed=packed, scene=scene)
         else:
-            strategy.step_post_backward(**arguments, lr=1e-6)
+            strategy.step_post_backward(**arguments, lr=1e-6, scene=scene)
+        assert torch.equal(scene.rows, params["origins"])
         losses.append(float(loss.detach()))
         counts.append(len(params["means"]))
         assert all(len(value) == counts[-1] for value in params.values())
@@ -89,6 +114,23 @@ def test_relocated_gaussians_look_as_the_one_did():
         alpha = own.double() * torch.exp(-((x / size.double()) ** 2) / 2)
         together = (1 - (1 - alpha) ** int(ratio)).sum()
         assert float(together / one) == pytest.approx(1, rel=1e-4)
+
+
+def test_noise_fades_with_the_opacity_and_ends():
+    params, optimizers, _, _ = model(count=2)
+    params["opacities"].data = torch.tensor([0.1, 0.4]).logit()
+    params["scales"].data.zero_()
+    options = {"noise_opacity_t": 0.1, "noise_opacity_k": 20.0, "noise_lr": 1.0}
+    moved = []
+    for strategy in (MCMCStrategy(**options), MCMCStrategy(**options, noise_injection_stop_iter=7)):
+        before = params["means"].detach().clone()
+        torch.manual_seed(0)
+        strategy.step_post_backward(params, optimizers, {}, 7, {}, lr=0.1)
+        moved.append(params["means"].detach() - before)
+    torch.manual_seed(0)
+    noise = 0.1 * torch.randn(2, 3) * torch.tensor([[0.5], [torch.sigmoid(torch.tensor(-6.0))]])
+    torch.testing.assert_close(moved[0], noise, rtol=1e-4, atol=1e-6)
+    assert not moved[1].any()
 
 
 def test_rows_change_with_their_optimizers():
