@@ -23,6 +23,7 @@ from .lens import Lens, Undistortion, area_average
 from .linear_photos import float_codes, kind_of, linear_codes
 from .masks import mask_note, read_mask
 from .names import unique_names
+from .photo_content import ContentCheck, unused_bits_note
 from .photo_file import PhotoKeeper
 from .photos import fitted_lens, read_photo, truth_notes, unusable_notes
 from .primaries import linear_to_srgb
@@ -88,39 +89,11 @@ def preprocess(
         count = f"{len(preprocessor.transparent)} of {len(names)} photos"
         masks.append(f"transparency: {count} have transparent pixels, which {meaning}")
     masks += gain_map_notes(preprocessor.gain_map_problems)
+    masks += unused_bits_note(preprocessor.largest_code, linear=dataset.kind == "linear")
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
     times_known = dataset.times_known
     return Scene(dataset.name, dataset.format, tuple(views), points, colors, times_known, notes, response=response)
-
-
-class ContentCheck:
-    """Counts the samples of photos that are neither black nor white. Large photos are sampled on a grid."""
-
-    def __init__(self) -> None:
-        """Start without photos."""
-        self._visible = self._total = 0
-        self._light = 0.0
-
-    def add(self, codes: np.ndarray, mask: np.ndarray | None = None) -> None:
-        """Count a photo, [H, W, 3], by about a million of its pixels, of which the mask [H, W] may leave some out."""
-        step = max(1, round((codes.shape[0] * codes.shape[1] / 1e6) ** 0.5))
-        values, white = codes[::step, ::step], np.iinfo(codes.dtype).max
-        values = values if mask is None else values[mask[::step, ::step] > 0.5]
-        self._visible += int(((values > white * 1.5 / 255) & (values < white * (1 - 1.5 / 255))).sum())
-        self._total += values.size
-        self._light += float(values.sum(dtype=np.float64)) / white
-
-    def require_content(self, folder: Path) -> None:
-        """Raise InputError, which names the folder, if fewer than one sample in a thousand shows something."""
-        if self._total == 0:
-            remedy = "masks keep what is white, and transparent photos their opaque pixels"
-            raise InputError(folder, "masks or transparency leave out all pixels of the training photos", remedy)
-        if self._visible < self._total * 1e-3:
-            share, mean = 100 - 100 * self._visible / self._total, self._light / self._total
-            state = f"black or white in {share:.1f} % (mean {mean:.3f})"
-            remedy = "expose them so that the scene shows, or choose another exposure index"
-            raise InputError(folder, f"the training photos are {state}", remedy)
 
 
 def read_codes(record: ImageRecord) -> EncodedImage:
@@ -206,6 +179,7 @@ class _Preprocessor:
         self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
         self.labeled_masks: set[Path] = set()
         self.transparent: set[str] = set()  # Views whose photos have transparent pixels
+        self.largest_code = 0  # Of photos with 16 bits
         self.unusable_truth: list[InputError] = []
         self.gain_map_problems: dict[Path, str] = {}
         self._alone = threading.Lock()  # Guards what threads share; a response uses all cores by itself
@@ -236,6 +210,8 @@ class _Preprocessor:
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
         photo, encoding = _read_stored(record, self.gain_map_problems, oriented=oriented, masked=self.alpha == "mask")
+        if photo.levels > 255 and kind_of(record.image) == "encoded" and not record.gain_map:
+            self.largest_code = max(self.largest_code, int(photo.pixels.max()))
         masks = resample.borders()
         if stored is not None:
             masks.append(resample(stored))

@@ -15,7 +15,8 @@ from .exif import are_camera_jpegs
 from .gain_map import MOST_STOPS_IN_CODES, read_gain_map
 from .images import has_16_bits
 from .linear_photos import CURVES, color_matrix
-from .preprocess import ContentCheck, read_codes
+from .photo_content import ContentCheck
+from .preprocess import read_codes
 from .types import View
 
 if TYPE_CHECKING:
@@ -160,8 +161,8 @@ def _select_for_dataset(dataset: DataparserOutputs, method: str, candidates: Seq
                 image = read_codes(record)
             except InputError:
                 continue  # Preprocessing names it.
-            if image.alpha is not None:  # Transparent pixels have no color.
-                image.pixels[image.alpha < 1] = 0
+            if image.alpha is not None:  # Transparent pixels have no color, nearly opaque ones have theirs.
+                image.pixels[image.alpha < 0.5] = 0
             pixels = image.pixels
             del image  # Free the memory before the next photo is read.
             content.add(pixels)

@@ -1,0 +1,42 @@
+"""What the codes of all photos together say."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.scene import load_scene
+from tests.make_scenes import load, pattern, write_colmap
+
+
+def unused_bits(scene):
+    return [note for note in scene.notes if "bits" in note]
+
+
+@pytest.mark.parametrize("response", ["srgb", "linear"])
+@pytest.mark.parametrize("bits", [12, 14, 16])
+def test_codes_of_fewer_bits_in_files_of_16_are_named(tmp_path, bits, response):
+    tifffile = pytest.importorskip("tifffile")
+    write_colmap(tmp_path)
+    for i in range(6):
+        (tmp_path / "images" / f"{i:03d}.png").unlink()
+        codes = pattern(64, 48, i).astype(np.uint16) * 257 >> 16 - bits
+        codes[0, 0] = 2**bits - 1
+        tifffile.imwrite(tmp_path / "images" / f"{i:03d}.tif", codes, photometric="rgb")
+    notes = unused_bits(load(tmp_path, response=response))
+    if bits == 16:
+        assert notes == []
+    else:
+        (note,) = notes
+        largest, factor = 2**bits - 1, 2 ** (16 - bits)
+        assert note.startswith(f"no code of the 16-bit photos is above {largest}: if they hold {bits} bits")
+        assert note.endswith(f"multiply their codes by {factor}")
+
+
+def test_photos_that_are_nearly_opaque_everywhere_show_something(tmp_path):
+    """Editors that blend layers leave alpha at 254; it once made the photos black for the choice of the response."""
+    write_colmap(tmp_path)
+    for i in range(6):
+        alpha = np.full((48, 64, 1), 254, np.uint8)
+        Image.fromarray(np.concatenate([pattern(64, 48, i), alpha], 2)).save(tmp_path / "images" / f"{i:03d}.png")
+    scene = load_scene(tmp_path, holdout=0)
+    assert scene.views[0].codes.max() == 255 and scene.views[0].mask.min() > 0.99
