@@ -114,6 +114,9 @@ def _inria(entry: dict, path: Path) -> Camera:
 def _nerfstudio(entry, index: int, values: dict, path: Path, back: np.ndarray | None) -> Camera:
     """Read an entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows), fov (vertical, degrees)."""
     width, height = (whole_number(values[name], name) for name in ("render_width", "render_height"))
+    kind = entry.get("camera_type", values.get("camera_type", "perspective"))
+    if kind != "perspective":
+        raise InputError(path, f"camera {index} has camera_type {kind!r:.40}", "use perspective cameras")
     fov = float(entry["fov"])
     matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
     if not 1e-6 <= fov < 180:

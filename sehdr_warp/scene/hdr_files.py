@@ -301,7 +301,7 @@ def _exr_window(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _read_radiance(path: Path) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Return [H, W, 3] float32 radiance (a pixel divided by the header's EXPOSURE lines), and its primaries."""
+    """Return [H, W, 3] float32 radiance (pixels divided by the header's EXPOSURE and COLORCORR), and its primaries."""
     data = read_bytes(path)
     width, height, position, exposure, primaries = _radiance_header(data[:_MAX_HEADER_BYTES], path)
     rgbe = np.empty((height, width, 4), np.uint8)
@@ -316,8 +316,8 @@ def _read_radiance(path: Path) -> tuple[np.ndarray, tuple[float, ...]]:
     return pixels.astype(np.float32), primaries
 
 
-def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float, tuple[float, ...]]:
-    """Return width, height, offset of the pixels, the product of the exposures, and the primaries."""
+def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, np.ndarray, tuple[float, ...]]:
+    """Return width, height, offset of the pixels, the product of the exposures [3], and the primaries."""
     if not data.startswith((b"#?RADIANCE", b"#?RGBE")):
         raise InputError(path, "is not a Radiance picture", _REMEDY)
     end = data.find(b"\n\n")
@@ -326,11 +326,14 @@ def _radiance_header(data: bytes, path: Path) -> tuple[int, int, int, float, tup
         raise InputError(path, "Radiance header has no '-Y height +X width' line", _REMEDY)
     try:
         exposures = re.findall(rb"^EXPOSURE\s*=\s*([^\s]{1,40})", data[:end], re.MULTILINE)
-        exposure = float(np.prod([float(value) for value in exposures]))
+        corrections = re.findall(rb"^COLORCORR\s*=\s*([^\n]{1,120})", data[:end], re.MULTILINE)
+        factors = [np.full(3, float(value)) for value in exposures]
+        factors += [np.array(value.split(), np.float64).reshape(3) for value in corrections]
+        exposure = np.prod([np.ones(3), *factors], axis=0)
     except ValueError:
-        exposure = np.nan
-    if not (np.isfinite(exposure) and exposure > 0):
-        raise InputError(path, "EXPOSURE is not a positive number", _REMEDY)
+        exposure = np.full(3, np.nan)
+    if not (np.isfinite(exposure).all() and (exposure > 0).all()):
+        raise InputError(path, "EXPOSURE or COLORCORR are not positive numbers", _REMEDY)
     primaries = _XYZ if b"32-bit_rle_xyze" in data[:end] else REC709
     line = re.search(rb"^PRIMARIES\s*=\s*([^\n]{1,200})", data[:end], re.MULTILINE)
     if line and primaries is REC709:

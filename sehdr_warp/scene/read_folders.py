@@ -101,6 +101,8 @@ def read_colmap(folder: Path) -> DataparserOutputs:
         records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, hdr=hdr))
     if not records:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
+        others = unread_kinds(images)
+        problem += f"; files of kinds that are not read: {others}" * bool(others)
         raise InputError(images, problem, _REMEDY)
     records, repeated = distinct(records)
     unusable = unusable_notes(model.unusable, len(model.images) + len(model.unusable))

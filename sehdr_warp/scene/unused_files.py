@@ -62,7 +62,7 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
 
 def unread_kinds(folder: Path) -> str:
     """Describe the files of a folder that are of kinds that are not read; an empty text if there are none."""
-    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
+    files = [file for file in sorted(folder.iterdir()) if file.is_file() and not file.name.startswith(".")]
     others = [f for f in files if f.suffix.lower() not in _QUIET and f.suffix.lower() not in PHOTO_SUFFIXES]
     return _by_suffix(others) if others else ""
 

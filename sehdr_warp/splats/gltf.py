@@ -102,6 +102,8 @@ def read_glb(path: Path) -> GaussianArrays:
 
 def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path: Path) -> GaussianArrays:
     attributes, extension = primitive["attributes"], primitive["extensions"][EXTENSION]
+    if compressed := next((name for name in extension.get("extensions", {}) if "compression" in name), None):
+        raise InputError(path, f"is compressed ({compressed!s:.60})", "export it uncompressed, or as SPZ")
     for key, expected in (("colorSpace", _SPACE), ("kernel", "ellipse")):
         if extension.get(key) != expected:
             problem = f"its {key} is {extension.get(key)!r:.60}, not {expected}"

@@ -17,6 +17,15 @@ def nerfstudio(folder, world_to_camera):
     return load_cameras(folder / "camera_path.json")[0][1]
 
 
+@pytest.mark.parametrize("kind", ["fisheye", "equirectangular"])
+def test_nerfstudio_paths_of_other_projections_are_refused(tmp_path, kind):
+    nerfstudio(tmp_path, POSE)
+    values = json.loads((tmp_path / "camera_path.json").read_text())
+    (tmp_path / "camera_path.json").write_text(json.dumps(values | {"camera_type": kind}))
+    with pytest.raises(InputError, match=f"camera 0 has camera_type '{kind}'; use perspective cameras"):
+        load_cameras(tmp_path / "camera_path.json")
+
+
 def test_nerfstudio_paths_come_back_from_the_dataparsers_space(tmp_path, logged):
     np.testing.assert_allclose(nerfstudio(tmp_path, POSE).world_to_camera, POSE, atol=1e-9)
     assert "no dataparser_transforms.json beside it" in logged[0]

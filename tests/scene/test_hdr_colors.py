@@ -138,6 +138,16 @@ def test_primaries_of_radiance(tmp_path):
         read_hdr(radiance(tmp_path / "e.hdr", b"FORMAT=32-bit_rle_rgbe\nPRIMARIES=1 2 x"))
 
 
+def test_exposures_and_color_corrections_of_radiance(tmp_path):
+    plain = read_hdr(radiance(tmp_path / "a.hdr", b"FORMAT=32-bit_rle_rgbe"))
+    changed = b"EXPOSURE=2\nCOLORCORR=1 0.5 4\nEXPOSURE= 1e1\nCOLORCORR= 2 2 2\nFORMAT=32-bit_rle_rgbe"
+    read = read_hdr(radiance(tmp_path / "b.hdr", changed))
+    np.testing.assert_allclose(read, plain / (np.array([1, 0.5, 4]) * 40), rtol=1e-6)
+    for header in (b"EXPOSURE=0", b"COLORCORR=1 2", b"COLORCORR=1 -1 1", b"EXPOSURE=nan"):
+        with pytest.raises(InputError, match="EXPOSURE or COLORCORR are not positive numbers"):
+            read_hdr(radiance(tmp_path / "c.hdr", header))
+
+
 def float_set(folder, light, times, stated=True):
     write_blender(folder, 6, size=(40, 30))
     values = json.loads((folder / "transforms.json").read_text())

@@ -114,6 +114,16 @@ def test_a_model_without_its_photos_is_named(tmp_path):
         load(tmp_path / "sparse" / "0")
 
 
+def test_photos_of_a_kind_that_is_not_read_are_named_beside_a_model(tmp_path):
+    write_colmap(tmp_path)
+    for photo in (tmp_path / "images").iterdir():
+        photo.rename(photo.with_suffix(".jxl"))
+    with pytest.raises(
+        InputError, match=r"none .* is here .*; files of kinds that are not read: 6 JXL \(000.jxl ...\)"
+    ):
+        load(tmp_path)
+
+
 @pytest.mark.parametrize("file", ["points3D.txt", "points3D.bin", "points3D.ply"])
 def test_an_empty_file_of_points_has_none(tmp_path, file):
     """COLMAP asks for one where poses are known and points are not."""

@@ -198,6 +198,17 @@ def test_poses_that_are_no_rotations_are_refused(tmp_path, sides, problem):
         load(tmp_path)
 
 
+def test_transposed_poses_are_refused(tmp_path):
+    """ARKit and USD keep matrices by columns: all photos would be at one place."""
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in values["frames"]:
+        frame["transform_matrix"] = np.array(frame["transform_matrix"]).T.tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match=r"r_0' has the last row \[.*, 1.0\], not 0 0 0 1; transpose the matrix"):
+        load(tmp_path)
+
+
 def test_text_models_as_other_tools_write_them(tmp_path):
     """Names with spaces and brackets, CRLF, a byte order mark, and exponents of three digits."""
     write_colmap(tmp_path, name="A DJI [1] ({:03d}).png")

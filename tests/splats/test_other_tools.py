@@ -152,6 +152,18 @@ def rewrite(path, change):
     return path
 
 
+def test_compressed_primitives_are_named(tmp_path):
+    write_gaussians(tmp_path / "a.glb", arrays())
+
+    def compress(described):
+        extension = described["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+        extension["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
+
+    problem = "is compressed .KHR_gaussian_splatting_compression_spz_2.; export it uncompressed, or as SPZ"
+    with pytest.raises(InputError, match=problem):
+        read_gaussians(rewrite(tmp_path / "a.glb", compress))
+
+
 def test_identity_nodes_cameras_and_lights_do_not_matter(tmp_path):
     write_gaussians(tmp_path / "a.glb", arrays())
     expected = read_gaussians(tmp_path / "a.glb")
