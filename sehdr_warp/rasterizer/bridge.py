@@ -192,6 +192,7 @@ def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(body)
     def operation(*tensors: Tensor, **options: Any) -> Any:
         _check_tensors(body, tensors)
+        tensors = tuple(tensor.resolve_neg() for tensor in tensors)
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
             return _ProgramFunction.apply(body, options, *tensors)
         return body(Program(tensors, False), *tensors, **options)

@@ -46,8 +46,11 @@ def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:
 
 
 def kernel_layout(gradient: Tensor | None) -> Tensor | None:
-    """Return a gradient with strides that kernels read: rows at any distance, but each vector contiguous."""
-    if gradient is None or gradient.ndim < 2 or gradient.is_contiguous():
+    """Return a gradient as kernels read it: rows at any distance, but each vector contiguous, and no negated view."""
+    if gradient is None:
+        return None
+    gradient = gradient.resolve_neg()  # The imaginary part of a conjugate, as in losses of Fourier transforms.
+    if gradient.ndim < 2 or gradient.is_contiguous():
         return gradient
     if gradient.stride(1) == 1 if gradient.ndim == 2 else gradient[0].is_contiguous():
         return gradient

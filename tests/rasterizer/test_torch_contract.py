@@ -193,6 +193,21 @@ def test_inputs_that_are_not_contiguous_or_expanded_give_the_same(device):
     assert strided[0].grad is not None
 
 
+def test_imaginary_parts_of_conjugates_are_negated(device):
+    """Torch leaves such a view's numbers in memory as they were."""
+    values = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64, device=device)
+    view = torch.complex(values, values).conj().imag
+    torch.testing.assert_close(cube(view), -(values**3))
+    leaves = splats(device)
+    for result_of in (lambda: cube(leaves[3]), lambda: rasterize(*leaves, *SIZE).depths):
+        result = result_of()
+        expected = torch.autograd.grad(-result.sum(), leaves, retain_graph=True, allow_unused=True)
+        z = torch.complex(torch.zeros_like(result), result)
+        actual = torch.autograd.grad(z.conj().imag.sum(), leaves, allow_unused=True)
+        for mine, true in zip(actual, expected, strict=True):
+            assert (mine is None) == (true is None) and (mine is None or torch.equal(mine, true))
+
+
 def test_results_can_be_copied_and_operations_pickled():
     with torch.no_grad():
         rendering = rasterize(*splats(), WIDTH, HEIGHT)
