@@ -1,8 +1,10 @@
 """One render as a CUDA graph on memory of its own, and its backward passes."""
 
 import ctypes
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -27,11 +29,13 @@ from .warp_launch.launching import FixedLaunch, fixed_launch, warp_scalar, warp_
 
 MAX_COPIED_GAUSSIANS = MAX_SINGLE_SORT
 """More of them, without a backward pass, are read where they are, and the image is written where it stays."""
-SPINS = 200  # Looks at the number of intersections before other threads may run in between.
+SPINS = 200  # Looks at the number of intersections before other threads may run in between, and from query to query.
 HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
 MIN_INTERSECTIONS = 1 << 12
 FEATURES = 4
 """Index of features among a call's seven tensors, those that rasterize() takes first."""
+_let_others_run: Callable[[], object] = getattr(os, "sched_yield", partial(time.sleep, 0))
+"""Lets other threads run. On Linux time.sleep(0) takes 50 us, to which timers are rounded up."""
 
 
 class CapturedRender:
@@ -160,13 +164,12 @@ class CapturedRender:
 
     def count_intersections(self) -> int:
         """Wait for the last render's count; return it. Those beyond max_intersections were left out."""
-        count = self._count
-        for _ in range(SPINS):
-            if count.value >= 0:
-                return count.value
+        count, looks = self._count, 0
         while count.value < 0:
-            time.sleep(0)  # Lets other threads run.
-            if self._stream.query() and count.value < 0:
+            looks += 1
+            if looks > SPINS:
+                _let_others_run()
+            if looks % SPINS == 0 and self._stream.query() and count.value < 0:
                 raise RuntimeError("the GPU has not counted the intersections of a render")
         return count.value
 

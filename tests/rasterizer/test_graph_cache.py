@@ -1,5 +1,8 @@
 """Calls of rasterize() that are replayed: what they return is what launched calls do, and stays."""
 
+import ctypes
+import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -307,6 +310,25 @@ def test_sizes_that_equal_those_of_known_calls_are_checked_as_well():
         with pytest.raises(TypeError, match="expected a whole number"):
             rasterize(*tensors, *wrong)
     assert rasterize(*tensors, np.int64(width), height).image.shape[:2] == (height, width)
+
+
+def test_a_count_is_waited_for_while_other_threads_run_and_missed_if_the_gpu_is_idle():
+    graph = object.__new__(captured_render.CapturedRender)
+    graph._count, ended = ctypes.c_int64(-1), threading.Event()
+    graph._stream = SimpleNamespace(query=ended.is_set)
+
+    def count():
+        time.sleep(0.01)
+        graph._count.value = 7
+        ended.set()
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    assert graph.count_intersections() == 7
+    thread.join()
+    graph._count.value = -1
+    with pytest.raises(RuntimeError, match="has not counted"):
+        graph.count_intersections()
 
 
 def test_a_graph_whose_count_was_not_read_is_waited_for(monkeypatch):
