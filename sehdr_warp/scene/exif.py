@@ -22,6 +22,7 @@ _F_NUMBER, _APERTURE_APEX = 33437, 37378
 _ISO_TAGS = (34855, 34866, 34867, 34865)
 """PhotographicSensitivity, and what holds the ISO speed above its 16 bits: RecommendedExposureIndex, ISOSpeed,
 StandardOutputSensitivity (EXIF 2.3)."""
+_FLASH = 37385  # Its lowest bit: the flash fired
 _LARGEST_SHORT = 65535
 _IN_XMP = {
     _EXPOSURE_TIME: "exif:ExposureTime", _SHUTTER_APEX: "exif:ShutterSpeedValue", _F_NUMBER: "exif:FNumber",
@@ -37,11 +38,13 @@ class ExifExposure(NamedTuple):
         time: seconds.
         iso: ISO speed.
         f_number: focal length over aperture.
+        flash: it fired.
     """
 
     time: float | None = None
     iso: float | None = None
     f_number: float | None = None
+    flash: bool = False
 
 
 def exif_exposure(path: Path) -> ExifExposure:
@@ -65,6 +68,7 @@ def exif_exposure(path: Path) -> ExifExposure:
             tables = first.get_ifd(_EXIF_IFD), first, _xmp_table(image)
             numbers = {tag: _of_tag(tables, tag) for tag in (_EXPOSURE_TIME, _SHUTTER_APEX, _F_NUMBER, _APERTURE_APEX)}
             speeds = [_of_tag(tables, tag) for tag in _ISO_TAGS]
+            flash = bool(int(_of_tag(tables, _FLASH) or 0) & 1)
     except PILLOW_ERRORS:
         return ExifExposure()
     time = _within(numbers[_EXPOSURE_TIME], SHORTEST, _LONGEST_EXPOSURE)
@@ -75,7 +79,7 @@ def exif_exposure(path: Path) -> ExifExposure:
         f_number = 2.0 ** (apex / 2)
     speeds[0] = None if speeds[0] == _LARGEST_SHORT else speeds[0]
     iso = next((speed for speed in speeds if _within(speed, 1e-3, 1e9) is not None), None)
-    return ExifExposure(time, iso, f_number)
+    return ExifExposure(time, iso, f_number, flash)
 
 
 @lru_cache(maxsize=4096)

@@ -245,4 +245,7 @@ def _exif_times(records: list[ImageRecord]) -> tuple[list[float | None], list[st
             ]
             span = f"{min(values):g} to {max(values):g}"
             notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}")
+    if flashed := [record.image.name for record, e in zip(records, exposures, strict=True) if e.flash]:
+        count = f"{len(flashed)} of {len(records)} photos"
+        notes.append(f"the flash fired in {count}, so their light is not the scene's: {first_names(flashed)}")
     return [e.time and e.time * f for e, f in zip(exposures, factors, strict=True)], notes

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..errors import InputError
-from ..files import read_bytes, read_json, resolve_inside
+from ..files import has_file, read_bytes, read_json, read_lines, resolve_inside
 from ..subsets import first_names
 from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model
 from .copies import copies_note, find_copies
@@ -88,6 +88,7 @@ def read_colmap(folder: Path) -> DataparserOutputs:
     if images is None:
         raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
     records, absent, photo_names = [], [], []
+    held_out = _held_out_names(source)
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
         image = find_image(images, entry.name, source)
         photo_names += [] if image is None else [(entry.name, image)]
@@ -98,7 +99,8 @@ def read_colmap(folder: Path) -> DataparserOutputs:
             continue
         else:
             hdr = None
-        records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, hdr=hdr))
+        split = "test" if entry.name in held_out else "train" if held_out else None
+        records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, split=split, hdr=hdr))
     if not records:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         others = unread_kinds(images)
@@ -110,6 +112,12 @@ def read_colmap(folder: Path) -> DataparserOutputs:
     if absent:
         notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
     return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))
+
+
+def _held_out_names(source: Path) -> set[str]:
+    """Return the images that a list beside a model holds out, as 3DGS reads it; none without the list."""
+    listed = source / "test.txt"
+    return {line.strip() for line in read_lines(listed, "surrogateescape")} - {""} if has_file(listed) else set()
 
 
 def _images_of_model(source: Path, names: Sequence[str], folder: Path) -> Path | None:

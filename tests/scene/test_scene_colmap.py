@@ -114,6 +114,14 @@ def test_a_model_without_its_photos_is_named(tmp_path):
         load(tmp_path / "sparse" / "0")
 
 
+def test_a_list_beside_the_model_states_the_held_out_photos(tmp_path):
+    write_colmap(tmp_path)
+    (tmp_path / "sparse" / "0" / "test.txt").write_text("004.png\r\n001.png\r\n\r\n")
+    splits = {view.name: view.split for view in load(tmp_path).views}
+    assert [name for name, split in splits.items() if split == "test"] == ["001", "004"] and len(splits) == 6
+    assert {view.split for view in load(tmp_path, holdout=0).views} == {"train"}
+
+
 def test_photos_of_a_kind_that_is_not_read_are_named_beside_a_model(tmp_path):
     write_colmap(tmp_path)
     for photo in (tmp_path / "images").iterdir():
