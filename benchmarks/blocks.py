@@ -143,9 +143,9 @@ def run_study(study: Study) -> None:
     assert plan is not None
     fraction = sum(block.fraction for block in plan.blocks) / study.count
     plan = replace(plan, config=override_config(plan.config, {"schedule.iterations": round(study.steps * fraction)}))
-    _warm_up(study, plan, data, config)
     devices = study.devices
     at_once = min(AT_ONCE, len(devices))
+    _warm_up(study, plan, at_once)
     arguments = data, config.model_dump(), study.out / "whole", devices[-1].type
     whole = multiprocessing.get_context("spawn").Process(target=_train_whole, args=arguments, daemon=True)
 
@@ -214,13 +214,16 @@ def _config(study: Study) -> Config:
     return override_config(load_config("default", fields), {"plan.keep": sorted(fields)})
 
 
-def _warm_up(study: Study, plan: BlockPlan, data: LoadArguments, config: Config) -> None:
-    """Compile kernels before anything is timed, with a block's photos: few Gaussians take other kernels."""
-    scene = load_saved_scene({**data, "views": list(plan.blocks[0].views)}, response="srgb")
-    short = override_config(config, {"schedule.iterations": WARM_UP})
-    create_trainer(scene, study.out / "warm", short, device=study.device, overwrite=True).train()
-    if study.device.type == "cuda":
-        torch.cuda.empty_cache()
+def _warm_up(study: Study, plan: BlockPlan, at_once: int) -> None:
+    """Train two blocks for a moment as they are trained later, so that no timed job is the first to do something.
+
+    Kernels are then compiled, and files read that processes start from.
+    """
+    short = override_config(plan.config, {"schedule.iterations": WARM_UP})
+    plan, out = replace(plan, config=short, blocks=plan.blocks[:AT_ONCE]), study.out / "warm"
+    out.mkdir(exist_ok=True)
+    plan.write(out)
+    run_blocks(out, plan, device=study.device, gpus=at_once)
 
 
 @contextmanager
