@@ -38,6 +38,7 @@ _log = logging.getLogger("sehdr_warp.scene")
 MOST_STOPS_IN_CODES = 4.0  # Above white; of more, 16 bits would keep less of the dark than 8 bits of a photo
 DEVIATION = 0.05
 """Standard deviation of the logarithm of decoded light: 8 bits of map and photo, and a map of fewer pixels."""
+_SHAPE = 0.02  # Part by which the aspect of a map may differ from its photo's
 _HEAD_BYTES = 1 << 18  # In which a file names a second picture: behind EXIF and a profile
 _ISO_JPEG = b"urn:iso:std:iso:ts:21496:-1\0"
 _HDRGM = "http://ns.adobe.com/hdr-gain-map/1.0/"
@@ -194,7 +195,8 @@ def _of_jpeg(path: Path) -> GainMap | None:
                 continue
             profile = second.info.get("icc_profile")
             alternate = encoding_of_profile(bytes(profile)) if profile else None
-            return _gain_map_of(make, _pixels(second, photo), _primaries_matrix(own, alternate))
+            pixels = _of_shape(_pixels(second, photo), photo)
+            return _gain_map_of(make, pixels, _primaries_matrix(own, alternate))
     return None
 
 
@@ -269,6 +271,14 @@ def _item_pixels(path: Path, items: HeifItems, number: int, photo: tuple[int, in
     own = {name for name, _ in items.items[number].properties}
     if heif and "irot" in turned and "irot" not in own:
         pixels = np.rot90(pixels, turned["irot"][-1] & 3)
+    return _of_shape(pixels, photo)
+
+
+def _of_shape(pixels: np.ndarray, photo: tuple[int, int]) -> np.ndarray:
+    """Return the pixels of a gain map; raise ValueError for another shape than its photo's, as of one cropped later."""
+    height, width = pixels.shape[:2]
+    if abs(width * photo[1] / (height * photo[0]) - 1) > _SHAPE + 1 / width + 1 / height:
+        raise ValueError(f"it has {width} x {height} pixels, which is not the shape of {photo[0]} x {photo[1]}")
     return pixels
 
 

@@ -290,6 +290,18 @@ def write_set(folder, count=4):
     return light
 
 
+@pytest.mark.parametrize(
+    "edit", [lambda photo: photo[:64], lambda photo: np.rot90(photo).copy()], ids=["cut", "turned"]
+)
+def test_a_map_of_another_shape_than_its_photo_is_named(tmp_path, caplog, edit):
+    """Programs that know nothing of gain maps crop or turn the photo, and keep the second picture as it was."""
+    _, base, gain = pair()
+    write_jpeg_pair(tmp_path / "a.jpg", edit(base), gain, [hdrgm()])
+    assert not has_gain_map(tmp_path / "a.jpg")
+    read_gain_map(tmp_path / "a.jpg")
+    assert "it has 64 x 48 pixels, which is not the shape of" in caplog.text
+
+
 def test_a_set_with_gain_maps_has_their_light(tmp_path):
     light = write_set(tmp_path)
     scene = load_scene(tmp_path)
