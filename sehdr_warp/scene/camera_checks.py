@@ -13,6 +13,7 @@ _FAR = 20.0  # Times the usual distance between cameras: to 19 a training loses 
 _USUAL = 75  # Percentile of the cameras' distances from their middle
 _NEAR_POINTS = 0.1  # Part of the points' distance that counts as usual, where cameras stand at one place
 _OFF_CENTER = 0.25  # Part of a photo's size by which its principal point may lie beside the middle
+_ONE_PLACE = 1e-9  # Part of their coordinates by which cameras at one place may differ
 _MOST_POINTS, _MOST_CAMERAS = 2000, 64  # That are looked at
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # Between the axes of OpenGL (y up, z back) and OpenCV (y down, z ahead)
 
@@ -31,7 +32,17 @@ def check_cameras(records: Sequence[ImageRecord], cloud: PointCloud) -> CheckedC
     unit, and training would fail.
     """
     near, notes = _without_far_cameras(records, cloud)
-    return CheckedCameras(near, [*notes, *_off_center(near), *_wrong_way(near, cloud)])
+    return CheckedCameras(near, [*notes, *_at_one_place(near), *_off_center(near), *_wrong_way(near, cloud)])
+
+
+def _at_one_place(records: Sequence[ImageRecord]) -> list[str]:
+    """Return a note if all cameras have one position: their photos show no depth, or an export lost the positions."""
+    positions = np.stack([_position(record) for record in records])
+    if len(records) < 2 or np.ptp(positions, axis=0).max() > _ONE_PLACE * max(1.0, float(np.abs(positions).max())):
+        return []
+    place = ", ".join(f"{value:.4g}" for value in positions[0])
+    remedy = "check that the poses have positions, and are not inverted"
+    return [f"all {len(records)} cameras are at one place ({place}), and show no depth: {remedy}"]
 
 
 def _without_far_cameras(records: Sequence[ImageRecord], cloud: PointCloud) -> tuple[list[ImageRecord], list[str]]:

@@ -35,10 +35,23 @@ def test_cameras_on_a_tripod_beside_others_stay(tmp_path):
     assert len(checked.records) == 9 and not checked.notes
 
 
+@pytest.mark.parametrize("place", [0.0, 4.5e6])
+def test_cameras_that_all_stand_at_one_place_are_named(tmp_path, place):
+    """An export lost the positions, or the camera only turned."""
+    poses = [look_at((place, 0.0, 0.0), (place + np.sin(a), np.cos(a), 0.0)) for a in np.linspace(0, 3, 6)]
+    (note,) = check_cameras(records(tmp_path, poses), NO_POINTS).notes
+    assert note.startswith(
+        f"all 6 cameras are at one place ({place:.4g}, 0, 0), and show no depth: check that the poses"
+    )
+    poses[3:] = [look_at((place + 0.1, 0.0, 0.0), (place, 1.0, 0.0))] * 3
+    assert not check_cameras(records(tmp_path, poses), NO_POINTS).notes
+
+
 def test_poses_of_another_convention_are_named(tmp_path):
     poses, flip = arc_poses(8), np.diag([1.0, -1.0, -1.0, 1.0])
     assert not check_cameras(records(tmp_path, poses), CLOUD).notes
-    (inverted,) = check_cameras(records(tmp_path, [np.linalg.inv(pose) for pose in poses]), CLOUD).notes
+    one_place, inverted = check_cameras(records(tmp_path, [np.linalg.inv(pose) for pose in poses]), CLOUD).notes
+    assert "all 8 cameras are at one place" in one_place  # Cameras that look at the origin, read as if inverted
     assert "show 0 %" in inverted and "are read inverted" in inverted
     (turned,) = check_cameras(records(tmp_path, [flip @ pose for pose in poses]), CLOUD).notes
     assert "show 0 %" in turned and "in other axes" in turned
