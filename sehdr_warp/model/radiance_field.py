@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_harmonics
 from ..rasterizer.activations import opacity_penalty
-from ..rasterizer.graph_cache import without_replays
+from ..rasterizer.cuda_graphs import without_replays
 from ..response import Response
 from ..scene import Camera
 from ..scene.normalization import Normalization
@@ -333,7 +333,9 @@ class RadianceField(nn.Module):
         gaussians = self.gaussians
         shapes = gaussians.means, gaussians.log_scales, gaussians.quaternions
         if opacities is None:
-            shapes, opacities = [tensor.detach() for tensor in shapes], gaussians.opacities().detach()
+            means, log_scales, quaternions = shapes
+            shapes = means.detach(), log_scales.detach(), quaternions.detach()
+            opacities = gaussians.opacities().detach()
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities)
         return self.rasterizer(
@@ -353,7 +355,7 @@ class RadianceField(nn.Module):
         self,
         camera: CameraTensors,
         directions: Tensor,
-        shapes: Sequence[Tensor],
+        shapes: tuple[Tensor, Tensor, Tensor],
         features: Tensor,
         opacities: Tensor,
     ) -> Rendering:

@@ -9,6 +9,7 @@ import threading
 import weakref
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from typing import Any, TypeVar
 
 import torch
@@ -52,6 +53,24 @@ def _one_thread():
 def is_capturing(device: torch.device) -> bool:
     """Return whether launches on a device are being captured in a CUDA graph instead of run."""
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
+_replays_are_off: ContextVar[bool] = ContextVar("replays_are_off", default=False)
+
+
+@contextmanager
+def without_replays() -> Iterator[None]:
+    """Launch this thread's renders within the block; graph_cache.py else gives them graphs of 0.4 kB for a Gaussian."""
+    token = _replays_are_off.set(True)
+    try:
+        yield
+    finally:
+        _replays_are_off.reset(token)
+
+
+def replays_are_off() -> bool:
+    """Return whether this is within without_replays()."""
+    return _replays_are_off.get()
 
 
 _idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}
@@ -102,7 +121,7 @@ class CudaGraphRunner:
 
     @contextmanager
     def on_capture_stream(self) -> Iterator[None]:
-        """Launch on the capture stream within the block, as work must that is captured later.
+        """Launch on the capture stream within the block, without replays, as work must that is captured later.
 
         Torch keeps the stream on which a parameter's gradient was first summed for as long as any graph of it lives,
         and a capture that meets another stream than its own is invalid.
@@ -110,7 +129,7 @@ class CudaGraphRunner:
         current = torch.cuda.current_stream(self.device)
         self.stream.wait_stream(current)
         try:
-            with torch.cuda.stream(self.stream), _one_thread():
+            with torch.cuda.stream(self.stream), _one_thread(), without_replays():
                 yield
         finally:
             current.wait_stream(self.stream)

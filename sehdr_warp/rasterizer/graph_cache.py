@@ -11,9 +11,7 @@ graph (training/step_graphs.py); within it, and with max_intersections, calls ar
 import atexit
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, NamedTuple
@@ -24,7 +22,7 @@ from torch import Tensor
 from .blending import BlendResult
 from .captured_backward import GradientMemory
 from .captured_render import CapturedRender
-from .cuda_graphs import is_capturing
+from .cuda_graphs import is_capturing, replays_are_off
 from .projection import Gradients, with_projection_gradient
 from .render_options import RenderOptions
 from .tile_lists import MAX_SINGLE_SORT
@@ -38,18 +36,6 @@ MAX_GRAPHS = 4  # CUDA graphs of a size: each holds a render until its backward 
 MAX_LARGE_GRAPHS = 1  # The same with more than MAX_SINGLE_SORT Gaussians, whose memory is hundreds of megabytes.
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
 MAX_GAUSSIANS = 1 << 21
-
-_launches: ContextVar[bool] = ContextVar("launches", default=False)
-
-
-@contextmanager
-def without_replays() -> Iterator[None]:
-    """Launch the renders of this thread within the block: no CUDA graph takes memory, 0.4 kB for each Gaussian."""
-    token = _launches.set(True)
-    try:
-        yield
-    finally:
-        _launches.reset(token)
 
 
 class _Signature(NamedTuple):
@@ -75,7 +61,7 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
         pool = _pools.get(_signature(tensors, options))
     except (AttributeError, TypeError, RuntimeError):
         return None
-    if pool is None or _launches.get() or is_capturing(tensors[0].device):
+    if pool is None or replays_are_off() or is_capturing(tensors[0].device):
         return None
     pool.last_use = next(_uses)
     return pool
@@ -91,7 +77,7 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     first = tensors[0]
     if not on_gpu(first) or first.dtype != torch.float32:
         return None
-    if options.max_intersections is not None or options.deterministic or _launches.get():
+    if options.max_intersections is not None or options.deterministic or replays_are_off():
         return None
     signature = _signature(tensors, options)
     fits = 0 < len(first) <= MAX_GAUSSIANS and options.width * options.height <= MAX_PIXELS

@@ -1,5 +1,8 @@
 """Torch operations and Warp launches in one CUDA graph."""
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -29,6 +32,17 @@ def test_no_two_recorders_alive_record_on_one_stream(monkeypatch):
     del first
     assert cuda_graphs._own_stream(third, device) == streams[0]
     assert cuda_graphs._own_stream(Owner(), device) == (device, 2), "taken anew, as both others are in use"
+
+
+def test_work_on_a_capture_stream_is_launched(monkeypatch):
+    stream = SimpleNamespace(wait_stream=lambda other: None)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
+    monkeypatch.setattr(torch.cuda, "stream", nullcontext)
+    runner = object.__new__(CudaGraphRunner)
+    runner.device, runner.stream = torch.device("cuda:0"), stream
+    with runner.on_capture_stream():
+        assert cuda_graphs.replays_are_off()
+    assert not cuda_graphs.replays_are_off()
 
 
 @needs_gpu
