@@ -4,6 +4,7 @@ Scales are linear, opacities in [0, 1], rotations (x y z w); COLOR_0 is what vie
 """
 
 import json
+import logging
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..errors import InputError
 from ..files import atomic_path, read_bytes
 from .arrays import HARMONIC_0, GaussianArrays, degree_of, join_gaussians, read_matrix
 
+log = logging.getLogger(__name__)
 EXTENSION = "KHR_gaussian_splatting"
 _SPACE = "srgb_rec709_display"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
@@ -118,9 +120,12 @@ def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path
     degree = degree_of(sum(1 for _ in names), path)
     opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
     extras = mesh.get("extras", {})
+    scales = values(f"{EXTENSION}:SCALE", 3)
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_scales = np.log(values(f"{EXTENSION}:SCALE", 3))
+        log_scales = scales if (are_logarithms := bool((scales < 0).any())) else np.log(scales)
         logits = np.log(opacities) - np.log1p(-opacities)
+    if are_logarithms:
+        log.warning("%s: its SCALE has negative numbers and is read as logarithms, as SplatTransform wrote it", path)
     return GaussianArrays(
         means=values("POSITION", 3),
         log_scales=log_scales,

@@ -37,6 +37,7 @@ _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
 _GROUPS = ("x y z", "scale_0 scale_1 scale_2", "rot_0 rot_1 rot_2 rot_3", "opacity", "f_dc_0 f_dc_1 f_dc_2")
 _RGB = ("red", "green", "blue")
+_FEWEST_JUDGED = 100  # Gaussians of a file whose values are judged together
 _MOST_HEADER = 1 << 16
 _MEMORY_PER_BYTE = 2.5
 """Bytes of memory for each byte of a file: its columns as arrays, once by property and once by Gaussian, and checks."""
@@ -114,6 +115,7 @@ def read_ply(path: Path) -> GaussianArrays:
     means, log_scales, quaternions, opacity, constant, higher, smoothing = columns
     if flat:
         log.info("%s: its Gaussians have two sizes (2D Gaussian Splatting), and are read as flat ones", path)
+    _warn_of_activated(path, log_scales, opacity)
     if smoothing.size:
         log_scales, opacity = _smooth(log_scales, opacity, smoothing)
         log.info("%s: its 3D smoothing filter (filter_3D) is fused into sizes and opacities", path)
@@ -143,6 +145,18 @@ def _read(path: Path):
     data = bytearray(path.read_bytes())
     data[: len(head)] = bytes(byte if byte < 128 else ord("?") for byte in head)
     return PlyData.read(io.BytesIO(data))
+
+
+def _warn_of_activated(path: Path, log_scales: np.ndarray, logits: np.ndarray) -> None:
+    """Warn if a program stored sizes [N, 2 or 3] or opacities [N, 1] themselves, not logarithms and logits."""
+    if len(logits) < _FEWEST_JUDGED:
+        return
+    if logits.min() >= 0 and logits.max() <= 1:
+        log.warning(
+            "%s: all opacities lie between 0 and 1: if they are not logits, the scene is half transparent", path
+        )
+    if log_scales[:, :2].min() > 0:
+        log.warning("%s: all sizes are above 1 unit: if they are not logarithms, its Gaussians are far too large", path)
 
 
 def _smooth(log_scales: np.ndarray, logits: np.ndarray, smoothing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

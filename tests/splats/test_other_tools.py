@@ -152,6 +152,31 @@ def rewrite(path, change):
     return path
 
 
+def test_logarithms_in_gltf_are_read_as_such(tmp_path, caplog):
+    """SplatTransform wrote them until June 2026 (its pull request 268); the extension forbids negative sizes."""
+    write_gaussians(tmp_path / "a.glb", arrays())
+    before = read_gaussians(tmp_path / "a.glb")
+    data = (tmp_path / "a.glb").read_bytes()
+    linear, stored = np.exp(before.log_scales).astype("<f4"), before.log_scales.astype("<f4")
+    assert stored.min() < 0
+    (tmp_path / "b.glb").write_bytes(data.replace(linear.tobytes(), stored.tobytes()))
+    np.testing.assert_array_equal(read_gaussians(tmp_path / "b.glb").log_scales, stored)
+    assert "b.glb: its SCALE has negative numbers and is read as logarithms" in caplog.text
+
+
+def test_opacities_and_sizes_in_place_of_logits_and_logarithms_are_named(tmp_path, caplog):
+    """pixelSplat issue 115, GPS-Gaussian issue 46, mesh2splat pull request 21."""
+    splats = arrays(100)
+    write_gaussians(tmp_path / "right.ply", splats)
+    write_gaussians(tmp_path / "opacity.ply", replace(splats, opacity_logits=splats.opacities))
+    write_gaussians(tmp_path / "size.ply", replace(splats, log_scales=np.exp(splats.log_scales)))
+    for name in ("right.ply", "opacity.ply", "size.ply"):
+        read_gaussians(tmp_path / name)
+    assert "opacity.ply: all opacities lie between 0 and 1: if they are not logits" in caplog.text
+    assert "size.ply: all sizes are above 1 unit: if they are not logarithms" in caplog.text
+    assert len(caplog.records) == 2
+
+
 def test_compressed_primitives_are_named(tmp_path):
     write_gaussians(tmp_path / "a.glb", arrays())
 
