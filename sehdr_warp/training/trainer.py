@@ -118,7 +118,9 @@ class Trainer:
         self.order = PhotoOrder(len(views), config.seed, self.rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self.can_seed = not has_wide_views(normalized, config)  # Seeding samples pixels of pinhole photos.
-        self._get_matcher = get_matcher or cache(partial(make_matcher, normalized, field.response, self.device))
+        self._get_matcher: Callable[[], Matcher] | None = get_matcher or cache(
+            partial(make_matcher, normalized, field.response, self.device)
+        )
 
         self._result: StepResult | None = None
         self._view_index = 0
@@ -248,6 +250,8 @@ class Trainer:
         # Densification.
         self.strategy.inject_noise(self.iteration, gaussians, means_lr)
         self._densify()
+        if self.strategy.schedule.is_over(self.iteration):
+            self._get_matcher = None  # Its copies of the photos take memory on the device.
         # Moving average.
         self.average.update(self.iteration, self.step_batch, gaussians)
         if self.came_to(CHECK_EVERY):
@@ -279,7 +283,7 @@ class Trainer:
         """Propose new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
         random_seed = self.config.seed * SEED_STRIDE + self.iteration
         view, result = self.views.source(self.iteration)[self._view_index], self._result
-        assert result is not None
+        assert result is not None and self._get_matcher is not None
         with self.graphs.on_capture_stream():
             image = result.image
             rendered = image if self.gradient_step.needs_encoded else self.field.response.encode_extended(image)

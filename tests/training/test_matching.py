@@ -1,6 +1,8 @@
 """Points matched between photos lie on what the photos show, and errors are where Gaussians are born."""
 
+import gc
 import math
+import weakref
 from dataclasses import replace
 from functools import partial
 
@@ -16,7 +18,7 @@ from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
 from sehdr_warp.training.matching import seed_gaussians
 from sehdr_warp.training.targets import PhotoSource
-from sehdr_warp.training.train import train
+from sehdr_warp.training.train import create_trainer, train
 
 from .wall_and_lamp import LAMP, WALL, wall_and_lamp
 
@@ -91,6 +93,17 @@ def test_start_points_are_the_scenes_and_matched_ones():
     assert len(start_points(inputs, none, never, np.random.default_rng(0))[0]) == 300
     # Without any, they are drawn where cameras look.
     assert len(start_points(scene, none, never, np.random.default_rng(0))[0]) == 5000
+
+
+def test_a_training_frees_the_matcher_after_the_last_refinement(tmp_path):
+    fields = {"schedule.iterations": 90, "plan.enabled": False}
+    trainer = create_trainer(wall_and_lamp(), tmp_path / "run", load_config("default", fields), device="cpu")
+    matcher, alive = weakref.ref(trainer._get_matcher()), []
+    for step in trainer:
+        gc.collect()
+        alive.append(matcher() is not None)
+        assert alive[-1] != trainer.strategy.schedule.is_over(step.iteration)
+    assert alive[0] and not alive[-1]
 
 
 def test_gaussians_are_born_where_the_photos_are_not_explained(device):
