@@ -19,6 +19,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import atomic_path, plain_size
 from ..limits import available_memory
+from ..subsets import first_names
 from .arrays import (
     HARMONIC_0,
     LONGEST_TIME,
@@ -71,7 +72,7 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
 
 
 def read_ply(path: Path) -> GaussianArrays:
-    """Read a file of the reference release, gsplat, nerfstudio or this package; other properties are ignored.
+    """Read a file of the reference release, gsplat, nerfstudio or this package; a warning names other properties.
 
     Compressed PLY is recognized by its properties, whatever the file's name.
     """
@@ -101,6 +102,9 @@ def read_ply(path: Path) -> GaussianArrays:
         rest = sorted((n for n in names if re.fullmatch(r"f_rest_\d{1,4}", n)), key=lambda name: int(name[7:]))
         degree_of(1 + len(rest) / 3, path)
         filtered = ["filter_3D"] if "filter_3D" in names else []
+        read_or_idle = {*" ".join(_GROUPS).split(), *rest, *filtered, *_RGB, "alpha", "nx", "ny", "nz"}
+        if unread := [each.name for each in vertex.properties if each.name not in read_or_idle]:
+            log.warning("%s: is read as 3D Gaussians, without its further properties %s", path, first_names(unread, 6))
         groups = (*(group.split() for group in _GROUPS), rest, filtered)
         stored = [[np.asarray(vertex[name], np.float32) for name in group if name in names] for group in groups]
         columns = [np.stack(group, axis=1) if group else np.zeros(0, np.float32) for group in stored]

@@ -52,6 +52,14 @@ def test_the_smoothing_filter_is_fused(tmp_path):
     np.testing.assert_allclose(np.exp(plain.log_scales), [sizes] * 3, rtol=1e-5)
 
 
+def test_properties_of_other_models_are_named(tmp_path, caplog):
+    """Spacetime Gaussians move, Beta Splatting has another kernel: as 3D Gaussians they look otherwise."""
+    read_gaussians(write_ply(tmp_path / "plain.ply", red=1, alpha=1))
+    assert not caplog.records
+    assert read_gaussians(write_ply(tmp_path / "a.ply", trbf_center=0.5, motion_0=1)).count == 3
+    assert "a.ply: is read as 3D Gaussians, without its further properties trbf_center, motion_0" in caplog.text
+
+
 def test_the_mark_of_opacity_compensation_is_kept_and_warned_of(tmp_path, caplog):
     comments = ["Exported from Brush", "SplatRenderMode: mip"]
     read = read_gaussians(write_ply(tmp_path / "a.ply", comments))
