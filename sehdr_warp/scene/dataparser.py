@@ -156,13 +156,13 @@ def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
     The matrix is 3 x 4 or 4 x 4; errors name the file `source` and the image `name`.
 
     Raises:
-        InputError: for another shape, values that are not finite, a last row other than 0 0 0 1, scale (beyond 1e-3),
+        InputError: for another shape, values that are not finite, a position in the last row, scale (beyond 1e-3),
             shear or reflection.
     """
     remedy = "export the poses again without scale"
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise InputError(source, f"pose of {name!r:.90} is not a finite 4 x 4 matrix", remedy)
-    if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-3:
+    if len(matrix) == 4 and np.abs(matrix[3, :3]).max() > 1e-3:
         problem = f"pose of {name!r:.90} has the last row {matrix[3].tolist()}, not 0 0 0 1"
         raise InputError(source, problem, "transpose the matrix if it states the position there")
     u, stretch, vt = np.linalg.svd(matrix[:3, :3])
