@@ -1,7 +1,10 @@
 """Small real scenes for tests, written with the formats' own libraries."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -16,6 +19,14 @@ from sehdr_warp.synth.expose import RadianceView, write_hdr_nerf_scene
 def load(path, response="srgb", **options) -> Scene:
     """load_scene by a response that need not be chosen, which takes seconds."""
     return load_scene(path, response=response, **options)
+
+
+@contextmanager
+def edited_json(path: Path) -> Iterator[Any]:
+    """The values of a JSON file, which are written back as they are at the end of the block."""
+    values = json.loads(path.read_text())
+    yield values
+    path.write_text(json.dumps(values))
 
 
 def arc_poses(count: int) -> list[np.ndarray]:

@@ -45,17 +45,6 @@ def test_version_and_help(capsys, monkeypatch):
         assert len(text.splitlines()) <= 48 and all(len(line) <= 80 for line in text.splitlines())
 
 
-def test_the_help_of_train_fits_two_screens(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    assert call("train", "--help") == 0
-    text = capsys.readouterr().out
-    assert len(text.splitlines()) <= 50
-    for group in ("scene", "training", "output", "machine"):
-        assert f" {group} options " in text
-    assert "None" not in text and "default: False" not in text and "--loss.clipping" not in text
-    assert text.splitlines()[-1].startswith("sehdr-warp train --help-all")
-
-
 def test_every_field_of_the_config_is_a_flag_with_help(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     assert call("train", "--help-all") == 0

@@ -68,14 +68,6 @@ def test_quiet_is_quiet(monkeypatch):
     assert printed(monkeypatch, Terminal(), level="warning") == "" and Step.read == 0
 
 
-def test_reports_that_cost_more_come_less_often(monkeypatch):
-    now = iter(range(10_000))
-    monkeypatch.setattr(console.time, "monotonic", lambda: next(now))
-    printed(monkeypatch, Terminal())
-    # A second each time the clock is asked: a report costs one, and waits for the ten of the longest pause.
-    assert 20 < Step.read < 40
-
-
 def test_debug_names_the_logger(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr("sys.stderr", stream)

@@ -203,15 +203,6 @@ def test_little_address_space_is_one_line_whatever_finds_none(tmp_path, mebibyte
     assert "ulimit -v" in ended.stderr and ended.stderr.count("\n") == 1 and list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("columns", [1, 5])
-def test_narrow_terminals_get_help(columns):
-    call = [sys.executable, "-m", "sehdr_warp", "train", "--help"]
-    ended = subprocess.run(
-        call, env=os.environ | {"COLUMNS": str(columns)}, capture_output=True, timeout=60, check=False
-    )
-    assert ended.returncode == 0 and b"--iterations" in ended.stdout
-
-
 def test_names_are_utf8_in_any_locale(tmp_path):
     """As the locale C has it where Python is told to believe that."""
     environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}

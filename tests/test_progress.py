@@ -33,13 +33,6 @@ def test_the_start_of_the_training_is_estimated(clock):
         assert features.line() == "finding features: 10 of 20, 0:30 left; training starts in about 2:00"
 
 
-def test_an_unknown_total_promises_nothing(clock, logged):
-    with progress.stage("looking at frames", 0, LOG) as frames:
-        clock[0] = 11.0
-        frames.update(300)
-    assert logged == ["looking at frames", "looking at frames: 300"]
-
-
 def test_a_display_replaces_lines(logged):
     fractions = []
     with progress.display_stages(lambda stage: fractions.append((stage.done, stage.ended))):

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import quality
 from benchmarks.quality import FAILURE, FORMAT, RESULT, Job, exposed, plan_jobs, run_job, run_jobs
-from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.errors import SehdrError
 from sehdr_warp.files import write_json
 from sehdr_warp.runs.config_files import config_from_dict
 from sehdr_warp.training.plan import make_plan
@@ -150,21 +150,6 @@ def test_a_job_that_fails_costs_itself_alone_and_is_tried_again(tmp_path, monkey
     assert (request[1].folder(tmp_path) / FAILURE).is_file()
 
 
-def test_submitit_runs_several_at_once_and_outlives_one_that_dies(tmp_path, monkeypatch):
-    # What it waits for the result of a process that is gone.
-    monkeypatch.setattr(pytest.importorskip("submitit").LocalJob, "_results_timeout_s", 1)
-    work = quality.work
-    monkeypatch.setattr(quality, "work", lambda *arguments: _run_stubbed(work, arguments))
-    rows = run_jobs(jobs(seeds=(DIES, 7)), tmp_path, device="cpu", at_once=2)
-    assert [row.get("error") for row in rows] == ["its process ended without a result", None]
-    assert ran(tmp_path).count(7) == 1
-
-
-def _run_stubbed(work, arguments):
-    work.__globals__["run_job"] = run_stub
-    return work(*arguments)
-
-
 def test_several_jobs_without_submitit_end_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "submitit", None)
     with pytest.raises(SehdrError, match="submitit starts several jobs at once and is not installed; pip install"):
@@ -186,12 +171,6 @@ def test_only_methods_with_truth_see_that_of_training_views(tmp_path, monkeypatc
         assert environments == {"train": {truth}, "test": {True}}, name
 
 
-def test_exposures_are_four_times_apart_and_photos_follow():
-    dark, bright = (exposed("embedded", 32, "hdr-nerf", place) for place in (1, 2))
-    assert bright.views[0].exposure_time == pytest.approx(4 * dark.views[0].exposure_time)
-    assert bright.views[0].image.mean() > 1.3 * dark.views[0].image.mean()
-
-
 def test_one_training_from_the_command_line(tmp_path, capsys, few_probes, monkeypatch):
     monkeypatch.setattr(quality, "WARM_UP_ITERATIONS", 2)
     command = [*SMALL, "--methods", "default", "--out", tmp_path / "out", "--json"]
@@ -204,8 +183,3 @@ def test_one_training_from_the_command_line(tmp_path, capsys, few_probes, monkey
     assert call(*command, tmp_path / "b.json") == 0
     again = json.loads((tmp_path / "b.json").read_text())["rows"]
     assert again == [row], "a finished job keeps its figures, its seconds among them"
-
-
-def test_a_scene_that_lost_its_place_is_told(tmp_path):
-    with pytest.raises(InputError, match="is not here"):
-        plan_jobs(["embedded:nowhere"], ["default"])

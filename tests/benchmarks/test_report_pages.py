@@ -7,8 +7,6 @@ import pytest
 
 from benchmarks.quality import plan_jobs, row_of
 from benchmarks.report_pages import REPORTS, write_readme, write_reports
-from benchmarks.report_plots import error_over_time
-from benchmarks.report_tables import median_of_runs
 from sehdr_warp.errors import InputError
 
 from .test_quality import made_up
@@ -75,23 +73,6 @@ def test_quality_is_paired_with_the_upper_bound(tmp_path):
     short = next(line for line in lines if line.startswith("| default") and "of 7 lights" in line)
     assert short.split("|")[-3].strip() == "0.95" and "0.80 to 1.10" in short  # Of one training's two lights
     assert "## Energy of the lights that photos clip, over the truth's" in lines
-
-
-def test_times_of_several_runs_are_shown_as_their_medians():
-    place = {"gaussians": 200, "width": 40, "height": 30, "channels": 3, "pass": "forward"}
-    rows = [
-        place | {"implementation": name, "median_ms": factor * ms, "host_ms": ms / 10}
-        for ms in (4.0, 1.0, 2.0)
-        for name, factor in (("sehdr-warp", 1), ("gsplat", 3))
-    ]
-    ours, theirs = median_of_runs(rows)
-    assert ours == place | {"implementation": "sehdr-warp", "median_ms": 2.0, "host_ms": 0.2}
-    assert (theirs["implementation"], theirs["median_ms"]) == ("gsplat", 6.0)
-
-
-def test_error_over_time_is_a_mean_on_a_log_scale():
-    seconds, mean = zip(*error_over_time([[[1.0, 20.0], [100.0, 40.0]], [[1.0, 10.0], [10.0, 30.0]]], count=3))
-    assert seconds == pytest.approx([1, 10, 100]) and mean == pytest.approx([15, 30, 35])
 
 
 def test_what_is_no_result_is_named(tmp_path):

@@ -6,7 +6,6 @@ import pytest
 
 from benchmarks import workers
 from benchmarks.splats import Size
-from sehdr_warp.errors import SehdrError
 
 from .command_line import call
 
@@ -38,14 +37,3 @@ def test_ranks_are_timed_by_photo(monkeypatch, count):
     timing = workers.time_ranks(Size(300, 40, 32), count, "cpu", 1)
     assert timing["photo_ms"] > 0 and timing["amortized_ms"] > 0
     assert timing["repetitions"] == workers.STEPS
-
-
-def test_what_ends_a_process_is_told_in_a_line():
-    with pytest.raises(SehdrError, match="a training of .* by 1 processes ended early: .*nosuch"):
-        workers.time_ranks(Size(300, 40, 32), 1, "nosuch", 1)
-
-
-def test_counts_double_up_to_what_there_is():
-    assert [workers.doubled(most) for most in (1, 2, 3, 16, 24)] == [
-        [1], [1, 2], [1, 2, 3], [1, 2, 4, 8, 16], [1, 2, 4, 8, 16, 24],
-    ]  # fmt: skip

@@ -14,6 +14,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import Config
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.training.compensation import SharedDecisions
+from tests.make_scenes import edited_json
 
 DATA = {"path": "photos"}
 
@@ -55,9 +56,8 @@ def test_a_plan_is_read_as_it_was_written(tmp_path, plan):
 )
 def test_blocks_that_cannot_be(tmp_path, plan, fields, named):
     path = tmp_path / "run" / FILE
-    values = json.loads(path.read_text())
-    values["blocks"][0] |= fields
-    path.write_text(json.dumps(values))
+    with edited_json(path) as values:
+        values["blocks"][0] |= fields
     with pytest.raises(InputError, match=named):
         BlockPlan.read(tmp_path / "run")
 
@@ -72,9 +72,8 @@ def test_plans_that_cannot_be(tmp_path, plan, fields):
 
 def test_more_blocks_than_can_be(tmp_path, plan):
     path = tmp_path / "run" / FILE
-    values = json.loads(path.read_text())
-    values["blocks"] = [values["blocks"][0] | {"name": f"block_{number}"} for number in range(MOST_BLOCKS + 1)]
-    path.write_text(json.dumps(values))
+    with edited_json(path) as values:
+        values["blocks"] = [values["blocks"][0] | {"name": f"block_{number}"} for number in range(MOST_BLOCKS + 1)]
     with pytest.raises(InputError, match=f"{FILE}: blocks.*at most {MOST_BLOCKS}"):
         BlockPlan.read(tmp_path / "run")
 

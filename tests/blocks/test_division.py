@@ -54,14 +54,6 @@ def test_many_points_and_photos_take_little_memory():
     assert np.abs(places.middles[:, :2]).max() < 0.2, "of all that they show, not of the first points"
 
 
-def test_the_distance_to_a_border_is_that_to_the_faces_between_cores(ground):
-    division = divide("street", street(60), ground, 2)
-    at = next(float(cell.high[0]) for cell in division.cells if np.isfinite(cell.high[0]))
-    x = division.axes[0]  # Along the street, one way or the other.
-    points = np.array([(at + 3.0) * x, (at - 0.5) * x + 7 * division.axes[1]])
-    assert division.border_distance(points) == pytest.approx([3.0, 0.5])
-
-
 def test_photos_of_one_object_cannot_be_divided():
     cameras = [orbit_camera(angle) for angle in np.linspace(0, 6, 40)]
     points = np.random.default_rng(0).uniform(-1, 1, (1000, 3))

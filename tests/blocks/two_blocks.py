@@ -18,12 +18,7 @@ LITTLE = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_p
 def train_two_blocks(folder: Path, iterations: int) -> BlockPlan:
     """Train two blocks of a town of 32 photos in FOLDER/run and return their plan."""
     write_survey(folder / "town", views=32, size=48, gaussians=6000)
-    data: LoadArguments = {
-        "path": str(folder / "town"),
-        "exposure_index": None,
-        "max_size": None,
-        "holdout": None,
-    }
+    data: LoadArguments = {"path": str(folder / "town"), "exposure_index": None, "max_size": None, "holdout": None}
     fields = {"response.name": "srgb", "schedule.iterations": iterations}
     plan = make_block_plan(data, override_config(Config(), fields | LITTLE), torch.device("cpu"), 2)
     assert plan is not None

@@ -29,13 +29,6 @@ def test_psnr_of_a_known_offset():
     assert psnr(truth, truth) == math.inf
 
 
-def test_psnr_of_channels_apart():
-    truth = torch.zeros(4, 4, 3)
-    prediction = truth + torch.tensor([0.1, 0.01, 0.001])
-    assert psnr(prediction, truth, channels_apart=True) == pytest.approx(40.0, abs=1e-5)
-    assert psnr(prediction, truth) == pytest.approx(10 * math.log10(3 / 0.010101), abs=1e-5)
-
-
 def test_masks_weigh_the_pixels():
     prediction, truth = noisy_pair()
     mask = torch.zeros(48, 61)

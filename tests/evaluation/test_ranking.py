@@ -23,19 +23,6 @@ def images(height=16, width=20):
     return truth, stops
 
 
-def test_the_scale_is_that_of_well_exposed_pixels():
-    truth, stops = images()
-    prediction = 3 * truth * 2 ** stops[..., None]
-    ranking = ErrorRanking()
-    ranking.add(torch.exp2(-stops), prediction, truth, stops == 0, 1e-6)
-    result = ranking.result()
-    assert result["scale"] == pytest.approx(1 / 3) and result["pixels"] == 320
-    # Not 1: pixels of one confidence are ranked by the rounding of their errors.
-    assert result["spearman_log2"] > 0.85
-    assert 0.7 < result["spearman_mu"] < 1
-    assert result["mean"] == pytest.approx(float(torch.exp2(-stops).mean()))
-
-
 def test_masked_pixels_do_not_count():
     truth, stops = images()
     prediction = truth * 2 ** stops[..., None]

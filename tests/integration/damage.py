@@ -3,6 +3,7 @@
 import json
 
 from sehdr_warp.runs.run_folder import RunFolder
+from tests.make_scenes import edited_json
 
 
 def snapshot(folder) -> dict:
@@ -25,10 +26,9 @@ def edit_json(path, **fields):
 
 def edit_view(run, **fields):
     """Change the first view or its camera, and state the file's hash anew, so that the value itself is checked."""
-    values = json.loads((run / "scene.json").read_text())
-    for name, value in fields.items():
-        (values["views"][0] if name in values["views"][0] else values["views"][0]["camera"])[name] = value
-    (run / "scene.json").write_text(json.dumps(values))
+    with edited_json(run / "scene.json") as values:
+        for name, value in fields.items():
+            (values["views"][0] if name in values["views"][0] else values["views"][0]["camera"])[name] = value
     edit_json(checkpoint_of(run) / "checkpoint.json", run=RunFolder(run).hashes())
 
 

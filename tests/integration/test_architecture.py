@@ -46,10 +46,7 @@ ALLOWED = {
     "check": ANY | {"kernels.constants", "rasterizer", "runs.device"},
 }
 # Packages that only some packages may import.
-ONLY_IN = {
-    "torch": ALLOWED.keys() - ANY - {"kernels", "splats", "scene", "synth"},
-    "warp": {"kernels", "rasterizer"},
-}
+ONLY_IN = {"torch": ALLOWED.keys() - ANY - {"kernels", "splats", "scene", "synth"}, "warp": {"kernels", "rasterizer"}}
 LARGEST_FILE = 400
 NOT_FIRST = {"as", "how", "of", "that", "those", "what", "when", "where", "whether", "which", "who"}
 """Words that no docstring starts with."""

@@ -8,16 +8,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.runs.run_writer import RunWriter
 
 from ..refusals import call, refused
-from .damage import (
-    checkpoint_of,
-    edit_json,
-    edit_view,
-    flip_byte,
-    remove_value,
-    resign,
-    shorten_means,
-    snapshot,
-)
+from .damage import checkpoint_of, edit_json, edit_view, flip_byte, remove_value, resign, shorten_means, snapshot
 
 
 @pytest.fixture

@@ -8,11 +8,12 @@ import zlib
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from sehdr_warp import load_scene
 from sehdr_warp.scene.hdr_files import read_hdr
 
-from ..make_scenes import write_blender, write_colmap
+from ..make_scenes import edited_json, write_blender, write_colmap
 from ..refusals import call, train_refused
 
 
@@ -264,8 +265,6 @@ def test_exposure_times(data, capfd, case):
 
 
 def test_exposure_times_of_zero_in_exif_count_as_none(tmp_path):
-    from PIL.TiffImagePlugin import IFDRational
-
     write_colmap(tmp_path / "data", name="{:03d}.jpg", exif={i: {33434: IFDRational(0, 1)} for i in range(6)})
     assert not load_scene(tmp_path / "data", response="srgb").exposure_times_known
 
@@ -295,14 +294,13 @@ def test_transforms(frames, capfd, case):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None, "scaled", "mirrored"])
 def test_a_frame_without_a_place_is_left_out(frames, value):
-    values = json.loads((frames / "transforms.json").read_text())
-    matrix = values["frames"][2]["transform_matrix"]
-    if value in ("scaled", "mirrored"):
-        factors = (2, 2, 2) if value == "scaled" else (-1, 1, 1)
-        values["frames"][2]["transform_matrix"] = [[*np.multiply(row[:3], factors), row[3]] for row in matrix]
-    else:
-        matrix[0][3] = value
-    (frames / "transforms.json").write_text(json.dumps(values))
+    with edited_json(frames / "transforms.json") as values:
+        matrix = values["frames"][2]["transform_matrix"]
+        if value in ("scaled", "mirrored"):
+            factors = (2, 2, 2) if value == "scaled" else (-1, 1, 1)
+            values["frames"][2]["transform_matrix"] = [[*np.multiply(row[:3], factors), row[3]] for row in matrix]
+        else:
+            matrix[0][3] = value
     scene = load_scene(frames)
     assert "r_2" not in {view.name for view in scene.views} and any("r_2" in note for note in scene.notes)
 

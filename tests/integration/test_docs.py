@@ -119,10 +119,6 @@ def test_flags_and_fields_on_the_pages_exist(page):
     assert named <= fields | set(GONE) | set(RENAMED)
 
 
-def test_the_pages_hold_command_lines():
-    assert {line.values[0].split()[1] for line in command_lines()} >= {"train", "render", "eval", "export", "report"}
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)

@@ -71,9 +71,3 @@ def test_relighting(tmp_path):
     pytest.importorskip("mitsuba")
     error = example("relighting")["main"](tmp_path, views=12, size=24, samples=8, iterations=60)
     assert 0 < error < 1 and (tmp_path / "relighting.png").is_file()
-
-
-def test_every_example_is_run_here():
-    text = Path(__file__).read_text()
-    assert all(f'example("{path.stem}"' in text for path in EXAMPLES.glob("*.py"))
-    assert all(f'notebook("{path.stem}"' in text for path in EXAMPLES.glob("*.ipynb"))

@@ -1,6 +1,5 @@
 """Full disks, read-only places and signals through the command line: nothing half-written, nothing lost."""
 
-import json
 import shutil
 import signal
 import subprocess
@@ -8,6 +7,8 @@ import sys
 import time
 
 import pytest
+
+from tests.make_scenes import edited_json
 
 from ..full_disk import full_disk
 from ..refusals import call, refused
@@ -35,9 +36,8 @@ def test_full_disk(embedded_run, tmp_path, capfd, command, coarse_figures):
 def test_full_disk_while_training_keeps_the_last_checkpoint(embedded_run, tmp_path, capfd):
     out = tmp_path / "run"
     shutil.copytree(embedded_run, out)
-    values = json.loads((out / "config.json").read_text())
-    values["schedule"]["iterations"] = 34
-    (out / "config.json").write_text(json.dumps(values))
+    with edited_json(out / "config.json") as values:
+        values["schedule"]["iterations"] = 34
     resign(out, lambda tensors: None)
     before = snapshot(out / "checkpoints")
     flags = ("--device", "cpu", "--resume")

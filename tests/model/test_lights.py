@@ -79,13 +79,6 @@ def test_lights_apart_are_two_and_what_is_dark_or_did_not_clip_is_none():
     assert find_lights(scene, torch.ones(len(places)), []) == []
 
 
-def test_deviation_follows_the_confidence():
-    scene = field(panel(), RADIANCE, 0.03)
-    scene.confidence = torch.full((scene.gaussians.count,), 0.5)
-    (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views())
-    assert light.deviation == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize("target", [(0, 0, 4.0), (4.0, 0, 0), (0, 0, -4.0), (0.5, -3.5, 0)])
 def test_panoramas_show_lights_in_all_directions(target):
     scene, clipped = field(ball(target), RADIANCE, 0.03), torch.ones(900)

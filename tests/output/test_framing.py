@@ -64,16 +64,6 @@ def test_a_path_shows_little_more_than_its_photos(tmp_path):
             assert each.fx == pytest.approx(each.fy)
 
 
-def test_close_ups_along_an_arc_do_not_cut_the_subject(tmp_path):
-    """Most photos show half of the ball, a third of them all of it."""
-    run, near, far = ball(tmp_path), around(12, 2.5, span=90, fov=24), around(6, 6, span=90, fov=24)
-    photos = [*near, *far]
-    framed = frame_subject(run, [film_camera(each, photos) for each in orbit(photos, 6, 1.0)], photos)
-    for each in framed:
-        alpha = np.asarray(run.render(each.within(96)).alpha)
-        assert max(alpha[0].max(), alpha[-1].max()) < 0.5
-
-
 def test_a_floater_in_the_way_is_passed(tmp_path, logged):
     photos = around(24, 4)
     path = [film_camera(each, photos) for each in orbit(photos, 24, 1.0)]
@@ -93,13 +83,6 @@ def test_a_floater_in_the_way_is_passed(tmp_path, logged):
 )
 def test_sizes_of_films(short, size):
     assert film_size([camera(width=short * 2, height=short)]) == size
-
-
-def test_a_scene_without_a_focus_keeps_its_path():
-    run = AnalyticRun()
-    photos = [camera(position=(i, 0, 0), target=(i, 0, 5)) for i in range(4)]
-    path = orbit(photos, 4, 2.0)
-    assert frame_subject(run, path, photos) == path
 
 
 def street(count=12, bend=0.0, leap=None):

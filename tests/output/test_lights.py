@@ -2,21 +2,20 @@
 
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError, UsageError
+from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.commands import Lights, WorldOptions, run_lights
-from sehdr_warp.output.environment_map import write_environment_map
-from sehdr_warp.output.lights import lights_table, write_lights
-from sehdr_warp.output.world_transform import WorldTransform, world_transform
+from sehdr_warp.output.environment_map import latlong, write_environment_map
+from sehdr_warp.output.lights import write_lights
+from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
-from sehdr_warp.splats.arrays import join_gaussians
 
 from .helpers import Entry, camera
 from .test_environment_map import lamps
@@ -32,8 +31,6 @@ LIGHTS = [
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """A scene of six lamps, of which three belong to two lights."""
-    from sehdr_warp.model.baking import field_of
-
     cameras = tuple(Entry(str(i), "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0, 0, 9))) for i in range(3))
     scene = Splats(tmp_path / "run", field_of(lamps()), cameras)
     scene.find_lights = lambda: LIGHTS
@@ -82,8 +79,6 @@ def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
     run.find_lights = list
     write_lights(run, tmp_path / "none.usda", axes="scene", unseen="black")
     whole = read_hdr(tmp_path / "none_rest.exr")
-    from sehdr_warp.output.environment_map import latlong
-
     directions = latlong(1024)
     for index, axis in enumerate(np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]):
         place = np.unravel_index(np.argmax(directions @ axis), directions.shape[:2])
@@ -108,27 +103,6 @@ def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, 
     assert filled[unseen].min() > 0.5 * lit.min() and filled[unseen].max() < 1.01 * lit.max()
 
 
-def test_the_map_of_a_walk_around_something_is_what_surrounds_it(tmp_path, monkeypatch):
-    pytest.importorskip("pxr")
-    from sehdr_warp.model.baking import field_of
-
-    angles = 2 * np.pi * np.arange(8) / 8
-    places = 2 * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
-    cameras = tuple(Entry(str(i), "train", camera(position=tuple(place))) for i, place in enumerate(places))
-    wall, statue = lamps(), replace(lamps(), means=lamps().means * 0.02, log_scales=lamps().log_scales - 3)
-    around = lights_map(tmp_path / "wall", field_of(wall), cameras)
-    both = lights_map(tmp_path / "both", field_of(join_gaussians([wall, statue])), cameras)
-    np.testing.assert_allclose(both, around, rtol=1e-3, atol=1e-3)
-
-
-def lights_map(folder, field, cameras):
-    scene = Splats(folder, field, cameras)
-    scene.find_lights = list
-    folder.mkdir()
-    write_lights(scene, folder / "lights.usda", axes="scene")
-    return read_hdr(folder / "lights_rest.exr")
-
-
 def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
     run.find_lights = list
     place = {"at": (0.5, 0.2, 1.0), "beyond": 4.3, "axes": "scene"}  # One lamp is nearer.
@@ -142,14 +116,6 @@ def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
         write_lights(run, tmp_path / "lights.json", **place)
     with pytest.raises(UsageError, match="--at, --beyond: set for a file"):
         run_lights(Lights(run=run.path, at="0,0,1", beyond=1.0))
-
-
-def test_the_table_names_place_size_and_doubt():
-    lines = lights_table(LIGHTS).splitlines()
-    assert "50.0 %" in lines[1] and "0.70" in lines[1] and "0.4 x 0.2" in lines[1] and "sphere" in lines[2]
-    assert "(1, 0.5, 2)" in lines[1]
-    moved = WorldTransform(np.diag([-1.0, -1, 1]), np.array([0.0, 0, 1]), 2.0)
-    assert "(-2, -1, 5), 0.8 x 0.4" in lights_table(LIGHTS, transform=moved).splitlines()[1]
 
 
 def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):

@@ -9,7 +9,6 @@ import torch
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.lights import Light, LightShape
-from sehdr_warp.output.depth_fusion import zero_surface
 from sehdr_warp.output.proxy_mesh import find_ground, mesh_depth, proxy_mesh, write_proxy_mesh
 from sehdr_warp.output.splat_edits import Box
 from sehdr_warp.output.world_transform import WorldTransform
@@ -100,23 +99,6 @@ def test_a_crop_ends_at_its_box():
     assert np.percentile(np.minimum(ball, np.abs(mesh.vertices[:, 1] - FLOOR)), 90) < 0.5 * mesh.voxel
 
 
-def test_no_triangle_is_without_area():
-    """A distance that is exactly 0 at voxels gives marching cubes triangles of one corner."""
-    grid = np.arange(24.0) - 11.5
-    distance = np.rint(np.sqrt(sum(side**2 for side in np.meshgrid(grid, grid, grid))) - 7)
-    vertices, faces = zero_surface(distance, np.ones(distance.shape, bool), np.ones(3))
-    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
-    assert len(faces) > 500 and np.linalg.norm(np.cross(second - first, third - first), axis=1).min() > 1e-6
-
-
-def test_each_triangle_is_there_once():
-    """Thin walls of distances that are exactly 0 have a triangle from either side."""
-    distance = np.random.default_rng(0).integers(-1, 2, (14, 14, 14)).astype(float)
-    corners = np.sort(zero_surface(distance, np.ones(distance.shape, bool), np.ones(3))[1], axis=1)
-    assert len(corners) > 500 and len(np.unique(corners, axis=0)) == len(corners)
-    assert (np.diff(corners, axis=1) > 0).all()
-
-
 def test_the_floor_is_found_and_a_tilt_of_it(mesh):
     assert mesh.ground is not None
     assert mesh.ground.height == pytest.approx(FLOOR, abs=0.3 * mesh.voxel) and mesh.ground.tilt < 0.5
@@ -166,55 +148,6 @@ def test_a_floor_that_is_not_level_comes_with_the_option_that_levels_it(tmp_path
     write_proxy_mesh(BallOnFloor(), tmp_path / "level.obj", resolution=48, up=",".join(map(str, measured)))
     [line] = [line for line in logged if line.startswith("ground")]
     assert "--up" not in line
-
-
-def test_mitsuba_composites_and_shadows_by_the_mesh(tmp_path):
-    """A CG ball behind the photographed one is hidden as far as it should be, and its shadow falls on the floor."""
-    mi = pytest.importorskip("mitsuba")
-    mi.set_variant("scalar_rgb")
-    run, camera = BallOnFloor(), around(0.0).within(48)
-    path = write_proxy_mesh(run, tmp_path / "proxy.obj", resolution=64, axes="scene")
-    eye, ahead, center, radius = camera.position, camera.camera_to_world[:3, 2], np.array([0.5, 0.1, -0.8]), 0.4
-    sensor = {
-        "type": "perspective", "fov": float(np.degrees(2 * np.arctan(24 / camera.fx))), "fov_axis": "x",
-        "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), (eye + ahead).tolist(), [0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}},
-        "sampler": {"type": "independent", "sample_count": 4},
-    }  # fmt: skip
-    travel = np.array([0.5, -1, 1]) / 1.5
-    sun = {"type": "directional", "direction": travel.tolist(), "irradiance": 1.0}
-    material = {"type": "twosided", "inside": {"type": "diffuse"}}
-    proxy = {"type": "obj", "filename": str(path), "face_normals": True, "bsdf": material}
-    ball = {"type": "sphere", "center": center.tolist(), "radius": radius}
-    plain = {"type": "scene", "sensor": sensor, "sun": sun, "proxy": proxy}
-    with_ball = plain | {"ball": ball}
-
-    def positions(scene):
-        aov = {"integrator": {"type": "aov", "aovs": "p:position"}}
-        return np.array(mi.render(mi.load_dict(scene | aov), spp=1))[..., -3:]
-
-    # The CG ball is seen where Mitsuba's rays end on it before they end on the mesh.
-    visible = np.abs(np.linalg.norm(positions(with_ball) - center, axis=2) - radius) < 1e-3
-    depth = np.where(run.render(camera).depth > 0, run.render(camera).depth, np.inf)
-    y, x = np.mgrid[:48, :48] + 0.5
-    local = np.stack([(x - 24) / camera.fx, (y - 24) / camera.fy, np.ones_like(x)], axis=2)
-    rays, offset = local @ camera.world_to_camera[:3, :3], eye - center
-    a, b = (rays**2).sum(2), (rays * offset).sum(2)
-    root = b**2 - a * (offset @ offset - radius**2)
-    hit = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
-    expected = hit < depth
-    assert (np.isfinite(hit) & ~expected).sum() > 20 and expected.sum() > 20, "it is partly hidden"
-    assert (visible == expected).mean() > 0.98
-    # Its shadow, away from that of the photographed ball.
-    direct = {"integrator": {"type": "direct"}}
-    lit, shaded = (np.array(mi.render(mi.load_dict(each | direct), spp=16)).mean(2) for each in (plain, with_ball))
-    ground = positions(plain)
-    floor = np.abs(ground[..., 1] - FLOOR) < 0.05
-    distance = np.linalg.norm(np.cross(ground - center, travel), axis=2)
-    away = floor & (distance > 0.5) & ~visible & (np.linalg.norm(np.cross(ground, travel), axis=2) > 0.8)
-    under = floor & (distance < 0.3) & ~visible
-    assert under.sum() > 3 and np.median(shaded[under]) < 0.1 * np.median(lit[away])
-    assert np.median(shaded[away]) == pytest.approx(np.median(lit[away]), rel=0.05)
 
 
 class LampOnFloor(BallOnFloor):

@@ -3,8 +3,8 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.charts import save_picture, training_chart
-from sehdr_warp.output.comparison import Comparison, compare, darker_stops
+from sehdr_warp.output.charts import training_chart
+from sehdr_warp.output.comparison import Comparison, compare
 from sehdr_warp.output.report import check_report_folder, comparison_figure, stops_figure, write_report
 from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.scene import Scene, View, codes_of
@@ -68,14 +68,6 @@ def test_the_chart_has_a_line_for_every_run_and_a_name_for_every_row():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a and 1 more", "c"]
 
 
-def test_names_of_runs_stand_in_a_chart_as_they_are(tmp_path, recwarn):
-    names = [r"$\frac$", "_hidden", "\u65e5\u672c"]
-    figure = training_chart({name: [METRICS] for name in names})
-    assert [text.get_text().strip() for text in figure.legends[0].get_texts()] == names
-    save_picture(figure, tmp_path / "chart.png", 40)
-    assert (tmp_path / "chart.png").stat().st_size and not recwarn.list
-
-
 def test_stops_show_what_the_photo_lost(tmp_path):
     run, scene = make(tmp_path)
     view = scene.views[1]
@@ -101,34 +93,6 @@ def test_photos_in_a_sensors_colors_are_shown_as_the_scene_is(tmp_path):
     np.testing.assert_allclose(compared.from_photo, plain.from_photo[..., ::-1], rtol=1e-5, atol=1e-6)
     exposure = np.clip(compared.from_photo * view.exposure_time, 0, 1)
     np.testing.assert_allclose(compared.photo, encode_srgb(exposure), atol=1e-6)
-
-
-def test_the_new_view_lies_halfway_to_the_nearest(tmp_path):
-    run, scene = make(tmp_path, splits=("train", "test", "train"))
-    calls = []
-    render = run.render
-    run.render = lambda camera: calls.append(camera.position) or render(camera)
-    write_report(run, scene, tmp_path / "report")
-    first, second, third = (view.camera.position for view in scene.views)
-    between = 0.5 * (second + min(first, third, key=lambda place: np.linalg.norm(place - second)))
-    assert np.abs(np.array(calls) - between).sum(axis=1).min() < 1e-9
-    comparison = Comparison("v", scene.views[0].image, *[scene.views[0].hdr] * 3, None, scene.views[0].hdr * 2)
-    titles = [axes.get_title() for axes in comparison_figure([comparison], 0.5, "").axes]
-    stops = f"\N{MINUS SIGN}{-darker_stops([comparison], 0.5)} EV"
-    darker = [f"{what} at {stops}" for what in ("Photo", "HDR scene", "Truth")]
-    assert titles == ["Held-out photo", *darker, "New view, tone-mapped"]
-
-
-def test_confidence_stands_beside_the_scene(tmp_path):
-    run, scene = make(tmp_path)
-    view = scene.views[1]
-    confidence = run.render_confidence(view.camera)
-    comparison = Comparison(view.name, view.image, view.image, view.hdr, view.hdr, confidence)
-    axes = stops_figure(comparison, 0.5).axes
-    assert len(axes) == 1 + 5 + 6 + 5
-    np.testing.assert_array_equal(axes[11].get_images()[0].get_array()[..., 0], confidence)
-    assert axes[11].get_position().x0 > axes[5].get_position().x1
-    assert axes[11].get_position().y0 == pytest.approx(axes[6].get_position().y0)
 
 
 @pytest.mark.parametrize("caption", ["", "Several lines of text. " * 20])

@@ -21,12 +21,11 @@ from PIL import Image
 
 from sehdr_warp import output
 from sehdr_warp.output.comparison import Comparison, darker_stops, opening_of
-from sehdr_warp.output.light_pictures import dial, jpeg, packed_light
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report import write_report
-from sehdr_warp.output.report_page import smaller
 from sehdr_warp.output.tonemap import display_gain
 from sehdr_warp.output.world_transform import world_transform
+from sehdr_warp.response import response_by_name
 
 from ..viewer.browser import browser
 from .helpers import AnalyticRun
@@ -99,12 +98,6 @@ def test_lights_are_listed_with_what_is_certain_of_them(tmp_path, monkeypatch):
     assert cells[7] == "lamp" and cells[13] == "\N{EN DASH}"
 
 
-def test_exposures_that_gains_changed_are_marked(tmp_path, monkeypatch):
-    assert "<li>exposure<b>" in page(tmp_path)
-    monkeypatch.setattr(AnalyticRun, "exposure_compensation", object())
-    assert "<li>exposure, compensated<b>" in page(tmp_path / "gains")
-
-
 def test_what_is_not_known_is_left_out(tmp_path):
     text = page(tmp_path, truth=False, splits=("train", "train"), metrics=None, unexplained=False)
     assert "What stays unexplained" not in headings(text) and "Error against time" not in headings(text)
@@ -126,29 +119,11 @@ def test_the_pictures_keep_the_light_and_look_like_photos(tmp_path):
     np.testing.assert_allclose(plain.mean((0, 1)), run.response.encode(exposure).clip(0, 1).mean((0, 1)), atol=0.01)
 
 
-def test_a_dial_holds_half_floats():
-    light = np.geomspace(1e-3, 1e3, 4 * 3 * 3).reshape(4, 3, 3)
-    floats = np.frombuffer(zlib.decompress(base64.b64decode(packed_light(light))), "<f2").reshape(4, 3, 3)
-    np.testing.assert_allclose(floats, light, rtol=1e-3)
-    html = dial({"A & B": light}, 0.5, 1.0, "A & B")
-    assert 'data-light="A &amp; B"' in html and "split" not in html
-
-
 def test_middle_grey_of_the_photo_is_shown_as_middle_grey():
-    from sehdr_warp.response import response_by_name
-
     assert display_gain(response_by_name("srgb")) == pytest.approx(1, rel=1e-4)
     response = response_by_name("hdr-nerf")
     grey = response.encode(np.array([0.18 / display_gain(response)]))
     assert grey[0] == pytest.approx(0.4614, abs=1e-3)
-
-
-def test_smaller_pictures_hold_means():
-    picture = np.random.default_rng(0).uniform(size=(6, 8, 3)).astype(np.float32)
-    half = smaller(picture, 4)
-    np.testing.assert_allclose(half, picture.reshape(3, 2, 4, 2, 3).mean((1, 3)), rtol=1e-5)
-    np.testing.assert_array_equal(smaller(picture, 100), picture)
-    assert jpeg(picture)[:2] == b"\xff\xd8"
 
 
 def test_a_run_shows_itself_in_a_notebook():

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from scipy.io import loadmat, savemat
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import Response, response_by_name, responses_in_file
@@ -22,8 +23,6 @@ def dorf_text(curves: dict[str, np.ndarray]) -> str:
 
 
 def test_dorf_matlab_file(shared, tmp_path):
-    from scipy.io import loadmat, savemat
-
     path = shared / "crf" / "201_CRF_data.mat"
     stored = loadmat(path)
     curves = responses_in_file(path)
@@ -129,8 +128,6 @@ def test_bad_files_are_refused_in_one_line(tmp_path, suffix, text):
 
 
 def test_damaged_matlab_files_end_no_more_than_their_reader(tmp_path):
-    from scipy.io import savemat
-
     path = tmp_path / "bad.mat"
     savemat(path, {"B": np.array([["a", "b"]]), "I": np.eye(2)})
     cut = b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM\x0e\x00\x00\x00"

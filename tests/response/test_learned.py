@@ -98,13 +98,6 @@ def test_seeds_differ_and_descriptions_keep_the_shape():
         Response.from_dict({"kind": "mlp"})
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_every_channel_starts_rising_in_the_dark_in_the_middle_and_in_the_light(seed):
-    log_exposure = torch.tensor([-12.0, -7.0, -0.01, 0.01, 3.0, 8.0])[:, None].expand(-1, 3)
-    with torch.no_grad():
-        assert (ToneMapper(32, seed).encode_log(log_exposure).logit().diff(dim=0) > 0).all()
-
-
 @pytest.mark.parametrize("tone_map", ["pixel", "gaussian"])
 def test_a_field_photographs_through_it_and_teaches_it(tone_map, device):
     gaussians = Gaussians.from_points(torch.tensor([[0.0, 0.0, 3.0]]), torch.full((1, 3), -1.0), 0, opacity=0.99)
@@ -117,13 +110,3 @@ def test_a_field_photographs_through_it_and_teaches_it(tone_map, device):
     photo.encoded.sum().backward()
     assert all(bool(parameter.grad.any()) for parameter in field.response.parameters())
     assert bool(field.gaussians.harmonics_dc.grad.any())
-
-
-def test_its_gradients_call_no_matrix_product():
-    mapper, exposures = ToneMapper(width=8), torch.rand(5000, 3)
-    with torch.profiler.profile() as profile:
-        mapper.encode(exposures).sum().backward()
-    called = {event.name for event in profile.events()}
-    assert "aten::addcmul" in called
-    assert not {name for name in called if name.endswith(("mm", "mv", "matmul", "bmm"))}
-    assert all(parameter.grad.abs().sum() > 0 for parameter in mapper.parameters())

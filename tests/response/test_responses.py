@@ -199,12 +199,6 @@ def test_names_are_listed_with_what_they_stand_for():
         response_by_name("flimic")
 
 
-def test_a_response_says_what_gaussians_start_from(response):
-    encoded = np.array([0.004, 0.5, 0.99])
-    assert not response.learnable
-    np.testing.assert_allclose(response.start_exposures(encoded), np.maximum(response.decode(encoded), 1e-6))
-
-
 def test_integer_tensors_are_refused():
     with pytest.raises(TypeError, match="float32"):
         response_by_name("srgb").encode(torch.tensor([128], dtype=torch.uint8))

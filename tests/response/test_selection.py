@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.response import Response, response_by_name, selection_scores
 from sehdr_warp.response.selection import select_response
-from sehdr_warp.response.selection_scores import FINE, GRID, edge_facts, family_curves
+from sehdr_warp.response.selection_scores import FINE, edge_facts, family_curves
 from sehdr_warp.response.table import TabulatedResponse
 from sehdr_warp.scene.response_choice import select_for_codes
 
@@ -56,23 +55,6 @@ def test_papers_score_orders_by_range_and_smoothness():
     clear = photo[((photo > 1.5 / 255) & (photo < 1 - 4.5 / 255)).all(2)]
     low, high = np.percentile(clear, (0.1, 99.9))
     assert linear.dynamic_range == pytest.approx(np.log2(high / low), rel=1e-3)
-
-
-def test_candidates_are_compared_on_one_thread_of_torch(monkeypatch):
-    """Between so many small operations further threads would spin."""
-    thread_counts, compare, before = set(), selection_scores._line_surprise, torch.get_num_threads()
-
-    def noted(*args):
-        thread_counts.add(torch.get_num_threads())
-        return compare(*args)
-
-    monkeypatch.setattr(selection_scores, "_line_surprise", noted)
-    torch.set_num_threads(2)
-    try:
-        select_response(photograph("srgb", mosaic()), named("srgb", "filmic"))
-        assert thread_counts == {1} and torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_thousands_of_edges_are_all_looked_at_and_count_as_few_facts_and_more_are_drawn_from():
@@ -166,24 +148,6 @@ def test_photos_without_a_well_exposed_pixel_are_judged_by_the_prior(value):
     assert {(score.span, score.density) for score in chosen.scores} == {(0.0, 0.0)}
 
 
-def test_edges_that_no_curve_explains_say_little(monkeypatch):
-    """Noise on the mixed pixels alone: how large it is must be found, not taken for what rounding does."""
-    truth, rng = response_by_name("srgb"), np.random.default_rng(0)
-    spoilt = []
-    for photo in (truth.encode(mosaic(seed)) for seed in range(4)):
-        step = sum(np.abs(photo - np.roll(photo, shift, axis)).max(2) for shift in (1, -1) for axis in (0, 1))
-        noisy = photo + rng.normal(0, 6 / 255, photo.shape) * (step > 2 / 255)[..., None]
-        spoilt.append(np.round(noisy.clip(0, 1) * 255) / 255)
-
-    def costs():
-        return np.array([score.edges for score in select_response(spoilt, named("srgb", "hdr-nerf", "camera")).scores])
-
-    thread_counts = costs()
-    monkeypatch.setattr(selection_scores, "EDGE_MISFITS", np.array([1.0]))
-    as_rounding = costs()
-    assert np.ptp(thread_counts) < 0.9 * np.ptp(as_rounding) and (thread_counts < as_rounding - 0.2).all()
-
-
 def test_prior_of_cameras_decides_where_nothing_else_does():
     ramp = np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))
     selection = select_response(ramp, from_camera=True)
@@ -231,17 +195,6 @@ def stops_off(response, truth) -> float:
     return float(np.std(np.log2(response.decode(CODES[10:246])) - np.log2(truth.decode(CODES[10:246]))))
 
 
-def test_family_is_increasing_and_holds_what_cameras_do():
-    logs, rises = family_curves()
-    assert logs.shape == rises.shape == (512, len(GRID)) and (np.diff(logs[:, FINE:]) > 0).all()
-    logs, rises = logs[:, ::FINE], rises[:, ::FINE]
-    assert rises[:, 128] == pytest.approx((logs[:, 129] - logs[:, 127]) * 127.5, rel=1e-3)
-    # Nearer than this to one of 512 curves: the camera's, sRGB, and light that is stored as it is.
-    for name, most in (("camera", 0.12), ("srgb", 0.15), ("linear", 0.2)):
-        stops = np.log2(response_by_name(name).decode(CODES[10:246]))
-        assert (logs[:, 10:246] / np.log(2) - stops).std(1).min() < most
-
-
 def test_curve_that_is_no_formula_is_met_by_the_posteriors_mean():
     off_mean, off_formula = [], []
     for draw in (3, 40, 77):
@@ -254,12 +207,3 @@ def test_curve_that_is_no_formula_is_met_by_the_posteriors_mean():
     assert np.mean(off_mean) < 0.15 and np.mean(off_mean) < 0.5 * np.mean(off_formula)
     again = Response.from_dict(selection.response.to_dict())
     np.testing.assert_allclose(again.decode(CODES), selection.response.decode(CODES))
-
-
-@pytest.mark.parametrize("options", [{"candidates": ("srgb", "camera")}, {"from_camera": True}, {"method": "paper"}])
-def test_candidates_that_are_given_and_photos_of_cameras_get_no_family(options):
-    truth = family_curve(3)
-    if "candidates" in options:
-        options = {"candidates": named(*options["candidates"])}
-    selection = select_response(photograph(truth, truth.clip_exposure * mosaic()), **options)
-    assert selection.response is selection.scores[0].response

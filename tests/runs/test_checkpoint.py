@@ -1,6 +1,5 @@
 """Checkpoints: complete or absent, hashed, newest first."""
 
-import json
 import os
 import subprocess
 
@@ -12,6 +11,7 @@ from sehdr_warp.files import _beside
 from sehdr_warp.runs.checkpoint import PICTURE, read_checkpoint
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
+from tests.make_scenes import edited_json
 
 
 @pytest.fixture
@@ -96,10 +96,9 @@ def test_a_wrong_tensor_file_with_a_right_hash_is_refused(folder):
     import hashlib
 
     path = folder.write_checkpoint(*state(1), keep=1)
-    values = json.loads((path / "checkpoint.json").read_text())
-    (path / "state.safetensors").write_bytes(b"not safetensors")
-    values["sha256"] = hashlib.sha256(b"not safetensors").hexdigest()
-    (path / "checkpoint.json").write_text(json.dumps(values))
+    with edited_json(path / "checkpoint.json") as values:
+        (path / "state.safetensors").write_bytes(b"not safetensors")
+        values["sha256"] = hashlib.sha256(b"not safetensors").hexdigest()
     with pytest.raises(InputError, match="safetensors"):
         read_checkpoint(path)
 

@@ -3,16 +3,20 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.model.confidence import Evidence
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.photo_signatures import changed_photos, photo_signature
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.runs.run_writer import RunWriter
+from sehdr_warp.runs.run_writer import RunWriter, write_confidence
+from sehdr_warp.training.train import create_trainer, train
 from tests.fuzz.run_readers import PLAN, REGION, SUMMARY, make_confidence, make_run
 from tests.training.toy import toy_scene
 from tests.trial.harness import files_in
@@ -215,8 +219,6 @@ def test_resume_begins_where_nothing_was_begun(tmp_path):
 
 
 def test_confidence_is_the_same_file_each_time(run):
-    from sehdr_warp.model.confidence import Evidence
-    from sehdr_warp.runs.run_writer import write_confidence
 
     evidence, folder = Evidence(*torch.rand(4, 4)), RunFolder(run)
     contents = set()
@@ -232,19 +234,17 @@ def test_photos_that_were_changed_are_noticed(run):
     folder.check_same_scene(scene)
     changed = [view.codes.copy() for view in scene.views]
     changed[0][:3, :3] = 255 - changed[0][:3, :3]
-    views = tuple(_with_codes(view, codes) for view, codes in zip(scene.views, changed, strict=True))
+    views = tuple(replace(view, codes=codes) for view, codes in zip(scene.views, changed, strict=True))
     with pytest.raises(
         InputError, match=f"photos or masks were changed since the training began: {scene.views[0].name};"
     ):
-        folder.check_same_scene(_with_views(scene, views))
+        folder.check_same_scene(replace(scene, views=views))
 
 
 def test_masks_that_were_changed_are_noticed(run):
-    from dataclasses import replace
-
     scene = toy_scene(2, 8)
     mask = np.ones(scene.views[0].codes.shape[:2], np.float32)
-    masked = _with_views(scene, tuple(replace(view, mask=mask) for view in scene.views))
+    masked = replace(scene, views=tuple(replace(view, mask=mask) for view in scene.views))
     with pytest.raises(InputError, match="photos or masks were changed"):
         RunFolder(run).check_same_scene(masked)
     ones, half = (photo_signature(scene.views[0].codes, mask * part) for part in (1, 0.5))
@@ -261,22 +261,8 @@ def test_a_signature_forgives_rounding_alone():
     assert changed_photos({"a": "no digits", "b": "00"}, {"a": "00", "c": "00"}) == ["a"]
 
 
-def _with_codes(view, codes):
-    from dataclasses import replace
-
-    return replace(view, codes=codes)
-
-
-def _with_views(scene, views):
-    from dataclasses import replace
-
-    return replace(scene, views=views)
-
-
 @pytest.mark.parametrize("data", [{"max_size": 2**63}, {"exposure_index": -1}])
 def test_options_that_no_reader_takes_are_refused_before_the_training(tmp_path, data):
-    from sehdr_warp.runs.config_files import load_config
-    from sehdr_warp.training.train import train
 
     config = load_config("default", {"schedule.iterations": 2, "plan.enabled": False, "response.name": "srgb"})
     with pytest.raises(InputError, match=f"{next(iter(data))} = .*; use a value in its range"):
@@ -287,14 +273,10 @@ def test_options_that_no_reader_takes_are_refused_before_the_training(tmp_path, 
 @pytest.mark.parametrize("where", ["view", "scene", "data", "folder"])
 def test_names_that_are_no_text_are_refused_before_the_training(tmp_path, where):
     """A run with such a name would be written, and then be read as damaged."""
-    from dataclasses import replace
-
-    from sehdr_warp.runs.config_files import load_config
-    from sehdr_warp.training.train import create_trainer
 
     scene, data, out = toy_scene(2, 8), {"path": "embedded"}, tmp_path / "run"
     if where == "view":
-        scene = _with_views(scene, (replace(scene.views[0], name="a\udcff"), *scene.views[1:]))
+        scene = replace(scene, views=(replace(scene.views[0], name="a\udcff"), *scene.views[1:]))
     elif where == "scene":
         scene = replace(scene, name="a\udcff")
     elif where == "data":

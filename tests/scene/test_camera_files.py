@@ -70,23 +70,3 @@ def test_camera_files_of_other_programs_are_told_what_to_export(tmp_path, suffix
     path.write_bytes(b"Ogawa\xff\x00")
     with pytest.raises(InputError, match=f"shot{suffix}: {name} files are not read; export the camera as OpenUSD"):
         load_cameras(path)
-
-
-def test_moving_usd_cameras_give_a_camera_a_frame(tmp_path):
-    Usd, UsdGeom, Gf = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Gf"))
-    stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
-    stage.SetStartTimeCode(1001)
-    stage.SetEndTimeCode(1003)
-    camera = UsdGeom.Camera.Define(stage, "/shot")
-    camera.CreateHorizontalApertureAttr(24.0)
-    camera.CreateVerticalApertureAttr(13.5)
-    camera.CreateFocalLengthAttr(24.0)
-    move = camera.AddTranslateOp()
-    for frame in (1001, 1003):
-        move.Set(Gf.Vec3d(frame - 1001, 0, 5), frame)
-    stage.GetRootLayer().Save()
-    named = load_cameras(tmp_path / "shot.usda")
-    assert [name for name, _ in named] == ["shot_1001", "shot_1002", "shot_1003"]
-    np.testing.assert_allclose(named[1][1].position, (1, 0, 5))
-    np.testing.assert_allclose(named[1][1].world_to_camera[2, :3], (0, 0, -1))
-    assert (named[0][1].width, named[0][1].height, named[0][1].fx) == (1920, 1080, 1920)

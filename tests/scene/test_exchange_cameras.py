@@ -68,14 +68,6 @@ def test_frames_follow_samples_where_the_stage_states_none(tmp_path):
     assert cameras[1][1].fx == pytest.approx(2 * cameras[0][1].fx)
 
 
-def test_a_single_sample_is_where_the_camera_stands(tmp_path, upright):
-    stage = stage_of(tmp_path / "shot.usda")
-    lens(stage, "/cam1").AddTransformOp().Set(POSE, 1.0)
-    stage.GetRootLayer().Save()
-    [(_, camera)] = load_cameras(tmp_path / "shot.usda")
-    np.testing.assert_allclose(camera.world_to_camera, upright.world_to_camera, atol=1e-9)
-
-
 def test_up_axis_and_units_are_those_of_the_stage(tmp_path, upright):
     turned = POSE * Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Vec3d(1, 0, 0), 90))
     stage = stage_of(tmp_path / "z.usda", up="Z", meters=1)

@@ -148,23 +148,6 @@ def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
     assert lenses(zoomed) == [0] * PHOTOS and lenses([one] * 4 + [two, None]) == [0, 0, 0, 0, -1, -1]
 
 
-def test_exposure_white_balance_and_falloff_are_parts(gains):
-    whole = ExposureCompensation(gains, everywhere(VIGNETTING))
-    values, exposure, white_balance = (
-        np.array(list(fitted.gains.values()))
-        for fitted in (whole, whole.parts(white_balance=False), whole.parts(exposure=False))
-    )
-    np.testing.assert_allclose(exposure, values[:, 1:2].repeat(3, 1))
-    np.testing.assert_allclose(exposure * white_balance, values)
-    assert whole.parts(vignetting=False).vignetting == {} and whole.parts().vignetting == whole.vignetting
-
-
-def test_photos_that_do_not_drift_have_no_gains(points):
-    scene = photographed({}, {})
-    fitted = fit_gains(scene.train_views, scene.test_views, points, np.ones((PHOTOS, len(points)), bool), SRGB)
-    assert fitted.stops < 0.02 and abs(fitted.corner_loss) < 0.02
-
-
 def test_evened_photos_hold_the_light_without_gains(gains):
     plain, scene = photographed({}, {}), photographed(gains, everywhere(VIGNETTING))
     evened = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)

@@ -11,7 +11,7 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.hdr_files import exr_exposure_time, read_hdr
-from tests.make_scenes import pattern, write_blender
+from tests.make_scenes import edited_json, pattern, write_blender
 
 RGB = np.array([0.8, 0.2, 0.05], np.float32)
 SPACES = {"lin_ap1_scene": "ACEScg", "lin_ap0_scene": "ACES2065-1", "lin_p3d65_scene": "Display P3",
@@ -46,12 +46,6 @@ def test_primaries_by_chromaticities_and_by_interop_id(tmp_path, interop):
     for header in ({"chromaticities": places}, {"colorInteropID": interop}):
         read = read_hdr(write_exr(tmp_path / "a.exr", planes(), **header))
         np.testing.assert_allclose(read[2, 3], expected, rtol=2e-3, atol=1e-4)
-
-
-def test_negative_parts_of_wide_colors_are_kept(tmp_path):
-    read = read_hdr(write_exr(tmp_path / "a.exr", planes((0.0, 1.0, 0.0)), colorInteropID="lin_ap0_scene"))
-    np.testing.assert_allclose(read[0, 0], rec709("ACES2065-1", (0.0, 1.0, 0.0)), rtol=2e-3)
-    assert read[0, 0].min() < -0.1
 
 
 def test_encoded_values_of_an_interop_id(tmp_path):
@@ -150,13 +144,12 @@ def test_exposures_and_color_corrections_of_radiance(tmp_path):
 
 def float_set(folder, light, times, stated=True):
     write_blender(folder, 6, size=(40, 30))
-    values = json.loads((folder / "transforms.json").read_text())
-    for i, frame in enumerate(values["frames"]):
-        (folder / "images" / f"r_{i}.png").unlink()
-        frame["file_path"] = f"images/r_{i}.exr"
-        channels = dict(zip("RGB", np.moveaxis(light * times[i], 2, 0).astype(np.float32).copy()))
-        write_exr(folder / frame["file_path"], channels, **({"expTime": times[i]} if stated else {}))
-    (folder / "transforms.json").write_text(json.dumps(values))
+    with edited_json(folder / "transforms.json") as values:
+        for i, frame in enumerate(values["frames"]):
+            (folder / "images" / f"r_{i}.png").unlink()
+            frame["file_path"] = f"images/r_{i}.exr"
+            channels = dict(zip("RGB", np.moveaxis(light * times[i], 2, 0).astype(np.float32).copy()))
+            write_exr(folder / frame["file_path"], channels, **({"expTime": times[i]} if stated else {}))
     return folder
 
 
@@ -186,12 +179,11 @@ def test_exposure_times_that_the_user_states_for_openexr(tmp_path, place):
 
     def load_with(folder, factors):
         float_set(folder, light, factors, stated=False)
-        values = json.loads((folder / "transforms.json").read_text())
-        for frame, time in zip(values["frames"], times):
-            frame.pop("exposure_time", None)
-            if place == "transforms.json":
-                frame["exposure_time"] = time
-        (folder / "transforms.json").write_text(json.dumps(values))
+        with edited_json(folder / "transforms.json") as values:
+            for frame, time in zip(values["frames"], times):
+                frame.pop("exposure_time", None)
+                if place == "transforms.json":
+                    frame["exposure_time"] = time
         if place == "exposures.json":
             (folder / place).write_text(json.dumps({f"r_{i}.exr": time for i, time in enumerate(times)}))
         return load_scene(folder, holdout=0)

@@ -21,7 +21,7 @@ from sehdr_warp.scene.sfm import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
 from sehdr_warp.training.plan import make_plan
 
-from ..make_scenes import write_colmap
+from ..make_scenes import edited_json, write_colmap
 from ..output.helpers import camera
 from ..splats.test_splat_files import gaussians
 from .raw_files import TO_CAMERA, write_dng
@@ -169,28 +169,13 @@ def test_cameras_whose_colors_libraw_knows(tmp_path, suffix, maker, white):
     assert (np.diag(matrix) > 0.5).all()
 
 
-def test_a_set_of_raw_files_becomes_a_scene(tmp_path):
-    pytest.importorskip("rawpy")
-
-    def write(path, i):
-        write_dng(path, np.clip(picture(i) / 20, 0, 2) * BALANCE, balance=BALANCE)
-
-    scene = load_scene(posed(tmp_path, write, ".dng"))
-    assert scene.response.name == "srgb" and scene.light_known
-    np.testing.assert_allclose([view.exposure_time for view in scene.views], 1 / 60, rtol=1e-4)
-    np.testing.assert_allclose(scene.color_matrix @ BALANCE, 1, atol=1e-3)
-    codes = [np.array(view.codes) for view in scene.views]
-    assert 0.01 < np.mean([(c == 65535).mean() for c in codes]) < 0.6
-
-
 def test_photos_of_another_kind_than_most_are_left_out(tmp_path):
     folder = posed(tmp_path, lambda path, i: write_exr(path, rgb_channels(picture(i))), ".exr")
-    values = json.loads((folder / "transforms.json").read_text())
-    odd = values["frames"][1]["file_path"].replace(".exr", ".png")
-    (folder / values["frames"][1]["file_path"]).unlink()
-    Image.fromarray(np.zeros((24, 32, 3), np.uint8)).save(folder / odd)
-    values["frames"][1]["file_path"] = odd
-    (folder / "transforms.json").write_text(json.dumps(values))
+    with edited_json(folder / "transforms.json") as values:
+        odd = values["frames"][1]["file_path"].replace(".exr", ".png")
+        (folder / values["frames"][1]["file_path"]).unlink()
+        Image.fromarray(np.zeros((24, 32, 3), np.uint8)).save(folder / odd)
+        values["frames"][1]["file_path"] = odd
     scene = load_scene(folder)
     assert len(scene.views) == len(values["frames"]) - 1 and scene.light_known
     assert any(odd.split("/")[-1] in note and "photos of one set are of one kind" in note for note in scene.notes)
@@ -273,3 +258,17 @@ def test_structure_from_motion_asks_linear_photos_for_no_exif(tmp_path):
     assert (sizes, small) == ([(32, 24)], [(32, 24)])
     copy = np.asarray(Image.open(tmp_path / "copies" / "00000.png"))
     assert copy.dtype == np.uint8 and 60 < copy.mean() < 180
+
+
+def test_a_set_of_raw_files_becomes_a_scene(tmp_path):
+    pytest.importorskip("rawpy")
+
+    def write(path, i):
+        write_dng(path, np.clip(picture(i) / 20, 0, 2) * BALANCE, balance=BALANCE)
+
+    scene = load_scene(posed(tmp_path, write, ".dng"))
+    assert scene.response.name == "srgb" and scene.light_known
+    np.testing.assert_allclose([view.exposure_time for view in scene.views], 1 / 60, rtol=1e-4)
+    np.testing.assert_allclose(scene.color_matrix @ BALANCE, 1, atol=1e-3)
+    codes = [np.array(view.codes) for view in scene.views]
+    assert 0.01 < np.mean([(c == 65535).mean() for c in codes]) < 0.6

@@ -1,18 +1,18 @@
 """Masks in every layout: found by name, read by value, counted in a note."""
 
-import json
-
 import numpy as np
 import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
-from sehdr_warp.scene.masks import mask_note, read_mask
-from sehdr_warp.scene.read_folders import find_photos, read_llff
+from sehdr_warp.scene.masks import read_mask
+from sehdr_warp.scene.names import list_images
+from sehdr_warp.scene.read_folders import find_photos
 from tests.make_scenes import (
     RadianceView,
     arc_poses,
+    edited_json,
     load,
     pattern,
     write_blender,
@@ -107,14 +107,6 @@ def test_case_and_forms_of_accents_do_not_matter_in_names_of_masks(tmp_path, nam
     assert shares(load(tmp_path, holdout=0)) == [0.5] * 6
 
 
-def test_masks_in_a_folder_of_each_camera(tmp_path):
-    write_colmap(tmp_path, name="cam{0}/0000.png")
-    write_mask(tmp_path / "images" / "cam1" / "masks" / "0000.png")
-    scene = load(tmp_path, holdout=0)
-    assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
-    assert not any("in no view" in note for note in scene.notes)
-
-
 def test_folders_and_files_that_look_like_masks_are_named(tmp_path):
     write_colmap(tmp_path)
     for folder in ("dynamic_masks", "Segmentation", "masks", "masks_2"):
@@ -130,11 +122,10 @@ def test_folders_and_files_that_look_like_masks_are_named(tmp_path):
 
 def test_a_folder_of_masks_that_frames_state_is_not_named(tmp_path):
     write_blender(tmp_path)
-    values = json.loads((tmp_path / "transforms.json").read_text())
-    for i, frame in enumerate(values["frames"]):
-        frame["mask_path"] = f"segmentation/{i}.png"
-        write_mask(tmp_path / "segmentation" / f"{i}.png", HALF[4:44, 4:34].T)
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with edited_json(tmp_path / "transforms.json") as values:
+        for i, frame in enumerate(values["frames"]):
+            frame["mask_path"] = f"segmentation/{i}.png"
+            write_mask(tmp_path / "segmentation" / f"{i}.png", HALF[4:44, 4:34].T)
     assert masks_said(load(tmp_path, holdout=0)) == [
         "masks: 6 of 6 photos have one; they leave out 50.0 % of their pixels"
     ]
@@ -150,14 +141,6 @@ def test_masks_that_fit_no_photo_are_named(tmp_path):
     strange, counted = masks_said(load(tmp_path, holdout=0))
     assert strange.startswith("masks/ holds 5 files that fit no photo: frame0.png, frame1.png, frame2.png ...; name")
     assert counted.startswith("masks: 1 of 6 photos have one; they leave out 50.0 %")
-
-
-def test_masks_of_transforms(tmp_path):
-    write_blender(tmp_path, size=(64, 48))
-    for i in range(3):
-        write_mask(tmp_path / "masks" / f"r_{i}.png")
-    write_mask(tmp_path / "masks" / "images" / "r_3.png")
-    assert shares(load(tmp_path, holdout=0)) == [0.5] * 4 + [1.0] * 2
 
 
 def test_masks_of_hdr_nerf_by_view_and_by_exposure(tmp_path):
@@ -180,8 +163,6 @@ def test_masks_of_bare_photos_beside_them_are_no_photos(tmp_path):
     for i in range(6):
         write_mask(tmp_path / "images" / f"{i:03d}_mask.png")
     Image.fromarray(HALF).save(tmp_path / "images" / "gas_mask.png")  # A photo of one.
-    from sehdr_warp.scene.names import list_images
-
     assert [file.name for file in list_images(tmp_path / "images", (".png",))] == [
         *(f"{i:03d}.png" for i in range(6)),
         "gas_mask.png",
@@ -236,8 +217,6 @@ def test_weights_and_masks_of_one_value(tmp_path):
 
 
 def test_a_mask_that_leads_out_of_the_set_is_refused(tmp_path):
-    from sehdr_warp import InputError
-
     write_colmap(tmp_path / "set")
     write_mask(tmp_path / "secret.png")
     (tmp_path / "set" / "masks").mkdir()
@@ -248,8 +227,6 @@ def test_a_mask_that_leads_out_of_the_set_is_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["masks", "mask", "old_masks", "hdr"])
 def test_folders_that_lead_out_of_the_set_are_not_searched(tmp_path, name):
-    from sehdr_warp import InputError
-
     write_colmap(tmp_path / "set")
     (tmp_path / "outside").mkdir()
     write_mask(tmp_path / "outside" / "strange.png")
@@ -259,17 +236,6 @@ def test_folders_that_lead_out_of_the_set_are_not_searched(tmp_path, name):
     else:
         with pytest.raises(InputError, match="outside the data folder"):
             load(tmp_path / "set")
-
-
-def test_note_without_masks():
-    assert mask_note([None, None]) == []
-
-
-def test_masks_of_the_tankard(shared):
-    dataset = read_llff(shared / "data" / "tankard_turntable")
-    assert len(dataset.records) == 69
-    scene = load(shared / "data" / "tankard_turntable", max_size=100)
-    assert "masks: 69 of 69 photos have one" in " ".join(scene.notes)
 
 
 def test_masks_of_another_size_of_the_same_shape(tmp_path):
@@ -282,8 +248,6 @@ def test_masks_of_another_size_of_the_same_shape(tmp_path):
 
 
 def test_a_photo_whose_mask_cannot_be_used_is_left_out(tmp_path):
-    from sehdr_warp import InputError
-
     write_colmap(tmp_path)
     write_mask(tmp_path / "masks" / "000.png", HALF[:30])
     (tmp_path / "masks" / "001.png").write_bytes(b"no picture")
@@ -305,20 +269,6 @@ def test_one_mask_of_all_photos(tmp_path, name):
     assert shares(scene) == [0.5, 0.5, 1.0, 0.5, 0.5, 0.5], "a photo's own mask counts"
     write_mask(tmp_path / name, HALF[:, :40])
     assert shares(load(tmp_path, holdout=0)) == [1.0] * 6, "a mask of another shape is no mask of these photos"
-
-
-def test_one_mask_of_all_panoramas(tmp_path):
-    write_blender(tmp_path, 6, size=(64, 32))
-    values = json.loads((tmp_path / "transforms.json").read_text())
-    (tmp_path / "transforms.json").write_text(json.dumps(values | {"camera_model": "EQUIRECTANGULAR"}))
-    whole = load(tmp_path, holdout=0).views[0].mask
-    assert not any(frame["file_path"].count("/") == 0 for frame in values["frames"]), "photos lie in a folder"
-    tripod = np.full((32, 64), 255, np.uint8)
-    tripod[-6:] = 0
-    write_mask(tmp_path / "mask.png", tripod)
-    masked = load(tmp_path, holdout=0).views[0].mask
-    np.testing.assert_allclose(masked[:-6], whole[:-6], atol=1e-6)
-    assert (masked[-6:] == 0).all() and (whole[-6:] > 0).all()
 
 
 def test_masks_that_leave_out_everything_are_named(tmp_path):

@@ -2,7 +2,6 @@
 
 import gc
 import os
-import subprocess
 import sys
 from collections import namedtuple
 
@@ -13,41 +12,6 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.photo_file import PhotoFile, open_shared
 from tests.make_scenes import write_blender, write_ply
-
-LOAD = """
-import gc, re, sys
-from pathlib import Path
-import torch
-from sehdr_warp.scene import load_scene
-# Pages of files can be dropped at any time; what cannot is anonymous.
-bytes_of = lambda name: 1024 * int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
-for where in ("disk", "memory", "disk"):  # The first loads libraries, too.
-    held, peak = bytes_of("RssAnon"), bytes_of("VmHWM")
-    scene = load_scene(sys.argv[1], response="srgb", photo_storage=where)
-    codes = [view.codes for view in scene.views]
-    grown = bytes_of("VmHWM") - peak
-    held = bytes_of("RssAnon") - held
-    print(held, grown, sum(photo.nbytes for photo in codes), sum(int(photo[::7].sum()) for photo in codes))
-    del scene, codes
-    gc.collect()
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
-def test_a_photo_takes_three_bytes_a_pixel_and_none_on_the_disk(tmp_path):
-    write_blender(tmp_path, 3, size=(1600, 1200), ply_file_path="p.ply")
-    write_ply(tmp_path / "p.ply", [(0, 0, 0)])
-    # What is freed is to be given back at once, so that what is counted is held.
-    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_ARENA_MAX": "1"}
-    call = [sys.executable, "-c", LOAD, str(tmp_path)]
-    ended = subprocess.run(call, capture_output=True, text=True, check=True, env=environment)
-    figures = [list(map(int, line.split())) for line in ended.stdout.splitlines()]
-    (_, grown, *_), (memory, more, *photos), (disk, _, *same_photos) = figures
-    codes = photos[0]
-    assert photos == same_photos and codes == 3 * 1600 * 1200 * 3
-    assert 0.9 * codes < memory < 1.1 * codes and disk < 0.1 * codes
-    # What decoding a few photos takes besides; float32 copies of all would be four times the codes more.
-    assert grown < codes + 200e6 and more < codes
 
 
 def test_arrays_are_kept_shared_and_gone(tmp_path):

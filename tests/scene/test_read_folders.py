@@ -1,7 +1,6 @@
 """Folders as phones, cameras and other programs leave them: what is read, and what is named instead."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene.load import parse_dataset
 from sehdr_warp.scene.read_folders import find_photos
 from sehdr_warp.scene.unused_files import unused_notes
-from tests.make_scenes import load, pattern, write_blender, write_colmap, write_ply
+from tests.make_scenes import edited_json, load, pattern, write_blender, write_colmap, write_ply
 
 
 def photos(folder, count=4, suffix=".jpg"):
@@ -65,13 +64,6 @@ def test_photos_as_3dgs_convert_expects_them(tmp_path):
     assert [record.image.parent.name for record in find_photos(tmp_path).records] == ["input"] * 4
 
 
-def test_photos_beside_the_model_in_dense(tmp_path):
-    write_colmap(tmp_path / "dense")
-    shutil.move(tmp_path / "dense" / "sparse" / "0", tmp_path / "model")
-    shutil.move(tmp_path / "model", tmp_path / "dense" / "sparse" / "0")
-    assert len(load(tmp_path, holdout=0).views) == 6
-
-
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
     ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"),
@@ -111,13 +103,6 @@ def test_folders_that_systems_keep_are_no_photos(tmp_path, place):
     assert len(scene.views) == 6 and not any("in no view" in note or "not used" in note for note in scene.notes)
 
 
-def test_what_cameras_write_beside_photos_is_named_by_kind(tmp_path):
-    write_colmap(tmp_path)
-    files(tmp_path, *(f"images/{name}" for name in ("a.insp", "DJI_1.SRT", "DJI_1.LRF", "p.dcp", "IMG_1.AAE", "1.xmp")))
-    note = next(note for note in load(tmp_path, holdout=0).notes if "not read" in note)
-    assert "1 DCP (p.dcp), 1 INSP (a.insp), 1 LRF (DJI_1.LRF), 1 SRT (DJI_1.SRT)" in note and "AAE" not in note
-
-
 @pytest.mark.parametrize("change", ["null model", "text numbers", "flat pose", "mark"])
 def test_transforms_as_apps_write_them(tmp_path, change):
     write_blender(tmp_path, 6)
@@ -148,9 +133,8 @@ def test_text_that_is_no_number_is_named(tmp_path, value):
 def test_masks_and_points_that_are_missing_are_named(tmp_path):
     write_blender(tmp_path, 6, ply_file_path="sparse_pc.ply")
     file = tmp_path / "transforms.json"
-    values = json.loads(file.read_text())
-    values["frames"][1]["mask_path"] = "masks/r_1.png"
-    file.write_text(json.dumps(values))
+    with edited_json(file) as values:
+        values["frames"][1]["mask_path"] = "masks/r_1.png"
     scene = load(tmp_path, holdout=0)
     assert len(scene.views) == 6
     assert "1 masks that frames state are not here, and their photos count whole: r_1.png" in scene.notes
@@ -164,11 +148,10 @@ def test_masks_and_points_under_other_spellings(tmp_path, before):
     (tmp_path / "m").mkdir()
     write_ply(tmp_path / "m" / "cloud.ply", [(0, 0, 0), (1, 2, 3)])
     file = tmp_path / "transforms.json"
-    values = json.loads(file.read_text())
-    for i, frame in enumerate(values["frames"]):
-        frame["mask_path"] = f"{before}half_{i}.png" if i else ""
-        Image.fromarray(np.eye(30, 40, dtype=np.uint8) * 255).save(tmp_path / "m" / f"half_{i}.png")
-    file.write_text(json.dumps(values))
+    with edited_json(file) as values:
+        for i, frame in enumerate(values["frames"]):
+            frame["mask_path"] = f"{before}half_{i}.png" if i else ""
+            Image.fromarray(np.eye(30, 40, dtype=np.uint8) * 255).save(tmp_path / "m" / f"half_{i}.png")
     scene = load(tmp_path, holdout=0)
     assert [view.mask is None for view in scene.views] == [True] + [False] * 5
     assert "not here" not in str(scene.notes) and len(scene.points) == 2

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
+from tests.make_scenes import edited_json
 
 SIZES = {"spherical": (64, 32), "perspective": (48, 36), "fisheye": (48, 48)}
 
@@ -53,13 +54,12 @@ def test_what_cannot_be_used_is_named(tmp_path):
         with pytest.raises(InputError, match=match):
             load_scene(folder, response="srgb")
 
-    whole = json.loads((folder / "reconstruction.json").read_text())
-    refused("is not a list of reconstructions", "{}")
-    whole[1]["cameras"]["v2"]["projection_type"] = "dual"
-    refused("projection_type 'dual', which is not supported", json.dumps(whole))
-    whole[1]["cameras"]["v2"]["projection_type"] = "spherical"
-    whole[1]["shots"]["1.jpg"]["rotation"] = [0, "x", 1]
-    (folder / "reconstruction.json").write_text(json.dumps(whole))
+    with edited_json(folder / "reconstruction.json") as whole:
+        refused("is not a list of reconstructions", "{}")
+        whole[1]["cameras"]["v2"]["projection_type"] = "dual"
+        refused("projection_type 'dual', which is not supported", json.dumps(whole))
+        whole[1]["cameras"]["v2"]["projection_type"] = "spherical"
+        whole[1]["shots"]["1.jpg"]["rotation"] = [0, "x", 1]
     scene = load_scene(folder, response="srgb")
     assert len(scene.views) == 3 and "pose of '1.jpg' cannot be used" in scene.notes[0]
     for name in ("0.jpg", "2.jpg"):

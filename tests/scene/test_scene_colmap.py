@@ -8,6 +8,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.colmap_model import find_model
+from sehdr_warp.scene.dataparser import reinhard_gamma
 from sehdr_warp.scene.lens import CAMERA_MODELS
 from sehdr_warp.scene.read_folders import find_photos, model_fits
 from tests.make_scenes import arc_poses, load, pattern, write_colmap
@@ -89,23 +90,6 @@ def test_a_model_without_cameras_is_named(tmp_path, place):
     shutil.rmtree(tmp_path / "model")
     note = f"{place} is not read, because it has no cameras.bin or cameras.txt: cameras are found anew"
     assert find_photos(tmp_path).notes == (note,)
-
-
-def test_of_models_under_other_names_the_largest_is_used(tmp_path):
-    write_colmap(tmp_path / "few", 3)
-    write_colmap(tmp_path)
-    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "second")
-    (tmp_path / "few" / "sparse" / "0").rename(tmp_path / "sparse" / "first")
-    scene = load(tmp_path, holdout=0)
-    assert len(scene.views) == 6
-    assert "sparse/second is used, the largest model (6 images); not used: first (3 images)" in scene.notes
-
-
-def test_a_folder_above_sets_is_no_set(tmp_path):
-    write_colmap(tmp_path / "room")
-    assert find_model(tmp_path, anywhere=True) is None
-    with pytest.raises(InputError, match="give one of its folders with photos: room"):
-        load(tmp_path)
 
 
 def test_a_model_without_its_photos_is_named(tmp_path):
@@ -222,23 +206,6 @@ def test_reduced_images_scale_the_camera_and_others_are_refused(tmp_path):
         load(tmp_path)
 
 
-def test_mask_and_alpha_keep_pixels_out(tmp_path):
-    write_colmap(tmp_path)
-    (tmp_path / "masks").mkdir()
-    mask = np.full((48, 64), 255, np.uint8)
-    mask[:, :16] = 0
-    Image.fromarray(mask).save(tmp_path / "masks" / "000.png.png")
-    alpha = np.full((48, 64, 1), 255, np.uint8)
-    alpha[:12] = 0
-    Image.fromarray(np.concatenate([pattern(64, 48, 1), alpha], 2)).save(tmp_path / "images" / "001.png")
-    scene = load(tmp_path)
-    assert scene.views[0].mask[:, :16].max() == 0 and scene.views[0].mask[:, 16:].min() == 1
-    assert scene.views[1].mask[:12].max() == 0 and scene.views[1].mask[12:].min() == 1
-    np.testing.assert_array_equal(scene.views[1].image, pattern(64, 48, 1).astype(np.float32) / np.float32(255))
-    assert scene.views[2].mask is None
-    assert "transparency: 1 of 6 photos have transparent pixels, which are left out" in scene.notes
-
-
 def test_files_of_a_model_of_two_kinds(tmp_path):
     write_colmap(tmp_path, binary=True)
     write_colmap(tmp_path / "text", binary=False)
@@ -304,23 +271,8 @@ def test_the_folder_of_photos_may_be_a_link(tmp_path):
     assert len(load(tmp_path / "set").views) == 6
 
 
-def test_fern_is_read_as_pycolmap_reads_it(shared):
-    folder = shared / "data" / "fern"
-    oracle = pycolmap.Reconstruction(folder / "sparse" / "0")
-    scene = load(folder, max_size=100)
-    assert [view.name for view in scene.test_views] == ["000", "008", "016"] and len(scene.views) == 20
-    assert not scene.exposure_times_known and any("1 s" in note for note in scene.notes)
-    assert scene.points.shape == (oracle.num_points3D(), 3)
-    poses = {image.name: image.cam_from_world().matrix() for image in oracle.images.values()}
-    for view in scene.views:
-        np.testing.assert_allclose(view.camera.world_to_camera[:3], poses[view.source.name], atol=1e-12)
-        assert view.image.shape == (75, 100, 3)
-
-
 def test_hdr_gs_layout(tmp_path):
     write_colmap(tmp_path, name="{}_1.png")
-    from sehdr_warp.scene.dataparser import reinhard_gamma
-
     (tmp_path / "exr").mkdir()
     import OpenEXR
 

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.response import response_by_name, selection
 from sehdr_warp.scene import load_scene, sfm
 from sehdr_warp.scene.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.dataparser import ImageRecord, PointCloud
@@ -23,7 +24,7 @@ from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
 from sehdr_warp.scene.names import natural_key, unique_names
 from sehdr_warp.scene.sfm import MOST_ERROR, Reconstruction, image_name, reconstruct
-from tests.make_scenes import load, write_blender, write_colmap, write_ply
+from tests.make_scenes import edited_json, load, write_blender, write_colmap, write_ply
 
 _TIME, _NUMBER, _ISO, _APEX = 33434, 33437, 34855, 37377
 
@@ -83,11 +84,6 @@ def test_times_read_as_photographers_write_them(seconds, text):
     assert shutter(seconds) == text
 
 
-def test_shutter_speed_stands_in_for_exposure_time(tmp_path):
-    write_colmap(tmp_path, name="{:03d}.jpg", exif={i: {_APEX: 3.0} for i in range(6)})
-    assert {view.exposure_time for view in load(tmp_path).views} == {0.125}
-
-
 def test_one_photo_without_time_does_not_stop_a_set_and_a_list_helps(tmp_path):
     write_colmap(tmp_path, name="{:03d}.jpg", exif={i: {_TIME: 0.01} for i in range(5)})
     assert any(note.startswith("005 states no exposure time: ") for note in load(tmp_path).notes)
@@ -128,10 +124,9 @@ def test_lists_of_times_that_are_not_read_are_named(tmp_path, name):
 
 def test_one_frame_with_an_impossible_time_stops_no_set(tmp_path):
     write_blender(tmp_path)
-    values = json.loads((tmp_path / "transforms.json").read_text())
-    for i, frame in enumerate(values["frames"]):
-        frame["exposure_time"] = 0.5 if i else -1
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with edited_json(tmp_path / "transforms.json") as values:
+        for i, frame in enumerate(values["frames"]):
+            frame["exposure_time"] = 0.5 if i else -1
     scene = load(tmp_path, holdout=0)
     assert len(scene.views) == 6 and scene.views[1].exposure_time == 0.5
     assert "1 of 6 frames state no usable exposure time: exposure time of './images/r_0' is -1" in scene.notes
@@ -156,16 +151,6 @@ def test_listed_times_under_other_spellings(tmp_path, name):
     assert not [note for note in scene.notes if "exposures.json" in note]
 
 
-def test_splits(tmp_path):
-    write_colmap(tmp_path, 9)
-    assert [view.name for view in load(tmp_path).test_views] == ["000", "008"]
-    assert [view.name for view in load(tmp_path, holdout=4).test_views] == ["000", "004", "008"]
-    assert not load(tmp_path, holdout=0).test_views
-    write_colmap(tmp_path / "few", 4)
-    few = load(tmp_path / "few")
-    assert not few.test_views and "no views are held out for testing" in few.notes
-
-
 def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
     write_blender(tmp_path, 13, ply_file_path="p.ply")
     write_ply(tmp_path / "p.ply", [(0, 0, 0)])
@@ -187,8 +172,6 @@ def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
 
 def test_the_response_is_chosen_from_codes_as_photographed(monkeypatch):
     """At any size the same photos are judged; what chose is noted, and another curve develops otherwise."""
-    from sehdr_warp.response import response_by_name, selection
-
     judged = []
 
     def select(photos, candidates, **options):
@@ -205,18 +188,6 @@ def test_the_response_is_chosen_from_codes_as_photographed(monkeypatch):
     assert named.chosen_by is None and named.response.name == "hdr-nerf"
     assert np.abs(named.views[0].image - scenes[1].views[0].image).max() > 1e-3
     assert load_scene("embedded", max_size=40, response=named.response).response is named.response
-
-
-def test_names_are_unique_and_test_views_keep_theirs(tmp_path):
-    lens = Lens("SIMPLE_PINHOLE", 4, 4, (4, 2, 2), tmp_path)
-
-    def shot(path, split):
-        return ImageRecord((tmp_path / path).stem, tmp_path / path, lens, np.eye(4), split=split)
-
-    shots = [shot("train/r_0.png", "train"), shot("train/R_1.png", "train"), shot("test/r_0.png", "test"),
-             shot("a/x.png", None), shot("b/X.png", None), shot("train/r_2.png", "train")]  # fmt: skip
-    assert unique_names(shots) == ["train_r_0", "R_1", "r_0", "a_x", "b_X", "r_2"]
-    assert sorted(["img10", "img2", "a"], key=natural_key) == ["a", "img2", "img10"]
 
 
 def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, shared, caplog):
@@ -307,14 +278,6 @@ def test_poor_placement_is_named_with_its_photos():
     assert weak.startswith("1 photo shares few points with others, so its place is uncertain: 3.jpg;")
 
 
-def test_embedded_scene_loads():
-    scene = load("embedded")
-    assert scene.format == "hdr-nerf" and scene.name == "embedded"
-    assert len(scene.train_views) >= 10 and len(scene.test_views) >= 5 and not len(scene.points)
-    assert all(view.hdr is not None and view.hdr.shape == view.image.shape for view in scene.views)
-    assert scene.exposure_times_known
-
-
 def test_the_room_is_light_and_transforms_need_no_pycolmap(tmp_path):
     """Unless lenses distort."""
     write_blender(tmp_path)
@@ -352,3 +315,25 @@ def test_scenes_views_and_cameras_print_in_one_line():
     assert repr(scene) == "Scene('embedded', hdr-nerf, 27 views of 32 x 32, 18 to train)"
     assert repr(view) == "View('train_r_0', 32 x 32, train, 0.5 s)"
     assert repr(view.camera).startswith("Camera(32 x 32, focal length 32.8") and "\n" not in repr(view.camera)
+
+
+def test_splits(tmp_path):
+    write_colmap(tmp_path, 9)
+    assert [view.name for view in load(tmp_path).test_views] == ["000", "008"]
+    assert [view.name for view in load(tmp_path, holdout=4).test_views] == ["000", "004", "008"]
+    assert not load(tmp_path, holdout=0).test_views
+    write_colmap(tmp_path / "few", 4)
+    few = load(tmp_path / "few")
+    assert not few.test_views and "no views are held out for testing" in few.notes
+
+
+def test_names_are_unique_and_test_views_keep_theirs(tmp_path):
+    lens = Lens("SIMPLE_PINHOLE", 4, 4, (4, 2, 2), tmp_path)
+
+    def shot(path, split):
+        return ImageRecord((tmp_path / path).stem, tmp_path / path, lens, np.eye(4), split=split)
+
+    shots = [shot("train/r_0.png", "train"), shot("train/R_1.png", "train"), shot("test/r_0.png", "test"),
+             shot("a/x.png", None), shot("b/X.png", None), shot("train/r_2.png", "train")]  # fmt: skip
+    assert unique_names(shots) == ["train_r_0", "R_1", "r_0", "a_x", "b_X", "r_2"]
+    assert sorted(["img10", "img2", "a"], key=natural_key) == ["a", "img2", "img10"]

@@ -12,6 +12,7 @@ from sehdr_warp.scene.dataparser import reinhard_gamma
 from sehdr_warp.scene.read_transforms import read_transforms
 from tests.make_scenes import (
     arc_poses,
+    edited_json,
     load,
     pattern,
     room_views,
@@ -20,7 +21,7 @@ from tests.make_scenes import (
     write_llff,
     write_ply,
     write_room,
-)  # fmt: skip
+)
 
 
 def _edit(folder, **fields):
@@ -47,15 +48,6 @@ def test_transparent_pixels_show_black_light(tmp_path):
     note = "transparency: 6 of 6 photos have transparent pixels, which count as black light"
     assert note in load(tmp_path, cache=tmp_path / "cache").notes
     np.testing.assert_allclose(view.image[:, 20:], pattern(40, 30, 0)[:, 20:] / 255, atol=1e-6)
-
-
-def test_clipping_survives_where_it_covers_half(tmp_path):
-    write_blender(tmp_path)
-    photo = np.full((30, 40, 3), 128, np.uint8)
-    photo[::2, :20] = photo[::2, 20::2] = 255
-    Image.fromarray(photo).save(tmp_path / "images" / "r_0.png")
-    image = load(tmp_path, max_size=20, cache=tmp_path / "cache").views[0].image
-    assert image[:, :10].min() == 1 and image[:, 10:].min() > 0.5 and image[:, 10:].max() < 0.9
 
 
 def test_frame_values_win_over_the_files(tmp_path):
@@ -114,27 +106,20 @@ def test_distortion_whose_meaning_is_open_is_refused(tmp_path, name):
 def test_intrinsics_of_frames_alone_and_in_degrees(tmp_path):
     """LichtFeld-Studio pull request 1608, nerfstudio issue 737."""
     write_blender(tmp_path, exposure_time=0.25)
-    values = json.loads((tmp_path / "transforms.json").read_text())
-    del values["camera_angle_x"]
-    for frame in values["frames"]:
-        frame |= {"x_fov": np.degrees(0.8), "w": 40, "h": 30, "cx": 19.0}
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with edited_json(tmp_path / "transforms.json") as values:
+        del values["camera_angle_x"]
+        for frame in values["frames"]:
+            frame |= {"x_fov": np.degrees(0.8), "w": 40, "h": 30, "cx": 19.0}
     view = load(tmp_path).views[0]
     assert view.camera.fx == view.camera.fy == pytest.approx(20 / np.tan(0.4)) and view.camera.cx == 19
     assert view.exposure_time == 0.25
 
 
 def test_nerfstudio_points_move_with_the_poses(tmp_path):
-    write_blender(tmp_path, applied_transform=[[0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]])
+    write_blender(tmp_path, applied_transform=[[0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]], applied_scale=0.5)
     write_colmap(tmp_path / "colmap")
-    points = load(tmp_path).points
-    assert {tuple(p) for p in points} == {(-i / 3 + 5, i, -0.25) for i in range(5)}
-
-
-def test_points_have_the_scale_that_was_applied_to_the_poses(tmp_path):
-    write_blender(tmp_path, applied_transform=np.eye(4)[:3].tolist(), applied_scale=0.5)
-    write_colmap(tmp_path / "colmap")
-    assert {tuple(p) for p in load(tmp_path).points} == {(i / 2, -i / 6, 0.125) for i in range(5)}
+    expected = sorted([(-i / 3 + 5) / 2, i / 2, -0.125] for i in range(5))
+    np.testing.assert_allclose(sorted(load(tmp_path).points.tolist()), expected)
 
 
 def test_distortion_as_a_list(tmp_path):
@@ -192,12 +177,11 @@ def test_exr_among_photos_is_refused_and_beside_one_is_truth(tmp_path):
     import OpenEXR
 
     write_blender(tmp_path)
-    values = json.loads((tmp_path / "transforms.json").read_text())
-    for i, frame in enumerate(values["frames"]):
-        frame["file_path"] = f"images/r_{i}.exr"
-        with OpenEXR.File({}, {"RGB": np.full((30, 40, 3), i + 1, np.float32)}) as file:
-            file.write(str(tmp_path / frame["file_path"]))
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with edited_json(tmp_path / "transforms.json") as values:
+        for i, frame in enumerate(values["frames"]):
+            frame["file_path"] = f"images/r_{i}.exr"
+            with OpenEXR.File({}, {"RGB": np.full((30, 40, 3), i + 1, np.float32)}) as file:
+                file.write(str(tmp_path / frame["file_path"]))
     scene = load(tmp_path, cache=tmp_path / "cache")
     assert [view.hdr.max() for view in scene.views] == [1, 2, 3, 4, 5, 6]
     (tmp_path / "images" / "r_2.png").unlink()
@@ -230,16 +214,6 @@ def test_hdr_nerf_round_trip(room, shared):
     assert len(scene.points) == 21600
     with pytest.raises(InputError, match=r"index 7 asked for, but the exposures are \[0, 1, 2, 3, 4\]"):
         load(folder, exposure_index=7)
-
-
-def test_photos_are_averaged_as_light(room):
-    """Half-size photos must agree with the half-size radiance that was photographed, not with averaged code values."""
-    folder, _ = room
-    small = load(folder, max_size=25, response="hdr-nerf")
-    for view in small.views:
-        exact = reinhard_gamma(view.hdr * view.exposure_time)
-        assert np.percentile(np.abs(view.image - exact), 99) < 1 / 255
-        assert (view.camera.width, view.camera.cx) == (25, 12.5)
 
 
 @pytest.mark.parametrize("value, message", [(0, "0"), (-1, "-1"), ("NaN", "NaN"), (None, "None")])

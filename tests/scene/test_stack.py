@@ -7,7 +7,9 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.stack import calibrate
 
 
 class Matched(Exception):
@@ -63,9 +65,6 @@ def test_other_photos_are_matched(tmp_path, times, shift):
 
 
 def test_a_curve_for_each_channel_is_calibrated(tmp_path):
-    from sehdr_warp.response import response_by_name
-    from sehdr_warp.scene.stack import calibrate
-
     rng = np.random.default_rng(0)
     light = 2.0 ** rng.uniform(-8, 0, (60, 80, 1)).repeat(3, 2)
     (tmp_path / "stack").mkdir()

@@ -28,15 +28,6 @@ def test_names_of_truth(tmp_path, layout, name):
     assert not any("in no view" in note or "left out" in note for note in scene.notes)
 
 
-def test_truth_of_no_photo_is_named(tmp_path):
-    write_colmap(tmp_path)
-    write_truth(tmp_path / "hdr" / "000.exr")
-    write_truth(tmp_path / "hdr" / "probe.exr")
-    scene = load(tmp_path, holdout=0)
-    assert [view.hdr is not None for view in scene.views] == [True] + [False] * 5
-    assert "hdr/ holds 1 file that is the truth of no photo: probe.exr" in scene.notes
-
-
 @pytest.mark.parametrize("fault", ["not finite", "cannot be read as OpenEXR", "HDR truth is 32 x 24", "negative"])
 def test_truth_that_cannot_be_used_is_left_out_and_named(tmp_path, fault):
     write_colmap(tmp_path)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.camera import Camera
 from sehdr_warp.scene.lens import Lens
@@ -124,16 +123,3 @@ def test_panoramas_of_nerfstudio_are_loaded_whole(tmp_path, model):
     assert view.camera.projection == "equirectangular" and view.codes.shape == (32, 64, 3)
     np.testing.assert_allclose(view.mask[:24], solid_angles(view.camera)[:24], atol=1e-6)
     assert (view.mask[24:] == 0).all()
-
-
-def test_a_wide_fisheye_photo_is_loaded_whole(tmp_path):
-    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
-    lens = dict(zip(names, FISHEYE, strict=True)) | {"camera_model": "OPENCV_FISHEYE"}
-    view = load_scene(write_set(tmp_path, lens, (128, 96)), response="srgb").views[0]
-    assert view.camera.projection == "OPENCV_FISHEYE" and view.codes.shape == (96, 128, 3)
-    assert view.codes.dtype == np.uint8 and view.mask.max() == pytest.approx(1)
-
-
-def test_panoramas_that_are_not_whole_are_refused(tmp_path):
-    with pytest.raises(InputError, match="equirectangular photos are 128 x 96, not twice as wide as high"):
-        load_scene(write_set(tmp_path, {"camera_model": "EQUIRECTANGULAR"}, (128, 96)))

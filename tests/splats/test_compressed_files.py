@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.splats import LOSSY_SUFFIXES, GaussianArrays, check_suffix, read_gaussians, write_gaussians
-from sehdr_warp.splats.packing import codebook, from_smallest_three, morton_order, palette, smallest_three
 
 from .test_npm_parsers import package
 from .test_splat_files import gaussians
@@ -49,8 +49,6 @@ def covariances(each):
 
 def pairs(a, b):
     """The index of the Gaussian of b at the place of each of a."""
-    from scipy.spatial import cKDTree
-
     return cKDTree(b.means).query(a.means)[1]
 
 
@@ -222,32 +220,3 @@ def test_damage_and_other_versions_are_one_line(tmp_path):
             changed.writestr(name, text)
     with pytest.raises(InputError, match="is SOG of version 1"):
         read_gaussians(old)
-
-
-def test_neighbors_stay_neighbors():
-    points = np.random.default_rng(0).uniform(size=(4000, 3)).astype(np.float32)
-    points[0] = 1e6  # A stray changes nothing.
-    order = morton_order(points)
-    assert sorted(order.tolist()) == list(range(4000))
-    steps = np.linalg.norm(np.diff(points[order], axis=0), axis=1)
-    assert np.median(steps) < 0.1
-
-
-def test_codebooks_and_palettes_are_near():
-    random = np.random.default_rng(0)
-    values = np.concatenate([random.normal(size=5000), [40.0, -30.0]])
-    levels, codes = codebook(values)
-    assert (np.diff(levels) >= 0).all() and np.abs(levels[codes] - values).max() < 0.4
-    assert np.abs(levels[codes] - values).mean() < 0.02
-    rows = np.repeat(random.normal(size=(40, 9)), 50, axis=0) + random.normal(0, 0.01, (2000, 9))
-    centers, labels = palette(rows, 128)
-    assert np.abs(centers[labels] - rows).mean() < 0.02 and labels.max() < 128
-    few, same = palette(np.ones((5, 3)), 5)
-    np.testing.assert_allclose(few[same], 1)
-
-
-def test_three_components_make_a_quaternion():
-    turns = np.random.default_rng(0).normal(size=(100, 4))
-    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
-    back = from_smallest_three(*smallest_three(turns))
-    np.testing.assert_allclose(np.abs((back * turns).sum(axis=1)), 1, atol=1e-6)

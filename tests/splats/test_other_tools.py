@@ -73,16 +73,6 @@ def test_the_mark_of_opacity_compensation_is_kept_and_warned_of(tmp_path, caplog
     assert b"SplatRenderMode" not in (tmp_path / "d.ply").read_bytes()
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply"])
-def test_the_mark_of_opacity_compensation_in_compressed_files(tmp_path, caplog, suffix):
-    """Brush issue 466: SPZ has a flag of it, SOG a field of meta.json; both were passed over."""
-    path = tmp_path / f"a{suffix}"
-    write_gaussians(path, arrays())
-    assert not read_gaussians(path).compensated and not caplog.records
-    write_gaussians(path, replace(arrays(), compensated=True), overwrite=True)
-    assert read_gaussians(path).compensated and "trained with opacity compensation" in caplog.text
-
-
 def test_gaussians_of_two_sizes_are_flat(tmp_path, caplog):
     """SuperSplat issue 975: 2D Gaussian Splatting writes scale_0 and scale_1 alone."""
     write_ply(tmp_path / "a.ply")

@@ -36,15 +36,6 @@ def test_the_embedded_photos_come_back():
     assert off.max() <= 1.001 / 255 and (off > 1e-4).mean() < 0.25
 
 
-def test_the_same_photos_color_the_points_alike(room):
-    rng, response = np.random.default_rng(0), response_by_name("srgb")
-    points, colors = rng.uniform(-1, 1, (200, 3)), rng.uniform(0, 1, (200, 3)).astype(np.float32)
-    once = expose(replace(room, points=points, point_colors=colors), response, 0.25)
-    again = expose(once, response, 0.25)
-    assert (once.point_colors != colors).any()
-    np.testing.assert_array_equal(again.point_colors, once.point_colors)
-
-
 def test_noise_has_the_variance_of_photons_and_read_out():
     noise, white = SensorNoise(full_well=1000.0, read_noise=3.0), 4.0
     electrons = noisy(np.full((300, 300, 3), 0.2 * white), white, noise, np.random.default_rng(0)) / white * 1000.0

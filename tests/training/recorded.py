@@ -1,15 +1,16 @@
 """Whole trainings on a GPU, with recorded steps and with launched ones."""
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.run_output import evaluate_views
 from sehdr_warp.training.trainer import Trainer
+
+from .toy import make_trainer
 
 
 def train_on_gpu(scene, config, *, recorded: bool = True, iterations: int | None = None) -> tuple[Trainer, int]:
     """The trainer after its iterations, and how many of them were replayed."""
     config = override_config(config, {"schedule.use_cuda_graph": recorded})
-    trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cuda:0"))
+    trainer = make_trainer(scene, config, "cuda:0")
     replays = 0
     for _ in range(iterations or config.schedule.iterations):
         trainer.step()

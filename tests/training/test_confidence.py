@@ -2,6 +2,7 @@
 load."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -22,8 +23,6 @@ def trained(scene, tmp_path_factory):
 
 @pytest.fixture
 def run(trained, tmp_path):
-    import shutil
-
     shutil.copytree(trained.path, tmp_path / "run")
     return load_run(tmp_path / "run")
 

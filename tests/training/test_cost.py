@@ -72,14 +72,6 @@ def test_blocks_take_as_long_and_as_much_memory_as_measured():
             assert error(cost.gpu_bytes + cost.photo_bytes, row["peak_memory_bytes"]) < 0.3
 
 
-def test_only_what_was_measured_is_no_prediction():
-    small = Workload(200, 2e6, 1e6, 15_000)
-    assert [training_cost(small, gpus).predicted for gpus in (1, 2, 4)] == [False, False, True]
-    assert training_cost(small, 2, 2).predicted and training_cost(replace(small, gaussians=2e7)).predicted
-    lines = [choice.line() for choice in choices(SURVEY, SURVEY, 65, 80e9, 2)]
-    assert all(line.endswith("(prediction)") for line in lines if "64" in line or "8 GPUs" in line)
-
-
 def test_more_gpus_and_blocks_cost_what_they_must():
     small = Workload(200, 2e6, 1e6, 15_000)
     times = [training_cost(small, gpus).seconds for gpus in (1, 2, 4)]

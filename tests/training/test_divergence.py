@@ -9,7 +9,7 @@ from sehdr_warp.training.train import train
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
 
-from .toy import load_unscaled
+from .toy import load_unscaled, make_trainer
 
 
 def config(**overrides):
@@ -54,11 +54,10 @@ def test_while_the_loss_is_not_finite_the_last_checkpoint_stays(scene, tmp_path,
 
 def test_huge_gradients_leave_finite_parameters(scene):
     """A gradient too large to be squared in float32 would freeze Adam's second moment at infinity."""
-    from sehdr_warp.training.initialization import make_field, response_for_training
 
     options = config()
-    field = make_field(scene, options, response_for_training(scene, options), "cpu")
-    trainer = Trainer(scene, options, field)
+    trainer = make_trainer(scene, options)
+    field = trainer.field
     factor = [1e36]
     field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * factor[0])
     trainer.step()

@@ -6,11 +6,9 @@ import pytest
 import torch
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.machine import torch_settings
-from sehdr_warp.training.trainer import Trainer
 
-from .toy import quick
+from .toy import make_trainer, quick
 
 EARLY = {
     f"densification.{name}": value
@@ -20,8 +18,7 @@ EARLY |= {"adc.reset_every": 20, "schedule.sh_degree_interval": 4}
 BASE = {
     "mcmc": quick(length=45, **EARLY),
     "adc": quick(
-        length=45,
-        **EARLY | {"densification.strategy": "adc", "loss.opacity_weight": 0.0, "mcmc.noise_lr": 0.0},
+        length=45, **EARLY | {"densification.strategy": "adc", "loss.opacity_weight": 0.0, "mcmc.noise_lr": 0.0}
     ),
 }
 FIELDS = [
@@ -48,7 +45,7 @@ def end(scene):
     def train(strategy, *changed):
         config = override_config(BASE[strategy], dict([changed] if changed else []))
         with torch_settings(deterministic=False):
-            trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
+            trainer = make_trainer(scene, config)
             for _ in range(config.schedule.iterations):
                 trainer.step()
         return torch.cat([tensor.flatten() for tensor in trainer.field.gaussians.tensors().values()]).detach()

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.model.baking import field_of
@@ -136,8 +137,6 @@ def test_auto_chooses_from_the_candidates(method, tmp_path):
 
 
 def test_posterior_takes_a_cameras_curve_for_a_cameras_files(tmp_path):
-    from PIL import Image
-
     tags = Image.Exif()
     tags.get_ifd(0x8769)[0x829A] = 0.01
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "photo.jpg", exif=tags)

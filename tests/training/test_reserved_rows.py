@@ -5,17 +5,15 @@ import torch
 
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.training import step_graphs, trainer
-from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.strategies import base
-from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
 
-from .toy import VARIANTS
+from .toy import VARIANTS, make_trainer
 
 
 def trained_steps(scene, config, device, reserves):
     """A trainer after 60 steps, and how often its Gaussians moved in how many changes of their number."""
-    training = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), device))
+    training = make_trainer(scene, config, device)
     training.reserves_rows, gaussians, moves = reserves, training.field.gaussians, []
     for _ in range(60):
         count, before = gaussians.count, gaussians.reallocations
@@ -46,7 +44,7 @@ def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch
     monkeypatch.setattr(trainer, "MAX_RESERVE", 8.0)
     monkeypatch.setattr(step_graphs, "MIN_HEADROOM", 0.0)
     config = VARIANTS["default"]
-    training = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cuda:0"))
+    training = make_trainer(scene, config, "cuda:0")
     for _ in range(48):
         training.step()
     recorded, count = training.graphs.captured, training.field.gaussians.count

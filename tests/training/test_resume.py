@@ -14,12 +14,11 @@ from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
-from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import TrainingState, load_state, state_of
 
-from .toy import VARIANTS, quick, toy_scene, without_truth
+from .toy import VARIANTS, make_trainer, quick, toy_scene, without_truth
 
 
 @pytest.mark.parametrize("variant", ["adc", "default", "paper"])
@@ -109,7 +108,7 @@ def test_a_trainer_continues_from_its_state(scene, variant):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        whole = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
+        whole = make_trainer(scene, config)
         _steps(whole, 30)
         tensors, values = state_of(whole)
         tensors = {name: value.clone() for name, value in tensors.items()}

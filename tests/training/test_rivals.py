@@ -14,18 +14,17 @@ from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.runs.config_files import load_config, override_config, preset_names
-from sehdr_warp.training.initialization import make_field, response_for_training
+from sehdr_warp.training.initialization import response_for_training
 from sehdr_warp.training.losses import Target, anchor_loss, code_scale, data_loss, hdr_loss
 from sehdr_warp.training.scene_facts import largest_hdr_truth
 from sehdr_warp.training.train import train
-from sehdr_warp.training.trainer import Trainer
 
 from .recorded import train_on_gpu
-from .toy import VARIANTS, quick, without_truth
+from .toy import VARIANTS, make_trainer, quick, without_truth
 
 
 def trainer_of(scene, config):
-    return Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
+    return make_trainer(scene, config)
 
 
 def test_presets_are_what_their_methods_say():

@@ -7,12 +7,10 @@ import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer.training_step import check_finite
-from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.step_graphs import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
-from sehdr_warp.training.trainer import Trainer
 
 from .recorded import check_recorded_like_launched
-from .toy import VARIANTS, quick, toy_scene
+from .toy import VARIANTS, make_trainer, quick, toy_scene
 
 MANY = 10 * MIN_CAPACITY
 
@@ -89,7 +87,7 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
             raise RuntimeError("operation not permitted when stream is capturing\nmore")
 
     config = quick()
-    trainer = Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), "cpu"))
+    trainer = make_trainer(scene, config)
     trainer.graphs._first = BrokenRunner()
     monkeypatch.setattr(trainer.graphs, "is_ready", lambda *_: trainer.iteration > 1)
     trainer.step()

@@ -111,12 +111,6 @@ def test_statistics_stay_where_recorded_steps_add_to_them():
     assert strategy.photo_count.shape == (6,) and strategy.state_dict(5)["seen"].shape == (5,)
 
 
-def test_rotation_is_the_quaternions():
-    half = math.sqrt(0.5)
-    turned = rotate(torch.tensor([[2 * half, 0.0, 0.0, 2 * half]]), torch.tensor([[1.0, 0.0, 0.0]]))
-    torch.testing.assert_close(turned, torch.tensor([[0.0, 1.0, 0.0]]))
-
-
 def test_the_budget_goes_to_the_largest_gradients():
     gaussians = cloud(6)
     optimizer = adam(gaussians)

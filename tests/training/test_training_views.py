@@ -8,6 +8,7 @@ import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.evaluation.evaluate import evaluate
+from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run_folder import RunFolder
@@ -15,14 +16,13 @@ from sehdr_warp.scene import Scene, View, codes_of
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.photo_file import PhotoKeeper
 from sehdr_warp.scene.wide_camera import pixel_directions, solid_angles
-from sehdr_warp.training.initialization import make_field, response_for_training
+from sehdr_warp.training.initialization import make_field
 from sehdr_warp.training.targets import PhotoSource
 from sehdr_warp.training.train import train
-from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
 from sehdr_warp.training.training_views import PhotoOrder, PhotoStream, has_wide_views
 
-from .toy import EXPOSURE_TIME, VARIANTS, toy_scene
+from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, toy_scene
 
 
 def test_every_photo_comes_once_before_any_comes_again():
@@ -104,9 +104,6 @@ def test_held_out_panoramas_of_a_training_on_panoramas(tmp_path):
 
 
 def test_gradients_of_a_panorama_reach_all_parameters():
-    from sehdr_warp.model.renders import CameraTensors
-    from sehdr_warp.training.initialization import make_field
-
     scene = panoramas(4)
     config = load_config("fast", {"model.sh_degree": 0})
     field = make_field(scene, config, response_by_name("srgb"), "cpu")
@@ -166,7 +163,7 @@ def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
     config, states = override_config(VARIANTS["default"], {"deterministic": True}), []
     for photos in ("device", "memory"):
         chosen = override_config(config, {"schedule.photo_cache": photos})
-        trainer = Trainer(scene, chosen, make_field(scene, chosen, response_for_training(scene, chosen), "cuda:0"))
+        trainer = make_trainer(scene, chosen, "cuda:0")
         for _ in range(60):
             trainer.step()
         assert (

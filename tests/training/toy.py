@@ -11,6 +11,8 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import REFERENCE_ITERATIONS, Config
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
+from sehdr_warp.training.initialization import make_field, response_for_training
+from sehdr_warp.training.trainer import Trainer
 
 EXPOSURE_TIME = 0.25
 NUMBERS = (
@@ -50,6 +52,11 @@ def toy_scene(view_count: int = 8, size: int = 32, with_points: bool = True) -> 
     colors = np.full((len(points), 3), 0.5, dtype=np.float32)
     chosen = slice(None) if with_points else slice(0)
     return Scene("toy", "transforms", tuple(views), points[chosen], colors[chosen])
+
+
+def make_trainer(scene: Scene, config: Config, device: str = "cpu") -> Trainer:
+    """A trainer of a new field of the scene."""
+    return Trainer(scene, config, make_field(scene, config, response_for_training(scene, config), device))
 
 
 def stated(iteration: float, iterations: int) -> int:

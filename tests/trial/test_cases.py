@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene.hdr_files import read_hdr
@@ -111,36 +110,6 @@ def test_tampered_runs(space, prepared, number):
     if ended.code == 0 and not signed:
         for path in (space / "made" / "hdr").glob("[!.]*"):
             np.testing.assert_array_equal(read_hdr(path), read_hdr(prepared / "made" / "hdr" / path.name))
-
-
-FORMATS = (
-    "EPS", "GIF", "PPM", "PDF", "ICO", "TGA", "PCX", "SGI", "DDS", "JPEG2000", "CMYK", "LAB", "1", "F", "YCbCr", "APNG",
-    "pages",
-)  # fmt: skip
-EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 16\n%%EndComments\n"
-
-
-@pytest.mark.parametrize("format_", FORMATS)
-@pytest.mark.parametrize("name", ["r_2.png", "r_0.png"])
-def test_hostile_photos(space, name, format_):
-    """No program is started on them: the child watches what it starts."""
-    path = space / "photos" / "images" / name
-    picture = Image.open(path).convert("RGB")
-    picture.load()
-    if format_ == "EPS":
-        path.write_bytes(EPS)
-    elif format_ in ("APNG", "pages"):
-        picture.save(
-            path, format={"APNG": "PNG", "pages": "TIFF"}[format_], save_all=True, append_images=[picture.rotate(180)]
-        )
-    elif format_ in ("CMYK", "LAB", "1", "F", "YCbCr"):
-        other = Image.new("LAB", picture.size) if format_ == "LAB" else picture.convert("L").convert(format_)
-        other.save(path, format="TIFF")
-    else:
-        picture.save(path, format=format_)
-    before = files_in(space)
-    ended = call("train", "photos", "--out", "new", "--iterations", "2", "--device", "cpu", folder=space)
-    assert ended.code == 1 and name in ended.err.splitlines()[-1] and files_in(space) == before
 
 
 # Files of runs and sets, cameras and PLY have trials of their own.

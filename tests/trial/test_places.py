@@ -9,39 +9,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from sehdr_warp.own_files import LIST
 
 from .harness import COMMANDS, LATEST, TRAIN, call, files_in
-from .hostile import MARKUP, SHORT, link, scripts_of, tried
+from .hostile import MARKUP, SHORT, scripts_of, tried
 
 pytestmark = pytest.mark.trial
-
-
-SET_LINKS = {
-    "a photo that leads out": ("photos/images/r_2.png", "../../secret.png"),
-    "a photo that leads to itself": ("photos/images/r_2.png", "r_2.png"),
-    "photos that lead out": ("photos/images", "../elsewhere"),
-    "a mask that leads out": ("photos/masks/r_2.png", "../../secret.png"),
-    "masks that lead out": ("photos/masks", "../elsewhere"),
-    "times that lead out": ("photos/exposures.json", "../secret.json"),
-    "cameras that lead out": ("photos/transforms.json", "../secret.json"),
-}
-
-
-@pytest.mark.parametrize("name", SET_LINKS)
-def test_links_in_a_set(space, name):
-    """What leads out of a data set is not read: neither shown nor named by its content."""
-    (space / "elsewhere").mkdir()
-    for path in (space / "secret.png", space / "elsewhere" / "r_2.png"):
-        Image.fromarray(np.full((16, 24, 3), 201, np.uint8)).save(path)
-    (space / "secret.json").write_text('{"SECRET": 1}')
-    link(*SET_LINKS[name])(space)
-    ended = tried(space, SHORT)
-    assert "SECRET" not in ended.err + ended.out
 
 
 @pytest.mark.parametrize("name", ["run", "link to run", "output folder", "output file", "list", "cache"])

@@ -98,6 +98,10 @@ LINKS = {
     "one mask of a device": ("mask.png", "/dev/zero"),
     "times of a device": ("exposures.json", "/dev/zero"),
     "itself": ("masks/again", ".."),
+    "a photo that leads out": ("images/r_2.png", "../../elsewhere/secret.png"),
+    "a photo that leads to itself": ("images/r_2.png", "r_2.png"),
+    "a mask that leads out": ("masks/r_2.png", "../../elsewhere/secret.png"),
+    "cameras that lead out": ("transforms.json", "../elsewhere/secret.json"),
 }
 
 
@@ -114,6 +118,7 @@ def test_links_that_lead_out_of_a_set(space, name, layout):
     for stem in ("000", "r_0", "secret"):
         write_exr(space / "elsewhere" / f"{stem}.exr", np.full((16, 24, 3), 3.0, np.float32))
         Image.new("L", (24, 16), 255).save(space / "elsewhere" / f"{stem}.png")
+    (space / "elsewhere" / "secret.json").write_text('{"secret": 1}')
     link(f"set/{LINKS[name][0]}", LINKS[name][1])(space)
 
     def watch(event, arguments):

@@ -1,6 +1,8 @@
 """A server over an analytic scene, on a free port."""
 
 import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 
 import pytest
@@ -13,10 +15,21 @@ from ..output.helpers import AnalyticRun
 from ..output.test_report import make
 
 
+@contextmanager
+def serving(viewer: Viewer, port: int) -> Iterator[Server]:
+    """A server of a viewer that answers until the end of the block."""
+    with Server(viewer, port=port) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+
+
 @pytest.fixture
 def serve(tmp_path):
     """serve(**options) starts a server of two runs with photos, and returns it."""
-    servers = []
+    servers = ExitStack()
 
     def start(count=1, **options):
         run, scene = make(tmp_path)
@@ -24,12 +37,7 @@ def serve(tmp_path):
         runs = [run, AnalyticRun()][:count]
         scenes = [ViewerScene(each, f"run {i}", torch.ones(1) if i == 0 else None) for i, each in enumerate(runs)]
         viewer = Viewer(scenes, lambda index: {view.name: view for view in scene.views}, **options)
-        server = Server(viewer, port=18080)
-        servers.append(server)
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-        return server
+        return servers.enter_context(serving(viewer, 18080))
 
-    yield start
-    for server in servers:
-        server.shutdown()
-        server.server_close()
+    with servers:
+        yield start

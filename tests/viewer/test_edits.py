@@ -1,7 +1,6 @@
 """Edits in the viewer: crops, gains of lights, up and scale."""
 
 import json
-import threading
 from dataclasses import replace
 from typing import Any
 
@@ -15,10 +14,11 @@ from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.scene import Camera, View
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.viewer.frames import ViewerScene
-from sehdr_warp.viewer.server import Server, Viewer
+from sehdr_warp.viewer.server import Viewer
 
 from ..output.test_splat_edits import run_of, splats
 from .browser import browser, page_of
+from .conftest import serving
 from .test_page import until
 from .test_server import ask, frame
 
@@ -28,11 +28,8 @@ def server(tmp_path):
     """A viewer of two Gaussians, in a folder that keeps an orientation."""
     run = run_of(tmp_path, splats([(0, 0, 0), (1, 0, 0)], [0.9, 0.9]))
     run.path = tmp_path
-    server = Server(Viewer([ViewerScene(run, "run")]), port=18400)
-    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-    yield server
-    server.shutdown()
-    server.server_close()
+    with serving(Viewer([ViewerScene(run, "run")]), 18400) as server:
+        yield server
 
 
 @pytest.fixture
@@ -42,11 +39,8 @@ def lamps(tmp_path):
     run.path = tmp_path
     shape = LightShape("sphere", np.array([1.0, 0, 0]), np.eye(3), (0.3, 0.3))
     run.find_lights = lambda: [Light(shape, np.full(3, 8.0), np.ones(3), 0.75, 0.4, torch.tensor([1]))]
-    server = Server(Viewer([ViewerScene(run, "run", torch.tensor([0.0, 1.0]))]), port=18500)
-    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-    yield server
-    server.shutdown()
-    server.server_close()
+    with serving(Viewer([ViewerScene(run, "run", torch.tensor([0.0, 1.0]))]), 18500) as server:
+        yield server
 
 
 def test_a_light_is_listed_and_made_brighter(lamps):
@@ -146,8 +140,7 @@ def test_floaters_faint_and_unmasked_gaussians_are_left_out(tmp_path):
     codes = np.zeros((photo.height, photo.width, 3), np.uint8)
     mask = np.tile(np.float32(beyond), (photo.height, 1))
     photos = {"2": View("2", codes, photo, 1.0, "train", mask)}
-    with Server(Viewer([ViewerScene(run, "run")], lambda index: photos), port=18600) as server:
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    with serving(Viewer([ViewerScene(run, "run")], lambda index: photos), 18600) as server:
         logits = run.field.gaussians.opacity_logits
 
         def shown(**request):
@@ -161,7 +154,6 @@ def test_floaters_faint_and_unmasked_gaussians_are_left_out(tmp_path):
         assert sum(shown(mask_only=True)) == 1
         assert edit(server, min_opacity=0.95)[0] == 409
         assert sum(shown()) == 3
-        server.shutdown()
 
 
 def test_masks_that_are_not_there_are_told(server):
@@ -178,12 +170,6 @@ def test_up_and_scale_are_kept_with_the_run(server, tmp_path):
     for request in ({"scale": -1}, {"up": [0, 0, 0]}, {"up": [1]}):
         assert ask(server, "/orientation", request)[0] == 409
     assert json.loads((tmp_path / "orientation.json").read_text()) == orientation
-
-
-def test_a_page_to_share_is_saved(server):
-    view = server.viewer.runs[0].cameras[0].camera.to_dict()
-    status, kind, page = ask(server, "/save", {"kind": "page", "cameras": [view]})
-    assert (status, kind) == (200, "text/html") and b"</html>" in page
 
 
 def test_the_button_saves_a_page_that_opens_with_the_same_view(server, tmp_path):
@@ -246,10 +232,8 @@ def two_runs(tmp_path):
     north = run_of(tmp_path, splats([(0, 0, 0), (1, 0, 0)], [0.9, 0.9]), "north")
     south = run_of(tmp_path, splats([(-1, 0, 0)], [0.9]), "south")
     scenes = [ViewerScene(run, f"runs/{run.scene_name}") for run in (north, south)]
-    with Server(Viewer(scenes), port=18700) as server:
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    with serving(Viewer(scenes), 18700) as server:
         yield server
-        server.shutdown()
 
 
 def test_another_run_is_merged_edited_and_taken_out_again(two_runs):

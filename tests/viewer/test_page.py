@@ -8,7 +8,7 @@ from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.scene import Camera
 
 from ..output.helpers import AnalyticRun, read_exr
-from .browser import browser, page_of, pinch, pixels
+from .browser import browser, page_of, pixels
 
 FULL = "#stage[data-frame=full]"
 
@@ -142,31 +142,6 @@ def test_the_tables_are_the_shader(chromium, serve):
             page.evaluate("light.shaded = null, light.draw()")
 
 
-def test_an_exposure_is_none_of_the_shader_s_work_in_software(chromium, serve):
-    with page_of(chromium, serve(count=2).url) as page:
-        page.wait_for_selector(FULL)
-        page.evaluate(
-            "() => { light.shade = (...how) => { shaded++; LightCanvas.prototype.shade.apply(light, how); }; }"
-        )
-        for left in ("0", "photo"):
-            page.select_option("#left", left)
-            for overlay in ("none", "stops", "depth", "error", "clipped"):
-                page.select_option("#overlay", overlay)
-                rest(page)
-                screenshots = [pixels(page, "#picture")]
-                page.evaluate("window.shaded = 0")
-                slide(page, "#stops", -2)
-                screenshots.append(pixels(page, "#picture"))
-                assert page.evaluate("shaded") == 0, (left, overlay)
-                page.select_option("#overlay", "stops")
-                page.select_option("#overlay", overlay)
-                rest(page)
-                np.testing.assert_array_equal(pixels(page, "#picture"), screenshots[1])
-                moves = overlay in ("none", "stops", "clipped")
-                assert (np.abs(screenshots[0] - screenshots[1]).max() > 0.02) == moves, (left, overlay)
-                slide(page, "#stops", 0)
-
-
 def test_without_webgl_the_light_is_shown_all_the_same(chromium, serve):
     server, get = serve(count=2), "HTMLCanvasElement.prototype.getContext"
     run = server.viewer.runs[0].run
@@ -237,14 +212,6 @@ def test_moving_resizing_and_two_at_once(chromium, serve):
             page.click("#savePath")
         assert '"cameras"' in download.value.path().read_text()
         np.testing.assert_array_equal(pixels(other, "#picture"), theirs)
-
-
-def test_two_fingers_come_nearer(chromium, serve):
-    with page_of(chromium, serve().url, has_touch=True) as page:
-        page.wait_for_selector(FULL)
-        ahead = page.evaluate("camera.ahead")
-        settle(page, lambda: pinch(page, [(100, 80), (120, 80)], [(90, 80), (130, 80)]))
-        assert page.evaluate("camera.ahead") == pytest.approx(ahead / 2)
 
 
 def test_brackets_and_a_film_are_saved_and_what_is_wrong_is_told(chromium, serve):
