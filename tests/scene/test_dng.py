@@ -179,9 +179,9 @@ def test_bad_pixels_are_filled(tmp_path):
 
 
 def test_vignetting_and_distortion_after_demosaicing(tmp_path):
-    half = np.hypot((HEIGHT - 1) / 2, (WIDTH - 1) / 2)
-    squared = ((Y - (HEIGHT - 1) / 2) ** 2 + (X - (WIDTH - 1) / 2) ** 2) / half**2
-    body = struct.pack(">7d", 1.5, 0, 0, 0, 0, 0.5, 0.5)
+    x, y = 0.3 * (WIDTH - 1), 0.6 * (HEIGHT - 1)  # The farthest corner from there has radius 1.
+    squared = ((Y - y) ** 2 + (X - x) ** 2) / ((WIDTH - 1 - x) ** 2 + y**2)
+    body = struct.pack(">7d", 1.5, 0, 0, 0, 0, 0.3, 0.6)
     write_tagged_dng(
         tmp_path / "a.dng", stored(mosaic(EVEN / (1 + 1.5 * squared)[..., None])), LEVELS | {51022: opcodes((3, body))}
     )
