@@ -13,7 +13,7 @@ from ..subsets import first_names
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, exif_exposure, parse_number
 from .images import PHOTO_SUFFIXES
-from .names import Listing, bases_of, fold_name
+from .names import bases_of, fold_name, lies_at
 
 EXPOSURES = "exposures.json"
 _LISTS = ("exposures", "exposure_times", "exposure")  # Names under which people list times in other files
@@ -151,7 +151,7 @@ def _listed_times(records: Sequence[ImageRecord], source: Path) -> tuple[dict[Pa
     images = list(dict.fromkeys(record.image for record in records))
     bases = bases_of(images, source)
     parents = {image.parent for image in images}
-    places, listing = dict.fromkeys((source, *reversed(bases), *(image.parent for image in images))), Listing()
+    places = dict.fromkeys((source, *reversed(bases), *(image.parent for image in images)))
     times, notes = {}, _unread_lists(places)
     for place in places:
         if not has_file(place / EXPOSURES):
@@ -167,7 +167,7 @@ def _listed_times(records: Sequence[ImageRecord], source: Path) -> tuple[dict[Pa
                 ambiguous.append(
                     f"{name:.90} ({', '.join(image.relative_to(bases[-1]).as_posix() for image in matches[:2])})"
                 )
-            elif not any(listing.holds(f"{base}/{_plain(name)}") for base in {place, *bases, *parents}):
+            elif not any(lies_at(f"{base}/{_plain(name)}") for base in {place, *bases, *parents}):
                 strange.append(name)
         if strange:
             text = first_names([f"{name:.90}" for name in strange])

@@ -13,7 +13,7 @@ from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import UNPLACED, ImageRecord
 from .images import LDR_SUFFIXES, open_image, read_ldr
-from .names import INVERTED_MASK, Listing, bases_of, fold_name, folders_named, natural_key, without_mask_mark
+from .names import INVERTED_MASK, bases_of, fold_name, folders_named, lies_at, natural_key, without_mask_mark
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
@@ -69,14 +69,13 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
             mask = common.file
         mask_files.add(mask)
         masked.append(replace(record, mask=mask))
-    notes, listing = [], Listing()
+    notes = []
     for place, keys in files.items():
         # A mask of a photo that the set leaves out is named with that photo, not here.
         strange = [
             file
             for file, key in keys.items()
-            if file not in mask_files
-            and not any(listing.holds(f"{base}/{key}") or listing.holds_photo(f"{base}/{key}") for base in bases)
+            if file not in mask_files and not any(lies_at(f"{base}/{key}") for base in bases)
         ]
         names = [file.relative_to(place).as_posix() for file in strange]
         if names:

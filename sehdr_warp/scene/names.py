@@ -48,33 +48,12 @@ def folders_named(folder: Path, names: Sequence[str]) -> list[Path]:
     return sorted(places, key=lambda place: names.index(place.name.lower()))
 
 
-class Listing:
-    """The files of folders, each folder read once: a set may state hundred thousands of names."""
-
-    def __init__(self) -> None:
-        """Begin without any folder."""
-        self._names: dict[str, frozenset[str]] = {}
-        self._stems: dict[str, frozenset[str]] = {}
-
-    def holds(self, path: str) -> bool:
-        """Return whether a path is a file."""
-        folder, name = os.path.split(path)
-        return name in self._read(folder)
-
-    def holds_photo(self, path: str) -> bool:
-        """Return whether a path with some suffix of photos is a file."""
-        folder, stem = os.path.split(path)
-        if folder not in self._stems:
-            pairs = (os.path.splitext(name) for name in self._read(folder))
-            self._stems[folder] = frozenset(start for start, suffix in pairs if suffix.lower() in PHOTO_SUFFIXES)
-        return stem in self._stems[folder]
-
-    def _read(self, folder: str) -> frozenset[str]:
-        if folder not in self._names:
-            self._names[folder] = frozenset()
-            with suppress(OSError, ValueError), os.scandir(folder) as entries:  # No folder, or a name that cannot be.
-                self._names[folder] = frozenset(entry.name for entry in entries if entry.is_file())
-        return self._names[folder]
+def lies_at(path: str) -> bool:
+    """Return whether a path, or one with a suffix of photos behind it, is a file; case and accents do not matter."""
+    folder, name = os.path.split(path)
+    names, folded = _entries(Path(folder)), fold_name(name)
+    found = (names.get(folded + suffix) for suffix in ("", *PHOTO_SUFFIXES))
+    return any(os.path.isfile(os.path.join(folder, each)) for each in found if each is not None)
 
 
 def without_mask_mark(stem: str) -> str:
@@ -164,7 +143,7 @@ def _entries(folder: Path) -> Mapping[str, str]:
     """Return the names in a folder by their folded form; empty if it cannot be read."""
     try:
         return _entries_at(folder, folder.stat().st_mtime_ns)
-    except OSError:
+    except (OSError, ValueError):  # Also of a name that cannot be.
         return {}
 
 
