@@ -112,10 +112,12 @@ class _Blend(torch.autograd.Function):
         if grad_image is None and grad_transmittance is None:
             return (None,) * len(ctx.needs_input_grad)
         _, width, channels = ctx.sizes
-        grad_image = grad_transmittance.new_zeros(ctx.sizes) if grad_image is None else grad_image.contiguous()
-        # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
-        if grad_image.stride() != (width * channels, channels, 1):
-            grad_image = grad_image.as_strided(ctx.sizes, (width * channels, channels, 1))
+        strides = width * channels, channels, 1
+        if grad_image is None:
+            grad_image = grad_transmittance.new_zeros(ctx.sizes)
+        elif grad_image.stride() != strides:
+            # Of an axis of length 1 torch calls any stride contiguous, and kernels do not.
+            grad_image = grad_image.contiguous().as_strided(ctx.sizes, strides)
         if grad_transmittance is not None:
             grad_transmittance = grad_transmittance.contiguous()
         return None, *gradients_of(grad_image, grad_transmittance)

@@ -100,11 +100,16 @@ class BlockBackward:
         )
         return FixedBackward(fixed, gathered)
 
-    def _zeros(self) -> Tensor:
+    @property
+    def columns(self) -> int:
+        """Columns of the gradients by Gaussian."""
         columns = self.channels + 6
         if blend_cuda_backward.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
             columns = blend_cuda.padded_channels(columns)
-        return self.transmittance.new_zeros(len(self.features), columns)
+        return columns
+
+    def _zeros(self) -> Tensor:
+        return self.transmittance.new_zeros(len(self.features), self.columns)
 
     @property
     def _cuda(self) -> bool:

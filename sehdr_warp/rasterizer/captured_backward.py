@@ -19,7 +19,7 @@ from .render_options import RenderOptions
 from .warp_launch.launching import FixedLaunch, fixed_launch, warp_scalar, warp_stream
 
 
-class _Place(NamedTuple):
+class _View(NamedTuple):
     """Layout of a tensor within a longer one, as as_strided() takes it."""
 
     shape: Sequence[int]
@@ -48,50 +48,71 @@ class GradientMemory:
     features: int
 
 
+class GradientLayout:
+    """Views of the gradients of blend and projection in one tensor.
+
+    It begins with a row for each Gaussian, which the blend adds to: features, conic, x, y, opacity, and columns that
+    pad the row. A copy of the features' gradient follows, and if the CUDA graph projects, the gradients by the
+    projection's inputs.
+
+    Args:
+        blend: of the render.
+        gaussians: inputs of the projection; none if the CUDA graph begins with 2D Gaussians.
+
+    Attributes:
+        size: numbers in the tensor.
+        like: a tensor of this shape that takes no memory, for torch.empty_like().
+    """
+
+    def __init__(self, blend: BlockBackward, gaussians: Sequence[Tensor]) -> None:
+        """Add up the offsets."""
+        count, columns, channels = len(blend.features), blend.columns, blend.channels
+        self.means2d = _View((count, 2), (columns, 1), channels + 3)
+        self.features = _View((count, channels), (columns, 1), 0)
+        self.conics = _View((count, 3), (columns, 1), channels)
+        self.opacities = _View((count,), (columns,), channels + 5)
+        self.features_copy = _View((count, channels), (channels, 1), _aligned(count * columns))
+        self.size = self.features_copy.begin + count * channels
+        self.gaussians: list[_View] = []
+        for tensor in gaussians:
+            view = _View(tensor.shape, tensor.stride(), _aligned(self.size))
+            self.gaussians.append(view)
+            self.size = view.begin + tensor.numel()
+        self.like = blend.transmittance.new_empty(1).expand(self.size)
+
+
 class CapturedBackward:
     """The backward passes of blend and projection.
 
-    Their gradients share one tensor. It begins with a row for each Gaussian, which the blend adds to: features, conic,
-    x, y, opacity, and columns that pad the row. A copy of the features' gradient follows, and if the CUDA graph
-    projects, the gradients by the projection's inputs.
-
     Args:
+        layout: of the gradients.
         blend: of the captured render.
         gaussians: inputs of the projection on the graph's memory; none if the graph begins with 2D Gaussians.
         options: of the image.
         projected: outputs of the projection on the graph's memory.
 
     Attributes:
-        proxy: takes the place of conics and opacities in the autograd graph, between blend and projection: its gradient
-            is GradientMemory.zeros. None if the CUDA graph does not project.
+        conics_opacities: stands for both in the autograd graph, between blend and projection: its gradient is
+            GradientMemory.zeros, and nothing reads its values. None if the CUDA graph does not project.
     """
 
     def __init__(
-        self, blend: BlockBackward, gaussians: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians
+        self,
+        layout: GradientLayout,
+        blend: BlockBackward,
+        gaussians: Sequence[Tensor],
+        options: RenderOptions,
+        projected: ProjectedGaussians,
     ) -> None:
         """Pack the launches."""
+        self._layout, self.conics_opacities = layout, layout.like if gaussians else None
         self._blend, rows = blend.on_fixed_memory()
-        self._device, self._like = rows.device, rows.new_empty(0)
-        (count, columns), channels = rows.shape, blend.channels
-        self._means2d = _Place((count, 2), (columns, 1), channels + 3)
-        self._features = _Place((count, channels), (columns, 1), 0)
-        self._conics = _Place((count, 3), (columns, 1), channels)
-        self._opacities = _Place((count,), (columns,), channels + 5)
-        self._features_copy = _Place((count, channels), (channels, 1), _aligned(rows.numel()))
-        copy = rows.new_empty(count, channels)
-        self._copy_features = fixed_launch(
-            copy_features_kernel(warp_scalar(rows.dtype)), copy.shape, rows, copy, whole=(rows, copy)
-        )
-        self._size = self._features_copy.begin + copy.numel()
-        self._of_gaussians: list[_Place] = []
-        for tensor in gaussians:
-            place = _Place(tensor.shape, tensor.stride(), _aligned(self._size))
-            self._of_gaussians.append(place)
-            self._size = place.begin + tensor.numel()
-        self.proxy: Tensor | None = None
+        self._device = rows.device
+        copy = rows.new_empty(layout.features_copy.shape)
+        kernel = copy_features_kernel(warp_scalar(rows.dtype))
+        self._copy_features = fixed_launch(kernel, copy.shape, rows, copy, whole=(rows, copy))
         if gaussians:
-            self.proxy = rows.new_empty(1).expand(self._size)
-            like = rows.as_strided(*self._conics), rows.as_strided(*self._opacities)
+            like = rows.as_strided(*layout.conics), rows.as_strided(*layout.opacities)
             self._project = _fixed_projection_backward(gaussians, options, projected, *like)
 
     def allocate(self, needed: Sequence[bool], *, copies_features: bool, zeros: Tensor | None = None) -> GradientMemory:
@@ -99,33 +120,35 @@ class CapturedBackward:
 
         needed: which gradients by the projection's inputs are needed; empty if the CUDA graph does not project.
         copies_features: return a contiguous gradient by features, which torch can use as a leaf's without a copy.
-        zeros: memory that a backward pass of the blend has filled; by default new zeros.
+        zeros: [GradientLayout.size] zeros that the render's replay wrote; by default new ones.
         """
+        layout = self._layout
         if zeros is None:
-            zeros = self._like.new_zeros(self._size)
+            zeros = torch.zeros_like(layout.like)
         first, size = zeros.data_ptr(), zeros.element_size()
-        features = self._features_copy if copies_features else self._features
-        of_splats = [zeros.as_strided(*self._means2d), zeros.as_strided(*features)]
-        if self.proxy is None:
-            of_splats += zeros.as_strided(*self._conics), zeros.as_strided(*self._opacities)
-        places = [place if need else None for place, need in zip(self._of_gaussians, needed, strict=True)]
+        features = layout.features_copy if copies_features else layout.features
+        of_splats = [zeros.as_strided(*layout.means2d), zeros.as_strided(*features)]
+        if self.conics_opacities is None:
+            of_splats += zeros.as_strided(*layout.conics), zeros.as_strided(*layout.opacities)
+        views = [view if need else None for view, need in zip(layout.gaussians, needed, strict=True)]
+        rows = layout.conics, layout.opacities
         return GradientMemory(
             zeros,
             of_splats,
-            [None if place is None else zeros.as_strided(*place) for place in places],
-            [0 if place is None else first + size * place.begin for place in (self._conics, self._opacities, *places)],
+            [None if view is None else zeros.as_strided(*view) for view in views],
+            [0 if view is None else first + size * view.begin for view in (*rows, *views)],
             first + size * features.begin if copies_features else 0,
         )
 
     def blend(self, memory: GradientMemory, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        """Return the gradients by means2d, features, and either the proxy or conics and opacities."""
+        """Return the gradients by means2d, features, and conics and opacities, as one or each."""
         stream, rows = warp_stream(self._device), memory.zeros.data_ptr()
         transmittance = 0 if grad_transmittance is None else grad_transmittance.data_ptr()
         self._blend.launch((), (grad_image.data_ptr(), transmittance, rows), stream)
         if memory.features:
             self._copy_features.launch((), (rows, memory.features), stream)
         gradients, memory.of_splats = memory.of_splats, ()
-        return gradients if self.proxy is None else (*gradients, memory.zeros)
+        return gradients if self.conics_opacities is None else (*gradients, memory.zeros)
 
     def project(self, memory: GradientMemory, grad_means2d: Tensor | None, grad_depths: Tensor | None) -> Gradients:
         """Return the gradients by the projection's inputs.

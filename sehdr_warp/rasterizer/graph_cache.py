@@ -71,7 +71,7 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     """Return the CUDA graphs of calls like this one, an empty pool at first; None if the call cannot be captured.
 
     Args:
-        tensors: as GraphPool.acquire() takes them, of one device.
+        tensors: as GraphPool.begin_render() takes them, of one device.
         options: of the image.
     """
     first = tensors[0]
@@ -117,50 +117,57 @@ class ReplayedRender:
         means2d: [N, 2]; this and the next three if the CUDA graph began with 3D Gaussians.
         depths: [N].
         extents: [N, 2].
-        proxy: stands for conics and opacities in the autograd graph, see CapturedBackward.
+        conics_opacities: stands for both in the autograd graph, see CapturedBackward; None without gradients.
     """
 
     result: BlendResult
     means2d: Tensor
     depths: Tensor
     extents: Tensor
-    proxy: Tensor | None
+    conics_opacities: Tensor | None
 
     def __init__(self, pool: "GraphPool", graph: "CapturedRender") -> None:
-        """Acquire the CUDA graph."""
-        self._pool, self._acquired = pool, _AcquiredGraph(pool.idle, graph)
+        """Keep the CUDA graph from other calls."""
+        self._pool, self._in_use = pool, _GraphInUse(pool.idle, graph)
         self.intersections = 0
 
     def render(self, tensors: Sequence[Tensor]) -> None:
-        """Render from the seven tensors of a call; means2d, depths and proxy are differentiable functions of them."""
+        """Render from the seven tensors of a call, of which the attributes are differentiable functions."""
         if not self._pool.differentiable:
-            (self.means2d, self.depths, self.extents), self.proxy = self._replay(tensors, ()), None
+            self.means2d, self.depths, self.extents = self._replay(tensors, (), ())
+            self.conics_opacities = None
             return
         means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
         gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
-        proxy = self._acquired.graph.backward.proxy
-        assert proxy is not None, "the CUDA graph begins with 2D Gaussians"
+        needed = [tensor.requires_grad for tensor in gaussians]
+        conics_opacities = self._in_use.graph.backward.conics_opacities
+        assert conics_opacities is not None, "the CUDA graph begins with 2D Gaussians"
 
         def project() -> tuple[Tensor, ...]:
-            means2d, depths, extents = self._replay(tensors, ())
-            return means2d, proxy.detach(), depths, extents
+            means2d, depths, extents = self._replay(tensors, (), needed, copies_features=_is_trained(features))
+            return means2d, conics_opacities.detach(), depths, extents
 
-        outputs = with_projection_gradient(gaussians, project, self._acquired.project_backward)
-        self.means2d, self.proxy, self.depths, self.extents = outputs
-        needed = [tensor.requires_grad for tensor in gaussians]
-        self._acquired.prepare(needed, copies_features=features.is_leaf and features.requires_grad)
+        outputs = with_projection_gradient(gaussians, project, self._in_use.project_backward)
+        self.means2d, self.conics_opacities, self.depths, self.extents = outputs
 
     def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> None:
         """Render from flatten() of RasterInputs; write the extents that are left, see pack_splats()."""
         with torch.no_grad():
-            self._replay(tensors, (extents,))
-        if self._pool.differentiable:
-            features = tensors[-1]
-            self._acquired.prepare((), copies_features=features.is_leaf and features.requires_grad)
+            self._replay(tensors, (extents,), (), copies_features=_is_trained(tensors[-1]))
 
-    def _replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> Sequence[Tensor]:
-        image, transmittance, *others = self._acquired.graph.replay(tensors, outputs)
-        self.result = BlendResult(image, transmittance, self._acquired.blend_backward)
+    def _replay(
+        self,
+        tensors: Sequence[Tensor],
+        outputs: Sequence[Tensor],
+        needed: Sequence[bool],
+        *,
+        copies_features: bool = False,
+    ) -> Sequence[Tensor]:
+        """Replay the CUDA graph and prepare a backward pass, with options of CapturedBackward.allocate()."""
+        image, transmittance, others, gradients = self._in_use.graph.replay(tensors, outputs)
+        self.result = BlendResult(image, transmittance, self._in_use.blend_backward)
+        if self._pool.differentiable:
+            self._in_use.prepare(needed, gradients, copies_features=copies_features)
         return others
 
     def fits(self) -> bool:
@@ -168,12 +175,17 @@ class ReplayedRender:
 
         If not, the render is not to be used.
         """
-        graph = self._acquired.graph
+        graph = self._in_use.graph
         self.intersections = graph.count_intersections()
         if self.intersections <= graph.max_intersections:
             return True
         self._pool.grow(self.intersections)
         return False
+
+
+def _is_trained(tensor: Tensor) -> bool:
+    """Return whether torch keeps the tensor's gradient, and so would copy one that is not contiguous."""
+    return tensor.is_leaf and tensor.requires_grad
 
 
 @dataclass
@@ -215,7 +227,7 @@ class GraphPool:
             self.captured = self.max_graphs
             return None
 
-    def acquire(self, tensors: Sequence[Tensor], options: RenderOptions) -> ReplayedRender | None:
+    def begin_render(self, tensors: Sequence[Tensor], options: RenderOptions) -> ReplayedRender | None:
         """Return a render by a CUDA graph that is to be made, or None if the call is to be launched instead.
 
         Args:
@@ -235,7 +247,7 @@ class GraphPool:
         self.intersections, self.captured, self.idle = max(intersections, self.intersections), 0, []
 
 
-class _AcquiredGraph:
+class _GraphInUse:
     """Keeps a CUDA graph from other calls, and returns it to the idle ones when it is deleted."""
 
     def __init__(self, idle: list[CapturedRender], graph: CapturedRender) -> None:
@@ -245,11 +257,11 @@ class _AcquiredGraph:
         self._next: GradientMemory | None = None  # Of the next backward pass of the blend.
         self._between: GradientMemory | None = None  # Of the last one, until that of the projection.
 
-    def prepare(self, needed: Sequence[bool], *, copies_features: bool) -> None:
-        """Prepare a backward pass; see CapturedBackward.allocate()."""
+    def prepare(self, needed: Sequence[bool], gradients: Tensor | None, *, copies_features: bool) -> None:
+        """Prepare a backward pass; see CapturedBackward.allocate() and ReplayResult.gradients."""
         self._needed, self._copies_features = needed, copies_features
-        if self.graph.count <= MAX_SINGLE_SORT:  # With more of them memory is worth more than the host's time.
-            self._next = self._allocate()
+        if gradients is not None:
+            self._next = self._allocate(gradients)
 
     def _allocate(self, zeros: Tensor | None = None) -> GradientMemory:
         return self.graph.backward.allocate(self._needed, copies_features=self._copies_features, zeros=zeros)

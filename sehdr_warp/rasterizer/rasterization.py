@@ -206,7 +206,7 @@ def _project(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool 
 
     pool: CUDA graphs of calls like this one (graph_cache.py); None if it is to be launched.
     """
-    replayed = None if pool is None else pool.acquire(tensors, options)
+    replayed = None if pool is None else pool.begin_render(tensors, options)
     if replayed is None:
         return _launch_projection(tensors, options)
     replayed.render(tensors)
@@ -228,7 +228,7 @@ def _render(projection: _Projection, means2d: Tensor, tensors: Sequence[Tensor],
     if isinstance(projection, ReplayedRender):
         # The replay does not read it: it leads the gradients to features and depths.
         blended = torch.cat([features, projection.depths[:, None]], 1) if options.depth else features
-        image, transmittance = with_gradient(projection.result, means2d, blended, projection.proxy)
+        image, transmittance = with_gradient(projection.result, means2d, blended, projection.conics_opacities)
         if projection.fits():  # Called last, because it waits for the GPU.
             splats = means2d, projection.depths, projection.extents
             return _rendering(image, transmittance, *splats, projection.intersections, None, None, options)
@@ -281,8 +281,9 @@ def render_projected(
     features = features.contiguous()
     # extents.data: pack_splats() writes to it in place, which torch's check of saved tensors must not see.
     inputs = RasterInputs(projected._replace(extents=extents.data), features)
-    pool = get_or_create_pool(flatten(inputs), options) if replays and store_absolute is None else None
-    replayed = None if pool is None else pool.acquire(flatten(inputs), options)
+    replays = replays and store_absolute is None and extents.is_contiguous()
+    pool = get_or_create_pool(flatten(inputs), options) if replays else None
+    replayed = None if pool is None else pool.begin_render(flatten(inputs), options)
     if replayed is not None:
         replayed.render_projected(flatten(inputs), extents.data)
         image, transmittance = with_gradient(replayed.result, means2d, features, conics, opacities)

@@ -238,16 +238,15 @@ def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
     assert [kind.take(lambda pairs: next(labels)) for _ in range(graph_cache.WARMUP_CALLS)] == [
         None
     ] * graph_cache.WARMUP_CALLS
-    acquired = [
-        graph_cache._AcquiredGraph(kind.idle, kind.take(lambda pairs: next(labels)))
-        for _ in range(graph_cache.MAX_GRAPHS)
+    in_use = [
+        graph_cache._GraphInUse(kind.idle, kind.take(lambda pairs: next(labels))) for _ in range(graph_cache.MAX_GRAPHS)
     ]
     assert kind.take(lambda pairs: next(labels)) is None, "all are held"
-    del acquired[1]
+    del in_use[1]
     assert kind.take(lambda pairs: next(labels)) == "b"
     kind.grow(70)
     kind.grow(50)
-    del acquired
+    del in_use
     assert kind.idle == [], "too small, they are let go"
     assert kind.take(lambda pairs: pairs) == 70
 
