@@ -5,6 +5,7 @@ results are tensors alone.
 """
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
@@ -19,7 +20,14 @@ from .ssim import ssim, ssim_map
 from .torch_contract import HALF, register_compiled
 
 Operation = Callable[..., list[Tensor]]
-_KEYS = torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
+
+
+def _keys_of_thread() -> tuple[Any, Any]:
+    return torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
+
+
+with ThreadPoolExecutor(1) as _executor:  # This thread may be importing within torch.inference_mode().
+    _KEYS = _executor.submit(_keys_of_thread).result()
 """Dispatch keys of torch outside of an operator: within one it records no gradients."""
 
 
@@ -129,6 +137,7 @@ def compiled_rasterize(
     **others: Any,
 ) -> Rendering:
     """Do what rasterize() does, as a custom operator. The number of intersections is 0 without max_intersections."""
+    cameras = len(world_to_camera) if world_to_camera.ndim == 3 else 1
     tensors = [means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics]
     if background is not None:
         tensors.append(background)
@@ -144,7 +153,7 @@ def compiled_rasterize(
         means2d=means2d,
         depths=depths,
         extents=extents,
-        intersection_count=options.max_intersections or 0,
+        intersection_count=cameras * (options.max_intersections or 0),
         overflow=overflow,
         needed_intersections=needed,
         depth=results[5] if options.depth else None,

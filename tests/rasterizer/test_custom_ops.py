@@ -14,7 +14,8 @@ from .test_torch_contract import HEIGHT, WIDTH, directions, splats
 STEP = """
 import time, warnings
 import torch
-from sehdr_warp.rasterizer import rasterize, rasterize_directions, spherical_harmonics, ssim, ssim_map
+with torch.inference_mode():  # Without gradients, in which an import must not leave operators.
+    from sehdr_warp.rasterizer import rasterize, rasterize_directions, spherical_harmonics, ssim, ssim_map
 from tests.rasterizer.test_torch_contract import HEIGHT, WIDTH, directions, splats
 
 leaves = splats(dtype=torch.float32, channels=3)
@@ -86,6 +87,7 @@ def test_several_cameras_and_room_have_the_shapes_that_the_compiler_expects(devi
     for name in ("image", "transmittance", "means2d", "depths", "extents", "overflow", "needed_intersections", "depth"):
         mine, true = getattr(rendering, name), getattr(truth, name)
         assert mine.shape == true.shape and torch.equal(mine, true)
+    assert rendering.intersection_count == truth.intersection_count == 1000
 
 
 def test_a_misfit_is_named_while_compiling():
