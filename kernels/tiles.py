@@ -176,11 +176,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
             count = cumulative_counts.shape[0]
             if overflow and rank == 0:
                 overflow[0] = cumulative_counts[count - 1] > wp.int64(max_intersections)
-            entry = int(wp.min(cumulative_counts[count - 1], wp.int64(max_intersections))) + rank
-            while entry < max_intersections:
-                keys[entry] = no_tile
-                gaussians[entry] = 0
-                entry += count
+            unused = wp.min(cumulative_counts[count - 1], wp.int64(max_intersections)) + wp.int64(rank)
+            while unused < wp.int64(max_intersections):
+                keys[int(unused)] = no_tile
+                gaussians[int(unused)] = 0
+                unused += wp.int64(count)
 
         return emit_intersections
 

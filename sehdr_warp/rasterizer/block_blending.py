@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..errors import SehdrError
 from ..kernels import blend_cuda, blend_cuda_backward
 from .tile_lists import MAX_SINGLE_SORT, PackedSplats, TileLists
 from .warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar
@@ -72,7 +73,13 @@ class BlockBackward:
             arguments = *self._arguments(grad_image, grad_transmittance), 0, lists.gaussians, gathered
             launch_blocks(self._kernel(), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
             return gathered
-        grad_intersections = self.transmittance.new_zeros(lists.intersection_count, self.channels + 6)
+        columns = self.channels + 6
+        if lists.intersection_count * columns >= 1 << 31:
+            raise SehdrError(
+                f"{lists.intersection_count} intersections with {self.channels} channels have 2^31 gradients or more, "
+                "which deterministic=True keeps; render without it, or fewer Gaussians or a smaller image"
+            )
+        grad_intersections = self.transmittance.new_zeros(lists.intersection_count, columns)
         emit_order, arguments = lists.emit_order, self._arguments(grad_image, grad_transmittance)
         assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
         for subtile in range(blend_cuda.BLOCKS_PER_TILE):

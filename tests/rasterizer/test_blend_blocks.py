@@ -1,13 +1,16 @@
 """The CUDA block kernels run in Warp's CPU block emulation, so that a machine without a GPU tests their logic."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 import warp as wp
 from torch.profiler import ProfilerActivity, profile
 
+from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer import blending, block_blending, tile_lists
 from sehdr_warp.rasterizer.blending import blend
-from sehdr_warp.rasterizer.block_blending import blend_on_cuda
+from sehdr_warp.rasterizer.block_blending import BlockBackward, blend_on_cuda
 from sehdr_warp.rasterizer.reference import blend_reference
 from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_intersections
 
@@ -42,6 +45,14 @@ def leaves_and_lists(scene):
     lists = build_tile_lists(splats, offsets, depths, extents, scene.width, scene.height)
     leaves = [tensor.detach().requires_grad_() for tensor in (means2d, conics, opacities, scene.tensors[4])]
     return leaves, lists, splats, extents
+
+
+def test_more_gradients_than_int32_counts_are_refused_in_a_fixed_order():
+    transmittance = torch.ones(2, 2)
+    lists = SimpleNamespace(intersection_count=1 << 28)
+    backward = BlockBackward(torch.ones(1, 3), 3, lists, None, transmittance, transmittance, THRESHOLD, True)
+    with pytest.raises(SehdrError, match="268435456 intersections with 3 channels have 2\\^31 gradients or more"):
+        backward(torch.ones(2, 2, 3), None)
 
 
 @pytest.mark.parametrize("dtype", BOUNDS, ids=["float64", "float32"])
