@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.compat.gsplat import rasterization
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.rasterizer import block_blending, captured_backward, captured_render, graph_cache, rasterize, tile_lists
@@ -259,6 +260,17 @@ def test_what_cannot_be_recorded_is_launched():
         raise torch.OutOfMemoryError("no memory")
 
     assert not any(pool.take(record) for _ in range(graph_cache.WARMUP_CALLS + 5)) and len(requests) == 1
+
+
+def test_packed_calls_of_gsplats_push_out_no_graphs():
+    scene = scene_of()
+    means, log_scales, quaternions, opacities, features, pose, (fx, fy, cx, cy) = scene.tensors
+    lens = torch.stack([fx, 0 * fx, cx, 0 * fx, fy, cy, 0 * fx, 0 * fx, 0 * fx + 1]).view(1, 3, 3)
+    for packed in (True, False):
+        for _ in range(CALLS):
+            splats = means, quaternions, log_scales.exp(), opacities, features
+            rasterization(*splats, pose[None], lens, scene.width, scene.height, packed=packed)
+        assert bool(graph_cache._pools) != packed
 
 
 def test_renders_of_a_field_hold_no_graphs():

@@ -123,6 +123,7 @@ def rasterization(
         intersections are computed when they are first read.
 
     Raises:
+        TypeError: for what is not a tensor or not a number, and for colors that are missing.
         ValueError: for an argument that is not supported, by its name, and for shapes, dtypes or devices that do not
             fit.
     """
@@ -174,7 +175,10 @@ def rasterization(
                 features.append(mine.projected.depths[:, None])
             features = torch.cat(features, 1) if len(features) > 1 else features[0]
             store = _store(splats, mine.rows) if absgrad and means2d.requires_grad else None
-            rendering = render_projected(mine.projected, features, RenderOptions(*size), store_absolute=store)
+            # The number of packed Gaussians differs from view to view, so no CUDA graph fits two of them.
+            rendering = render_projected(
+                mine.projected, features, RenderOptions(*size), replays=not packed, store_absolute=store
+            )
             image, transmittance = rendering.image, rendering.transmittance
             if view.background is not None:
                 behind = view.background
