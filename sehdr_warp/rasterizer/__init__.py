@@ -1,4 +1,4 @@
-"""torch <-> Warp: differentiable splatting and the bridge that makes torch operations of Warp programs."""
+"""Differentiable splatting as torch operations of Warp kernels, and a bridge for kernels of users."""
 
 from . import custom_ops as custom_ops  # Registers what torch.compile calls in place of the operations.
 from .bridge import Program, differentiable

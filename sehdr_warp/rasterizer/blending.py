@@ -183,7 +183,7 @@ class _Tiles:
 
 @dataclass(frozen=True)
 class TileBackward:
-    """The backward pass of blend_on_cpu(); see Backward.
+    """The backward pass of blend_on_cpu(); see RowBackward.
 
     Attributes:
         tiles: that were blended.

@@ -103,8 +103,12 @@ def check_render_options(near_plane: Any, alpha_threshold: Any, **flags: Any) ->
 def check_opacities(opacities: Tensor) -> None:
     """Raise ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
     if opacities.device.type == "cpu" and opacities.numel():
-        low, high = (float(value) for value in opacities.detach().aminmax())
-        if -math.inf < low < -1e-6 or math.inf > high > 1 + 1e-6:
+        values = opacities.detach()
+        low, high = (float(value) for value in values.aminmax())
+        if not (math.isfinite(low) and math.isfinite(high)):
+            finite = values[values.isfinite()]
+            low, high = (float(value) for value in finite.aminmax()) if len(finite) else (0.0, 0.0)
+        if low < -1e-6 or high > 1 + 1e-6:
             raise ValueError(f"opacities are from {low:g} to {high:g}, expected 0 to 1; give logits through a sigmoid")
 
 
@@ -123,7 +127,7 @@ def check_directions(directions: Tensor) -> None:
 
 
 def check_cameras(world_to_camera: Tensor, intrinsics: Tensor) -> None:
-    """Raise ValueError for a camera on the CPU that is not finite, has a focal length below 0 or cannot be inverted."""
+    """Raise ValueError for a camera on the CPU that is not finite or invertible or has no positive focal length."""
     if world_to_camera.device.type != "cpu":
         return
     lenses, poses = intrinsics.detach().reshape(-1, 4).tolist(), world_to_camera.detach().reshape(-1, 16).tolist()

@@ -60,7 +60,8 @@ def kernel_layout(gradient: Tensor | None) -> Tensor | None:
 @cache
 def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return a shared vector of these values, which nobody may change."""
-    return torch.tensor(values, dtype=dtype, device=device)
+    with torch.inference_mode(False):  # The vector outlives the caller's mode.
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 def unit_gradient(like: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ class ProjectedGaussians(NamedTuple):
 
 
 class RasterInputs(NamedTuple):
-    """2D Gaussians with features [N, C], as the stages after projection read them: contiguous, without a graph."""
+    """2D Gaussians with features [N, C], as the stages after projection read them: contiguous."""
 
     projected: ProjectedGaussians
     features: Tensor

@@ -38,8 +38,8 @@ class Rendering:
             signal.
         depths: [N] along the camera's axis, in scene units; 0 if culled.
         extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 if culled.
-        intersection_count: number of (Gaussian, tile) intersections that memory was allocated for: max_intersections
-            if that was given, else as many as there are, of all cameras.
+        intersection_count: number of (Gaussian, tile) intersections of all cameras that memory was allocated for:
+            max_intersections for each camera if that was given, else as many as there are.
         overflow: scalar bool, whether max_intersections was too few and some were left out; None without it.
         needed_intersections: scalar int64, how many there are, of all cameras; None without max_intersections.
         depth: [H, W] blended depths along the camera's axis over zero if depth was requested. Divided by alpha it is

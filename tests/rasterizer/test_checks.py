@@ -17,6 +17,10 @@ def arguments(**changes):
     return args | {name: change(args.get(name)) for name, change in changes.items()}
 
 
+def with_nan_and_logits(opacities):
+    return torch.tensor([NAN, -4.0, float("inf"), 0.0, NAN]).to(opacities)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "kind", "message"),
     [
@@ -25,6 +29,7 @@ def arguments(**changes):
         ("log_scales", lambda t: t[:-1], ValueError, r"log_scales has shape \[4, 3\], expected \[N, 3\] with N = 5"),
         ("quaternions", lambda t: t[:, :3], ValueError, r"quaternions has shape \[5, 3\], expected \[N, 4\]"),
         ("opacities", lambda t: t.float(), ValueError, "opacities is torch.float32 on cpu, but means is torch.float64"),
+        ("opacities", with_nan_and_logits, ValueError, "opacities are from -4 to 0"),
         ("opacities", lambda t: t.detach() + 5, ValueError, "opacities are from 5.* expected 0 to 1; give logits"),
         ("features", lambda t: t[:, :0], ValueError, r"features has shape \[5, 0\], expected \[N, C\] with C >= 1"),
         ("features", lambda t: t.to("meta"), ValueError, "features is torch.float64 on meta, but means is .* on cpu"),
