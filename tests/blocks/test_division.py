@@ -74,3 +74,11 @@ def test_blocks_need_photos(ground):
         divide("street", street(20), ground, 4)
     division = largest_count("street", street(20), ground, 4)
     assert division is not None and len(division.cells) == 20 // LEAST_PHOTOS
+
+
+def test_the_distance_to_a_border_is_that_to_the_faces_between_cores(ground):
+    division = divide("street", street(60), ground, 2)
+    at = next(float(cell.high[0]) for cell in division.cells if np.isfinite(cell.high[0]))
+    x = division.axes[0]  # Along the street, one way or the other.
+    points = np.array([(at + 3.0) * x, (at - 0.5) * x + 7 * division.axes[1]])
+    assert division.border_distance(points) == pytest.approx([3.0, 0.5])

@@ -107,3 +107,12 @@ def test_any_prediction_has_a_figure(numbers, protocol):
         assert psnr(ours, reference) >= 0
     scale = fit_scale([(prediction, truth, None, None)])
     assert scale is None or scale > 0
+
+
+def test_black_images_stay_black():
+    black, truth = torch.zeros(5, 5, 3), radiance(8, (5, 5, 3))
+    for protocol in PROTOCOLS:
+        for prediction, target in ((black, truth), (truth, black), (black, black)):
+            a, b = tone_map(protocol, *normalize(protocol, prediction, target))
+            assert torch.isfinite(a).all() and torch.isfinite(b).all()
+    assert fit_scale([(black, truth, None, None)]) is None and fit_scale([]) is None

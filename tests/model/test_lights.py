@@ -106,3 +106,10 @@ def test_a_fisheye_lens_shows_a_light_beside_it():
     (reference,) = find_lights(scene, clipped, plain)
     assert light.shape.size == pytest.approx(reference.shape.size, rel=0.1)
     assert light.radiance == pytest.approx(reference.radiance, rel=0.1)
+
+
+def test_deviation_follows_the_confidence():
+    scene = field(panel(), RADIANCE, 0.03)
+    scene.confidence = torch.full((scene.gaussians.count,), 0.5)
+    (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views())
+    assert light.deviation == pytest.approx(1.0)

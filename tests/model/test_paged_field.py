@@ -12,7 +12,7 @@ from sehdr_warp.model import paged_field
 from sehdr_warp.model.confidence import gather_evidence
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.lights import find_lights
-from sehdr_warp.model.paged_field import PagedField
+from sehdr_warp.model.paged_field import PagedField, boxes_in_view
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import on_device
@@ -142,3 +142,12 @@ def test_lights_and_confidence_are_those_of_the_whole(street, device):
     one, other = (gather_evidence(model, photos).confidence() for model in (street, paged))
     assert one.max() > 0 and other.device == CPU
     torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-4)
+
+
+def test_boxes_in_view():
+    low = np.array([[-1, -1, -1], [50, 0, 0], [-1, -1, 20], [-1e3, -1e3, -1e3]], float)
+    high = np.array([[1, 1, 0], [51, 1, 1], [1, 1, 21], [1e3, 1e3, 1e3]], float)
+    in_view = boxes_in_view(
+        Camera(40, 40, 40.0, 40.0, 20.0, 20.0, look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0))), low, high
+    )
+    assert in_view.tolist() == [True, False, False, True]

@@ -267,3 +267,17 @@ def test_common_focus_is_where_the_axes_meet():
     assert common_focus(parallel) is None
     away = [camera(position=(x, 0, -3), target=(3 * x, 0, -9)) for x in (-1.0, -0.5, 0.5, 1.0)]
     assert common_focus(away) is None
+
+
+def test_orbit_follows_an_arc_that_goes_up_and_down():
+    # A hand-held walk over a mound and around a corner: higher and farther away in the middle.
+    angles = np.radians(np.linspace(-34, 34, 10))
+    heights, distances = 0.6 - 9 * (angles - 0.1) ** 2 / 4, 12 - 5 * angles**2
+    camera_path = [
+        camera(position=(d * np.sin(a), -h, -d * np.cos(a))) for a, h, d in zip(angles, heights, distances, strict=True)
+    ]
+    for view in orbit(camera_path, 48, 1):
+        x, y, z = view.position
+        near = np.argsort(np.abs(angles - np.arctan2(x, -z)))[:2]
+        assert heights[near].min() - 0.05 < -y < heights[near].max() + 0.05
+        assert distances[near].min() - 0.1 < np.hypot(x, z) < distances[near].max() + 0.1

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.output.tonemap import encode_srgb
-from sehdr_warp.output.ultra_hdr import ultra_hdr
+from sehdr_warp.output.ultra_hdr import MOST_STOPS, ultra_hdr
 
 X, Y = np.meshgrid(np.linspace(-5, 5, 256), np.linspace(0, 1, 192))
 LIGHT = (2.0**X)[..., None] * (1 - 0.3 * Y[..., None] * [0, 0.5, 1])
@@ -36,3 +36,12 @@ def test_the_plain_picture_and_the_index():
     assert index[0xB001] == 2 and first["Size"] == at and at + second["Size"] == len(data)
     gains = Image.open(io.BytesIO(data[at:]))
     assert gains.size == picture.size and b'Item:Length="%d"' % second["Size"] in data
+
+
+def test_brighter_light_than_the_most_is_shown_at_that():
+    imagecodecs = pytest.importorskip("imagecodecs")
+    light = np.full((32, 32, 3), 1000.0)
+    decoded = imagecodecs.ultrahdr_decode(ultra_hdr(light, np.ones_like(light))).astype(np.float64)[..., :3]
+    np.testing.assert_allclose(decoded, 2**MOST_STOPS, rtol=0.02)
+    dark = imagecodecs.ultrahdr_decode(ultra_hdr(0 * light, 0 * light)).astype(np.float64)[..., :3]
+    np.testing.assert_allclose(dark, 0, atol=1e-3)

@@ -252,3 +252,16 @@ def test_several_cameras_are_chosen_from_by_name(tmp_path):
     with pytest.raises(SehdrError, match="chooses from a file"):
         select_cameras(run, "test", camera="a")
     assert len(load_cameras(tmp_path / "c.json")) == 3
+
+
+def test_up_of_a_flight_to_and_fro():
+    """The level axes of all pictures lie along one line, which says nothing of what is up."""
+    random, cameras = np.random.default_rng(0), []
+    for index in range(20):
+        position = np.array([index % 5, 20.0, index // 5])
+        ahead = (0, 0, 1 if index // 5 % 2 else -1)
+        target = position - (*random.normal(0, 0.08, 1), 1, *random.normal(0, 0.08, 1))
+        cameras.append(Camera(32, 24, 40, 40, 16, 12, look_at(position, target, up=ahead)))
+    assert degrees(up_direction(cameras), np.array([0, 1, 0])) < 3
+    for each in orbit(cameras, 5, 20.0):
+        assert each.position[1] == pytest.approx(20, abs=1) and each.world_to_camera[2, 1] < -0.9

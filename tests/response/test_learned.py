@@ -110,3 +110,10 @@ def test_a_field_photographs_through_it_and_teaches_it(tone_map, device):
     photo.encoded.sum().backward()
     assert all(bool(parameter.grad.any()) for parameter in field.response.parameters())
     assert bool(field.gaussians.harmonics_dc.grad.any())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_channel_starts_rising_in_the_dark_in_the_middle_and_in_the_light(seed):
+    log_exposure = torch.tensor([-12.0, -7.0, -0.01, 0.01, 3.0, 8.0])[:, None].expand(-1, 3)
+    with torch.no_grad():
+        assert (ToneMapper(32, seed).encode_log(log_exposure).logit().diff(dim=0) > 0).all()

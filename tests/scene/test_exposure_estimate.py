@@ -1,5 +1,8 @@
 """Exposure times of photos that state none."""
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,3 +34,19 @@ def test_a_view_gets_the_time_by_its_brightness_beside_a_timed_one():
     scene = with_estimated_times(scene_of([120, 60], [0.5, 0.5]), {"1"}, response)
     assert scene.views[1].exposure_time == pytest.approx(0.25, rel=0.02)
     assert "by its brightness beside the others" in scene.notes[0]
+
+
+def test_a_channel_that_clips_in_the_other_photos_is_left_out_without_a_warning():
+    response = response_by_name("linear")
+    scene = scene_of([120, 60], [0.5, 0.5])
+    red_clips = np.full((12, 16, 3), 120, np.uint8)
+    red_clips[..., 0] = 255
+    column, row = np.meshgrid(np.arange(6) - 3, np.arange(5) - 2)
+    points = np.stack([column.ravel(), row.ravel(), np.full(30, 15)], axis=1).astype(float)
+    views = (replace(scene.views[0], codes=red_clips), scene.views[1])
+    scene = replace(scene, views=views, points=points, point_colors=np.zeros((30, 3)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = with_estimated_times(scene, {"1"}, response)
+    assert scene.views[1].exposure_time == pytest.approx(0.25, rel=0.02)
+    assert "by 30 points that other photos show too" in scene.notes[0]

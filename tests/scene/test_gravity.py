@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import rotate
 from scipy.spatial.transform import Rotation
 
 from sehdr_warp.scene import Camera, Scene, View, load_scene, look_at
-from sehdr_warp.scene.gravity import UpDirection, find_up, up_direction
+from sehdr_warp.scene.gravity import UpDirection, find_up, up_direction, up_from_lines
 
 UP = np.array([0.0, 0, 1])
 
@@ -103,3 +104,28 @@ def test_places_that_do_not_fit_the_poses_are_not_used(tmp_path):
     assert find_up(photos).source == "cameras" and UpDirection.from_dict(None) is None
     views = [replace(view, source=None) for view in flight(tmp_path)[0].views]
     assert find_up(scene(views)).source == "cameras"
+
+
+def test_lines_right_cameras_that_are_rolled_alike():
+    """A camera is screwed onto its tripod askew, and looks one way."""
+    views = []
+    for view in room("window").train_views:
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_euler("z", 6, degrees=True).as_matrix()
+        codes = rotate(view.codes, -6, reshape=False, order=1)[20:-20, 20:-20]  # Without the corners that turned in
+        camera = replace(view.camera, world_to_camera=turn @ view.camera.world_to_camera)
+        camera = replace(camera, width=160, height=160, cx=camera.cx - 20, cy=camera.cy - 20)
+        views.append(View(view.name, codes, camera, view.exposure_time, "train"))
+    poses = up_direction([view.camera for view in views])
+    lines = up_from_lines(views, poses)
+    assert degrees(poses) == pytest.approx(6, abs=1) and lines is not None and degrees(lines) < 2
+
+
+def test_photos_without_lines_leave_the_up_of_their_poses():
+    random = np.random.default_rng(0)
+    views = []
+    for index, view in enumerate(room("study").train_views):
+        codes = random.integers(0, 256, (60, 80, 3), np.uint8)
+        views.append(View(str(index), codes, view.camera.resized(80, 60), 1.0, "train"))
+    up = find_up(scene(views))
+    assert up.source == "cameras" and up.direction == pytest.approx(up_direction([view.camera for view in views]))

@@ -278,3 +278,11 @@ def test_masks_that_leave_out_everything_are_named(tmp_path):
         Image.new("L", (64, 48)).save(tmp_path / "masks" / photo.name)
     with pytest.raises(InputError, match="masks or transparency leave out all pixels .*; masks keep what is white"):
         load(tmp_path)
+
+
+def test_masks_in_a_folder_of_each_camera(tmp_path):
+    write_colmap(tmp_path, name="cam{0}/0000.png")
+    write_mask(tmp_path / "images" / "cam1" / "masks" / "0000.png")
+    scene = load(tmp_path, holdout=0)
+    assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
+    assert not any("in no view" in note for note in scene.notes)

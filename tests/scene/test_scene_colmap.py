@@ -291,3 +291,20 @@ def test_hdr_gs_layout(tmp_path):
         np.testing.assert_array_equal(view.hdr, truth[i])
         np.testing.assert_allclose(view.image, reinhard_gamma(truth[i] * 8), atol=0.5 / 255 + 1e-6)
         np.testing.assert_allclose(view.camera.world_to_camera, arc_poses(6)[i], atol=1e-12)
+
+
+def test_mask_and_alpha_keep_pixels_out(tmp_path):
+    write_colmap(tmp_path)
+    (tmp_path / "masks").mkdir()
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[:, :16] = 0
+    Image.fromarray(mask).save(tmp_path / "masks" / "000.png.png")
+    alpha = np.full((48, 64, 1), 255, np.uint8)
+    alpha[:12] = 0
+    Image.fromarray(np.concatenate([pattern(64, 48, 1), alpha], 2)).save(tmp_path / "images" / "001.png")
+    scene = load(tmp_path)
+    assert scene.views[0].mask[:, :16].max() == 0 and scene.views[0].mask[:, 16:].min() == 1
+    assert scene.views[1].mask[:12].max() == 0 and scene.views[1].mask[12:].min() == 1
+    np.testing.assert_array_equal(scene.views[1].image, pattern(64, 48, 1).astype(np.float32) / np.float32(255))
+    assert scene.views[2].mask is None
+    assert "transparency: 1 of 6 photos have transparent pixels, which are left out" in scene.notes

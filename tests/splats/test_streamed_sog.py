@@ -3,6 +3,7 @@
 import json
 import subprocess
 
+import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError
@@ -94,3 +95,16 @@ def test_splat_transform_reads_them(tmp_path, small_chunks):
     chunk = path.parent / "0_0" / "meta.json"
     subprocess.run(["node", tool, chunk, tmp_path / "b.ply"], check=True, capture_output=True)
     assert read_gaussians(tmp_path / "b.ply").count == 150
+
+
+def test_bounds_hold_the_gaussians_of_their_chunks(tmp_path, small_chunks):
+    original, path = natural(), tmp_path / "town" / "lod-meta.json"
+    write_gaussians(path, original)
+    meta, volume = json.loads(path.read_text()), 0.0
+    for node in leaves(meta["tree"]):
+        low, high = (np.array(node["bound"][name]) for name in ("min", "max"))
+        inside = ((original.means >= low) & (original.means <= high)).all(1)
+        assert inside.sum() >= 150
+        volume += np.prod(high - low)
+    whole = meta["tree"]["bound"]
+    assert volume < 2.5 * np.prod(np.subtract(whole["max"], whole["min"])), "chunks are compact"
