@@ -4,8 +4,8 @@ Rendering 2D Gaussians takes some ten launches; called from Python one by one, t
 After a few calls with the same sizes the next one is captured as CUDA graphs on memory of its own: inputs are copied
 in, outputs are copied out.
 
-This applies to calls of rasterize() and of gsplat's rasterization(). A training captures its whole step as one CUDA
-graph (training/step_graphs.py); within it, and with max_intersections, calls are launched.
+This applies to calls of rasterize() and, with packed=False, of gsplat's rasterization(). A training captures its whole
+step as one CUDA graph (training/step_graphs.py); within it, and with max_intersections, calls are launched.
 """
 
 import atexit

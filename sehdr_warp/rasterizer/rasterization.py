@@ -147,6 +147,7 @@ def rasterize(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
     tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
+    # A call like an earlier one has arguments that were checked then, but for the background.
     pool = find_pool(tensors, options) if background is None else None
     if pool is None:
         check_shapes(*tensors, background)
@@ -155,8 +156,8 @@ def rasterize(
         options = options.checked(means.device)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
         if world_to_camera.ndim == 2:
-            projection = _project(tensors, options, pool or get_or_create_pool(tensors, options))
-            rendering = _render(projection, projection.means2d, tensors, options)
+            begun = _begin(tensors, options, pool or get_or_create_pool(tensors, options))
+            rendering = _finish(begun, begun.means2d, tensors, options)
         else:
             rendering = _render_cameras(tensors, options)
         if background is None:
@@ -201,8 +202,8 @@ def check_shapes(
         raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
 
 
-def _project(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool | None) -> "_Projection":
-    """Project to one camera. On a GPU, a repeated call replays a CUDA graph, which holds the whole render.
+def _begin(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool | None) -> "_Begun":
+    """Project to one camera. On a GPU, a repeated call replays a CUDA graph, which renders the image as well.
 
     pool: CUDA graphs of calls like this one (graph_cache.py); None if it is to be launched.
     """
@@ -213,7 +214,7 @@ def _project(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool 
     return replayed
 
 
-_Projection = ProjectedGaussians | ReplayedRender
+_Begun = ProjectedGaussians | ReplayedRender
 
 
 def _launch_projection(tensors: Sequence[Tensor], options: RenderOptions) -> ProjectedGaussians:
@@ -222,18 +223,22 @@ def _launch_projection(tensors: Sequence[Tensor], options: RenderOptions) -> Pro
     return project_to_camera(*dense, opacities, world_to_camera, intrinsics, options)
 
 
-def _render(projection: _Projection, means2d: Tensor, tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
-    """Render what _project() returned for these tensors, as a function of means2d [N, 2]."""
+def _finish(begun: _Begun, means2d: Tensor, tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
+    """Return the rendering of what _begin() returned for these tensors, as a function of means2d [N, 2].
+
+    means2d: those of `begun`; of several cameras a part of one tensor, whose gradient then holds all of theirs.
+    """
     features = tensors[FEATURES]
-    if isinstance(projection, ReplayedRender):
-        # The replay does not read it: it leads the gradients to features and depths.
-        blended = torch.cat([features, projection.depths[:, None]], 1) if options.depth else features
-        image, transmittance = with_gradient(projection.result, means2d, blended, projection.conics_opacities)
-        if projection.fits():  # Called last, because it waits for the GPU.
-            splats = means2d, projection.depths, projection.extents
-            return _rendering(image, transmittance, *splats, projection.intersections, None, None, options)
-        projection = _launch_projection(tensors, options)
-    return render_projected(projection._replace(means2d=means2d), features, options, replays=False)
+    if isinstance(begun, ReplayedRender):
+        blended = features
+        if options.depth and torch.is_grad_enabled():  # The image is there: they lead its gradients to the depths.
+            blended = torch.cat([features, begun.depths[:, None]], 1)
+        image, transmittance = with_gradient(begun.result, means2d, blended, begun.conics_opacities)
+        if begun.fits():  # Called last, because it waits for the GPU.
+            splats = means2d, begun.depths, begun.extents
+            return _rendering(image, transmittance, *splats, begun.intersections, None, None, options)
+        begun = _launch_projection(tensors, options)
+    return render_projected(begun._replace(means2d=means2d), features, options, replays=False)
 
 
 def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
@@ -248,10 +253,10 @@ def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Render
         strict=True,
     )
     calls = [(means, log_scales, quaternions, *own) for own in each]
-    projections = [_project(call, options, get_or_create_pool(call, options)) for call in calls]
+    renders = [_begin(call, options, get_or_create_pool(call, options)) for call in calls]
     # One tensor that every image is rendered from, so that its gradient holds every camera's.
-    means2d = torch.stack([projection.means2d for projection in projections])
-    renderings = [_render(*view, options) for view in zip(projections, means2d, calls, strict=True)]
+    means2d = torch.stack([begun.means2d for begun in renders])
+    renderings = [_finish(*view, options) for view in zip(renders, means2d, calls, strict=True)]
     return join_renderings(means2d, renderings)
 
 
