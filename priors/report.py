@@ -33,8 +33,9 @@ _TEXT = """# The prior for light above white
 How well the network that comes with the package estimates clipped light ([Light above white](light.md)), on photos of
 ten panoramas that it was not trained on (`priors/sources.toml`). Each row estimates the log2 excess over white of
 clipped values: by nothing (*white*), by the mean of the training (*constant*), by a ridge regression on ten figures of
-the photo's histogram, and by a network that was trained like the one in the package on the other panoramas. RMS counts
-all clipped values alike. The card beside the weights, `sehdr_warp/prior/clipped_light.md`, says how it was trained.
+the photo's histogram, and by a network that was trained on the other panoramas like the one in the package, up to its
+third stage. RMS counts all clipped values alike. The card beside the weights, `sehdr_warp/prior/clipped_light.md`, says
+how it was trained, and what the further stages gave.
 
 {tables}
 

@@ -1,0 +1,38 @@
+"""Average weights of the prior, which went on from the same weights.
+
+`python -m priors.average OUT A.safetensors=0.7 B.safetensors=0.3`; shares are divided by their sum.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+
+def average(weights: dict[Path, float], out: Path) -> None:
+    """Write the mean of weights files, deviation scales included, by their shares of the sum of the values."""
+    total, scale = sum(weights.values()), 0.0
+    mean: dict[str, torch.Tensor] = {}
+    for path, share in weights.items():
+        with safe_open(path, "pt") as file:
+            scale += share / total * float(file.metadata()["deviation_scale"])
+            for name in file.keys():  # noqa: SIM118 (no mapping)
+                mean[name] = mean.get(name, 0) + share / total * file.get_tensor(name).float()
+    tensors = {name: values.half().contiguous() for name, values in mean.items()}
+    save_file(tensors, out, {"deviation_scale": f"{scale:.4f}"})
+
+
+def main() -> None:
+    """Average the files of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("weights", nargs="+", metavar="FILE=SHARE")
+    args = parser.parse_args()
+    pairs = [each.rpartition("=") for each in args.weights]
+    average({Path(path): float(share) for path, _, share in pairs}, args.out)
+
+
+if __name__ == "__main__":
+    main()
