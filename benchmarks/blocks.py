@@ -49,7 +49,7 @@ from .survey import write_survey
 from .timing import forget_peaks
 
 AT_ONCE = 2  # Blocks that train at once
-WARM_UP = 30  # Steps of a training before the first that is timed, in which kernels are compiled
+WARM_UP = 100  # Steps of a training before the first that is timed; it has refinements, whose kernels are compiled
 FRAMES = 20
 SIZE = 1920, 1080  # Pixels of the pictures of copies
 DRAFT = 480, 270  # Of the page's pictures while it moves
