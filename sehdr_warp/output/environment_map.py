@@ -113,7 +113,8 @@ def write_environment_map(
     options = {"beyond": center.beyond, "shares": run.clipped_share()}
     rendered = render_map(run, center.position, size, layout, to_world.T, focal, **options)
     weight = solid_angles(size, layout)
-    _judge(run, center.position, photos, rendered.alpha, rendered.distance, weight)
+    place = transform.points(center.position)
+    _judge(run, place, photos, rendered.alpha, rendered.distance, weight)
     added = np.zeros_like(rendered.hdr)
     if inpaint:
         light = inpainted_light(rendered.hdr, rendered.alpha, directions, weight)
@@ -129,7 +130,6 @@ def write_environment_map(
         absolute = 1.0 if luminance is None else EFFICACY / luminance
         write_radiance(path, hdr, exposure=exposure * absolute, overwrite=overwrite)
         return path
-    place = transform.points(center.position)
     beyond = center.beyond * transform.scale if beyond is None else beyond
     facts = {**provenance(run), "position": json.dumps(place.tolist()), "axes": axes}
     facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(shares.to_dict())}
@@ -309,11 +309,25 @@ def inpainted_light(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, 
 
 
 def _judge(
-    run: "RenderableScene", position, photos: list[Camera], alpha: np.ndarray, distance: np.ndarray, weight: np.ndarray
+    run: "RenderableScene",
+    point: np.ndarray,
+    photos: list[Camera],
+    alpha: np.ndarray,
+    distance: np.ndarray,
+    weight: np.ndarray,
 ) -> None:
-    """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is."""
+    """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is.
+
+    Args:
+        run: Scene, for its path.
+        point: [3] in the coordinates that `--at` takes, for messages.
+        photos: Training cameras; their spread says what is near.
+        alpha: [H, W] coverage of the map's pixels.
+        distance: [H, W] of what they show, in the scene's units.
+        weight: [H, W] solid angles.
+    """
     share = weight[alpha > COVERED].sum() / weight.sum()
-    place = ", ".join(f"{value:.4g}" for value in position)
+    place = ", ".join(f"{value:.4g}" for value in point)
     if share < 1e-3:
         remedy = "choose a point among the cameras (center, camera:NAME)"
         raise SehdrError(f"{run.path}: from ({place}) nothing of the scene is seen; {remedy}")

@@ -184,7 +184,7 @@ def test_points_and_options_that_cannot_be(tmp_path, run, logged):
         ({"at": "camera:x"}, r"'x' is not one of the scene's \(0, 1, 2"),
         ({"at": "1,2"}, "neither x,y,z nor camera:NAME nor center"),
         ({"at": "1,2,nan"}, "neither"),
-        ({"at": "1e6,0,0"}, "nothing of the scene is seen"),
+        ({"at": "1e6,2e6,3e6", "scale": 2.0}, r"from \(1e\+06, 2e\+06, 3e\+06\) nothing of the scene is seen"),
         ({"size": 7}, "size 7 is not usable"),
         ({"layout": "ball"}, "is not one of latlong, cube"),
     ):
