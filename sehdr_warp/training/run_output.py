@@ -95,8 +95,8 @@ class RunOutput:
         self._log(trainer, "test", scores)
         log.info("iteration %d: %s, after %.1f s", trainer.iteration, format_scores(scores), trainer.seconds)
 
-    def checkpoint(self, trainer: Trainer) -> None:
-        """Write a checkpoint, unless the training has diverged: the last good one then stays the newest.
+    def checkpoint(self, trainer: Trainer, *, last: bool = False) -> None:
+        """Write a checkpoint; if the loss is not finite, only the last one, because the training may be diverging.
 
         Raises:
             SehdrError: If a tensor is not finite.
@@ -107,7 +107,7 @@ class RunOutput:
                 f"iteration {trainer.iteration}: {name} is not finite and was not saved; --resume goes back to "
                 "the last good checkpoint; if it happens again, lower the learning rates or check photos and cameras"
             )
-        if trainer.iteration > trainer.first_iteration and not math.isfinite(loss := trainer.loss):
+        if not last and not math.isfinite(loss := trainer.loss):
             message = "iteration %d: the loss is %s; no checkpoint is written, the last one stays"
             log.warning(message, trainer.iteration, loss)
             return
@@ -125,7 +125,7 @@ class RunOutput:
         if trainer.iteration >= trainer.total and trainer.iteration > trainer.first_iteration:
             evidence = remove_unseen(trainer)
             self.evaluate(trainer)
-        self.checkpoint(trainer)
+        self.checkpoint(trainer, last=True)
         if trainer.ranks is not None:
             trainer.ranks.shutdown()
         self._write_summary(trainer)

@@ -1,11 +1,16 @@
 """A training that diverges: what is skipped, what is saved, and where it goes on."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.training.train import train
+from sehdr_warp.training import gradient_step
+from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
 
@@ -50,6 +55,26 @@ def test_while_the_loss_is_not_finite_the_last_checkpoint_stays(scene, tmp_path,
     assert "iteration 20: the loss is inf; no checkpoint is written" in caplog.text
     names = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
     assert names == ["iteration_00000000", "iteration_00000010", "iteration_00000030"]
+
+
+@pytest.mark.parametrize("end", [15, 30])
+def test_the_last_state_is_saved_though_its_step_was_skipped(scene, tmp_path, monkeypatch, end):
+    """Beside 60 Gaussians, five that no photo shows: they are removed at the end, and the confidence is of the rest."""
+    points = np.concatenate([scene.points, np.full((5, 3), 1e3)])
+    colors = np.concatenate([scene.point_colors, np.ones((5, 3), np.float32)])
+    larger = dataclasses.replace(scene, points=points, point_colors=colors)
+    options = config(**{"model.initial_density": 0.0, "densification.cap_max": 65})
+    trainer = create_trainer(larger, tmp_path / "run", options, device="cpu")
+    loss = gradient_step.data_loss
+    monkeypatch.setattr(
+        gradient_step, "data_loss", lambda *args: loss(*args) * (float("nan") if trainer.iteration == end else 1)
+    )
+    for progress in trainer:
+        if progress.iteration == end:
+            trainer.stop()
+    run = load_run(tmp_path / "run")
+    assert trainer.skipped_steps == 1 and run.iterations == end
+    assert run.gaussian_count == (65 if end == 15 else 60)
 
 
 def test_huge_gradients_leave_finite_parameters(scene):
