@@ -43,7 +43,10 @@ def register_custom_op(name: str, options: str, run: Operation, fake: Operation)
 
     def forward(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
         with torch.no_grad():
-            return [result.contiguous() for result in run(tensors, *values)]
+            results = [result.contiguous() for result in run(tensors, *values)]
+        # Color and depth of a single pixel are contiguous parts of one tensor, which torch refuses.
+        memory = [result.untyped_storage().data_ptr() for result in results]
+        return [result.clone() if memory.index(memory[k]) < k else result for k, result in enumerate(results)]
 
     def gradients_of(tensors: Sequence[Tensor], upstream: Sequence[Tensor | None], *values: Any) -> list[Tensor]:
         with torch._C._ForceDispatchKeyGuard(*_KEYS), torch.enable_grad():

@@ -90,6 +90,13 @@ def test_several_cameras_and_room_have_the_shapes_that_the_compiler_expects(devi
     assert rendering.intersection_count == truth.intersection_count == 1000
 
 
+def test_color_and_depth_of_one_pixel_have_memory_of_their_own():
+    arguments = *splats(dtype=torch.float32, channels=3), 1, 1
+    truth = rasterize(*arguments, depth=True)
+    rendering = torch.compile(rasterize, backend="aot_eager", fullgraph=True)(*arguments, depth=True)
+    assert torch.equal(rendering.image, truth.image) and torch.equal(rendering.depth, truth.depth)
+
+
 def test_a_misfit_is_named_while_compiling():
     leaves = splats(dtype=torch.float32)
     draw = torch.compile(
