@@ -70,9 +70,9 @@ def project_gaussians(
         antialiased: lower opacities so that eps2d keeps a Gaussian's energy.
         camera_model: "pinhole", "ortho" or "fisheye".
     """
+    near = max(culling.near_plane, 1e-30)
     if camera_model == "pinhole" and quats is not None and scales is not None:
         intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-        near = max(culling.near_plane, 1e-30)
         options = RenderOptions(width, height, near, eps2d, ALPHA_THRESHOLD, antialiased)
         log_scales = scales.abs().clamp_min(SMALLEST_SIZE).log().contiguous()
         shapes = means.contiguous(), log_scales, quats.contiguous()
@@ -83,7 +83,7 @@ def project_gaussians(
             covars = _finite_covariances(quats, scales)
         assert covars is not None
         projected = _project_covariances(
-            means, covars, opacities, viewmat, K, width, height, eps2d, culling.near_plane, antialiased, camera_model
+            means, covars, opacities, viewmat, K, width, height, eps2d, near, antialiased, camera_model
         )
     extents = projected.extents
     if culling.far_plane < 1e10:

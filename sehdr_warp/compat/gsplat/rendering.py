@@ -149,7 +149,7 @@ def rasterization(
     )
     size = integer("width", width, 1, MAX_SIDE), integer("height", height, 1, MAX_SIDE)
     tile_size = integer("tile_size", DEFAULT_TILE_SIZE if tile_size is None else tile_size, 1, MAX_SIDE)
-    culling = Culling(max(near_plane, 0.0), far_plane, radius_clip)
+    culling = Culling(near_plane, far_plane, radius_clip)
     with oom_context(means.device, lambda: (means.shape[-2], *size)):
         views = list(inputs.views())
         projected = [

@@ -33,6 +33,23 @@ def test_covariances_and_cameras_are_projected_alike(model, device):
     assert torch.autograd.gradcheck(conics, few, eps=1e-6, atol=1e-5, rtol=1e-3)
 
 
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_a_negative_near_plane_shows_nothing_behind_the_camera(model, device):
+    leaves, place = scene(device, count=12)
+    leaves[0].data[:6, 2] = -5.0
+    leaves[0].data[6, 2] = -3.0  # At the first camera.
+    radii, *_ = fully_fused_projection(
+        leaves[0], None, *leaves[1:3], **place._asdict(), near_plane=-9.0, camera_model=model
+    )
+    covars = quat_scale_to_covar_preci(leaves[1], leaves[2])[0]
+    same, means2d, *_ = fully_fused_projection(
+        leaves[0], covars, None, None, **place._asdict(), near_plane=-9.0, camera_model=model
+    )
+    assert not radii[0, :7].any() and not same[0, :7].any() and same[0, 7:].any()
+    means2d.sum().backward()
+    assert leaves[0].grad.isfinite().all()
+
+
 def test_far_planes_and_small_radii_cull(device):
     leaves, place = scene(device)
     _, _, info = rasterization(*leaves, **place._asdict(), packed=False)
