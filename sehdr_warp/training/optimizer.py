@@ -229,9 +229,9 @@ class MovingAverage:
             now = gaussians.tensors()
             if self.means:
                 # A plain mean at first, so that the first sample does not weigh more than others.
-                samples = (iteration - self.first) // self.every
+                samples = iteration // self.every - self.first // self.every + (iteration % self.every >= step_batch)
                 means = [self.means[name] for name in now]
-                torch._foreach_lerp_(means, list(now.values()), max(self.weight, 1 / (samples + 1)))
+                torch._foreach_lerp_(means, list(now.values()), max(self.weight, 1 / max(1, samples)))
             else:
                 self.means = {name: values.clone() for name, values in now.items()}
         if iteration >= self.total:

@@ -67,6 +67,28 @@ def test_the_mean_is_as_old_as_its_span(average):
     assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not moving_average.state_dict()
 
 
+@pytest.mark.parametrize(
+    ("iterations", "last_change", "batch", "samples"),
+    [
+        (6000, 5950, 1, [5960, 5970, 5980, 5990, 6000]),
+        (6000, 5955, 1, [5960, 5970, 5980, 5990, 6000]),
+        (5999, 5950, 1, [5960, 5970, 5980, 5990, 5999]),
+        (6000, 5946, 4, [5952, 5960, 5972, 5980, 5992, 6000]),
+        (6000, 5950, 4, [5960, 5972, 5980, 5992, 6000]),
+    ],
+)
+def test_fewer_samples_than_the_window_weigh_alike(iterations, last_change, batch, samples):
+    """The window is 100 iterations, with a sample every 10."""
+    config = load_config("default", {"schedule.iterations": iterations, "schedule.ema_window": 500})
+    moving_average, gaussians = MovingAverage(config, last_change), Moving()
+    # As from a training that was stopped and goes on with more iterations.
+    moving_average.load_state_dict({"means": torch.full((3,), 1e6)})
+    for iteration in range(batch, iterations + 1, batch):
+        gaussians.value.fill_(iteration)
+        moving_average.update(iteration, batch, gaussians)
+    assert float(gaussians.value[0]) == pytest.approx(sum(samples) / len(samples), abs=0.01)
+
+
 def test_means_begin_when_the_count_stays():
     config = load_config("default", {"schedule.iterations": 1000, "schedule.ema_window": 15_000})
     assert MovingAverage(config, 500).first == 500
