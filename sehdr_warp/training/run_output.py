@@ -81,7 +81,7 @@ class RunOutput:
         if save and iteration < trainer.total and time.monotonic() - self._saved_at >= self._least_seconds:
             self.checkpoint(trainer)
         if self._tensorboard and trainer.came_to(self._log_every):
-            figures = {"loss": trainer.run_timed(lambda: trainer.loss), "psnr": trainer.run_timed(trainer.psnr)}
+            figures = {"loss": trainer.run_timed(lambda: trainer.loss), "psnr": trainer.psnr()}
             self._log(trainer, "train", figures | {"gaussians": trainer.field.gaussians.count})
 
     def evaluate(self, trainer: Trainer) -> None:

@@ -79,7 +79,7 @@ class Trainer:
         total: Iterations in all.
         batch: Photos of a step, one for each rank; each counts as an iteration.
         step_batch: Photos of the last step: `batch`, or as many as iterations were left.
-        seconds: Duration so far, without evaluation and checkpoints.
+        seconds: Duration so far, without evaluation, renders for figures that are shown, and checkpoints.
     """
 
     def __init__(
@@ -352,7 +352,8 @@ class Trainer:
 
     @torch.no_grad()
     def psnr(self) -> float:
-        """Render the last step's view and return its PSNR against the photo inside the mask, dB."""
+        """Return the PSNR of the last step's photo inside the mask, dB; its render is no time of the training."""
+        self.synchronize()
         view = self.views.source(self.iteration)[self._view_index]
         with self.graphs.on_capture_stream():
             photo = self.field.render_train_view(view.camera, view.exposure_time, degree=self.degree).encoded

@@ -95,7 +95,7 @@ class TrainingProgress:
     @property
     def psnr(self) -> float:
         """PSNR of the step's photo, dB."""
-        return self._trainer.run_timed(self._trainer.psnr)
+        return self._trainer.psnr()
 
     @property
     def gaussians(self) -> int:

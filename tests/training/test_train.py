@@ -273,7 +273,9 @@ def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path)
     for step in training:
         progress_lines.append((step.iteration, step.seconds, step.seconds_left))
         if step.iteration == 12:
-            assert step.loss > 0 and step.psnr > 5 and step.gaussians >= 60 and step.total == 90
+            before = training.seconds
+            assert step.psnr > 5 and training.seconds == before, "a render for the display is no training"
+            assert step.loss > 0 and step.gaussians >= 60 and step.total == 90
             break
     assert [iteration for iteration, *_ in progress_lines] == list(range(1, 13))
     assert progress_lines[0][2] is None and 0 < progress_lines[-1][2] < 78 * (
