@@ -54,7 +54,7 @@ def project_to_camera(
     """Project Gaussians to the image plane of one camera; all but the extents are differentiable.
 
     Args:
-        means: [N, 3]; this and the next two contiguous.
+        means: [N, 3].
         log_scales: [N, 3].
         quaternions: [N, 4] (w, x, y, z), of any length.
         opacities: [N].
@@ -73,8 +73,8 @@ def project_to_camera(
     )
     antialiased = options.antialiased
     kernel = projection_kernel(warp_scalar(means.dtype), antialiased, differentiate_compensation and antialiased)
-    camera = opacities.contiguous(), world_to_camera.contiguous(), intrinsics.contiguous()
-    inputs = means, log_scales, quaternions, *camera
+    tensors = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
+    inputs = tuple(tensor.contiguous() for tensor in tensors)
     return ProjectedGaussians(*launch_projection(kernel, inputs, projection_parameters(options), outputs))
 
 

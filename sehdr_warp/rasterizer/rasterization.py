@@ -219,8 +219,7 @@ _Begun = ProjectedGaussians | ReplayedRender
 
 def _launch_projection(tensors: Sequence[Tensor], options: RenderOptions) -> ProjectedGaussians:
     means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
-    dense = means.contiguous(), log_scales.contiguous(), quaternions.contiguous()
-    return project_to_camera(*dense, opacities, world_to_camera, intrinsics, options)
+    return project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
 
 
 def _finish(begun: _Begun, means2d: Tensor, tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:

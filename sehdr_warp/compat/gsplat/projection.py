@@ -74,9 +74,10 @@ def project_gaussians(
     if camera_model == "pinhole" and quats is not None and scales is not None:
         intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
         options = RenderOptions(width, height, near, eps2d, ALPHA_THRESHOLD, antialiased)
-        log_scales = scales.abs().clamp_min(SMALLEST_SIZE).log().contiguous()
-        shapes = means.contiguous(), log_scales, quats.contiguous()
-        projected = project_to_camera(*shapes, opacities, viewmat, intrinsics, options, differentiate_compensation=True)
+        log_scales = scales.abs().clamp_min(SMALLEST_SIZE).log()
+        projected = project_to_camera(
+            means, log_scales, quats, opacities, viewmat, intrinsics, options, differentiate_compensation=True
+        )
     else:
         if covars is None:
             assert quats is not None and scales is not None
