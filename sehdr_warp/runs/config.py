@@ -224,7 +224,7 @@ class ScheduleConfig(_Table):
     )
     """iterations at which held-out views are evaluated; the last one always is"""
     checkpoint_every: Iteration = 5000
-    """iterations between checkpoints, and with the default also 10 s; one is always written at the end"""
+    """iterations between checkpoints, which are also 10 s apart if this is not set; one is always written at the end"""
     keep_checkpoints: Annotated[int, Field(ge=1, le=1000)] = 1
     """number of checkpoints in the run folder; older ones are deleted"""
     photo_cache: Literal["auto", "device", "memory", "disk"] = "auto"

@@ -54,7 +54,8 @@ class RunOutput:
         self._evaluate_at = {config.scaled(n) for n in config.schedule.evaluate_at} | {total}
         every = config.schedule.checkpoint_every
         self._checkpoint_every = config.scaled(every)
-        self._least_seconds = LEAST_SECONDS if every == ScheduleConfig().checkpoint_every else 0.0
+        is_set = every != ScheduleConfig().checkpoint_every or "schedule.checkpoint_every" in config.plan.keep
+        self._least_seconds = 0.0 if is_set else LEAST_SECONDS
         self._saved_at = time.monotonic()
         self._log_every = max(1, total // CURVE_POINTS)
         self._tensorboard = tensorboard

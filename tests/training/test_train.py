@@ -13,7 +13,6 @@ from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import codes_of
-from sehdr_warp.training import run_output
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.run_output import evaluate_views
 from sehdr_warp.training.train import create_trainer, train
@@ -40,11 +39,12 @@ def test_every_variant_learns_and_loads_as_it_was_trained(scene, trained, varian
     assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
 
 
-@pytest.mark.parametrize(("every", "apart", "saved"), [(5000, 10.0, 2), (5001, 10.0, 7)])
-def test_checkpoints_are_seconds_apart_unless_their_interval_is_set(scene, tmp_path, monkeypatch, every, apart, saved):
+@pytest.mark.parametrize(
+    ("every", "keep", "saved"), [(5000, [], 2), (5001, [], 7), (5000, ["schedule.checkpoint_every"], 7)]
+)
+def test_checkpoints_are_seconds_apart_unless_their_interval_is_set(scene, tmp_path, every, keep, saved):
     """The default of 5000 iterations of 30,000 are 2 of 12 here; one more is of the start."""
-    monkeypatch.setattr(run_output, "LEAST_SECONDS", apart)
-    fields = {"schedule.keep_checkpoints": 9, "schedule.checkpoint_every": every}
+    fields = {"schedule.keep_checkpoints": 9, "schedule.checkpoint_every": every, "plan.keep": keep}
     train(scene, tmp_path / "run", override_config(quick(length=12), fields), device="cpu")
     names = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
     assert len(names) == saved and names[-1] == "iteration_00000012", names
