@@ -117,13 +117,13 @@ class RunOutput:
         self.folder.write_checkpoint(state.tensors, state.values | {"seconds": trainer.seconds}, keep=keep)
         self._saved_at = time.monotonic()
 
-    def finish(self, trainer: Trainer, *, complete: bool) -> None:
-        """Write the last checkpoint and the summary; if complete, also the confidence, and the regions that differ.
+    def finish(self, trainer: Trainer) -> None:
+        """Write the last checkpoint and the summary; after the last step, also the confidence and residual regions.
 
         After the last step, Gaussians that no photo shows are removed before, and the rest is evaluated.
         """
-        evidence = None
-        if trainer.iteration >= trainer.total and trainer.iteration > trainer.first_iteration:
+        evidence, complete = None, trainer.iteration >= trainer.total
+        if complete and trainer.iteration > trainer.first_iteration:
             evidence = remove_unseen(trainer)
             self.evaluate(trainer)
         self.checkpoint(trainer, last=True)

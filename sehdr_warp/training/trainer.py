@@ -160,11 +160,11 @@ class Trainer:
             except GeneratorExit:  # The caller left the loop.
                 self.stop()
                 self._agree_to_continue()
-                self._finish(complete=False)
+                self._finish()
                 raise
             if self.iteration < self.total and self.output is not None:
                 log.info("stopped at iteration %d; continue with --resume", self.iteration)
-            self._finish(complete=self.iteration >= self.total)
+            self._finish()
 
     @contextmanager
     def _session(self) -> Iterator[None]:
@@ -189,13 +189,13 @@ class Trainer:
             pass
         return agreed == GO
 
-    def _finish(self, *, complete: bool) -> None:
-        """Save the end of the training; if complete, also the confidence and the residual regions."""
+    def _finish(self) -> None:
+        """Save the end of the training; after the last step, also the confidence and the residual regions."""
         self.synchronize()
         self.gather()
         self.check()
         if self.output is not None:
-            self.output.finish(self, complete=complete)
+            self.output.finish(self)
         elif self.ranks is not None:
             self.ranks.shutdown()
 

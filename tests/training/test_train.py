@@ -292,6 +292,14 @@ def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path)
     assert not RunFolder(tmp_path / "run").confidence.exists(), "that of an earlier checkpoint would not fit"
 
 
+def test_a_loop_that_is_left_after_the_last_step_ends_as_one_that_is_not(scene, tmp_path):
+    trainer = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
+    for progress in trainer:
+        if progress.iteration == progress.total:
+            break
+    assert trainer.run.summary()["finished"] and trainer.run.field.confidence is not None
+
+
 def test_the_last_score_is_that_of_the_saved_gaussians(scene, tmp_path):
     run = train(scene, tmp_path / "run", quick(), device="cpu")
     last = [line for line in run.metrics() if line["iteration"] == run.iterations]
