@@ -30,9 +30,10 @@ def check_finite(
 ):
     """Decide whether a step is skipped because its loss or a gradient is not finite; one thread.
 
-    step_flags: [2], 1 or 0: skipped, not skipped. norms: [K] of the gradients. overflow: [1], whether there were more
-    intersections than memory, or [0] if there cannot be. step_counters: [3] or [0], counts steps that are not finite
-    and, with intersections ([1] or [0]), holds the most intersections and counts the steps with overflow.
+    step_flags: [2], 1 or 0: skipped, not skipped. norms: [K], not all finite if a gradient is not. overflow: [1],
+    whether there were more intersections than memory, or [0] if there cannot be. step_counters: [3] or [0], counts
+    steps that are not finite and, with intersections ([1] or [0]), holds the most intersections and counts the steps
+    with overflow.
     """
     finite = wp.isfinite(loss[0])
     for i in range(norms.shape[0]):

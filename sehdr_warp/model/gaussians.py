@@ -91,7 +91,7 @@ class Gaussians(nn.Module):
 
     @property
     def count(self) -> int:
-        """Number of Gaussians."""
+        """Number of Gaussians; within all_rows(), of reserved rows."""
         return self.means.shape[0]
 
     @property

@@ -61,15 +61,15 @@ def opacity_penalty(
 ) -> Tensor:
     """Return `weight` times the sum of the opacities that count over the number of Gaussians, a scalar.
 
-    Gaussians in view count, and those that were in view since they were added or copied. For the others the
-    penalty would be Adam's only gradient, which fades them at several times its rate until a photo shows them: where
-    few photos show a place, they would be gone by then.
+    Gaussians in view count, and those that were in view since they were added; a relocated Gaussian keeps moments, so
+    it counts. For the others the penalty would be Adam's only gradient, which fades them at several times its rate
+    until a photo shows them: where few photos show a place, they would be gone by then.
 
     Args:
         opacities: [N] opacities, float32 or float64.
         extents: [N, 2] half-extents of the projected Gaussians, 0 if culled (Rendering.extents); None counts all.
-        moments: [N] Adam's second moments of the opacities, 0 from an addition or copy on until a photo shows the
-            Gaussian; None for zeros.
+        moments: [N] Adam's second moments of the opacities, 0 from an addition on until a photo shows the Gaussian;
+            None for zeros.
         weight: Weight of the mean.
         active_count: [1] int32 on the device, the number of Gaussians if those behind them have an opacity of 0.
     """

@@ -206,7 +206,7 @@ class ScheduleConfig(_Table):
     """Length of a training, and what happens when."""
 
     iterations: Annotated[int, Field(ge=1, le=10_000_000)] = 30_000
-    """number of steps, of one photo each"""
+    """number of photos that are trained on; a step takes one, or one for each GPU"""
     sh_degree_interval: Iteration = 1000
     """iterations after which the SH degree increases by one, from 0"""
     ema_window: Annotated[int, Field(ge=0, le=10**12)] = 750

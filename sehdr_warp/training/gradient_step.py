@@ -52,7 +52,7 @@ class Gradients:
     Attributes:
         loss: Scalar loss of this rank's photo.
         image: [H, W, 3] rendered image that was compared with the photo.
-        rendering: Result of the rasterizer, without tensors that nothing reads any more.
+        rendering: Result of the rasterizer; tensors that nothing reads any more are None.
         needs_means2d_grad: As in StepOptions.
         harmonics: Gradients of the harmonics in factored form; None if the parameters hold them.
     """

@@ -6,8 +6,9 @@ training_state.py lists what a checkpoint holds.
 
 The calls of a step: step() -> GradientStep.run() -> compute_gradients() -> RadianceField.render_train_view() ->
 rasterize() (kernels project, tiles, blend_cuda or blend_cpu) -> data_loss() -> differentiate() -> apply_gradients() ->
-guarded_step() -> Adam.step() (kernels training_step). create_trainer() writes the checkpoint of iteration 0 before the
-first step, RunOutput.after_step() the later ones.
+guarded_step() -> Adam.step() (kernels training_step). On a GPU, StepGraphs.run() captures GradientStep.run() as CUDA
+graphs; a replay repeats the kernels, and none of these functions runs. create_trainer() writes the checkpoint of
+iteration 0 before the first step, RunOutput.after_step() the later ones, and RunOutput.finish() the last one.
 """
 
 import logging
@@ -50,7 +51,7 @@ T = TypeVar("T")
 CHECK_EVERY = 20  # Iterations between checks of the counts that steps keep on the device
 COMPARE_EVERY = 500  # Iterations between checks that all ranks have the same Gaussians
 MAX_RESERVE = 1.5  # Largest number of reserved rows as a multiple of the count; they cost memory and a little time
-MAX_SKIPPED = 20  # More skipped steps than this end the training; a step is skipped if it is not finite
+MAX_SKIPPED = 20  # More steps than this with a loss or gradient that is not finite end the training
 
 
 class Trainer:
@@ -323,7 +324,7 @@ class Trainer:
                 f"iteration {self.iteration}: {skipped} steps had a loss or gradient that is not finite, "
                 f"more than {MAX_SKIPPED}; lower the learning rates or check photos and cameras"
             )
-        if overflowed:  # Those steps changed nothing; the next capture has the capacity that they needed.
+        if overflowed:  # Those steps applied no gradients; the next capture has the capacity that they needed.
             self.graphs.invalidate()
 
     def gather(self) -> None:
@@ -333,7 +334,7 @@ class Trainer:
             self.ranks.check_equal(self.field.gaussians.tensors(), self.iteration)
 
     def run_timed(self, function: Callable[[], T]) -> T:
-        """Call a function whose time, with what the device had left to do, counts as time of the training."""
+        """Call a function, and count the time that it takes on the host as time of the training."""
         started = time.perf_counter()
         try:
             return function()

@@ -121,7 +121,7 @@ class Strategy:
             step_batch: Photos of the step, one for each rank; each counts as an iteration.
 
         Returns:
-            True if the number of Gaussians, or any parameter tensor, changed.
+            True if Gaussians were added or removed; False if at most their values changed in place, as by relocation.
         """
         return False
 
