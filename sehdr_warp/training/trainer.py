@@ -34,6 +34,7 @@ from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
 from .gradient_step import Gradients, GradientStep, StepOptions, StepResult
 from .initialization import make_matcher, sizes_of
+from .losses import INTERVALS_FROM
 from .machine import interruptible, torch_settings
 from .matching import Matcher, seed_gaussians
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
@@ -211,7 +212,9 @@ class Trainer:
         # The last step may have more photos than iterations are left.
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
-        views, gaussians = self.views.source(self.iteration), self.field.gaussians
+        if self.iteration > INTERVALS_FROM * self.total:
+            self.views.widen_codes()
+        views, gaussians = self.views.source, self.field.gaussians
         index = self._view_index = self.order.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
@@ -283,7 +286,7 @@ class Trainer:
     def _propose_gaussians(self, number: Tensor, bound: int) -> Proposals:
         """Propose new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
         random_seed = self.config.seed * SEED_STRIDE + self.iteration
-        view, result = self.views.source(self.iteration)[self._view_index], self._result
+        view, result = self.views.source[self._view_index], self._result
         assert result is not None and self._get_matcher is not None
         with self.graphs.on_capture_stream():
             image = result.image
@@ -355,7 +358,7 @@ class Trainer:
     def psnr(self) -> float:
         """Return the PSNR of the last step's photo inside the mask, dB; its render is no time of the training."""
         self.synchronize()
-        view = self.views.source(self.iteration)[self._view_index]
+        view = self.views.source[self._view_index]
         with self.graphs.on_capture_stream():
             photo = self.field.render_train_view(view.camera, view.exposure_time, degree=self.degree).encoded
         assert photo is not None

@@ -20,11 +20,10 @@ from torch import Tensor
 from ..errors import InputError
 from ..model.radiance_field import RadianceField
 from ..model.renders import CameraTensors
-from ..rasterizer.code_residual import CodeScale
 from ..runs.config import Config
 from ..runs.light_estimates import ClippedLight, light_estimates
 from ..scene import Scene, View
-from .losses import INTERVALS_FROM, Target, compares_exposures, select_view
+from .losses import Target, compares_exposures, select_view
 from .targets import PhotoSource, TrainingView, ViewStack
 
 log = logging.getLogger(__name__)
@@ -227,18 +226,13 @@ class PhotoStream:
 class TrainingViews:
     """The training views in the form that steps take.
 
-    They are uploaded at the first access. In the last part of a training, bright codes become intervals.
-
-    Attributes:
-        scale: Values and intervals that the codes stand for.
+    They are uploaded at the first access of `source`.
     """
 
     def __init__(self, views: Sequence[View], field: RadianceField, config: Config, *, use_cuda_graph: bool):
         """Prepare the views of a field's normalized scene; steps are captured if use_cuda_graph."""
         self._views, self._field, self._config, self._use_cuda_graph = views, field, config, use_cuda_graph
-        self._source: ViewStack | PhotoStream | Sequence[TrainingView] | None = None
         self._widened = False
-        self.scale = CodeScale(torch.empty(0))
 
     @cached_property
     def estimates(self) -> list[ClippedLight] | None:
@@ -254,21 +248,24 @@ class TrainingViews:
         estimates = self.estimates if compares_exposures(self._config.loss, self._field) else None
         return None if estimates is None else [estimate.log_light for estimate in estimates]
 
-    def source(self, iteration: int) -> ViewStack | PhotoStream | Sequence[TrainingView]:
-        """Return the views that the step of an iteration selects from; uploads them at the first call."""
-        if self._source is None:
-            self._source = self._upload()
-        if not self._widened and iteration > INTERVALS_FROM * self._config.schedule.iterations:
+    def widen_codes(self) -> None:
+        """Turn bright codes into intervals, if they are not yet."""
+        if not self._widened:
             self._widened = True
-            self.scale.widen()
-        return self._source
+            self._photos.scale.widen()
 
-    def _upload(self) -> ViewStack | PhotoStream | Sequence[TrainingView]:
-        """Return the views on the device, or as a source that uploads them one by one."""
+    @cached_property
+    def source(self) -> ViewStack | PhotoStream | Sequence[TrainingView]:
+        """The views that a step selects from: on the device, or in a source that uploads them one by one."""
+        return make_view_source(self._photos, self._config.schedule.photo_cache, self._use_cuda_graph)
+
+    @cached_property
+    def _photos(self) -> PhotoSource:
+        """The views, with the scale of their codes."""
         loss, field = self._config.loss, self._field
         device = field.gaussians.means.device
         response = field.response if compares_exposures(loss, field) else None
-        source = PhotoSource(
+        return PhotoSource(
             self._views,
             field.base_time,
             device,
@@ -277,5 +274,3 @@ class TrainingViews:
             estimates=self.loss_estimates,
             truth=loss.uses_hdr,
         )
-        self.scale = source.scale
-        return make_view_source(source, self._config.schedule.photo_cache, self._use_cuda_graph)
