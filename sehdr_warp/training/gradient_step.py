@@ -14,7 +14,9 @@ from ..model.adam import Adam
 from ..model.gaussians import moments_of
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients, Rendering
+from ..rasterizer.tile_lists import MAX_SINGLE_SORT
 from ..rasterizer.training_step import differentiate
+from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..scene import Scene
 from .losses import compares_exposures, data_loss, extra_images
@@ -43,6 +45,24 @@ class StepOptions:
     degree: int
     opacity_weight: float
     needs_means2d_grad: bool
+
+
+class GraphKey(NamedTuple):
+    """Everything that changes which kernels a step launches; steps of one key share a CUDA graph.
+
+    Attributes:
+        degree: SH degree.
+        needs_means2d_grad: As in StepOptions.
+        penalizes_opacity: Whether the loss has an opacity penalty.
+        exact_response: Whether Gaussians are so few that a learned response encodes them exactly.
+        single_sort: Whether Gaussians are so few that they are sorted in a single pass.
+    """
+
+    degree: int
+    needs_means2d_grad: bool
+    penalizes_opacity: bool
+    exact_response: bool
+    single_sort: bool
 
 
 @dataclass(frozen=True)
@@ -109,7 +129,16 @@ class GradientStep:
         self._spares_unseen = share_in_view(scene) < LARGE_SCENE
         self._flat: FlatGradients | None = None
 
-    def run(self, compute: Callable[[], Gradients], apply: Callable[[Gradients], Tensor]) -> StepResult:
+    def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:
+        """Return the key of a step on one of the views; None if it cannot be captured as a CUDA graph."""
+        # Display colors compare the exposure time with the base time on the host, so it must be a number there.
+        if self._field.color_model.encoded and not isinstance(getattr(views, "times", None), float):
+            return None
+        rows, penalizes = self._field.gaussians.row_count, options.opacity_weight > 0
+        few = rows < EXACT_BELOW, rows <= MAX_SINGLE_SORT
+        return GraphKey(options.degree, options.needs_means2d_grad, penalizes, *few)
+
+    def compute_and_apply(self, compute: Callable[[], Gradients], apply: Callable[[Gradients], Tensor]) -> StepResult:
         """Compute gradients, average them over the ranks, and apply them.
 
         `compute` and `apply` are the two functions below, or replay their CUDA graphs.

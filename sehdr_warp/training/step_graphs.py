@@ -53,7 +53,7 @@ class StepGraphs:
 
         Args:
             views: The training views, which a captured step selects by an index on the device.
-            graph_key: Everything that changes which kernels a step launches; steps of one key share a graph.
+            graph_key: As by GradientStep.graph_key; None, which is never launched, if the step cannot be captured.
         """
         return self._first is not None and isinstance(views, ViewStack | PhotoStream) and graph_key in self._launched
 
@@ -75,7 +75,7 @@ class StepGraphs:
     ) -> Any:
         """Replay run_step(compute_gradients, apply_gradients), after capturing it if this key has no graph.
 
-        `run_step` is GradientStep.run: it averages the gradients of the ranks between the two.
+        `run_step` is GradientStep.compute_and_apply: it averages the gradients of the ranks between the two.
         """
         first, second = self._first, self._second
         assert first is not None

@@ -4,11 +4,12 @@ Read `Trainer.__iter__` for the loop and `Trainer.step` for a step: gradient ste
 gradient step (forward, loss, backward, optimizer) is in gradient_step.py; run_output.py evaluates, logs and saves, and
 training_state.py lists what a checkpoint holds.
 
-The calls of a step: step() -> GradientStep.run() -> compute_gradients() -> RadianceField.render_train_view() ->
-rasterize() (kernels project, tiles, blend_cuda or blend_cpu) -> data_loss() -> differentiate() -> apply_gradients() ->
-guarded_step() -> Adam.step() (kernels training_step). On a GPU, StepGraphs.run() captures GradientStep.run() as CUDA
-graphs; a replay repeats the kernels, and none of these functions runs. create_trainer() writes the checkpoint of
-iteration 0 before the first step, RunOutput.after_step() the later ones, and RunOutput.finish() the last one.
+The calls of a step: step() -> GradientStep.compute_and_apply() -> compute_gradients() ->
+RadianceField.render_train_view() -> rasterize() (kernels project, tiles, blend_cuda or blend_cpu) -> data_loss() ->
+differentiate() -> apply_gradients() -> guarded_step() -> Adam.step() (kernels training_step). On a GPU,
+StepGraphs.run() captures compute_gradients() and apply_gradients() as CUDA graphs; a replay repeats their kernels, and
+neither runs. create_trainer() writes the checkpoint of iteration 0 before the first step, RunOutput.after_step() the
+later ones, and RunOutput.finish() the last one.
 """
 
 import logging
@@ -26,13 +27,11 @@ from ..errors import SehdrError
 from ..model.radiance_field import RadianceField
 from ..model.renders import RenderedView
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
-from ..rasterizer.tile_lists import MAX_SINGLE_SORT
-from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..runs.run import Run, as_rec709
 from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
-from .gradient_step import Gradients, GradientStep, StepOptions, StepResult
+from .gradient_step import Gradients, GradientStep, GraphKey, StepOptions, StepResult
 from .initialization import make_matcher, sizes_of
 from .losses import INTERVALS_FROM
 from .machine import interruptible, torch_settings
@@ -42,6 +41,7 @@ from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .step_graphs import GraphCapacity, StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
+from .targets import ViewStack
 from .training_state import Pace, TrainingProgress
 from .training_views import PhotoOrder, PhotoStream, TrainingViews, has_wide_views
 
@@ -105,7 +105,7 @@ class Trainer:
             output: Run folder to evaluate, log and save to; None to save nothing.
         """
         self.scene, self.config, self.field, self.ranks, self.output = scene, config, field, ranks, output
-        self.rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)
+        rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)
         self.device = field.gaussians.means.device
         self.total = config.schedule.iterations
         self.iteration, self.first_iteration, self.step_batch, self.seconds = 0, 0, 1, 0.0
@@ -117,7 +117,7 @@ class Trainer:
         positions = torch.tensor([view.camera.position.tolist() for view in views], device=self.device)
         self.strategy = make_strategy(config, pixels, positions)
         self.average = MovingAverage(config, self.strategy.schedule.stop)
-        self.order = PhotoOrder(len(views), config.seed, self.rank, self.batch)
+        self.order = PhotoOrder(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         self.can_seed = not has_wide_views(normalized, config)  # Seeding samples pixels of pinhole photos.
         self._get_matcher: Callable[[], Matcher] | None = get_matcher or cache(
@@ -215,7 +215,7 @@ class Trainer:
         if self.iteration > INTERVALS_FROM * self.total:
             self.views.widen_codes()
         views, gaussians = self.views.source, self.field.gaussians
-        index = self._view_index = self.order.next()
+        self._view_index = self.order.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
@@ -223,32 +223,20 @@ class Trainer:
         # The opacity penalty ends with the refinements.
         opacity_weight = 0.0 if self.strategy.schedule.is_over(self.iteration) else self.config.loss.opacity_weight
         options = StepOptions(self.degree, opacity_weight, self.strategy.needs_gradients(self.iteration))
-        step = self.gradient_step
         if options.needs_means2d_grad:
             self.strategy.prepare(gaussians.row_count, self.device)
 
-        # Gradient step; as a CUDA graph if a step with this key has been launched before. Small counts use other
-        # kernels: an exact learned response, and a sort in a single pass.
-        small = gaussians.row_count < EXACT_BELOW, gaussians.row_count <= MAX_SINGLE_SORT
-        graph_key = (options.degree, options.needs_means2d_grad, options.opacity_weight > 0, *small)
-        # Display colors compare the exposure time with the base time on the host, so it must be a number there.
-        fixed_time = not self.field.color_model.encoded or isinstance(getattr(views, "times", None), float)
-        if fixed_time and self.capacity.has_counts and self.graphs.is_ready(views, graph_key):
-            self._device_index.fill_(index)
-            if isinstance(views, PhotoStream):
-                views.bring(index)
-            capacity = self.capacity.capacity()
-
-            def compute() -> Gradients:
-                return step.compute_gradients(views.at(self._device_index), options, capacity)
-
-            self._result = self.graphs.run(graph_key, step.run, compute, step.apply_gradients, self.iteration)
-            if isinstance(views, PhotoStream):
-                views.release(self.order.peek())
+        # Gradient step; as a CUDA graph if a step with this key has been launched before.
+        step = self.gradient_step
+        graph_key = step.graph_key(views, options)
+        if self.capacity.has_counts and self.graphs.is_ready(views, graph_key):
+            self._result = self._run_captured(views, options, graph_key)
         else:
             with self.graphs.on_capture_stream():
-                self._result = step.run(partial(step.compute_gradients, views[index], options), step.apply_gradients)
-            if fixed_time:
+                self._result = step.compute_and_apply(
+                    partial(step.compute_gradients, views[self._view_index], options), step.apply_gradients
+                )
+            if graph_key is not None:
                 self.graphs.mark_launched(graph_key)
 
         # Densification.
@@ -262,6 +250,21 @@ class Trainer:
             self.check(wait=False)
         if self.came_to(COMPARE_EVERY):
             self.gather()
+
+    def _run_captured(self, views: ViewStack | PhotoStream, options: StepOptions, key: GraphKey | None) -> StepResult:
+        """Take a gradient step on the current view by replaying CUDA graphs, which are captured if the key is new."""
+        step, capacity = self.gradient_step, self.capacity.capacity()
+        self._device_index.fill_(self._view_index)
+        if isinstance(views, PhotoStream):
+            views.bring(self._view_index)
+
+        def compute() -> Gradients:
+            return step.compute_gradients(views.at(self._device_index), options, capacity)
+
+        result = self.graphs.run(key, step.compute_and_apply, compute, step.apply_gradients, self.iteration)
+        if isinstance(views, PhotoStream):
+            views.release(self.order.peek())
+        return result
 
     def _densify(self) -> None:
         """Refine the Gaussians if that is due; on several ranks, rank 0 does and the others receive the result."""
