@@ -43,7 +43,7 @@ from .step_graphs import GraphCapacity, StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
 from .targets import ViewStack
 from .training_state import Pace, TrainingProgress
-from .training_views import PhotoOrder, PhotoStream, TrainingViews, has_wide_views
+from .training_views import PhotoOrder, PhotoStream, TrainingViews, check_projections, first_wide_view
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,8 @@ class Trainer:
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.order = PhotoOrder(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
-        self.can_seed = not has_wide_views(normalized, config)  # Seeding samples pixels of pinhole photos.
+        check_projections(normalized, config)
+        self.can_seed = first_wide_view(normalized) is None  # Seeding samples pixels of pinhole photos.
         self._get_matcher: Callable[[], Matcher] | None = get_matcher or cache(
             partial(make_matcher, normalized, field.response, self.device)
         )

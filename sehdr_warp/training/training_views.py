@@ -32,18 +32,18 @@ SLOTS = 3  # One is read, one is filled, and one may still be read by a step tha
 SHARE = 0.4  # Largest fraction of the device's free memory for photos; stacking them takes as much again for a while
 
 
-def has_wide_views(scene: Scene, config: Config) -> bool:
-    """Return whether some training views are not pinholes.
+def first_wide_view(scene: Scene) -> View | None:
+    """Return the first training view that is not a pinhole, None if all are."""
+    return next((view for view in scene.train_views if not view.camera.is_pinhole), None)
 
-    Raises:
-        InputError: if there are, and the densification needs projected centers, which only pinholes have.
-    """
-    wide = next((view for view in scene.train_views if not view.camera.is_pinhole), None)
+
+def check_projections(scene: Scene, config: Config) -> None:
+    """Raise InputError if the densification needs projected centers, which only pinholes have, and a view is none."""
+    wide = first_wide_view(scene)
     if wide is not None and config.densification.strategy != "mcmc":
         problem = f"view {wide.name} is {wide.camera.projection}, for which densification.strategy = "
         problem += f"{config.densification.strategy!r} has no projected centers"
         raise InputError(scene.name, problem, "use densification.strategy=mcmc")
-    return wide is not None
 
 
 class PhotoOrder:

@@ -20,7 +20,7 @@ from sehdr_warp.training.initialization import make_field
 from sehdr_warp.training.targets import PhotoSource
 from sehdr_warp.training.train import train
 from sehdr_warp.training.training_state import state_of
-from sehdr_warp.training.training_views import PhotoOrder, PhotoStream, has_wide_views
+from sehdr_warp.training.training_views import PhotoOrder, PhotoStream, check_projections
 
 from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, toy_scene
 
@@ -118,7 +118,7 @@ def test_gradients_of_a_panorama_reach_all_parameters():
 def test_a_densification_by_projected_centers_is_refused():
     config = load_config("default", {"densification.strategy": "adc"})
     with pytest.raises(InputError, match=r"p0 is equirectangular.*use densification.strategy=mcmc"):
-        has_wide_views(panoramas(3), config)
+        check_projections(panoramas(3), config)
 
 
 @pytest.mark.parametrize("truth", [False, True])
