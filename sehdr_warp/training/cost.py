@@ -15,10 +15,10 @@ NUMBERS, RANK_NUMBERS = 11, 3  # Floats per Gaussian in the all-reduce: 11, plus
 EXCHANGE_SECONDS, NUMBER_SECONDS = 1.5e-4, 2.3e-11
 """Additional duration on two GPUs of one node: to start the all-reduce, and per float of the gradients."""
 NETWORK = 12.5e9  # Bytes a second between nodes, of 100 Gb/s; not measured
-GAUSSIAN_BYTES, PIXEL_BYTES = 1700, 177
-"""Memory on the GPU: of a Gaussian with gradients, optimizer state and its part of the tile lists, and of a pixel of a
-photo in a step. Fitted to trainings on ten captures (480 to 864 pixels); where Gaussians are small in the photo, as in
-large photos of synthetic scenes, 920 for each are enough."""
+GAUSSIAN_BYTES, PIXEL_BYTES, FIXED_BYTES = 1120, 177, 45e6
+"""Memory on the GPU: of a Gaussian with gradients, optimizer state and its part of the tile lists, of a pixel of a
+photo in a step, and of any training. Fitted to trainings on ten captures, to a town of 5.5 million Gaussians and to a
+block of it, which they give within 10 %. Where Gaussians are small in the photo, 920 for each are enough."""
 STATE_BYTES = 940  # Of a Gaussian in a checkpoint: parameters, moments, moving average
 CPU_PIXEL, CPU_GAUSSIAN = 1.0e-6, 1.5e-6  # Seconds of one core for each in a step, measured on two of an AMD EPYC
 GROWTH = 1.5  # Final number of Gaussians relative to the mean over a training that grows for half of its steps
@@ -99,7 +99,7 @@ def training_cost(work: Workload, gpus: int = 1, nodes: int = 1) -> Cost:
     photos = work.photos * work.pixels * work.code_bytes
     return Cost(
         seconds + around,
-        GAUSSIAN_BYTES * work.gaussians + PIXEL_BYTES * work.pixels,
+        FIXED_BYTES + GAUSSIAN_BYTES * work.gaussians + PIXEL_BYTES * work.pixels,
         steps * exchange_bytes(mean, gpus) if nodes > 1 else 0.0,
         STATE_BYTES * work.gaussians,
         photos,

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from sehdr_warp.training.cost import (
+    FIXED_BYTES,
     GAUSSIAN_BYTES,
     PIXEL_BYTES,
     Workload,
@@ -55,11 +56,11 @@ def test_memory_is_as_measured():
     for row in rows("captures", method="sehdr-warp"):
         if row.get("memory"):
             photos, pixels = int(row["photos"].split()[0]), 0.75 * row["size"] ** 2
-            estimate = GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels + 3 * photos * pixels
+            estimate = FIXED_BYTES + GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels + 3 * photos * pixels
             assert error(estimate, row["memory"]) < 0.2
     for row in rows("large", method="sehdr-warp"):
         pixels = row["width"] * row["height"]
-        estimate = GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels + 3 * 24 * pixels
+        estimate = FIXED_BYTES + GAUSSIAN_BYTES * row["gaussians"] + PIXEL_BYTES * pixels + 3 * 24 * pixels
         assert 1 < estimate / row["memory"] < 1.7
 
 
@@ -87,7 +88,7 @@ def test_recommendations():
     assert recommend(small, 1, 80e9) == "one GPU: the set is one training"
     assert recommend(small, 1, 80e9, 2).startswith("--gpus 2: 1.")
     assert recommend(SURVEY, 65, 80e9, 2).startswith("--blocks 65: the set fills 65 trainings")
-    assert recommend(replace(small, gaussians=2e8), 1, 80e9).startswith("--blocks 6: 341 GB are more than the 80 GB")
+    assert recommend(replace(small, gaussians=2e8), 1, 80e9).startswith("--blocks 4: 225 GB are more than the 80 GB")
     fits = {choice.name: choice.fits for choice in choices(replace(small, gaussians=2e8), SURVEY, 65, 80e9)}
     assert not fits["1 GPU"] and fits["65 blocks on 1 GPU"]
 
