@@ -120,7 +120,7 @@ def _in_colors(
     """Return gaussians_of() in the field's own coordinates, like camera_positions."""
     arrays, to_radiance = _arrays_of(field)
     if color_matrix is not None:
-        to_radiance = _in_rec709(to_radiance or (lambda x: x / field.base_time), color_matrix, field.base_time)
+        to_radiance = _in_rec709(to_radiance or (lambda x: x / field.base_time), color_matrix, field.white)
     time = exposure_time or field.base_time
     if color_model == "display":
         if arrays.color_model == "display" and time == field.base_time and color_matrix is None:
@@ -142,9 +142,9 @@ def _in_colors(
     return bake(arrays, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", camera_positions)
 
 
-def _in_rec709(native: Colors, matrix: np.ndarray, base_time: float) -> Colors:
+def _in_rec709(native: Colors, matrix: np.ndarray, white: float) -> Colors:
     """Return a function of colors that converts the radiance of another one to Rec.709."""
-    return lambda colors: rec709_of(torch.from_numpy(np.asarray(native(colors))), matrix, base_time).numpy()
+    return lambda colors: rec709_of(torch.from_numpy(np.asarray(native(colors))), matrix, white).numpy()
 
 
 def _arrays_of(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:

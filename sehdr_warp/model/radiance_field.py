@@ -176,6 +176,11 @@ class RadianceField(nn.Module):
             encoded = self.response.encode_extended(photo_exposure) if encode else None
         return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure)
 
+    @property
+    def white(self) -> float:
+        """Radiance that photos of the base exposure store as white."""
+        return self.response.white / self.base_time
+
     @torch.no_grad()
     @without_replays()
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:

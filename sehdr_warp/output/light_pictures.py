@@ -40,7 +40,7 @@ def photo_light(run: "RenderableScene", view: View) -> np.ndarray:
     light = np.asarray(run.response.decode(view.image), np.float32) / view.exposure_time
     if run.color_matrix is None:
         return light
-    return as_array(rec709_of(torch.from_numpy(light), run.color_matrix, run.base_time))
+    return as_array(rec709_of(torch.from_numpy(light), run.color_matrix, run.response.white / run.base_time))
 
 
 def photo_for_display(run: "RenderableScene", view: View) -> np.ndarray:

@@ -104,7 +104,7 @@ class RenderableScene:
 
     def render(self, camera: Camera) -> RenderedView:
         """Render HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
-        return as_rec709(self.field.render(camera, degree=self.degree), self.color_matrix, self.base_time)
+        return as_rec709(self.field.render(camera, degree=self.degree), self.color_matrix, self.field)
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float, **more: Any
@@ -117,7 +117,7 @@ class RenderableScene:
 
     def in_rec709(self, hdr: Tensor) -> Tensor:
         """Convert radiance [..., 3] from the colors that the scene was trained in to linear Rec.709."""
-        return hdr if self.color_matrix is None else rec709_of(hdr, self.color_matrix, self.base_time)
+        return hdr if self.color_matrix is None else rec709_of(hdr, self.color_matrix, self.field.white)
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:
         """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base exposure."""
@@ -331,9 +331,9 @@ def on_device(model: RadianceField, device: torch.device, budget: int | None = N
     return paged.requires_grad_(False)
 
 
-def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, base_time: float) -> RenderedView:
-    """Convert a view to linear Rec.709; `matrix` is Scene.color_matrix, None if the field's colors are these."""
-    return rendered if matrix is None else replace(rendered, hdr=rec709_of(rendered.hdr, matrix, base_time))
+def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, field: RadianceField) -> RenderedView:
+    """Convert a view of a field to linear Rec.709; `matrix` is Scene.color_matrix, None if its colors are these."""
+    return rendered if matrix is None else replace(rendered, hdr=rec709_of(rendered.hdr, matrix, field.white))
 
 
 def exposure_compensation(info: dict) -> ExposureCompensation | None:

@@ -397,4 +397,4 @@ class Trainer:
         """Render the scene as it is now in linear Rec.709; does not count as time of the training."""
         with self.graphs.on_capture_stream():
             view = self.field.render(camera, degree=self.degree)
-        return as_rec709(view, self.scene.color_matrix, self.field.base_time)
+        return as_rec709(view, self.scene.color_matrix, self.field)

@@ -37,7 +37,7 @@ class Rendered:
 class GammaResponse:
     """Clips at 1, gamma 2.2; no torch needed."""
 
-    name = "gamma-2.2"
+    name, white = "gamma-2.2", 1.0
 
     def encode(self, exposure):
         return np.clip(exposure, 0, 1) ** (1 / 2.2)

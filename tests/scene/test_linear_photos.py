@@ -235,20 +235,24 @@ def test_what_is_clipped_in_a_sensor_is_neutral_or_keeps_the_color_it_shows():
     light = torch.tensor([[1.0, 1, 1], [0.4, 0.2, 0.1], [0.6, 1.0, 0.7], [0.1, 1.0, 0.1]], dtype=torch.float64)
     # All clipped: white. None: as it is. Green alone, beside brighter ones: as bright. A green lamp: green.
     expected = [[2, 2, 2], [0.8, 0.2, 0.1 / 0.7], [1.2, 1.2, 1], [0.2, 1, 0.1 / 0.7]]
-    np.testing.assert_allclose(rec709_of(light / 0.25, matrix, 0.25), np.array(expected) / 0.25, rtol=1e-9)
+    for white in (4.0, 100.0):
+        np.testing.assert_allclose(rec709_of(light * white, matrix, white), np.array(expected) * white, rtol=1e-9)
 
 
 def test_a_scene_in_a_sensors_colors_is_rendered_in_rec709(tmp_path):
     scene = Splats(tmp_path, field_of(gaussians()), ())
     plain = scene.render(camera()).hdr.numpy()
     scene.color_matrix = np.array([[2, 0, 0], [0, 1, 0], [0, -1, 3.0]])
-    dark = plain.max(axis=2) < 0.75 / scene.base_time
+    dark = plain.max(axis=2) < 0.74 / scene.base_time
     expected = np.maximum(plain @ scene.color_matrix.T, 0)
     assert dark.mean() > 0.5
     np.testing.assert_allclose(scene.render(camera()).hdr.numpy()[dark], expected[dark], rtol=1e-5)
     options = {"focal_length": 50.0, "pixel_angle": 0.0}
     samples = scene.render_directions(np.zeros(3), np.array([[[0.0, 0, 1]]]), **options)
     assert samples.hdr.shape == (1, 1, 3)
+    scene.field.response = response_by_name("colour:S-Log3")  # White is far above an exposure of 1
+    light = np.array([8.0, 2, 6])
+    np.testing.assert_allclose(scene.in_rec709(torch.tensor(light)), scene.color_matrix @ light, rtol=1e-6)
 
 
 def test_structure_from_motion_asks_linear_photos_for_no_exif(tmp_path):
