@@ -181,7 +181,7 @@ def check_finite(path: Path, image: np.ndarray, what: str) -> None:
 
 def _is_depth(name: str) -> bool:
     """Return whether a channel holds depth or positions, for which half is too coarse."""
-    return name == "Z" or name.endswith(".Z") or name.startswith("position.")
+    return name in ("Z", "distance.Z") or name.startswith("position.")
 
 
 def _camera_attributes(camera: Camera) -> dict[str, Any]:

@@ -205,6 +205,7 @@ def test_aovs_are_parts_of_their_own(tmp_path):
     with OpenEXR.File(str(tmp_path / "hdr" / "t_0.exr"), separate_channels=True) as file:
         headers = {part.name(): dict(part.header) for part in file.parts}
         pixels = {name: channel.pixels for part in file.parts for name, channel in part.channels.items()}
+    assert {pixels[f"N.{axis}"].dtype for axis in "XYZ"} == {np.dtype(np.float16)}
     assert list(headers) == ["rgba", "depth", "position", "normals", "alpha", "confidence", "clipped"]
     assert headers.pop("rgba")["colorInteropID"] == "lin_rec709_scene"
     assert all(h["colorInteropID"] == "data" and "chromaticities" not in h for h in headers.values())
