@@ -317,10 +317,10 @@ def select_cameras(
         views = _from_file(run, Path(cameras), transform)
         if camera is not None:
             names = [name for name, _ in views]
-            views = [
-                (name, each)
-                for name, each in views
-                if name == camera or re.fullmatch(re.escape(camera) + r"_[\d.]+", name)
+            # Frames of a moving camera are named as by read_exchange_cameras(): numbers of four characters or more.
+            frames = re.compile(re.escape(camera) + r"_[-\d.]{4,}")
+            views = [view for view in views if view[0] == camera] or [
+                view for view in views if frames.fullmatch(view[0])
             ]
             if not views:
                 raise SehdrError(f"{cameras}: has no camera {camera!r}{did_you_mean(camera, names)}")

@@ -243,7 +243,7 @@ def test_only_numbered_views_of_one_size_are_a_path():
 
 def test_several_cameras_are_chosen_from_by_name(tmp_path):
     run = AnalyticRun()
-    entries = [{"name": name, **camera().to_dict()} for name in ("a", "b_0001", "b_0002")]
+    entries = [{"name": name, **camera().to_dict()} for name in ("a", "a_2000", "b_0001", "b_0002", "c_001")]
     (tmp_path / "c.json").write_text(json.dumps({"cameras": entries}))
     assert [name for name, _ in select_cameras(run, tmp_path / "c.json", camera="b")] == ["b_0001", "b_0002"]
     assert [name for name, _ in select_cameras(run, tmp_path / "c.json", camera="a")] == ["a"]
@@ -251,7 +251,7 @@ def test_several_cameras_are_chosen_from_by_name(tmp_path):
         select_cameras(run, tmp_path / "c.json", camera="c")
     with pytest.raises(SehdrError, match="chooses from a file"):
         select_cameras(run, "test", camera="a")
-    assert len(load_cameras(tmp_path / "c.json")) == 3
+    assert len(load_cameras(tmp_path / "c.json")) == 5
 
 
 def test_up_of_a_flight_to_and_fro():
