@@ -64,14 +64,8 @@ def chromaticities(name: str) -> tuple[float, ...]:
 
 
 @cache
-def matrix_from_rec709(name: str) -> np.ndarray:
-    """Return [3, 3] float64 that converts linear Rec.709 column vectors to the named space."""
-    return matrix_to(color_space(name).dataset)
-
-
-@cache
 def matrix_to(dataset: str) -> np.ndarray:
-    """Return [3, 3] float64 that converts linear Rec.709 to a space of colour.RGB_COLOURSPACES.
+    """Return [3, 3] float64 that converts linear Rec.709 column vectors to a space of colour.RGB_COLOURSPACES.
 
     White maps to white by Bradford's adaptation, as in the ACES transforms and OpenColorIO's built-in ones.
     """
@@ -84,7 +78,7 @@ def from_rec709(rgb: np.ndarray, name: str) -> np.ndarray:
     """Convert [..., 3] linear Rec.709 to the named space, in float64. Values are not clipped."""
     rgb = np.asarray(rgb, np.float64)
     # A product with the identity would turn infinities into NaN and -0 into 0; Rec.709 passes through untouched.
-    return rgb if color_space(name).name == "rec709" else rgb @ matrix_from_rec709(name).T
+    return rgb if color_space(name).name == "rec709" else rgb @ matrix_to(color_space(name).dataset).T
 
 
 def _dataset(dataset: str):

@@ -18,7 +18,7 @@ from ..errors import InputError, SehdrError, require_extra
 from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
-from .colorspace import matrix_from_rec709, matrix_to
+from .colorspace import color_space, matrix_to
 from .images import as_array
 from .render_views import shared_tone_map
 from .tonemap import display_gain, encode_srgb
@@ -186,7 +186,7 @@ def encode(light: np.ndarray, transfer: str) -> np.ndarray:
         curve, primaries = LOG_CURVES[transfer]
         linear = np.maximum(np.asarray(light, np.float64) @ matrix_to(primaries).T, 1e-10)
         return np.clip(colour.log_encoding(linear, curve), 0, 1)
-    wide = np.maximum(np.asarray(light, np.float64) @ matrix_from_rec709("rec2020").T, 0) * REFERENCE_WHITE
+    wide = np.maximum(np.asarray(light, np.float64) @ matrix_to(color_space("rec2020").dataset).T, 0) * REFERENCE_WHITE
     luminances = np.minimum(wide, PEAK)
     if transfer == "hdr10":
         powered = (luminances / 10000) ** 0.1593017578125

@@ -65,7 +65,7 @@ def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
     logs = np.log2(values)
     (low, high), average = np.percentile(logs, (_LOW, _HIGH)), logs.mean()
     # Between 0.09 for a mostly dark scene with highlights and 0.36 for a bright one.
-    key = 0.18 * 2.0 ** np.clip((2 * average - low - high) / max(high - low, 1e-6), -1, 1)
+    key = MIDDLE_GREY * 2.0 ** np.clip((2 * average - low - high) / max(high - low, 1e-6), -1, 1)
     scale = key / 2.0**average
     # A white below 1 would make the curve convex, and brighten everything.
     return ToneMap(float(scale), float(max(np.percentile(values, _WHITE) * scale, 1.0)))
