@@ -134,7 +134,8 @@ def render_views(
     if size is not None:
         width, height = read_size(size)
         views = [(name, reframe(camera, width, height)) for name, camera in views]
-    camera_files = _camera_files(views, transform, fps, moving=str(cameras) not in SPLITS)
+    are_photos = str(cameras) in SPLITS or (str(cameras) not in PATHS and Path(cameras).is_dir())
+    camera_files = _camera_files(views, transform, fps, moving=not are_photos)
     empty = []
     with ExitStack() as stack:
         for name, text in camera_files.items():

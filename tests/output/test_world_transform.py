@@ -17,6 +17,7 @@ from sehdr_warp.scene import Camera, load_cameras, load_scene, look_at
 from sehdr_warp.scene.gravity import is_pitch_known, up_direction
 from sehdr_warp.splats import read_gaussians, write_gaussians
 
+from ..make_scenes import write_colmap
 from ..splats.test_splat_files import gaussians
 from .helpers import AnalyticRun, Entry, camera, read_exr
 
@@ -228,6 +229,14 @@ def test_a_path_is_one_moving_camera(tmp_path):
             np.testing.assert_allclose(b.position, a.position, atol=1e-5)
             np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-5)
             assert b.fy / b.height == pytest.approx(a.fy / a.height, rel=1e-5)
+
+
+def test_numbered_photos_of_a_colmap_folder_are_not_frames_of_one_camera(tmp_path):
+    write_colmap(tmp_path / "set", name="IMG_{:03d}.png")
+    render_views(AnalyticRun(), tmp_path / "out", cameras=tmp_path / "set")
+    text = (tmp_path / "out/cameras.usda").read_text()
+    assert "IMG_000" in text and "IMG_001" in text, "each photo is a camera of its own"
+    assert not (tmp_path / "out/camera_path.json").exists()
 
 
 def test_only_numbered_views_of_one_size_are_a_path():
