@@ -267,8 +267,9 @@ class BracketWriter:
         if reason:
             log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)
         parts, entries = [], []
+        digits = len(str(len(pixels) - 1))  # Tools sort files by name.
         for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
-            label = f"b{index}_{exposure.label}"
+            label = f"b{index:0{digits}d}_{exposure.label}"
             header = options.header.of(name, exposure.time, camera, ev=repr(exposure.ev)) | reason
             parts.append(Part(rgb_channels(image), header, label))
             place = f"{name}/{name}_{label}" if options.group_by == "view" else f"{label}/{name}"

@@ -62,6 +62,11 @@ def test_exposures_differ_by_exactly_the_ratio_of_their_times(tmp_path, pixel, d
     np.testing.assert_allclose(ratio[exact], (1 / 3) / 0.3, rtol=bound)
 
 
+def test_names_of_many_exposures_sort_as_these_do(tmp_path):
+    files = write_brackets(tmp_path, {"r_0": radiance()}, 0.5, evs=range(-5, 6))
+    assert [file.name for file in files] == sorted(file.name for file in files) and len(files) == 11
+
+
 def test_manifest_lists_what_was_written(tmp_path):
     views = {"r_0": radiance(), "../a/b": radiance(seed=1), "R_0": radiance(seed=2)}
     files = write_brackets(tmp_path, views, 0.5, evs=[-2, 0, 2], cameras={"r_0": camera()}, colorspace="rec2020")
