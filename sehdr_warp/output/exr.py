@@ -186,6 +186,12 @@ def _is_depth(name: str) -> bool:
 
 def _camera_attributes(camera: Camera) -> dict[str, Any]:
     """Return a camera as OpenEXR attributes; matrices act on row vectors (p M), as all of OpenEXR's do."""
+    attributes: dict[str, Any] = {
+        "worldToCamera": np.ascontiguousarray((_FLIP_Y_Z @ camera.world_to_camera).T, np.float32),
+        "sehdr:camera": json.dumps(camera.to_dict()),
+    }
+    if not camera.is_pinhole:
+        return attributes  # OpenEXR's other attributes describe a screen, which a sphere or a fisheye has not.
     # x and y run over [0, 1] from the top left corner; z is the distance along the axis; w divides.
     to_ndc = np.zeros((4, 4))
     to_ndc[0, [0, 2]] = np.array([camera.fx, camera.cx]) / camera.width
@@ -193,13 +199,11 @@ def _camera_attributes(camera: Camera) -> dict[str, Any]:
     to_ndc[2:, 2] = 1
     # The screen window lies at distance 1; its axes point to the camera's left and up.
     center = ((camera.cx - camera.width / 2) / camera.fx, (camera.cy - camera.height / 2) / camera.fy)
-    return {
-        "worldToCamera": np.ascontiguousarray((_FLIP_Y_Z @ camera.world_to_camera).T, np.float32),
+    return attributes | {
         "worldToNDC": np.ascontiguousarray((to_ndc @ camera.world_to_camera).T, np.float32),
         "screenWindowCenter": np.array(center, np.float32),
         "screenWindowWidth": camera.width / camera.fx,
         "pixelAspectRatio": camera.fy / camera.fx,
-        "sehdr:camera": json.dumps(camera.to_dict()),
     }
 
 

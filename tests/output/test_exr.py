@@ -10,6 +10,7 @@ import pytest
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.colorspace import chromaticities, color_space, matrix_to
 from sehdr_warp.output.exr import Part, exr_header, rgb_channels, stored_pixel_type, write_exr, write_multipart_exr
+from sehdr_warp.scene import Camera
 
 from ..full_disk import full_disk
 from .helpers import camera, radiance, read_exr
@@ -78,6 +79,13 @@ def test_camera_matrices_follow_their_conventions():
     # The screen window: left edge at pixel 0, right edge at the width; its x axis points left.
     left = header["screenWindowCenter"][0] + header["screenWindowWidth"] / 2
     np.testing.assert_allclose(-left * view.fx + view.cx, 0, atol=1e-5)
+
+
+def test_a_panorama_states_its_pose_and_no_screen():
+    view = Camera(128, 64, 20.4, 20.4, 64.0, 32.0, np.eye(4), "equirectangular")
+    header = exr_header(camera=view)
+    assert "worldToCamera" in header and json.loads(header["sehdr:camera"])["projection"] == "equirectangular"
+    assert not {"worldToNDC", "screenWindowCenter", "screenWindowWidth"} & set(header)
 
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
