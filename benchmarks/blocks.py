@@ -215,10 +215,7 @@ def _config(study: Study) -> Config:
 
 
 def _warm_up(study: Study, plan: BlockPlan, at_once: int) -> None:
-    """Train two blocks for a moment as they are trained later, so that no timed job is the first to do something.
-
-    Kernels are then compiled, and files read that processes start from.
-    """
+    """Train two blocks for a moment, so that no timed job is the first to compile kernels or to read its program."""
     short = override_config(plan.config, {"schedule.iterations": WARM_UP})
     plan, out = replace(plan, config=short, blocks=plan.blocks[:AT_ONCE]), study.out / "warm"
     out.mkdir(exist_ok=True)

@@ -16,7 +16,7 @@ from .dataparser import ImageRecord
 from .images import PHOTO_SUFFIXES
 
 INVERTED_MASK = "dynamic_mask_"
-"""How names of instant-ngp's masks begin, in which 0 keeps a pixel and every other value leaves it out."""
+"""Beginning of the names of instant-ngp's masks, in which 0 keeps a pixel and every other value leaves it out."""
 
 
 def natural_key(name: str) -> tuple:

@@ -1,4 +1,4 @@
-"""What the codes of all photos together say: that they show something, and use the bits of their files."""
+"""Check the codes of all photos together: that they show something, and use the bits of their files."""
 
 from pathlib import Path
 

@@ -82,13 +82,12 @@ def test_weighted_sums_are_those_of_the_blend(device):
 
 
 def test_weighted_sums_differentiate_the_features_alone(monkeypatch):
-    model = field()
+    model, inputs = field(), []
     monkeypatch.setattr(
-        model, "rasterizer", lambda *tensors, **options: seen.extend(tensors) or rasterize(*tensors, **options)
+        model, "rasterizer", lambda *tensors, **options: inputs.extend(tensors) or rasterize(*tensors, **options)
     )
-    seen = []
     model.weighted_sums(CameraTensors.of(CAMERA, "cpu"), torch.ones(12, 20, 2))
-    assert [tensor.requires_grad for tensor in seen[:5]] == [False] * 4 + [True]
+    assert [tensor.requires_grad for tensor in inputs[:5]] == [False] * 4 + [True]
 
 
 def test_clipped_and_unseen_gaussians_are_doubted(device):

@@ -1,4 +1,4 @@
-"""What the codes of all photos together say."""
+"""Checks of the codes of all photos together."""
 
 import numpy as np
 import pytest

@@ -30,7 +30,7 @@ def model(device="cpu", count=COUNT):
 
 
 class Scene:
-    """What GaussianScene of gsplat 1.6 makes of the rows of a tensor when Gaussians change."""
+    """Rows of a tensor that follow the Gaussians, as GaussianScene of gsplat 1.6 has them."""
 
     def __init__(self, rows):
         self.rows = rows
