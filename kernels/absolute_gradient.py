@@ -1,6 +1,6 @@
 """Absolute gradients of 2D means (AbsGS, Ye et al. 2024): sums over pixels of |dL/dx| and |dL/dy|.
 
-In the plain gradient of a centre the pixels on its two sides cancel; a sum of absolute values shows that a Gaussian
+In the plain gradient of a center the pixels on its two sides cancel; a sum of absolute values shows that a Gaussian
 should be split. One thread takes one pixel, walks its tile's list to the front's end and then back as the backward
 pass of sphere.py does.
 """

@@ -4,7 +4,7 @@ One kernel index is one tile of 16 x 16 pixels, in two halves side by side. For 
 kernel walks the pixel rows that the Gaussian reaches, of the halves that it reaches. A row is one vector of 8, and
 every decision (is alpha high enough, is the pixel finished) is a factor of 0 or 1, so that LLVM turns a row into a
 handful of AVX2 instructions. The exponential is a polynomial for the same reason: a call of libm's expf would break the
-vectorisation.
+vectorization.
 
 Forward, per pixel, with T the transmittance so far:
 
@@ -89,7 +89,7 @@ def row_functions(dtype, exp_squarings: int):
 
     @wp.func
     def halves(x: real, conic_cutoff: vec4) -> wp.vec2i:
-        """Return the first half that is reached and one past the last; x: from the tile's first pixel to the centre."""
+        """Return the first half that is reached and one past the last; x: from the tile's first pixel to the center."""
         determinant = conic_cutoff[0] * conic_cutoff[2] - conic_cutoff[1] * conic_cutoff[1]
         reached = wp.vec2i(0, wp.static(HALVES))
         # For needles rounding leaves nothing of the determinant.

@@ -3,7 +3,7 @@
 A warp walks the list as in blend_cuda, but from the last Gaussian that contributes, and treats each batch of 32 that
 touch its subtile in two phases. In the first a lane is a pixel: it walks the batch back to front and writes (weight,
 slope) for each Gaussian. In the second a lane is a Gaussian: it sums its 32 pixels, without an exchange between lanes.
-Gradients go through shared memory as whole rows, so that the atomics of a warp fall on neighbouring addresses.
+Gradients go through shared memory as whole rows, so that the atomics of a warp fall on neighboring addresses.
 """
 
 from functools import cache

@@ -1,6 +1,6 @@
 """Neural exposure fusion (SeHDR, section 3.3) at given encoded brackets, and its backward pass.
 
-P brackets of M colours, Q = P M points of each of the three channels, in the order [3, P, M]. The perceptron of a
+P brackets of M colors, Q = P M points of each of the three channels, in the order [3, P, M]. The perceptron of a
 channel has H hidden units: its terms of a point are read by all threads of a warp at once, or a warp's threads are its
 units.
 """
@@ -46,7 +46,7 @@ def fusion_kernels(dtype) -> SimpleNamespace:
         most_log: real, most: real,
         inner: reals3d, inner_bias: reals2d, outer: reals2d, outer_bias: reals, exposedness: reals2d, outputs: reals2d,
     ):
-        """Write exposedness, exp(-d^2 / 2) of deviations from mid grey, and the outputs of the perceptron of both."""
+        """Write exposedness, exp(-d^2 / 2) of deviations from mid gray, and the outputs of the perceptron of both."""
         channel, point = wp.tid()
         x = encoded[channel, point]
         deviation = wp.clamp(deviation_of(x, log_sigma[channel], most_log), -most, most)

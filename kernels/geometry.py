@@ -1,4 +1,4 @@
-"""Quaternion, covariance and ellipse maths of the splat, written once for float32 and float64."""
+"""Quaternion, covariance and ellipse math of the splat, written once for float32 and float64."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -74,7 +74,7 @@ def geometry(dtype) -> SimpleNamespace:
 
         x_per_y, y_per_x: -b / a and -b / c, which callers divide once for many rectangles.
 
-        The form is smallest on one of the edges nearest to the centre. A small allowance keeps rounding from dropping a
+        The form is smallest on one of the edges nearest to the center. A small allowance keeps rounding from dropping a
         border pixel.
         """
         x0 = left - x

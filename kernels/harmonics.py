@@ -1,7 +1,7 @@
 """Real spherical harmonics up to degree 3 as functions of the view direction, with 3DGS's basis and signs.
 
-One thread evaluates the three channels of one Gaussian for the direction from the camera to its centre. The
-coefficients come in two arrays, the constant term and the rest, because optimisers treat them at different rates.
+One thread evaluates the three channels of one Gaussian for the direction from the camera to its center. The
+coefficients come in two arrays, the constant term and the rest, because optimizers treat them at different rates.
 They are numbered k = l^2 + l + m from 0 on, of which the constant term is the first.
 """
 

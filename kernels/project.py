@@ -1,6 +1,6 @@
 """Projection of 3D Gaussians to 2D Gaussians (EWA splatting, Zwicker et al. 2001, as in 3DGS, Kerbl et al. 2023).
 
-One thread takes one Gaussian to the camera, linearises the perspective at its centre and writes the centre in pixels,
+One thread takes one Gaussian to the camera, linearizes the perspective at its center and writes the center in pixels,
 the inverse of the 2D covariance (the conic), the depth, the opacity and the half-extent of the region in which its
 alpha reaches the threshold. Everything but the extents is differentiable; Warp generates the adjoint.
 
@@ -80,16 +80,16 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
             pose[1, 0], pose[1, 1], pose[1, 2],
             pose[2, 0], pose[2, 1], pose[2, 2],
         )
-        centre = rotation * means[i] + vec3(pose[0, 3], pose[1, 3], pose[2, 3])
-        depth = centre[2]
+        center = rotation * means[i] + vec3(pose[0, 3], pose[1, 3], pose[2, 3])
+        depth = center[2]
         in_front = depth > near_plane
         z = wp.where(in_front, depth, real(1.0))
         inverse_z = real(1.0) / z
-        x_ratio = wp.where(in_front, centre[0], real(0.0)) * inverse_z
-        y_ratio = wp.where(in_front, centre[1], real(0.0)) * inverse_z
+        x_ratio = wp.where(in_front, center[0], real(0.0)) * inverse_z
+        y_ratio = wp.where(in_front, center[1], real(0.0)) * inverse_z
         pixel = vec2(fx * x_ratio + pinhole[2], fy * y_ratio + pinhole[3])
 
-        # Far off the axis the linearisation explodes: hold its ray near the frustum.
+        # Far off the axis the linearization explodes: hold its ray near the frustum.
         w = real(width)
         h = real(height)
         margin = real(FRUSTUM_MARGIN)
@@ -136,7 +136,7 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
             cutoff = real(2.0) * wp.log(opacity / alpha_threshold)
             extent_x = wp.sqrt(cutoff * variance_x)
             extent_y = wp.sqrt(cutoff * variance_y)
-        # Keep only what reaches the centre of a pixel of this image.
+        # Keep only what reaches the center of a pixel of this image.
         usable = (
             usable and pixel[0] + extent_x > real(0.0) and pixel[0] - extent_x < w
             and pixel[1] + extent_y > real(0.0) and pixel[1] - extent_y < h

@@ -8,7 +8,7 @@ which equals the usual quotient. It needs four blurs in place of five, and both 
 near-identical images lose no digits, however bright they are.
 
 A row of the image is one run of W C numbers, channel fastest, so that a step of one pixel is a shift by C numbers and
-every kernel works on `lanes` neighbouring numbers at once, 16 as a rule: LLVM turns its serial loop into SIMD. Arrays
+every kernel works on `lanes` neighboring numbers at once, 16 as a rule: LLVM turns its serial loop into SIMD. Arrays
 of runs are overlapping views: element [y, i] holds the numbers i .. i + lanes - 1 of row y. Rows blurred vertically
 carry RADIUS pixels of zeros on both sides (zero padding, as in 3DGS). ssim_cuda.py has the kernels of a GPU.
 """

@@ -1,4 +1,4 @@
-"""Structural similarity and its gradient for CUDA, one launch each: the maths of ssim.py in the patches of patches.py.
+"""Structural similarity and its gradient for CUDA, one launch each: the math of ssim.py in the patches of patches.py.
 
 These kernels also run on the CPU where wp.config.enable_cpu_blocks is set: slow, but the same logic, for tests.
 """

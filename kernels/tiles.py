@@ -36,9 +36,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
     options = NO_AUTODIFF | {"fuse_fp": False}
 
     @wp.func
-    def tile_span(centre: real, extent: real, tiles: int) -> wp.vec2i:
-        first = wp.clamp(int(wp.floor((centre - extent) / real(size))), 0, tiles)
-        last = wp.clamp(int(wp.floor((centre + extent) / real(size))) + 1, 0, tiles)
+    def tile_span(center: real, extent: real, tiles: int) -> wp.vec2i:
+        first = wp.clamp(int(wp.floor((center - extent) / real(size))), 0, tiles)
+        last = wp.clamp(int(wp.floor((center + extent) / real(size))) + 1, 0, tiles)
         return wp.vec2i(first, last)
 
     @wp.func

@@ -11,7 +11,7 @@ import warp as wp
 from .constants import LOG_SCALE_MAX, NO_AUTODIFF
 from .geometry import geometry, vector
 
-SHARPNESS, CENTRE = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
+SHARPNESS, CENTER = 100.0, 0.995  # 3DGS-MCMC, equation 8: noise is for Gaussians of opacity below 1 - 0.995
 PARAMETERS_PER_LAUNCH = 4  # Parameters of one launch of Adam
 TENSORS_PER_CHECK = 12  # Tensors of one launch that looks for what is not finite
 VALUES_PER_THREAD = 4  # That one thread of the harmonics' Adam takes
@@ -243,7 +243,7 @@ def add_gradient_statistics(
     half_width: float, half_height: float,
     gradient_sum: wp.array(dtype=wp.float32), visits: wp.array(dtype=wp.float32),
 ):
-    """Add, for each Gaussian with a radius, the length of its gradient by the projected centre, and 1.
+    """Add, for each Gaussian with a radius, the length of its gradient by the projected center, and 1.
 
     Lengths are in units of half the image's sides. Nothing is added if usable[0] is 0.
     """
@@ -276,7 +276,7 @@ def add_position_noise(
     """
     i = range_start + wp.tid()
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[i]))
-    above = SHARPNESS * (opacity - (1.0 - CENTRE))
+    above = SHARPNESS * (opacity - (1.0 - CENTER))
     if above > NOISE_CUTOFF:
         return
     faintness = 1.0 / (1.0 + wp.exp(above))

@@ -65,7 +65,7 @@ def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device
 
 
 def unit_gradient(like: Tensor) -> Tensor:
-    """Return the shared scalar 1 of a tensor's type and device, which scale_gradient() recognises."""
+    """Return the shared scalar 1 of a tensor's type and device, which scale_gradient() recognizes."""
     return constant((1.0,), like.dtype, like.device)[0]
 
 

@@ -23,7 +23,7 @@ from .warp_launch.launching import launch, warp_scalar
 class ClippedWeights:
     """Weights of the parts of clipped_light_energy(), each at least 0.
 
-    smoothness: of squared differences to the mean of clipped neighbours. estimate: of the squared distance from an
+    smoothness: of squared differences to the mean of clipped neighbors. estimate: of the squared distance from an
     estimate, in its deviations.
     """
 

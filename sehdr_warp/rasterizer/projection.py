@@ -19,7 +19,7 @@ class ProjectedGaussians(NamedTuple):
     """2D Gaussians of one camera. A culled Gaussian has extents 0 and no gradient.
 
     Attributes:
-        means2d: [N, 2] centres in pixels.
+        means2d: [N, 2] centers in pixels.
         conics: [N, 3] a, b, c of the inverse covariance, in 1 / square pixels.
         depths: [N] along the camera's axis, in scene units.
         opacities: [N], lowered if antialiased.

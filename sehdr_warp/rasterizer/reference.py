@@ -28,11 +28,11 @@ def project_reference(
     """projection.project in torch: means2d, conics, depths, opacities and extents (0 where culled)."""
     fx, fy, cx, cy = intrinsics
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
-    centre = means @ rotation.T + translation
-    in_front = centre[:, 2] > near_plane
-    z = torch.where(in_front, centre[:, 2], 1.0)
-    x_ratio = torch.where(in_front, centre[:, 0], 0.0) / z
-    y_ratio = torch.where(in_front, centre[:, 1], 0.0) / z
+    center = means @ rotation.T + translation
+    in_front = center[:, 2] > near_plane
+    z = torch.where(in_front, center[:, 2], 1.0)
+    x_ratio = torch.where(in_front, center[:, 0], 0.0) / z
+    y_ratio = torch.where(in_front, center[:, 1], 0.0) / z
     means2d = torch.stack([fx * x_ratio + cx, fy * y_ratio + cy], 1)
 
     beyond_x, beyond_y = FRUSTUM_MARGIN * width / 2, FRUSTUM_MARGIN * height / 2
@@ -66,7 +66,7 @@ def project_reference(
     usable = in_front & (opacities > alpha_threshold)
     usable &= (means2d[:, 0] + extents[:, 0] > 0) & (means2d[:, 0] - extents[:, 0] < width)
     usable &= (means2d[:, 1] + extents[:, 1] > 0) & (means2d[:, 1] - extents[:, 1] < height)
-    return means2d, conics, centre[:, 2], opacities, torch.where(usable[:, None], extents, 0.0)
+    return means2d, conics, center[:, 2], opacities, torch.where(usable[:, None], extents, 0.0)
 
 
 def blend_reference(

@@ -185,7 +185,7 @@ class _Runs:
         self.weights = constant(tuple(window()), image.dtype, image.device)
 
     def padded(self, count: int) -> Tensor:
-        """[count, rows, ...] uninitialised rows with the zeros that the horizontal blur finds beyond the border."""
+        """[count, rows, ...] uninitialized rows with the zeros that the horizontal blur finds beyond the border."""
         margin = RADIUS * self.channels
         buffer = self.like.new_empty(count, self.rows, self.length + 2 * margin)
         buffer[..., :margin] = 0

@@ -67,7 +67,7 @@ class IntersectionOffsets(NamedTuple):
 
 @dataclass(frozen=True)
 class EmitOrder:
-    """The order of intersections before the sort by tile, in which those of one Gaussian are neighbours.
+    """The order of intersections before the sort by tile, in which those of one Gaussian are neighbors.
 
     Attributes:
         order: [N] int32 Gaussians by depth, nearest first (ties by index; culled ones last).

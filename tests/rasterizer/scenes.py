@@ -30,7 +30,7 @@ class SplatInputs:
 
 
 def random_scene(count=150, channels=3, seed=0, width=WIDTH, height=HEIGHT, spread=4.0, size=0.25) -> SplatInputs:
-    """float64 Gaussians before a camera that is neither centred nor axis-aligned; some lie behind it or off the image.
+    """float64 Gaussians before a camera that is neither centered nor axis-aligned; some lie behind it or off the image.
 
     Features are log-normal over several decades, as radiance is.
     """

@@ -52,7 +52,7 @@ def test_nothing_to_draw_on_any_image(device, count, size):
 def test_a_single_pixel(device):
     draw, leaves = splat(device, [[0.0, 0.0, 2.0]], [0.5], 0.5, [[3.0]], 1, 1)
     rendering = draw()
-    # The centre falls on the pixel's own: alpha is the opacity.
+    # The center falls on the pixel's own: alpha is the opacity.
     assert rendering.image.item() == pytest.approx(1.5, rel=1e-5)
     assert finite_gradients(rendering, leaves)
 

@@ -34,7 +34,7 @@ def launch(
     min_range: int = 1024,
     block_dim: int | None = None,
 ) -> None:
-    """Launch a kernel or its adjoint over `dim` threads, without a tape and without a synchronisation.
+    """Launch a kernel or its adjoint over `dim` threads, without a tape and without a synchronization.
 
     A kernel whose first parameter is `range_start` adds it to its thread index and writes nothing that another index
     writes. On the CPU such a kernel runs in parallel over ranges of indices.

@@ -1,4 +1,4 @@
-"""Initialise Warp; compile and load its kernels for the CPU."""
+"""Initialize Warp; compile and load its kernels for the CPU."""
 
 import os
 import threading
