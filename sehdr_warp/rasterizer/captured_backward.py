@@ -14,7 +14,7 @@ from torch import Tensor
 from ..kernels.blend_cuda_backward import copy_features_kernel
 from ..kernels.project import projection_kernel
 from .block_blending import BlockBackward
-from .projection import Gradients, ProjectedGaussians, adjoint_arguments, projection_parameters
+from .projection import ProjectedGaussians, adjoint_arguments, projection_parameters
 from .render_options import RenderOptions
 from .warp_launch.launching import FixedLaunch, fixed_launch, warp_scalar, warp_stream
 
@@ -150,7 +150,9 @@ class CapturedBackward:
         gradients, memory.of_splats = memory.of_splats, ()
         return gradients if self.conics_opacities is None else (*gradients, memory.zeros)
 
-    def project(self, memory: GradientMemory, grad_means2d: Tensor | None, grad_depths: Tensor | None) -> Gradients:
+    def project(
+        self, memory: GradientMemory, grad_means2d: Tensor | None, grad_depths: Tensor | None
+    ) -> Sequence[Tensor | None]:
         """Return the gradients by the projection's inputs.
 
         memory: of the blend's backward pass, or if the image has no gradient, a new one.

@@ -10,21 +10,20 @@ from torch import Tensor
 from .warp_launch.threads import torch_threads
 
 
-def zero_gradients(tensors: Sequence[Tensor], needed: Sequence[bool], leaves: Sequence[bool]) -> list[Tensor | None]:
+def zero_gradients(tensors: Sequence[Tensor], needed: Sequence[bool]) -> list[Tensor | None]:
     """Return zeros to accumulate into for each tensor that needs a gradient, and None for the others.
 
-    leaves: which tensors are leaves. On a GPU the gradients of leaves share one allocation, filled by one launch;
-    others are freed soon, each by itself.
+    On a GPU the gradients of leaves share one allocation, filled by one launch; others are freed soon, each by itself.
     """
     device = tensors[0].device
     if device.type == "cpu":
         with torch_threads(device):
             return [_zeros(tensor) if need else None for tensor, need in zip(tensors, needed, strict=True)]
-    together = [place for place, need in enumerate(needed) if need and leaves[place]]
-    zeros = dict(zip(together, _zeros_together([tensors[place] for place in together]), strict=False))
+    leaves = [index for index, tensor in enumerate(tensors) if needed[index] and tensor.is_leaf]
+    zeros = dict(zip(leaves, _zeros_together([tensors[index] for index in leaves]), strict=False))
     return [
-        zeros[place] if place in zeros else _zeros(tensors[place]) if need else None
-        for place, need in enumerate(needed)
+        zeros[index] if index in zeros else _zeros(tensors[index]) if need else None
+        for index, need in enumerate(needed)
     ]
 
 
@@ -34,10 +33,8 @@ def _zeros(like: Tensor) -> Tensor:
 
 def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:
     """Return zeros of the tensors' shapes in one allocation; none unless they are several, alike and contiguous."""
-    if len(tensors) < 2:
-        return []
     alike = len({tensor.dtype for tensor in tensors}) == 1 and all(tensor.is_contiguous() for tensor in tensors)
-    if not alike:
+    if len(tensors) < 2 or not alike:
         return []
     # Each starts at a multiple of 64 numbers, as memory of its own would.
     lengths = [-(-tensor.numel() // 64) * 64 for tensor in tensors]
@@ -46,15 +43,14 @@ def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:
 
 
 def kernel_layout(gradient: Tensor | None) -> Tensor | None:
-    """Return a gradient as kernels read it: rows at any distance, but each vector contiguous, and no negated view."""
+    """Return a gradient as kernels read it: contiguous, or with any stride from row to row; no negated view."""
     if gradient is None:
         return None
     gradient = gradient.resolve_neg()  # The imaginary part of a conjugate, as in losses of Fourier transforms.
     if gradient.ndim < 2 or gradient.is_contiguous():
         return gradient
-    if gradient.stride(1) == 1 if gradient.ndim == 2 else gradient[0].is_contiguous():
-        return gradient
-    return gradient.contiguous()
+    rows_are_contiguous = gradient.stride(1) == 1 if gradient.ndim == 2 else gradient[0].is_contiguous()
+    return gradient if rows_are_contiguous else gradient.contiguous()
 
 
 @cache

@@ -23,7 +23,7 @@ from .blending import BlendResult
 from .captured_backward import GradientMemory
 from .captured_render import CapturedRender
 from .cuda_graphs import is_capturing, replays_are_off
-from .projection import Gradients, with_projection_gradient
+from .projection import with_projection_gradient
 from .render_options import RenderOptions
 from .tile_lists import MAX_SINGLE_SORT
 from .warp_launch.launching import stream_handle
@@ -142,12 +142,9 @@ class ReplayedRender:
         needed = [tensor.requires_grad for tensor in gaussians]
         conics_opacities = self._in_use.graph.backward.conics_opacities
         assert conics_opacities is not None, "the CUDA graph begins with 2D Gaussians"
-
-        def project() -> tuple[Tensor, ...]:
-            means2d, depths, extents = self._replay(tensors, (), needed, copies_features=_is_trained(features))
-            return means2d, conics_opacities.detach(), depths, extents
-
-        outputs = with_projection_gradient(gaussians, project, self._in_use.project_backward)
+        means2d, depths, extents = self._replay(tensors, (), needed, copies_features=_is_trained(features))
+        outputs = means2d, conics_opacities.detach(), depths, extents
+        outputs = with_projection_gradient(outputs, gaussians, self._in_use.project_backward)
         self.means2d, self.conics_opacities, self.depths, self.extents = outputs
 
     def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> None:
@@ -272,8 +269,8 @@ class _GraphInUse:
         return self.graph.backward.blend(memory, grad_image, grad_transmittance)
 
     def project_backward(
-        self, inputs: Sequence[Tensor], culling: Tensor, upstream: Gradients, needed: Sequence[bool]
-    ) -> Gradients:
+        self, inputs: Sequence[Tensor], visibility: Tensor, upstream: Sequence[Tensor | None], needed: Sequence[bool]
+    ) -> Sequence[Tensor | None]:
         grad_means2d, zeros, grad_depths, _ = upstream
         memory, self._between = self._between, None
         if memory is None or memory.zeros is not zeros:  # Passes overlap, or nothing reached the image.

@@ -1,4 +1,4 @@
-"""Stage one of a render: 3D Gaussians to 2D Gaussians."""
+"""Stage one of a render: project Gaussians to the image. Projected ones, 2D Gaussians, are called splats."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..kernels.constants import FRUSTUM_MARGIN as FRUSTUM_MARGIN
+from ..kernels.constants import FRUSTUM_MARGIN as FRUSTUM_MARGIN  # For compat, which may not import kernels.
 from ..kernels.project import projection_kernel
 from .gradients import kernel_layout, zero_gradients
 from .render_options import RenderOptions
@@ -63,18 +63,11 @@ def project_to_camera(
         options: of the image; extents end where alpha falls to options.alpha_threshold.
         differentiate_compensation: differentiate the factor of antialiased opacities with respect to the covariance.
     """
-    count = means.shape[0]
-    outputs = ProjectedGaussians(
-        means.new_empty(count, 2),
-        means.new_empty(count, 3),
-        means.new_empty(count),
-        means.new_empty(count),
-        means.new_empty(count, 2),
-    )
     antialiased = options.antialiased
     kernel = projection_kernel(warp_scalar(means.dtype), antialiased, differentiate_compensation and antialiased)
     tensors = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
     inputs = tuple(tensor.contiguous() for tensor in tensors)
+    outputs = [means.new_empty(len(means), *shape) for shape in ((2,), (3,), (), (), (2,))]
     return ProjectedGaussians(*launch_projection(kernel, inputs, projection_parameters(options), outputs))
 
 
@@ -83,80 +76,83 @@ def projection_parameters(options: RenderOptions) -> tuple:
     return options.width, options.height, options.near_plane, options.eps2d, options.alpha_threshold
 
 
-Gradients = Sequence[Tensor | None]
-ProjectionAdjoint = Callable[[Sequence[Tensor], Tensor, Gradients, Sequence[bool]], Gradients]
-"""Takes the inputs, the last output, a gradient for each output (None for 0), and which inputs need one; returns a
-gradient for each input, None where none is needed."""
-
-
 def launch_projection(
-    kernel: Any, inputs: tuple[Tensor, ...], parameters: tuple, outputs: tuple[Tensor, ...]
-) -> tuple[Tensor, ...]:
-    """Fill the outputs by a projection kernel, one thread for each Gaussian, and return them, differentiable if needed.
+    kernel: Any, inputs: Sequence[Tensor], parameters: tuple, outputs: Sequence[Tensor]
+) -> Sequence[Tensor]:
+    """Fill the outputs by a projection kernel, one thread for each Gaussian; return them, differentiable if needed.
 
     Does what bridge.differentiable() would, at half of its host time.
 
     Args:
-        kernel: takes inputs, parameters, the last output (None in the forward pass), and outputs.
-        inputs: four tensors with a row for each Gaussian, then those that all share (the camera).
+        kernel: takes inputs, parameters, the last output of the forward pass (None within it), and outputs.
+        inputs: four tensors with a row for each Gaussian, then those that all share (the camera); contiguous.
         parameters: that are not tensors.
         outputs: with a row for each Gaussian. The last one is 0 if a Gaussian is culled, and not differentiable.
     """
-    count = inputs[0].shape[0]
+    count = len(inputs[0])
+    arguments = *inputs, *parameters, None, *outputs
+    launch(kernel, count, *arguments)
 
-    def project() -> tuple[Tensor, ...]:
-        arguments = *inputs, *parameters, None, *outputs
-        launch(kernel, count, *arguments)
-        return outputs
-
-    def adjoint(inputs: Sequence[Tensor], culling: Tensor, upstream: Gradients, needed: Sequence[bool]) -> Gradients:
-        results = zero_gradients(inputs, needed, [tensor.is_leaf for tensor in inputs])
-        arguments, gradients = adjoint_arguments(inputs, parameters, culling, upstream, results)
+    def backward(
+        inputs: Sequence[Tensor], visibility: Tensor, upstream: Sequence[Tensor | None], needed: Sequence[bool]
+    ) -> Sequence[Tensor | None]:
+        results = zero_gradients(inputs, needed)
+        arguments, gradients = adjoint_arguments(inputs, parameters, visibility, upstream, results)
         # All Gaussians add to the camera's gradients: on the CPU one thread must.
         ranges = single_range(count) if any(needed[4:]) else None
         launch(kernel, count, *arguments, gradients=gradients, ranges=ranges)
         return results
 
-    return with_projection_gradient(inputs, project, adjoint)
+    return with_projection_gradient(outputs, inputs, backward)
+
+
+ProjectionBackward = Callable[
+    [Sequence[Tensor], Tensor, Sequence[Tensor | None], Sequence[bool]], Sequence[Tensor | None]
+]
+"""Takes the inputs, the last output, a gradient for each output (None for 0), and which inputs need one; returns a
+gradient for each input, None if none is needed."""
 
 
 def adjoint_arguments(
-    inputs: Sequence[Tensor], parameters: tuple, culling: Tensor, upstream: Gradients, results: Gradients
+    inputs: Sequence[Tensor],
+    parameters: tuple,
+    visibility: Tensor,
+    upstream: Sequence[Tensor | None],
+    results: Sequence[Tensor | None],
 ) -> tuple[tuple, tuple]:
     """Return arguments of a projection kernel and, for each, its gradient or None, as launch() takes them.
 
-    See ProjectionAdjoint; results are added to. The adjoint does not read the outputs except the last one, culling.
+    See ProjectionBackward; results are added to. The adjoint reads none of the outputs but the last one, visibility.
     """
-    arguments = *inputs, *parameters, culling, *(None,) * len(upstream)
+    arguments = *inputs, *parameters, visibility, *(None,) * len(upstream)
     return arguments, (*results, *(None,) * (len(parameters) + 1), *upstream)
 
 
 def with_projection_gradient(
-    inputs: tuple[Tensor, ...], project: Callable[[], tuple[Tensor, ...]], adjoint: ProjectionAdjoint
-) -> tuple[Tensor, ...]:
-    """Return project(), the outputs of a projection, as differentiable functions of its inputs."""
-    return _apply_projection(project, adjoint, *inputs) if torch.is_grad_enabled() else project()
+    outputs: Sequence[Tensor], inputs: Sequence[Tensor], backward: ProjectionBackward
+) -> Sequence[Tensor]:
+    """Return the outputs of a projection as differentiable functions of its inputs."""
+    return _apply_projection(outputs, backward, *inputs) if torch.is_grad_enabled() else outputs
 
 
 class _Projection(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, project: Callable[[], tuple[Tensor, ...]], adjoint: ProjectionAdjoint, *inputs: Tensor):
-        outputs = project()
-        ctx.adjoint = adjoint
+    def forward(ctx, outputs: Sequence[Tensor], backward: ProjectionBackward, *inputs: Tensor):
+        ctx.gradients_of = backward
         ctx.save_for_backward(*inputs, outputs[-1])
         ctx.mark_non_differentiable(outputs[-1])
         ctx.set_materialize_grads(False)
-        return outputs
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *upstream):
-        *inputs, culling = ctx.saved_tensors
-        adjoint = ctx.adjoint
+        *inputs, visibility = ctx.saved_tensors
+        gradients_of = ctx.gradients_of
         if not keeps_graph():
-            ctx.adjoint = None
+            ctx.gradients_of = None
         upstream = [kernel_layout(gradient) for gradient in upstream]
-        return None, None, *adjoint(inputs, culling, upstream, ctx.needs_input_grad[2:])
+        return None, None, *gradients_of(inputs, visibility, upstream, ctx.needs_input_grad[2:])
 
 
 _apply_projection = direct_apply(_Projection)

@@ -1,5 +1,6 @@
 """Splats seen in any directions from one point: environment maps, as latitude and longitude or the faces of a cube."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -123,16 +124,10 @@ class _SphereSplats(NamedTuple):
     distances: Tensor
 
 
-def _project(inputs: tuple[Tensor, ...], parameters: tuple, antialiased: bool) -> _SphereSplats:
-    means, count = inputs[0], len(inputs[0])
-    outputs = _SphereSplats(
-        means.new_empty(count, 4),
-        means.new_empty(count, 3),
-        means.new_empty(count, 3),
-        means.new_empty(count),
-        means.new_empty(count),
-    )
+def _project(inputs: Sequence[Tensor], parameters: tuple, antialiased: bool) -> _SphereSplats:
+    means = inputs[0]
     kernel = projection_kernel(warp_scalar(means.dtype), antialiased)
+    outputs = [means.new_empty(len(means), *shape) for shape in ((4,), (3,), (3,), (), ())]
     return _SphereSplats(*launch_projection(kernel, inputs, parameters, outputs))
 
 
