@@ -4,7 +4,9 @@ NumPy alone is loaded here; USD needs the extra `usd`.
 """
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,10 +24,36 @@ from .usd import read_usd, write_usd
 
 log = logging.getLogger(__name__)
 USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
-SUFFIXES = (".ply", *USD_SUFFIXES, ".glb", ".sog", ".spz", COMPRESSED_PLY)
-"""Of the files that are read and written."""
-LOSSY_SUFFIXES = (".sog", ".spz", COMPRESSED_PLY)
-"""Of files that hold rounded numbers, a tenth to a fourth of the size."""
+
+
+class Format(NamedTuple):
+    """How a kind of file is read and written.
+
+    Attributes:
+        read: Return the Gaussians of a file.
+        write: Write Gaussians to a file; the last argument is `overwrite`.
+        color_model: The one color model that the file can hold; None if it can hold any.
+        is_lossy: Whether the file holds rounded numbers, which take a tenth to a fourth of the space.
+    """
+
+    read: Callable[[Path], GaussianArrays]
+    write: Callable[[Path, GaussianArrays, bool], object]
+    color_model: str | None
+    is_lossy: bool = False
+
+
+FORMATS = {
+    ".ply": Format(read_ply, write_ply, None),
+    **dict.fromkeys(USD_SUFFIXES, Format(read_usd, write_usd, "linear")),
+    ".glb": Format(read_glb, write_glb, "display"),
+    ".sog": Format(read_sog, write_sog, "display", is_lossy=True),
+    ".spz": Format(read_spz, write_spz, "display", is_lossy=True),
+    COMPRESSED_PLY: Format(read_ply, write_compressed_ply, "display", is_lossy=True),
+    STREAMED_SOG: Format(read_streamed_sog, write_streamed_sog, "display", is_lossy=True),
+}
+"""By suffix, and by name for streamed SOG."""
+SUFFIXES = tuple(suffix for suffix in FORMATS if suffix != STREAMED_SOG)
+LOSSY_SUFFIXES = tuple(suffix for suffix in SUFFIXES if FORMATS[suffix].is_lossy)
 _OTHER = {
     ".splat": "holds 8 bits and no harmonics",
     ".ksplat": "holds a viewer's own compression",
@@ -44,49 +72,44 @@ def check_suffix(path: Path | str, *others: str) -> str:
     suffix = STREAMED_SOG if name == STREAMED_SOG else suffix
     if name == "meta.json":
         raise InputError(path, "is SOG in pieces", "zip it and the pictures beside it as scene.sog")
-    if suffix not in (*SUFFIXES, STREAMED_SOG, *others):
+    if suffix not in (*FORMATS, *others):
         why = (
             f"{suffix} is not read or written here: it {_OTHER[suffix]}" if suffix in _OTHER else "is not a splat file"
         )
-        raise InputError(path, why, f"use one of {' '.join((*SUFFIXES, STREAMED_SOG, *others))}")
+        raise InputError(path, why, f"use one of {' '.join((*FORMATS, *others))}")
     return suffix
 
 
 def path_is_lossy(path: Path | str) -> bool:
     """Return whether a file of this suffix holds rounded numbers."""
-    return check_suffix(path) in (*LOSSY_SUFFIXES, STREAMED_SOG)
+    return FORMATS[check_suffix(path)].is_lossy
 
 
 def color_model_of(path: Path | str) -> str | None:
     """Return the one color model that a file of this suffix can hold; None if it can hold any (PLY)."""
-    suffix = check_suffix(path)
-    return None if suffix == ".ply" else "linear" if suffix in USD_SUFFIXES else "display"
+    return FORMATS[check_suffix(path)].color_model
 
 
 def read_gaussians(path: Path | str) -> GaussianArrays:
-    """Read the Gaussians in a file of one of SUFFIXES.
+    """Read the Gaussians in a file of one of FORMATS.
 
     Gaussians with a value that is not finite are left out, with a warning.
 
     Raises:
         InputError: If the file is missing, damaged, of another kind or holds no Gaussian.
     """
-    suffix = check_suffix(path)
-    readers = {".ply": read_ply, COMPRESSED_PLY: read_ply, ".glb": read_glb, ".sog": read_sog, ".spz": read_spz}
-    readers[STREAMED_SOG] = read_streamed_sog
-    read = readers.get(suffix, read_usd)
-    return read(Path(path)).checked(path)
+    return FORMATS[check_suffix(path)].read(Path(path)).checked(path)
 
 
 def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: bool = False) -> None:
-    """Write a file of one of SUFFIXES.
+    """Write a file of one of FORMATS.
 
     Raises:
         InputError: If a value is NaN or infinite (with field and index), the file exists (unless overwrite), or the
             format cannot hold these colors (see color_model_of).
         SehdrError: If the file cannot be written.
     """
-    color_model, suffix = color_model_of(path), check_suffix(path)
+    color_model = color_model_of(path)
     if color_model not in (None, gaussians.color_model):
         problem = f"holds {color_model} colors, and these are {gaussians.color_model}"
         raise InputError(path, problem, "choose another suffix, or let export change the colors")
@@ -98,10 +121,7 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
             "without --axes scene they are relative to the scene",
             *(Path(path).name, far),
         )
-    writers = {".ply": write_ply, COMPRESSED_PLY: write_compressed_ply, ".glb": write_glb}
-    writers |= {".sog": write_sog, ".spz": write_spz, STREAMED_SOG: write_streamed_sog}
-    write = writers.get(suffix, write_usd)
-    write(Path(path), gaussians, overwrite)
+    FORMATS[check_suffix(path)].write(Path(path), gaussians, overwrite)
 
 
 __all__ = [
