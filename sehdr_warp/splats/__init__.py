@@ -27,7 +27,7 @@ USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 
 
 class Format(NamedTuple):
-    """How a kind of file is read and written.
+    """Reader, writer and properties of a kind of file.
 
     Attributes:
         read: Return the Gaussians of a file.
