@@ -16,7 +16,7 @@ from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene
 from sehdr_warp.training.initialization import make_field
-from sehdr_warp.training.losses import data_loss
+from sehdr_warp.training.losses import data_loss, opacity_loss
 from sehdr_warp.training.targets import PhotoSource
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
@@ -74,9 +74,9 @@ def _gradient_norms(device):
     norms, broken = {}, 0
     for name, ssim, opacity in (("L1", 0.0, 0.0), ("L1 and SSIM", 0.2, 0.0), ("opacity", 0.0, 0.01)):
         config = load_config("default", {"loss.ssim_weight": ssim, "loss.opacity_weight": opacity}).loss
-        photo = field.render_train_view(view.camera, view.exposure_time, opacity_weight=config.opacity_weight)
+        photo = field.render_train_view(view.camera, view.exposure_time)
         field.zero_grad(set_to_none=True)
-        data_loss(field, photo, view.target, config).backward()
+        (data_loss(field, photo, view.target, config) + opacity_loss(field, photo, config.opacity_weight)).backward()
         gradients = [p.grad for p in field.gaussians.parameters() if p.grad is not None]
         broken += not_finite(*gradients)
         norms[name] = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))

@@ -5,14 +5,12 @@ sorted and blended once.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_harmonics
-from ..rasterizer.activations import opacity_penalty
 from ..rasterizer.cuda_graphs import without_replays
 from ..response import Response
 from ..scene import Camera
@@ -91,8 +89,6 @@ class RadianceField(nn.Module):
         max_intersections: int | None = None,
         encode: bool = True,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
-        opacity_weight: float = 0.0,
-        opacity_moments: Tensor | None = None,
     ) -> TrainRender:
         """Render a training view, differentiably.
 
@@ -105,9 +101,6 @@ class RadianceField(nn.Module):
             encode: If False, `encoded` stays None if `photo_exposure` is available.
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
                 harmonics have in this direction; the harmonics themselves then get no gradient.
-            opacity_weight: Weight of the mean opacity in opacity_penalty.
-            opacity_moments: [N] Adam's second moments of the opacities, by which opacity_penalty() spares Gaussians
-                that no photo has shown yet; None if the penalty counts all Gaussians.
         """
         opacities = self.gaussians.opacities()
         ratio = exposure_time / self.base_time
@@ -115,16 +108,9 @@ class RadianceField(nn.Module):
         if sh_gradient_hook is not None:
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.encoded:
-            render = self._render_display_colors(camera, values, opacities, ratio, max_intersections)
-        else:
-            color_sets = self._color_sets(values, ratio, extra_images)
-            render = self._render_color_sets(camera, color_sets, opacities, ratio, max_intersections, encode=encode)
-        if not opacity_weight:
-            return render
-        spares_unseen = opacity_moments is not None and camera.directions is None  # Of wide cameras all count.
-        extents = render.rendering.extents if spares_unseen else None
-        penalty = opacity_penalty(opacities, extents, opacity_moments, opacity_weight, self.gaussians.active_count)
-        return replace(render, opacity_penalty=penalty)
+            return self._render_display_colors(camera, values, opacities, ratio, max_intersections)
+        color_sets = self._color_sets(values, ratio, extra_images)
+        return self._render_color_sets(camera, color_sets, opacities, ratio, max_intersections, encode=encode)
 
     def _render_display_colors(
         self,
@@ -139,7 +125,7 @@ class RadianceField(nn.Module):
         image = rendering.image
         if ratio != 1.0:
             image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-        return TrainRender(image, None, None, rendering)
+        return TrainRender(image, None, None, rendering, opacities=opacities)
 
     def _color_sets(self, values: Tensor, ratio: float | Tensor, extra_images: frozenset[str]) -> dict[str, Tensor]:
         """Return the colors [N, 3] that a training view needs, by name: any of encoded, fused and base."""
@@ -174,7 +160,7 @@ class RadianceField(nn.Module):
         if self.tone_map == "pixel":
             photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
             encoded = self.response.encode_extended(photo_exposure) if encode else None
-        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure)
+        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure, opacities)
 
     @property
     def white(self) -> float:

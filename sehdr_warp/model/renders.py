@@ -22,7 +22,7 @@ class TrainRender:
         rendering: Result of the rasterizer: transmittance, projected means, extents.
         photo_exposure: Exposure of this photo, the input of the response; None if colors are encoded before they are
             composited.
-        opacity_penalty: Penalty on the opacities, a scalar; None without a weight.
+        opacities: [N] opacities of the Gaussians.
     """
 
     encoded: Tensor | None
@@ -30,7 +30,7 @@ class TrainRender:
     base: Tensor | None
     rendering: Rendering
     photo_exposure: Tensor | None = None
-    opacity_penalty: Tensor | None = None
+    opacities: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from ..errors import InputError, SehdrError
-from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
 from ..runs.open import load_saved_scene
@@ -18,10 +17,8 @@ from ..runs.run_folder import describe_scene, scene_difference
 from ..runs.values import LoadArguments
 from ..scene import Scene, View
 from ..scene.exposure_compensation import ExposureCompensation
-from .initialization import sizes_of
-from .machine import interruptible, torch_settings
 from .plan import gain_of_ranks
-from .ranks import END, GO, WAIT, Ranks
+from .ranks import Ranks
 from .trainer import Trainer
 from .training_state import TrainingState, load_state, state_of
 
@@ -117,21 +114,8 @@ def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
     trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks)
     load_state(trainer, TrainingState(checkpoint.tensors, checkpoint.values))
     del shared, checkpoint, tensors
-
-    every = config.scaled(config.schedule.checkpoint_every)
-    with (
-        oom_context(ranks.device, lambda: sizes_of(scene, trainer.field.gaussians.count), TRAINING_REMEDY),
-        torch_settings(config.deterministic),
-        interruptible() as interrupted,
-    ):
-        while (agreed := ranks.all_reduce_min(END if interrupted.is_set() else GO)) != END:
-            if agreed == WAIT:
-                continue
-            trainer.step()
-            if trainer.came_to(every):
-                trainer.gather()
-        trainer.gather()
-        ranks.shutdown()  # After rank 0 has saved.
+    for _ in trainer:
+        pass
     return trainer
 
 

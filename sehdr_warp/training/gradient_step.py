@@ -19,11 +19,10 @@ from ..rasterizer.training_step import differentiate
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..scene import Scene
-from .losses import compares_exposures, data_loss, extra_images
+from .losses import compares_exposures, data_loss, extra_images, opacity_loss
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
 from .scene_facts import largest_hdr_truth, share_in_view
-from .step_graphs import GraphCapacity
 from .strategies import Strategy
 from .targets import TrainingView
 
@@ -73,28 +72,37 @@ class Gradients:
         loss: Scalar loss of this rank's photo.
         image: [H, W, 3] rendered image that was compared with the photo.
         rendering: Result of the rasterizer; tensors that nothing reads any more are None.
-        needs_means2d_grad: As in StepOptions.
         harmonics: Gradients of the harmonics in factored form; None if the parameters hold them.
     """
 
     loss: Tensor
     image: Tensor
     rendering: Rendering
-    needs_means2d_grad: bool
     harmonics: HarmonicsGradients | None
 
 
 class StepResult(NamedTuple):
-    """Loss of a step, mean over the ranks, and the image [H, W, 3] that was compared with this rank's photo."""
+    """Result of a step.
+
+    Attributes:
+        loss: Scalar, mean over the ranks.
+        image: [H, W, 3] rendered image that was compared with this rank's photo.
+        intersections: Number of intersections, or the capacity of the step if it had one.
+    """
 
     loss: Tensor
     image: Tensor
+    intersections: int
 
 
 class GradientStep:
-    """Takes gradient steps on the parameters of a field.
+    """Takes gradient steps of a training; see the functions.
 
     Attributes:
+        field: The field that is trained.
+        optimizer: Adam over its parameters.
+        strategy: Densification strategy, which accumulates gradients of projected means.
+        ranks: Processes that train together.
         needs_encoded: Whether the loss compares encoded photos; if it compares exposures, they are not computed.
         defer_sh_gradients: Keep the gradients of the harmonics in factored form until the optimizer step: a gradient by
             one color per Gaussian in place of 48 numbers.
@@ -107,7 +115,7 @@ class GradientStep:
         field: RadianceField,
         optimizer: Adam,
         strategy: Strategy,
-        capacity: GraphCapacity,
+        step_counters: Tensor,
         ranks: Ranks | None,
     ):
         """Prepare steps of a training.
@@ -115,14 +123,14 @@ class GradientStep:
         Args:
             scene: The scene; its HDR truth scales the HDR loss.
             config: Options of the training.
-            field: The field.
-            optimizer: Adam over its parameters.
-            strategy: Densification strategy, which accumulates gradients of projected means.
-            capacity: Counts of intersections and of steps that were skipped.
+            field: As in the attributes, like the next two.
+            optimizer: Adam.
+            strategy: Densification strategy.
+            step_counters: Counters that steps add to, see GraphCapacity.
             ranks: Processes that train together.
         """
-        self._field, self._optimizer, self._strategy = field, optimizer, strategy
-        self._loss, self._capacity, self._ranks = config.loss, capacity, ranks
+        self.field, self.optimizer, self.strategy, self.ranks = field, optimizer, strategy, ranks
+        self._loss, self._step_counters = config.loss, step_counters
         self.needs_encoded = not compares_exposures(config.loss, field)
         self.defer_sh_gradients = field.gaussians.means.device.type == "cuda"
         self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
@@ -132,24 +140,34 @@ class GradientStep:
     def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:
         """Return the key of a step on one of the views; None if it cannot be captured as a CUDA graph."""
         # Display colors compare the exposure time with the base time on the host, so it must be a number there.
-        if self._field.color_model.encoded and not isinstance(getattr(views, "times", None), float):
+        if self.field.color_model.encoded and not isinstance(getattr(views, "times", None), float):
             return None
-        rows, penalizes = self._field.gaussians.row_count, options.opacity_weight > 0
-        few = rows < EXACT_BELOW, rows <= MAX_SINGLE_SORT
-        return GraphKey(options.degree, options.needs_means2d_grad, penalizes, *few)
+        rows = self.field.gaussians.row_count
+        return GraphKey(
+            options.degree,
+            options.needs_means2d_grad,
+            penalizes_opacity=options.opacity_weight > 0,
+            exact_response=rows < EXACT_BELOW,
+            single_sort=rows <= MAX_SINGLE_SORT,
+        )
+
+    def prepare(self, options: StepOptions) -> None:
+        """Allocate the statistics that the next step adds to: in a capture, they would lie in the graph's memory."""
+        if options.needs_means2d_grad:
+            self.strategy.prepare(self.field.gaussians.row_count, self._step_counters.device)
 
     def compute_and_apply(self, compute: Callable[[], Gradients], apply: Callable[[Gradients], Tensor]) -> StepResult:
         """Compute gradients, average them over the ranks, and apply them.
 
         `compute` and `apply` are the two functions below, or replay their CUDA graphs.
         """
-        with self._field.gaussians.all_rows(self._optimizer):
-            if self._ranks is not None:
-                self._flat_gradients(self._ranks)  # Allocated here, not in the memory of a CUDA graph.
+        with self.field.gaussians.all_rows(self.optimizer):
+            if self.ranks is not None:
+                self._flat_gradients(self.ranks)  # Allocated here, not in the memory of a CUDA graph.
             gradients = compute()
-            if self._ranks is not None and self._flat is not None:
-                self._ranks.all_reduce_mean(self._flat.buffer)
-            return StepResult(apply(gradients), gradients.image)
+            if self.ranks is not None and self._flat is not None:
+                self.ranks.all_reduce_mean(self._flat.buffer)
+            return StepResult(apply(gradients), gradients.image, gradients.rendering.intersection_count)
 
     def compute_gradients(
         self, view: TrainingView, options: StepOptions, max_intersections: int | None = None
@@ -161,9 +179,8 @@ class GradientStep:
             options: Options of the step.
             max_intersections: Fixed capacity, with which nothing waits for the device.
         """
-        target, camera, field = view.target, view.camera, self._field
+        target, camera, field = view.target, view.camera, self.field
         sh_gradients: list[Tensor] = []
-        opacity_moments = moments_of(self._optimizer, field.gaussians.opacity_logits).get("exp_avg_sq")
         render = field.render_train_view(
             camera,
             view.exposure_time,
@@ -172,16 +189,20 @@ class GradientStep:
             max_intersections=max_intersections,
             encode=self.needs_encoded,
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
-            opacity_weight=options.opacity_weight,
-            opacity_moments=opacity_moments if self._spares_unseen else None,
         )
-        # Drop references to tensors that the backward pass does not need, so that their memory is reused in the step.
-        needs_means2d_grad = options.needs_means2d_grad
-        dropped = {"image", "transmittance", "depths"} | (set() if needs_means2d_grad else {"means2d", "extents"})
-        rendering = replace(render.rendering, **dict.fromkeys(dropped))
-        if needs_means2d_grad:
-            rendering.means2d.retain_grad()
         loss = data_loss(field, render, target, self._loss, self._largest_truth)
+        if options.opacity_weight:
+            # Of wide cameras, which have no extents, all Gaussians count.
+            spares_unseen = self._spares_unseen and camera.directions is None
+            moments = moments_of(self.optimizer, field.gaussians.opacity_logits) if spares_unseen else {}
+            loss = loss + opacity_loss(field, render, options.opacity_weight, moments.get("exp_avg_sq"))
+        # Drop references to tensors that the backward pass does not need, so that their memory is reused in it.
+        dropped = {"image", "transmittance", "depths"}
+        if options.needs_means2d_grad:
+            render.rendering.means2d.retain_grad()
+        else:
+            dropped |= {"means2d", "extents"}
+        rendering = replace(render.rendering, **dict.fromkeys(dropped))
         image = render.encoded if self.needs_encoded else render.photo_exposure
         assert image is not None
         del render, target, view
@@ -190,9 +211,9 @@ class GradientStep:
         if self.defer_sh_gradients:
             values = sh_gradients[0].contiguous()
             harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, options.degree)
-        if self._ranks is not None:
-            self._flat_gradients(self._ranks).collect(loss, rendering.overflow, harmonics)
-        return Gradients(loss.detach(), image.detach(), rendering, needs_means2d_grad, harmonics)
+        if self.ranks is not None:
+            self._flat_gradients(self.ranks).collect(loss, rendering.overflow, harmonics)
+        return Gradients(loss.detach(), image.detach(), rendering, harmonics)
 
     def apply_gradients(self, gradients: Gradients) -> Tensor:
         """Update the parameters, unless the step is not finite; return its loss. Does not wait for the device."""
@@ -201,25 +222,23 @@ class GradientStep:
         if self._flat is not None:
             loss, overflow, harmonics = self._flat.distribute()
         applied = guarded_step(
-            self._optimizer,
+            self.optimizer,
             loss,
             overflow,
             harmonics,
-            step_counters=self._capacity.step_counters,
+            step_counters=self._step_counters,
             intersections=rendering.needed_intersections,
-            active_count=self._field.gaussians.active_count,
+            active_count=self.field.gaussians.active_count,
         )
-        if gradients.needs_means2d_grad:
+        if rendering.means2d is not None:
             height, width, _ = gradients.image.shape
-            self._strategy.accumulate(rendering, width, height, applied)
-        self._optimizer.zero_grad()
-        if rendering.needed_intersections is None:
-            self._capacity.observe(rendering.intersection_count)
+            self.strategy.accumulate(rendering, width, height, applied)
+        self.optimizer.zero_grad()
         return loss
 
     def _flat_gradients(self, ranks: Ranks) -> FlatGradients:
         """Return the buffer of all gradients, which ranks exchange; allocated anew when parameters change."""
-        if self._flat is None or not self._flat.fits(self._optimizer):
+        if self._flat is None or not self._flat.fits(self.optimizer):
             self._flat = None  # Freed first, because it is large.
-            self._flat = FlatGradients(self._optimizer, ranks.rank, ranks.count, defer_sh=self.defer_sh_gradients)
+            self._flat = FlatGradients(self.optimizer, ranks.rank, ranks.count, defer_sh=self.defer_sh_gradients)
         return self._flat

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..model.radiance_field import RadianceField
 from ..model.renders import TrainRender
+from ..rasterizer.activations import opacity_penalty
 from ..rasterizer.code_residual import CodeScale, code_residual, code_values
 from ..rasterizer.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
 from ..rasterizer.ssim import image_distance, ssim
@@ -228,7 +229,7 @@ def extra_images(config: LossConfig, has_truth: bool) -> frozenset[str]:
 def data_loss(
     field: RadianceField, render: TrainRender, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
-    """Return L_LDR + beta L_linear (SeHDR, equation 20) + HDR loss + anchor + opacity, each if it has a weight."""
+    """Return L_LDR + beta L_linear (SeHDR, equation 20) + HDR loss + anchor, each if it has a weight."""
     loss = ldr_loss(render, target, config) if config.ldr_weight > 0 else 0.0
     if config.ldr_weight not in (0, 1):
         loss = config.ldr_weight * loss
@@ -240,4 +241,14 @@ def data_loss(
     if config.anchor_weight > 0 and isinstance(field.response, ToneMapper):
         loss = loss + config.anchor_weight * anchor_loss(field.response)
     assert isinstance(loss, Tensor), "a config without any loss is refused"
-    return loss if render.opacity_penalty is None else loss + render.opacity_penalty
+    return loss
+
+
+def opacity_loss(field: RadianceField, render: TrainRender, weight: float, moments: Tensor | None = None) -> Tensor:
+    """Return `weight` times the mean opacity of the Gaussians.
+
+    With Adam's second moments [N] of the opacities, those that no photo has shown yet do not count.
+    """
+    assert render.opacities is not None
+    extents = None if moments is None else render.rendering.extents
+    return opacity_penalty(render.opacities, extents, moments, weight, field.gaussians.active_count)

@@ -77,8 +77,6 @@ class RunOutput:
             trainer.synchronize()
         if evaluate:
             self.evaluate(trainer)
-        if save:
-            trainer.gather()
         if save and iteration < trainer.total and time.monotonic() - self._saved_at >= self._least_seconds:
             self.checkpoint(trainer)
         if self._tensorboard and trainer.came_to(self._log_every):

@@ -1,91 +1,107 @@
-"""CUDA graphs around the two functions of a training step, compute_gradients and apply_gradients.
+"""Gradient steps as CUDA graphs.
 
-A graph fixes the size of its memory when it is captured, while photos differ in their number of Gaussian-tile
+A graph replays the kernels of GradientStep.compute_gradients() and apply_gradients(); none of their Python code runs.
+It fixes the size of its memory when it is captured, while photos differ in their number of Gaussian-tile
 intersections: GraphCapacity counts them and chooses how many a captured step has memory for.
 """
 
 import math
-from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TypeGuard, TypeVar
+from typing import TypeGuard
 
 import torch
 
 from ..errors import SehdrError
 from ..rasterizer import CudaGraphRunner
 from ..rasterizer.memory import failed_allocation
+from .gradient_step import Gradients, GradientStep, GraphKey, StepOptions, StepResult
 from .targets import ViewStack
-from .training_views import PhotoStream
+from .training_views import PhotoStream, Views
 
 HEADROOM = 1.25  # Capacity as a multiple of the largest count; the photos of a scene differ by a factor of up to 1.32
 MIN_HEADROOM = 1.08  # After densification, a capacity below this multiple of the expected count is replaced
 MIN_SHRINK = 0.97  # Smallest factor of the count after densification: a reset of opacities lowers it only for a while
 MIN_CAPACITY = 1 << 14
-
-G = TypeVar("G")
-Compute = Callable[[], G]
-Apply = Callable[[G], torch.Tensor]
+MAX_RESERVE = 1.5  # Largest number of reserved rows as a multiple of the count; they cost memory and a little time
 
 
 class StepGraphs:
-    """Captures training steps as CUDA graphs and replays them; on a CPU, or disabled, it does nothing.
+    """Runs gradient steps: as CUDA graphs if that is possible, else kernel by kernel, as on a CPU.
 
     On one GPU, both functions of a step are one graph. On several, they are two, and gradients are averaged between.
 
     Attributes:
         enabled: Whether steps are captured.
+        reserves_rows: Whether steps run on reserved rows, so that the number of Gaussians can change without a new
+            capture. Sums over more rows have other last bits.
     """
 
-    def __init__(self, device: torch.device, *, enabled: bool, several_ranks: bool):
-        """Create the graph runners of a device."""
+    def __init__(self, step: GradientStep, capacity: "GraphCapacity", *, enabled: bool, deterministic: bool):
+        """Create the graph runners of a training's steps; they are disabled on a CPU."""
+        self._step, self._capacity = step, capacity
+        device = capacity.step_counters.device
         self.enabled = enabled and device.type == "cuda"
+        self.reserves_rows, self._reserved_rows = self.enabled and not deterministic, 0
         self._first = CudaGraphRunner(device) if self.enabled else None
-        self._second = CudaGraphRunner(device, self._first.stream) if self._first and several_ranks else None
-        self._launched: set[Hashable] = set()
+        self._second = CudaGraphRunner(device, self._first.stream) if self._first and step.ranks is not None else None
+        self._index = torch.zeros(1, dtype=torch.int64, device=device)
+        self._eager_keys: set[GraphKey] = set()
 
-    @property
-    def captured(self) -> Any:
-        """The CUDA graph that the next step with the same key replays; None if there is none."""
-        return None if self._first is None else self._first._graph
+    def run(self, views: Views, index: int, following: int | None, options: StepOptions, iteration: int) -> StepResult:
+        """Take a gradient step on view `index`; view `following` is fetched meanwhile if photos are streamed."""
+        step, gaussians = self._step, self._step.field.gaussians
+        # Gaussians.surround() has reserved rows for another purpose.
+        if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
+            self._reserve_rows(iteration)
+        step.prepare(options)
+        key = step.graph_key(views, options)
+        if self._capacity.has_counts and self.can_replay(views, key):
+            return self._replay(views, index, following, options, key, iteration)
+        with self.on_capture_stream():
+            result = step.compute_and_apply(lambda: step.compute_gradients(views[index], options), step.apply_gradients)
+        self._capacity.observe(result.intersections)
+        if key is not None:
+            self._eager_keys.add(key)
+        return result
 
-    def is_ready(self, views: Any, graph_key: Hashable) -> TypeGuard[ViewStack | PhotoStream]:
-        """Return whether a step can be captured: photos of one size, after a step with this key was launched.
+    def can_replay(self, views: Views, key: GraphKey | None) -> TypeGuard[ViewStack | PhotoStream]:
+        """Return whether a step can be a graph: its photo is selected by an index on the device, and its kernels ran.
 
-        Args:
-            views: The training views, which a captured step selects by an index on the device.
-            graph_key: As by GradientStep.graph_key; None, which is never launched, if the step cannot be captured.
+        A kernel must have run before it is captured, so the first step of a key runs kernel by kernel.
         """
-        return self._first is not None and isinstance(views, ViewStack | PhotoStream) and graph_key in self._launched
-
-    def mark_launched(self, graph_key: Hashable) -> None:
-        """Note that a step with this key has been launched kernel by kernel, so that the next one can be captured."""
-        self._launched.add(graph_key)
+        return self._first is not None and isinstance(views, ViewStack | PhotoStream) and key in self._eager_keys
 
     def on_capture_stream(self) -> AbstractContextManager[None]:
-        """Return a context for launched work, which shares stream and memory with captured steps."""
+        """Return a context for other work, which shares stream and memory with captured steps."""
         return nullcontext() if self._first is None else self._first.on_capture_stream()
 
-    def run(
+    def _replay(
         self,
-        graph_key: Hashable,
-        run_step: Callable[[Compute, Apply], Any],
-        compute_gradients: Compute,
-        apply_gradients: Apply,
+        views: ViewStack | PhotoStream,
+        index: int,
+        following: int | None,
+        options: StepOptions,
+        key: GraphKey | None,
         iteration: int,
-    ) -> Any:
-        """Replay run_step(compute_gradients, apply_gradients), after capturing it if this key has no graph.
-
-        `run_step` is GradientStep.compute_and_apply: it averages the gradients of the ranks between the two.
-        """
-        first, second = self._first, self._second
+    ) -> StepResult:
+        """Replay the graphs of a key; they are captured if there are none."""
+        step, capacity, first, second = self._step, self._capacity.capacity(), self._first, self._second
         assert first is not None
+        self._index.fill_(index)
+        if isinstance(views, PhotoStream):
+            views.bring(index)
+
+        def compute() -> Gradients:
+            return step.compute_gradients(views.at(self._index), options, capacity)
+
         try:
             if second is None:
-                return first.run(graph_key, lambda: run_step(compute_gradients, apply_gradients))
-            return run_step(
-                lambda: first.run(graph_key, compute_gradients),
-                lambda gradients: second.run(graph_key, lambda: apply_gradients(gradients)),
-            )
+                result = first.run(key, lambda: step.compute_and_apply(compute, step.apply_gradients))
+            else:
+                result = step.compute_and_apply(
+                    lambda: first.run(key, compute),
+                    lambda gradients: second.run(key, lambda: step.apply_gradients(gradients)),
+                )
         except RuntimeError as error:
             if failed_allocation(error):
                 raise
@@ -94,6 +110,41 @@ class StepGraphs:
                 f"iteration {iteration}: the step could not be captured as a CUDA graph "
                 f"({str(error).splitlines()[0]}); train with --schedule.use-cuda-graph=false, which is slower"
             ) from error
+        if isinstance(views, PhotoStream):
+            views.release(following)
+        return result
+
+    def adapt(self, count: int, reallocations: int, iteration: int) -> None:
+        """Adapt rows, capacity and graphs after Gaussians were added or removed.
+
+        Args:
+            count: Number of Gaussians before.
+            reallocations: Gaussians.reallocations before.
+            iteration: Iterations done.
+        """
+        gaussians = self._step.field.gaussians
+        if self.reserves_rows:
+            self._reserve_rows(iteration)
+        if self.enabled:
+            same_memory = gaussians.reallocations == reallocations
+            if not self._capacity.rescale(gaussians.count / max(1, count), same_memory=same_memory):
+                self.invalidate()
+
+    def _reserve_rows(self, iteration: int) -> None:
+        """Reserve rows for the Gaussians that refinements will add; the same number on all ranks."""
+        gaussians, count = self._step.field.gaussians, self._step.field.gaussians.count
+        rows = self._step.strategy.reserved_rows(iteration, count)
+        if rows == count or not count <= self._reserved_rows <= MAX_RESERVE * count:
+            self._reserved_rows = rows
+        if gaussians.row_count != self._reserved_rows:
+            gaussians.reserve(self._reserved_rows, self._step.optimizer)
+
+    def poll(self, *, wait: bool) -> int:
+        """Return the number of steps that were not finite, as GraphCapacity.poll(); free graphs that were too small."""
+        not_finite, overflowed = self._capacity.poll(wait=wait)
+        if overflowed:  # Those steps applied no gradients; the next capture has the capacity that they needed.
+            self.invalidate()
+        return not_finite
 
     def invalidate(self) -> None:
         """Free the graphs, because something that they hold fixed has changed."""
@@ -106,8 +157,8 @@ class GraphCapacity:
     """Chooses the intersection capacity of the next capture from counts that steps keep on the device.
 
     Attributes:
-        step_counters: [3] int64, added up by training_step.check_finite(): steps that were not finite; largest number
-            of intersections, set to 0 by rescale(); steps with more intersections than the capacity.
+        step_counters: [3] int64, which each step adds to: steps that were not finite; largest number of intersections,
+            set to 0 by rescale(); steps with more intersections than the capacity. Neither kind of step is applied.
     """
 
     def __init__(self, device: torch.device | str):

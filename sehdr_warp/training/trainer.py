@@ -2,9 +2,9 @@
 
 Read `Trainer.__iter__` for the loop and `Trainer.step` for a step: gradient step, densification, moving average. The
 gradient step (forward, loss, backward, optimizer) is in gradient_step.py; run_output.py evaluates, logs and saves, and
-training_state.py lists what a checkpoint holds.
+training_state.py lists what a checkpoint holds. On several ranks, each runs this loop; only rank 0 has an output.
 
-The calls of a step: step() -> GradientStep.compute_and_apply() -> compute_gradients() ->
+The calls of a step: step() -> StepGraphs.run() -> GradientStep.compute_and_apply() -> compute_gradients() ->
 RadianceField.render_train_view() -> rasterize() (kernels project, tiles, blend_cuda or blend_cpu) -> data_loss() ->
 differentiate() -> apply_gradients() -> guarded_step() -> Adam.step() (kernels training_step). On a GPU,
 StepGraphs.run() captures compute_gradients() and apply_gradients() as CUDA graphs; a replay repeats their kernels, and
@@ -31,7 +31,7 @@ from ..runs.config import Config
 from ..runs.run import Run, as_rec709
 from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
-from .gradient_step import Gradients, GradientStep, GraphKey, StepOptions, StepResult
+from .gradient_step import GradientStep, StepOptions, StepResult
 from .initialization import make_matcher, sizes_of
 from .losses import INTERVALS_FROM
 from .machine import interruptible, torch_settings
@@ -41,9 +41,8 @@ from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .step_graphs import GraphCapacity, StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
-from .targets import ViewStack
 from .training_state import Pace, TrainingProgress
-from .training_views import PhotoOrder, PhotoStream, TrainingViews, check_projections, first_wide_view
+from .training_views import PhotoOrder, TrainingViews, check_projections, first_wide_view
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +50,6 @@ T = TypeVar("T")
 
 CHECK_EVERY = 20  # Iterations between checks of the counts that steps keep on the device
 COMPARE_EVERY = 500  # Iterations between checks that all ranks have the same Gaussians
-MAX_RESERVE = 1.5  # Largest number of reserved rows as a multiple of the count; they cost memory and a little time
 MAX_SKIPPED = 20  # More steps than this with a loss or gradient that is not finite end the training
 
 
@@ -125,18 +123,20 @@ class Trainer:
             partial(make_matcher, normalized, field.response, self.device)
         )
 
+        field.gaussians.release()  # Rows that another trainer of this field reserved hold its optimizer's moments.
+        self.capacity = GraphCapacity(self.device)
+        self.gradient_step = GradientStep(
+            scene, config, field, self.optimizer, self.strategy, self.capacity.step_counters, ranks
+        )
+        use_cuda_graph = config.schedule.use_cuda_graph
+        self.graphs = StepGraphs(
+            self.gradient_step, self.capacity, enabled=use_cuda_graph, deterministic=config.deterministic
+        )
+        self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
         self._result: StepResult | None = None
         self._view_index = 0
-
-        self.graphs = StepGraphs(self.device, enabled=config.schedule.use_cuda_graph, several_ranks=ranks is not None)
-        self.capacity = GraphCapacity(self.device)
-        self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
-        self._device_index = torch.zeros(1, dtype=torch.int64, device=self.device)
-        # Captured steps run on reserved rows, so that the number of Gaussians can change without a new capture.
-        self.reserves_rows, self._reserved_rows = self.graphs.enabled and not config.deterministic, 0
-        field.gaussians.release()
-        self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, self.capacity, ranks)
-        self.interrupted, self._stopped, self._pace = threading.Event(), False, Pace()
+        self._checkpoint_every = config.scaled(config.schedule.checkpoint_every)
+        self.interrupted, self._stopped, self._all_end, self._pace = threading.Event(), False, False, Pace()
 
     # The loop
 
@@ -184,12 +184,12 @@ class Trainer:
             yield
 
     def _agree_to_continue(self) -> bool:
-        """Return whether there is a next step; any rank may end the training."""
-        remains = self.iteration < self.total and not self.ending
-        if self.ranks is None:
-            return remains
-        while (agreed := self.ranks.all_reduce_min(GO if remains else END)) == WAIT:
-            pass
+        """Return whether there is a next step; any rank may end the training, and rank 0 may pause() it."""
+        agreed = END if self._all_end else WAIT
+        while agreed == WAIT:
+            agreed = GO if self.iteration < self.total and not self.ending else END
+            if self.ranks is not None:
+                agreed = self.ranks.all_reduce_min(agreed)
         return agreed == GO
 
     def _finish(self) -> None:
@@ -215,77 +215,40 @@ class Trainer:
         self.iteration += self.step_batch
         if self.iteration > INTERVALS_FROM * self.total:
             self.views.widen_codes()
-        views, gaussians = self.views.source, self.field.gaussians
         self._view_index = self.order.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
-        if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
-            self._reserve_rows()
-        # The opacity penalty ends with the refinements.
-        opacity_weight = 0.0 if self.strategy.schedule.is_over(self.iteration) else self.config.loss.opacity_weight
+        # The opacity loss ends with the refinements.
+        refines = not self.strategy.schedule.is_over(self.iteration)
+        opacity_weight = self.config.loss.opacity_weight if refines else 0.0
         options = StepOptions(self.degree, opacity_weight, self.strategy.needs_gradients(self.iteration))
-        if options.needs_means2d_grad:
-            self.strategy.prepare(gaussians.row_count, self.device)
 
-        # Gradient step; as a CUDA graph if a step with this key has been launched before.
-        step = self.gradient_step
-        graph_key = step.graph_key(views, options)
-        if self.capacity.has_counts and self.graphs.is_ready(views, graph_key):
-            self._result = self._run_captured(views, options, graph_key)
-        else:
-            with self.graphs.on_capture_stream():
-                self._result = step.compute_and_apply(
-                    partial(step.compute_gradients, views[self._view_index], options), step.apply_gradients
-                )
-            if graph_key is not None:
-                self.graphs.mark_launched(graph_key)
-
+        # Forward, loss, backward, optimizer.
+        self._result = self.graphs.run(self.views.source, self._view_index, self.order.peek(), options, self.iteration)
         # Densification.
-        self.strategy.inject_noise(self.iteration, gaussians, means_lr)
-        self._densify()
-        if self.strategy.schedule.is_over(self.iteration):
+        self.strategy.inject_noise(self.iteration, self.field.gaussians, means_lr)
+        if self.strategy.is_due(self.iteration, self.step_batch):
+            self._densify()
+        if not refines:
             self._get_matcher = None  # Its copies of the photos take memory on the device.
         # Moving average.
-        self.average.update(self.iteration, self.step_batch, gaussians)
+        self.average.update(self.iteration, self.step_batch, self.field.gaussians)
         if self.came_to(CHECK_EVERY):
             self.check(wait=False)
-        if self.came_to(COMPARE_EVERY):
+        if self.came_to(COMPARE_EVERY) or self.came_to(self._checkpoint_every):
             self.gather()
 
-    def _run_captured(self, views: ViewStack | PhotoStream, options: StepOptions, key: GraphKey | None) -> StepResult:
-        """Take a gradient step on the current view by replaying CUDA graphs, which are captured if the key is new."""
-        step, capacity = self.gradient_step, self.capacity.capacity()
-        self._device_index.fill_(self._view_index)
-        if isinstance(views, PhotoStream):
-            views.bring(self._view_index)
-
-        def compute() -> Gradients:
-            return step.compute_gradients(views.at(self._device_index), options, capacity)
-
-        result = self.graphs.run(key, step.compute_and_apply, compute, step.apply_gradients, self.iteration)
-        if isinstance(views, PhotoStream):
-            views.release(self.order.peek())
-        return result
-
     def _densify(self) -> None:
-        """Refine the Gaussians if that is due; on several ranks, rank 0 does and the others receive the result."""
+        """Refine the Gaussians; on several ranks, rank 0 does and the others receive the result."""
         gaussians, strategy, ranks = self.field.gaussians, self.strategy, self.ranks
-        if not strategy.is_due(self.iteration, self.step_batch):
-            return
         count, reallocations = gaussians.count, gaussians.reallocations
         propose = self._propose_gaussians if self.can_seed else None
         refine = partial(
             strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch
         )
         changed = refine() if ranks is None else ranks.refine_on_leader(refine, strategy, gaussians, self.optimizer)
-        if changed and self.reserves_rows:
-            self._reserve_rows()
-        if changed and self.graphs.enabled:
-            valid = self.capacity.rescale(
-                gaussians.count / max(1, count), same_memory=gaussians.reallocations == reallocations
-            )
-            if not valid:
-                self.graphs.invalidate()
+        if changed:
+            self.graphs.adapt(count, reallocations, self.iteration)
 
     def _propose_gaussians(self, number: Tensor, bound: int) -> Proposals:
         """Propose new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
@@ -299,15 +262,6 @@ class Trainer:
                 self.field, self._get_matcher(), rendered, view, self._view_index, number, bound, random_seed
             )
 
-    def _reserve_rows(self) -> None:
-        """Reserve rows for the Gaussians that refinements will add; the same number on all ranks."""
-        gaussians, count = self.field.gaussians, self.field.gaussians.count
-        rows = self.strategy.reserved_rows(self.iteration, count)
-        if rows == count or not count <= self._reserved_rows <= MAX_RESERVE * count:
-            self._reserved_rows = rows
-        if gaussians.row_count != self._reserved_rows:
-            gaussians.reserve(self._reserved_rows, self.optimizer)
-
     @property
     def degree(self) -> int:
         """SH degree of this iteration."""
@@ -320,19 +274,13 @@ class Trainer:
         return self.iteration % every < self.step_batch
 
     def check(self, *, wait: bool = True) -> None:
-        """Raise SehdrError if more than MAX_SKIPPED steps were skipped; raise the capacity if it was too small.
-
-        Args:
-            wait: If False, the latest steps are not considered.
-        """
-        skipped, overflowed = self.capacity.poll(wait=wait)
+        """Raise SehdrError if more than MAX_SKIPPED steps were not finite; the latest ones count if `wait`."""
+        skipped = self.graphs.poll(wait=wait)
         if skipped > MAX_SKIPPED:
             raise SehdrError(
                 f"iteration {self.iteration}: {skipped} steps had a loss or gradient that is not finite, "
                 f"more than {MAX_SKIPPED}; lower the learning rates or check photos and cameras"
             )
-        if overflowed:  # Those steps applied no gradients; the next capture has the capacity that they needed.
-            self.graphs.invalidate()
 
     def gather(self) -> None:
         """Gather statistics on rank 0 for a checkpoint; raise SehdrError if the ranks' Gaussians differ."""
@@ -391,6 +339,7 @@ class Trainer:
     def pause(self) -> None:
         """Keep other ranks waiting for the next step; call it now and then between steps."""
         if self.ranks is not None and self.ranks.all_reduce_min(WAIT) == END:
+            self._all_end = True
             self.stop()
 
     def render(self, camera: Camera) -> RenderedView:

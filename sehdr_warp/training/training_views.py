@@ -80,9 +80,7 @@ class PhotoOrder:
             raise ValueError(f"the order of the photos names others than the {self._count} there are")
 
 
-def make_view_source(
-    source: PhotoSource, where: str, use_cuda_graph: bool
-) -> "ViewStack | PhotoStream | Sequence[TrainingView]":
+def make_view_source(source: PhotoSource, where: str, use_cuda_graph: bool) -> "Views":
     """Return the views of a source in the form that steps take, captured as CUDA graphs or not.
 
     `where` is the value of schedule.photo_cache.
@@ -223,6 +221,9 @@ class PhotoStream:
         return arrays
 
 
+Views = ViewStack | PhotoStream | Sequence[TrainingView]
+
+
 class TrainingViews:
     """The training views in the form that steps take.
 
@@ -255,7 +256,7 @@ class TrainingViews:
             self._photos.scale.widen()
 
     @cached_property
-    def source(self) -> ViewStack | PhotoStream | Sequence[TrainingView]:
+    def source(self) -> Views:
         """The views that a step selects from: on the device, or in a source that uploads them one by one."""
         return make_view_source(self._photos, self._config.schedule.photo_cache, self._use_cuda_graph)
 

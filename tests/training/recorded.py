@@ -7,6 +7,12 @@ from sehdr_warp.training.trainer import Trainer
 from .toy import make_trainer
 
 
+def captured(trainer: Trainer):
+    """The CUDA graph that the next step with the same key replays; None if there is none."""
+    runner = trainer.graphs._first
+    return None if runner is None else runner._graph
+
+
 def train_on_gpu(scene, config, *, recorded: bool = True, iterations: int | None = None) -> tuple[Trainer, int]:
     """The trainer after its iterations, and how many of them were replayed."""
     config = override_config(config, {"schedule.use_cuda_graph": recorded})
@@ -14,7 +20,7 @@ def train_on_gpu(scene, config, *, recorded: bool = True, iterations: int | None
     replays = 0
     for _ in range(iterations or config.schedule.iterations):
         trainer.step()
-        replays += trainer.graphs.captured is not None
+        replays += captured(trainer) is not None
     assert trainer.skipped_steps == 0
     return trainer, replays
 

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from multiprocessing import active_children
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,12 +20,13 @@ from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.launch import device_of_rank
 from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
 from sehdr_warp.training.plan import gain_of_ranks
+from sehdr_warp.training.ranks import END, WAIT
 from sehdr_warp.training.strategies import make_strategy
 from sehdr_warp.training.train import train
 
 from ..refusals import call
 from . import team
-from .toy import VARIANTS, toy_field
+from .toy import VARIANTS, make_trainer, toy_field, toy_scene
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="ranks share photos through Linux's /proc")
 
@@ -186,3 +188,10 @@ def test_a_processor_takes_no_thousands_of_ranks():
     assert device_of_rank(1, "cpu").type == "cpu"
     with pytest.raises(SehdrError, match="100000 ranks on .* processors"):
         device_of_rank(99_999, "cpu")
+
+
+def test_ranks_that_end_during_a_pause_are_not_asked_again():
+    trainer, signals = make_trainer(toy_scene(), VARIANTS["default"]), []
+    trainer.ranks = SimpleNamespace(all_reduce_min=lambda signal: signals.append(signal) or END)
+    trainer.pause()
+    assert trainer.ending and not trainer._agree_to_continue() and signals == [WAIT]

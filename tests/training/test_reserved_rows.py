@@ -4,17 +4,18 @@ import pytest
 import torch
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training import step_graphs, trainer
+from sehdr_warp.training import step_graphs
 from sehdr_warp.training.strategies import base
 from sehdr_warp.training.training_state import state_of
 
+from .recorded import captured
 from .toy import VARIANTS, make_trainer
 
 
 def trained_steps(scene, config, device, reserves):
     """A trainer after 60 steps, and how often its Gaussians moved in how many changes of their number."""
     training = make_trainer(scene, config, device)
-    training.reserves_rows, gaussians, moves = reserves, training.field.gaussians, []
+    training.graphs.reserves_rows, gaussians, moves = reserves, training.field.gaussians, []
     for _ in range(60):
         count, before = gaussians.count, gaussians.reallocations
         training.step()
@@ -26,7 +27,7 @@ def trained_steps(scene, config, device, reserves):
 @pytest.mark.parametrize("variant", ["default", "adc"])
 def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monkeypatch):
     monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)  # So few Gaussians become many at once.
-    monkeypatch.setattr(trainer, "MAX_RESERVE", 8.0)
+    monkeypatch.setattr(step_graphs, "MAX_RESERVE", 8.0)
     config = override_config(VARIANTS[variant], {"deterministic": True, "schedule.use_cuda_graph": False})
     (plain, all_moved), (roomy, moved) = (trained_steps(scene, config, device, reserves) for reserves in (False, True))
     assert all(all_moved) and not any(moved) and len(moved) == len(all_moved) > 1
@@ -41,13 +42,13 @@ def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monk
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch):
     monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)
-    monkeypatch.setattr(trainer, "MAX_RESERVE", 8.0)
+    monkeypatch.setattr(step_graphs, "MAX_RESERVE", 8.0)
     monkeypatch.setattr(step_graphs, "MIN_HEADROOM", 0.0)
     config = VARIANTS["default"]
     training = make_trainer(scene, config, "cuda:0")
     for _ in range(48):
         training.step()
-    recorded, count = training.graphs.captured, training.field.gaussians.count
+    recorded, count = captured(training), training.field.gaussians.count
     assert recorded is not None
     torch.cuda.set_sync_debug_mode("error")
     try:
@@ -55,4 +56,4 @@ def test_recorded_steps_go_on_through_changes_and_do_not_wait(scene, monkeypatch
             training.step()
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert training.field.gaussians.count > count and training.graphs.captured is recorded
+    assert training.field.gaussians.count > count and captured(training) is recorded

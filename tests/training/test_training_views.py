@@ -22,6 +22,7 @@ from sehdr_warp.training.train import train
 from sehdr_warp.training.training_state import state_of
 from sehdr_warp.training.training_views import PhotoOrder, PhotoStream, check_projections
 
+from .recorded import captured
 from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, toy_scene
 
 
@@ -166,10 +167,7 @@ def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
         trainer = make_trainer(scene, chosen, "cuda:0")
         for _ in range(60):
             trainer.step()
-        assert (
-            isinstance(trainer.views.source, PhotoStream) == (photos == "memory")
-            and trainer.graphs.captured is not None
-        )
+        assert isinstance(trainer.views.source, PhotoStream) == (photos == "memory") and captured(trainer) is not None
         states.append(state_of(trainer).tensors)
     for name, value in states[0].items():
         assert torch.equal(value, states[1][name]), name
