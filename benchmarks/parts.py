@@ -28,7 +28,7 @@ KERNELS = {
     "harmonics": ("evaluate_*", "jacobian_backward_*"),
     "activations": ("activate_*", "sum_opacities*"),
     "lists": ("pack_splats_*", "key_by_*", "emit_*", "find_tile_ranges_*", "*radix_sort*", "*DeviceScan*"),
-    "blend": ("blend_forward_*", "pad_rows_*"),
+    "blend": ("blend_forward_*",),
     "response and fusion": (
         "encode_*",
         "interpolate_*",

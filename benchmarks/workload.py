@@ -46,12 +46,11 @@ def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) ->
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     image, transmittance = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
     last_contributor = blend_blocks(pad_features(features), lists, packed, image, transmittance, ALPHA_THRESHOLD)
-    beyond = 0, lists.columns * TILE_SIZE - width, 0, lists.rows * TILE_SIZE - height
+    columns, rows = lists.grid
+    beyond = 0, columns * TILE_SIZE - width, 0, rows * TILE_SIZE - height
     last_contributor = torch.nn.functional.pad(last_contributor.view(height, width), beyond)
     # Rows of tiles, of their subtile_masks, of pixels; then columns of each.
-    last_contributor = last_contributor.view(lists.rows, TILE_SIZE // 4, 4, lists.columns, TILE_SIZE // 8, 8).amax(
-        (2, 5)
-    )
+    last_contributor = last_contributor.view(rows, TILE_SIZE // 4, 4, columns, TILE_SIZE // 8, 8).amax((2, 5))
     last_contributor = last_contributor.permute(0, 2, 1, 3).reshape(len(lists.tile_ranges), BLOCKS_PER_TILE)
     lengths = (lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]).long()
     tiles = torch.repeat_interleave(torch.arange(len(lengths), device=last_contributor.device), lengths)

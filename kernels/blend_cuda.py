@@ -21,7 +21,7 @@ from functools import cache
 
 import warp as wp
 
-from .constants import ALPHA_MAX, NO_AUTODIFF, SUBTILE, TILE_SIZE, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, SUBTILE, TILE_SIZE, TRANSMITTANCE_MIN
 from .geometry import geometry, vector
 
 BLOCK_DIM = 32
@@ -32,30 +32,8 @@ QUEUE = 64 * ROUNDS  # Slots of the ring buffer: at least 32 ROUNDS + 31, and a 
 
 
 def padded_channels(channels: int) -> int:
-    """Return the columns of a feature row, a multiple of four, because rows are read four numbers at a time."""
+    """Return the next multiple of four: the columns of features that are read as quads, four numbers at once."""
     return (channels + 3) // 4 * 4
-
-
-@cache
-def pad_rows_kernel(dtype, channels: int):
-    """Return pad_rows() for one scalar type and features [N, channels], launched over the rows of four numbers."""
-    g = geometry(dtype)
-    real, vec4 = g.real, g.vec4
-    quads = padded_channels(channels) // 4
-
-    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def pad_rows(range_start: int, features: wp.array2d(dtype=real), rows: wp.array(dtype=vec4)):
-        """Copy features to rows [N quads] of four numbers, of which the last are filled with zeros."""
-        i = range_start + wp.tid()
-        gaussian = i // wp.static(quads)
-        begin = 4 * (i - gaussian * wp.static(quads))
-        four = vec4()
-        for k in range(4):
-            if begin + k < wp.static(channels):
-                four[k] = features[gaussian, begin + k]
-        g.write_row(rows, i, four)
-
-    return pad_rows
 
 
 def module_options(dtype) -> dict:

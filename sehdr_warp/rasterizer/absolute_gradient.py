@@ -54,7 +54,7 @@ class _Watch(torch.autograd.Function):
         # On the CPU each intersection has a row, and whole tiles go to a thread: sums keep one order.
         emit_indices = lists.gaussians if emit_order is None else emit_order.emit_indices
         rows = features.new_zeros(len(features) if emit_order is None else len(emit_indices), 2)
-        tiles = lists.columns * lists.rows
+        tiles = lists.grid.tiles
         launch(
             absolute_gradient_kernel(warp_scalar(features.dtype)),
             tiles * _PIXELS,
@@ -64,7 +64,7 @@ class _Watch(torch.autograd.Function):
             means_opacities,
             conics_cutoffs,
             features,
-            lists.columns,
+            lists.grid.columns,
             lists.width,
             lists.height,
             ctx.alpha_threshold,

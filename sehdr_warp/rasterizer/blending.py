@@ -1,4 +1,10 @@
-"""The last stage of a render: blend the tile lists front to back, any number of channels in one pass."""
+"""The last stage of a render: blend the tile lists front to back, any number of channels in one pass.
+
+blend() calls the backend of its device, blend_on_cpu() or blend_on_cuda(), which fills the image and returns its
+backward pass: a TileBackward or BlockBackward. Called with the gradients with respect to image and transmittance (None
+for 0), it returns the gradients by Gaussian, [N, C + 6 or more]: features, conic a b c, x, y, opacity, and columns that
+pad a row. with_gradient() makes this a node of the autograd graph.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,12 +23,9 @@ from .torch_contract import direct_apply, keeps_graph, once_differentiable
 from .warp_launch.launching import launch, warp_scalar
 
 ROWS_OF_TILE = blend_cpu.HALVES * TILE_SIZE  # Of LANES pixels each
-PIECES_PER_THREAD = 16  # Of the image, on the CPU: their work differs by more than their intersections.
+RANGES_PER_THREAD = 16  # Ranges of tiles on the CPU: their work differs by more than their intersections.
 Backward = Callable[[Tensor, Tensor | None], Sequence[Tensor]]
-"""Maps the gradients by image and transmittance (None for 0) to those by what they were blended from."""
-RowBackward = Callable[[Tensor, Tensor | None], Tensor]
-"""The same for gradients by Gaussian, [N, C + 6 or more]: features, conic a b c, x, y, opacity, and columns that pad a
-row."""
+"""Maps the gradients with respect to image and transmittance (None for 0) to those of the blended tensors."""
 
 
 class BlendResult(NamedTuple):
@@ -65,17 +68,18 @@ def blend(
         deterministic: on a GPU, sum gradients in a fixed order, as the CPU always does. Slower, and the gradients of
             every intersection take memory.
     """
-    rows = features.detach()
-    image = rows.new_empty(lists.height, lists.width, rows.shape[1])
-    transmittance = rows.new_empty(image.shape[:2])
-    backend = blend_on_cuda if rows.device.type == "cuda" else blend_on_cpu
+    channels = features.shape[1]
+    image = features.new_empty(lists.height, lists.width, channels)
+    transmittance = features.new_empty(image.shape[:2])
+    backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
     # Detached: the autograd node owns the backward function, which must not refer to the node's own results.
-    row_backward = backend(rows, lists, packed, image.detach(), transmittance.detach(), alpha_threshold, deterministic)
+    outputs = image.detach(), transmittance.detach()
+    gradients_by_gaussian = backend(features.detach(), lists, packed, *outputs, alpha_threshold, deterministic)
 
     def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        gathered, channels = row_backward(grad_image, grad_transmittance), grad_image.shape[2]
-        sizes = channels, 3, 2, gathered.shape[1] - channels - 5
-        grad_features, grad_conics, grad_means2d, opacity_and_padding = gathered.split_with_sizes(sizes, 1)
+        gradients = gradients_by_gaussian(grad_image, grad_transmittance)
+        sizes = channels, 3, 2, gradients.shape[1] - channels - 5
+        grad_features, grad_conics, grad_means2d, opacity_and_padding = gradients.split_with_sizes(sizes, 1)
         return grad_means2d, grad_features, grad_conics, opacity_and_padding.select(1, 0)
 
     return with_gradient(BlendResult(image, transmittance, backward), means2d, features, conics, opacities)
@@ -135,13 +139,13 @@ def blend_on_cpu(
     alpha_threshold: float,
     deterministic: bool,
 ) -> "TileBackward":
-    """Fill image [H, W, C] and transmittance [H, W]: balanced pieces of tiles, a thread each."""
+    """Fill image [H, W, C] and transmittance [H, W] by tiles; sums have a fixed order, deterministic or not."""
     assert lists.emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
-    tiles, channels = _Tiles(features, lists, packed, alpha_threshold, balanced_pieces(lists)), image.shape[2]
-    tile_transmittance, last_contributor = tiles.rows(ROWS_OF_TILE), tiles.rows(ROWS_OF_TILE)
-    inputs = lists.tile_ranges, lists.gaussians, packed.means_opacities, packed.conics_cutoffs, *tiles.frame()
+    tiles, channels = _Tiles(features, lists, packed, alpha_threshold, balanced_ranges(lists)), image.shape[2]
+    tile_transmittance, last_contributor = tiles.scratch(ROWS_OF_TILE), tiles.scratch(ROWS_OF_TILE)
+    inputs = lists.tile_ranges, lists.gaussians, *tiles.shared_arguments()
     outputs = last_contributor, image.view(-1, channels), transmittance
-    arguments = *inputs, tile_transmittance, tiles.rows(channels, ROWS_OF_TILE), *outputs
+    arguments = *inputs, tile_transmittance, tiles.scratch(channels, ROWS_OF_TILE), *outputs
     tiles.launch(blend_cpu.forward_kernel, *arguments)
     return TileBackward(tiles, transmittance, tile_transmittance, last_contributor)
 
@@ -155,35 +159,36 @@ class _Tiles:
         lists: to blend.
         packed: Gaussians to blend.
         alpha_threshold: contributions with a smaller alpha are left out.
-        pieces: ranges of tiles, see balanced_pieces().
+        ranges: of tiles, see balanced_ranges().
     """
 
     features: Tensor
     lists: TileLists
     packed: PackedSplats
     alpha_threshold: float
-    pieces: Tensor
+    ranges: Tensor
 
     def launch(self, kernel_of: Callable[..., Any], *arguments: Any) -> None:
         """Launch a kernel over the tiles; kernel_of makes it for a scalar type and a number of channels."""
         squarings = exp_squarings(self.alpha_threshold)
         kernel = kernel_of(warp_scalar(self.features.dtype), self.features.shape[1], squarings)
-        launch(kernel, self.lists.columns * self.lists.rows, *arguments, ranges=self.pieces)
+        launch(kernel, self.lists.grid.tiles, *arguments, ranges=self.ranges)
 
-    def rows(self, *shape: int) -> Tensor:
-        """Allocate rows of LANES numbers for each tile, [tiles, *shape, LANES]."""
-        return self.features.new_empty(self.lists.columns * self.lists.rows, *shape, blend_cpu.LANES)
+    def scratch(self, *shape: int) -> Tensor:
+        """Allocate vectors of LANES numbers for each tile, [tiles, *shape, LANES]."""
+        return self.features.new_empty(self.lists.grid.tiles, *shape, blend_cpu.LANES)
 
-    def frame(self) -> tuple[Any, ...]:
-        """Return the arguments that both kernels take behind the packed Gaussians."""
+    def shared_arguments(self) -> tuple[Any, ...]:
+        """Return the arguments that both kernels take after the intersections."""
+        lists, packed = self.lists, self.packed
         lane_offsets = torch.arange(blend_cpu.LANES, dtype=self.features.dtype, device=self.features.device)
-        lists = self.lists
-        return self.features, lists.columns, lists.width, lists.height, self.alpha_threshold, lane_offsets
+        sizes = lists.grid.columns, lists.width, lists.height
+        return packed.means_opacities, packed.conics_cutoffs, self.features, *sizes, self.alpha_threshold, lane_offsets
 
 
 @dataclass(frozen=True)
 class TileBackward:
-    """The backward pass of blend_on_cpu(); see RowBackward.
+    """The backward pass of blend_on_cpu().
 
     Attributes:
         tiles: that were blended.
@@ -199,18 +204,17 @@ class TileBackward:
 
     def __call__(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
         """Return the gradients by Gaussian."""
-        tiles, lists, packed = self.tiles, self.tiles.lists, self.tiles.packed
-        emit_order, channels = lists.emit_order, grad_image.shape[2]
+        tiles, lists, channels = self.tiles, self.tiles.lists, grad_image.shape[2]
+        emit_order = lists.emit_order
         assert emit_order is not None
         if grad_transmittance is None:
             grad_transmittance = torch.zeros_like(self.transmittance)
-        tile_state = self.tile_transmittance.clone() if keeps_graph() else self.tile_transmittance
+        tile_transmittance = self.tile_transmittance.clone() if keeps_graph() else self.tile_transmittance
         grad_intersections = tiles.features.new_empty(lists.intersection_count, channels + 6)
-        inputs = lists.tile_ranges, lists.gaussians, emit_order.emit_indices
-        inputs += packed.means_opacities, packed.conics_cutoffs, *tiles.frame(), self.last_contributor
-        gradients = grad_image.view(-1, channels), grad_transmittance, tile_state
-        scratch = tiles.rows(ROWS_OF_TILE), tiles.rows(channels, ROWS_OF_TILE)
-        scratch += tiles.rows(TILE_SIZE), tiles.rows(TILE_SIZE), tiles.rows(channels + 6)
+        inputs = lists.tile_ranges, lists.gaussians, emit_order.emit_indices, *tiles.shared_arguments()
+        gradients = self.last_contributor, grad_image.view(-1, channels), grad_transmittance, tile_transmittance
+        scratch = tiles.scratch(ROWS_OF_TILE), tiles.scratch(channels, ROWS_OF_TILE)
+        scratch += tiles.scratch(TILE_SIZE), tiles.scratch(TILE_SIZE), tiles.scratch(channels + 6)
         arguments = *inputs, *gradients, *scratch, grad_intersections
         tiles.launch(blend_cpu.backward_kernel, *arguments)
         return emit_order.sum_by_gaussian(grad_intersections)
@@ -221,14 +225,13 @@ def exp_squarings(alpha_threshold: float) -> int:
     return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
 
 
-def balanced_pieces(lists: TileLists) -> Tensor:
+def balanced_ranges(lists: TileLists) -> Tensor:
     """Return [K + 1] int32: where ranges of tiles with about the same work begin, and where the last one ends."""
-    tile_count = lists.tile_ranges.shape[0]
-    work = (
-        (lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]).add(16).cumsum(0).double()
-    )  # 16: a tile costs something in itself
-    pieces = min(thread_count() * PIECES_PER_THREAD, tile_count)
-    goals = torch.arange(pieces + 1, dtype=torch.float64, device=work.device) * (float(work[-1]) / pieces)
+    tile_count = lists.grid.tiles
+    lengths = lists.tile_ranges[:, 1] - lists.tile_ranges[:, 0]
+    work = lengths.add(16).cumsum(0).double()  # 16: a tile costs something in itself.
+    ranges = min(thread_count() * RANGES_PER_THREAD, tile_count)
+    goals = torch.arange(ranges + 1, dtype=torch.float64, device=work.device) * (float(work[-1]) / ranges)
     bounds = torch.searchsorted(work, goals, out_int32=True)
     bounds[0], bounds[-1] = 0, tile_count
     return bounds

@@ -21,27 +21,25 @@ def blend_on_cuda(
     alpha_threshold: float,
     deterministic: bool,
     *,
-    keeps_rows: bool = False,
+    keeps_padded: bool = False,
 ) -> "BlockBackward":
     """Fill image [H, W, C] and transmittance [H, W] by block kernels (in tests also in Warp's CPU block emulation).
 
-    keeps_rows: let the backward pass read the padded features of this call, as on_fixed_memory() needs.
+    keeps_padded: let the backward pass read the padded features of this call, as on_fixed_memory() needs.
     """
-    rows = pad_features(features) if packed.padded is None else packed.padded
-    last_contributor = blend_blocks(rows, lists, packed, image, transmittance, alpha_threshold)
-    # Padded features take more memory; few Gaussians keep them, so that they need not be padded again.
-    saved, packed = (
-        rows if keeps_rows or len(features) <= MAX_SINGLE_SORT else features,
-        packed._replace(padded=None),
-    )
+    padded = pad_features(features) if packed.padded is None else packed.padded
+    last_contributor = blend_blocks(padded, lists, packed, image, transmittance, alpha_threshold)
+    # Padded features take more memory. The backward pass pads those of many Gaussians again.
+    kept = padded if keeps_padded or len(features) <= MAX_SINGLE_SORT else features
+    packed = packed._replace(padded=None)
     return BlockBackward(
-        saved, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
+        kept, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
     )
 
 
 @dataclass(frozen=True)
 class BlockBackward:
-    """The backward pass of blend_on_cuda(); see RowBackward.
+    """The backward pass of blend_on_cuda(); see blending.py.
 
     Attributes:
         features: [N, C] or, padded, [N, more].
@@ -69,10 +67,10 @@ class BlockBackward:
             grad_transmittance = self.transmittance.view(-1)[:0]
         lists = self.lists
         if not self.deterministic:
-            gathered = self._zeros()
-            arguments = *self._arguments(grad_image, grad_transmittance), 0, lists.gaussians, gathered
+            gradients = self._zeros()
+            arguments = *self._arguments(grad_image, grad_transmittance), 0, lists.gaussians, gradients
             launch_blocks(self._kernel(), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
-            return gathered
+            return gradients
         columns = self.channels + 6
         if lists.intersection_count * columns >= 1 << 31:
             raise SehdrError(
@@ -90,22 +88,22 @@ class BlockBackward:
         """Return the backward pass for less host time; for use while all tensors stay where they are.
 
         features are padded, or the backward pass would read what they were at this call. Each launch gives the
-        addresses of the gradients by image and transmittance (0 for none) and of the rows, zeros that it adds to.
+        addresses of the gradients of image and transmittance (0 for none) and of those by Gaussian, zeros to add to.
         """
         assert not self.deterministic, "sums in a fixed order are several launches"
         grad_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
-        grad_transmittance, gathered = torch.empty_like(self.transmittance), self._zeros()
+        grad_transmittance, gradients = torch.empty_like(self.transmittance), self._zeros()
         fixed = fixed_launch(
             self._kernel(),
             block_threads(self.lists, blend_cuda.BLOCKS_PER_TILE),
             *self._arguments(grad_image, grad_transmittance),
             0,
             self.lists.gaussians,
-            gathered,
-            whole=(grad_image, grad_transmittance, gathered),
+            gradients,
+            whole=(grad_image, grad_transmittance, gradients),
             block_dim=blend_cuda.BLOCK_DIM,
         )
-        return FixedBackward(fixed, gathered)
+        return FixedBackward(fixed, gradients)
 
     @property
     def columns(self) -> int:
@@ -132,7 +130,7 @@ class BlockBackward:
         return (
             *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
             pad_features(self.features).reshape(-1, 4),
-            *(lists.columns, width, height, self.alpha_threshold, self.transmittance, self.last_contributor),
+            *(lists.grid.columns, width, height, self.alpha_threshold, self.transmittance, self.last_contributor),
             *(grad_image, grad_transmittance, blend_cuda_backward.ROWS, self.channels + 6),
         )
 
@@ -150,42 +148,36 @@ class FixedBackward(NamedTuple):
 
 
 def blend_blocks(
-    rows: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
+    padded: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
 ) -> Tensor:
     """Fill image [H, W, C] and transmittance [H, W] from pad_features(); return the last Gaussian of each pixel.
 
-    That is [H W] int32, 1 + its place in the tile's list, or 0.
+    That is [H W] int32, 1 + its index in the tile's list, or 0.
     """
-    last_contributor = torch.empty(image.shape[:2].numel(), dtype=torch.int32, device=rows.device)
-    arguments = _blend_arguments(rows, lists, packed, image, transmittance, alpha_threshold, last_contributor)
-    launch_blocks(_blend_kernel(rows, image), lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
-    return last_contributor
+    kernel, arguments = _forward(padded, lists, packed, image, transmittance, alpha_threshold)
+    launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
+    return arguments[-1]
 
 
 def fixed_blend_blocks(
-    rows: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
+    padded: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
 ) -> FixedLaunch:
     """Return the launch of blend_blocks(), whose tensors stay where they are but for image and transmittance."""
-    last_contributor = torch.empty(image.shape[:2].numel(), dtype=torch.int32, device=rows.device)
-    return fixed_launch(
-        _blend_kernel(rows, image),
-        block_threads(lists, blend_cuda.BLOCKS_PER_TILE),
-        *_blend_arguments(rows, lists, packed, image, transmittance, alpha_threshold, last_contributor),
-        whole=(image, transmittance),
-        block_dim=blend_cuda.BLOCK_DIM,
-    )
+    kernel, arguments = _forward(padded, lists, packed, image, transmittance, alpha_threshold)
+    threads = block_threads(lists, blend_cuda.BLOCKS_PER_TILE)
+    return fixed_launch(kernel, threads, *arguments, whole=(image, transmittance), block_dim=blend_cuda.BLOCK_DIM)
 
 
-def _blend_kernel(rows: Tensor, image: Tensor) -> Any:
-    return blend_cuda.forward_kernel(warp_scalar(rows.dtype), image.shape[2], rows.device.type == "cuda")
-
-
-def _blend_arguments(rows, lists, packed, image, transmittance, alpha_threshold, last_contributor) -> tuple[Any, ...]:
+def _forward(padded, lists, packed, image, transmittance, alpha_threshold) -> tuple[Any, tuple[Any, ...]]:
+    """Return the forward kernel and its arguments, of which the last is the last Gaussian of each pixel."""
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
-    height, width, _ = image.shape
-    return (
+    height, width, channels = image.shape
+    kernel = blend_cuda.forward_kernel(warp_scalar(padded.dtype), channels, padded.device.type == "cuda")
+    last_contributor = torch.empty(height * width, dtype=torch.int32, device=padded.device)
+    return kernel, (
         *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
-        *(rows.reshape(-1, 4), lists.columns, width, height, alpha_threshold, image, transmittance, last_contributor),
+        *(padded.reshape(-1, 4), lists.grid.columns, width, height, alpha_threshold),
+        *(image, transmittance, last_contributor),
     )
 
 
@@ -196,15 +188,12 @@ def launch_blocks(kernel: Any, lists: TileLists, blocks_per_tile: int, *argument
 
 def block_threads(lists: TileLists, blocks_per_tile: int) -> int:
     """Return the number of threads of a block kernel over the tiles."""
-    return lists.columns * lists.rows * blocks_per_tile * blend_cuda.BLOCK_DIM
+    return lists.grid.tiles * blocks_per_tile * blend_cuda.BLOCK_DIM
 
 
 def pad_features(features: Tensor) -> Tensor:
-    """Return features [N, C] with columns for whole rows of four, which block kernels read at once."""
-    count, channels = features.shape
+    """Return features [N, C] with columns of zeros to a multiple of four: block kernels read four numbers at once."""
+    channels = features.shape[1]
     if channels != (columns := blend_cuda.padded_channels(channels)):
-        rows = features.new_empty(count, columns)
-        quads = rows.view(-1, 4)
-        launch(blend_cuda.pad_rows_kernel(warp_scalar(rows.dtype), channels), len(quads), features, quads)
-        return rows
+        return torch.nn.functional.pad(features, (0, columns - channels))
     return features.clone() if features.data_ptr() % 16 else features

@@ -113,7 +113,7 @@ class CapturedRender:
 
         def blend(splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> BlockBackward:
             features = splats.features
-            return blend_on_cuda(features, lists, packed, image, transmittance, threshold, False, keeps_rows=True)
+            return blend_on_cuda(features, lists, packed, image, transmittance, threshold, False, keeps_padded=True)
 
         def middle(splats: RasterInputs, packed: PackedSplats) -> TileLists:
             return list_tiles(splats, packed, count(splats, packed))

@@ -146,23 +146,22 @@ class _Lists:
 def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_order: bool) -> _Lists:
     """List for each tile the Gaussians whose cap meets the tile's own, by distance."""
     count, (height, width) = len(caps), directions.shape[:2]
-    columns, rows = tile_grid(width, height)
+    grid = tile_grid(width, height)
     tile_caps, block_caps = (caps_of(directions, side * TILE_SIZE) for side in (1, BLOCK_TILES))
     kernel = sphere_kernels(warp_scalar(caps.dtype), 1).list_tiles
     order = depth_order(distances, caps[:, 3:].expand(-1, 2).contiguous())
-    frame = order, caps, tile_caps, block_caps, columns, rows
+    shared = order, caps, tile_caps, block_caps, *grid
     counts, none = torch.empty_like(order), order[:0]
-    launch(kernel, count, *frame, order, counts, none, none, min_range=256)
+    launch(kernel, count, *shared, order, counts, none, none, min_range=256)
     cumulative_counts = counts.cumsum(0)
-    length = check_intersection_count(int(cumulative_counts[-1]) if count else 0, count, columns, rows)
+    length = int(cumulative_counts[-1]) if count else 0
+    check_intersection_count(length, count, grid)
     starts = (cumulative_counts - counts).int()
     tiles, gaussians = (torch.empty(2 * length, dtype=torch.int32, device=order.device) for _ in range(2))
-    launch(kernel, count * bool(length), *frame, starts, counts, tiles, gaussians, min_range=256)
-    tile_ranges, gaussians, _, emit_indices = lists_by_tile(
-        tiles, gaussians, length, None, columns, rows, keep_emit_order
-    )
+    launch(kernel, count * bool(length), *shared, starts, counts, tiles, gaussians, min_range=256)
+    tile_ranges, gaussians, _, emit_indices = lists_by_tile(tiles, gaussians, length, None, grid, keep_emit_order)
     emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
-    return _Lists(directions, columns, tile_ranges, gaussians, emit_order)
+    return _Lists(directions, grid.columns, tile_ranges, gaussians, emit_order)
 
 
 class _Blend(torch.autograd.Function):

@@ -1,4 +1,8 @@
-"""The middle stages of a render: pack 2D Gaussians, order them by depth, and list for each tile those that touch it."""
+"""The middle stages of a render: pack 2D Gaussians, order them by depth, and list for each tile those that touch it.
+
+An *intersection* is a pair of a Gaussian and a tile that it touches. They are emitted Gaussian by Gaussian, then sorted
+by tile.
+"""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,7 +15,6 @@ from ..errors import SehdrError
 from ..kernels import tiles as kernels
 from ..kernels.blend_cuda import padded_channels
 from ..kernels.constants import TILE_SIZE
-from ..kernels.tiles import tile_kernels
 from ..parallel import thread_count
 from .projection import RasterInputs
 from .render_options import MAX_INTERSECTIONS
@@ -47,6 +50,11 @@ class TileGrid(NamedTuple):
     columns: int
     rows: int
 
+    @property
+    def tiles(self) -> int:
+        """All tiles. Unused intersections have this number for their tile."""
+        return self.columns * self.rows
+
 
 def tile_grid(width: int, height: int) -> TileGrid:
     """Return how many tiles cover an image of `width` x `height` pixels."""
@@ -57,7 +65,8 @@ class IntersectionOffsets(NamedTuple):
     """The order in which Gaussians emit intersections, and where each one's end.
 
     Attributes:
-        order: [N] int32 Gaussians by depth; None if they emit in the order of their indices.
+        order: [N] int32 Gaussians by depth; None for the order of their indices, after which the sort by tile also
+            sorts by depth.
         cumulative_counts: [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order.
     """
 
@@ -79,18 +88,18 @@ class EmitOrder:
     cumulative_counts: Tensor
     emit_indices: Tensor
 
-    def sum_by_gaussian(self, rows: Tensor) -> Tensor:
-        """Return [N, columns]: for each Gaussian the sum of its rows [M, columns], in the order of tiles.
+    def sum_by_gaussian(self, grad_intersections: Tensor) -> Tensor:
+        """Return [N, columns]: the sum over the intersections of each Gaussian, in the order of tiles.
 
-        rows: in the order of intersections before the sort by tile.
+        grad_intersections: [M, columns], in the order before the sort by tile.
         """
-        length, columns = rows.shape
-        count = self.order.shape[0]
-        sums = rows.new_zeros(count, columns)
+        length, columns = grad_intersections.shape
+        count = len(self.order)
+        sums = grad_intersections.new_zeros(count, columns)
         if length:
-            cumulative_counts = self.cumulative_counts.clamp(0, length)  # Beyond max_intersections there are no rows.
-            kernel = tile_kernels(warp_scalar(rows.dtype)).gather_intersections
-            launch(kernel, count, self.order, cumulative_counts, rows, columns, sums)
+            cumulative_counts = self.cumulative_counts.clamp(0, length)  # Nothing is beyond max_intersections.
+            kernel = kernels.tile_kernels(warp_scalar(sums.dtype)).gather_intersections
+            launch(kernel, count, self.order, cumulative_counts, grad_intersections, columns, sums)
         return sums
 
 
@@ -120,14 +129,9 @@ class TileLists:
     total: Tensor
 
     @property
-    def columns(self) -> int:
-        """Tiles across."""
-        return tile_grid(self.width, self.height).columns
-
-    @property
-    def rows(self) -> int:
-        """Tiles down."""
-        return tile_grid(self.width, self.height).rows
+    def grid(self) -> TileGrid:
+        """Tiles of the image."""
+        return tile_grid(self.width, self.height)
 
     @property
     def intersection_count(self) -> int:
@@ -154,7 +158,7 @@ def pack_splats(
         torch.empty(count, dtype=torch.int64, device=features.device),
         features.new_empty(count, padded_channels(channels)) if pads else None,
     )
-    kernel = tile_kernels(warp_scalar(features.dtype)).pack_splats
+    kernel = kernels.tile_kernels(warp_scalar(features.dtype)).pack_splats
     launch(kernel, count, *_pack_arguments(inputs, packed, alpha_threshold, width, height))
     return packed
 
@@ -163,7 +167,7 @@ def fixed_pack_splats(
     inputs: RasterInputs, packed: PackedSplats, alpha_threshold: float, width: int, height: int
 ) -> FixedLaunch:
     """Return the launch that fills `packed` anew, whose tensors stay where they are but for the features."""
-    kernel = tile_kernels(warp_scalar(inputs.features.dtype)).pack_splats
+    kernel = kernels.tile_kernels(warp_scalar(inputs.features.dtype)).pack_splats
     arguments = _pack_arguments(inputs, packed, alpha_threshold, width, height)
     return fixed_launch(kernel, len(inputs.features), *arguments, whole=(inputs.features,))
 
@@ -173,9 +177,8 @@ def _pack_arguments(
 ) -> tuple[Any, ...]:
     (means2d, conics, _, opacities, extents), features = inputs
     means_opacities, conics_cutoffs, counts, padded = packed
-    columns, rows = tile_grid(width, height)
     return (
-        *(means2d, conics, opacities, features, features.shape[1], alpha_threshold, columns, rows),
+        *(means2d, conics, opacities, features, features.shape[1], alpha_threshold, *tile_grid(width, height)),
         *(extents, means_opacities, conics_cutoffs, counts, None if padded is None else padded.view(-1, 4)),
     )
 
@@ -229,24 +232,22 @@ def build_tile_lists(
     Raises:
         SehdrError: if there are more than MAX_INTERSECTIONS.
     """
-    columns, rows = tile_grid(width, height)
+    grid, count = tile_grid(width, height), len(depths)
     order, cumulative_counts = offsets
-    count = len(depths)
     total = cumulative_counts[-1] if count else cumulative_counts.new_zeros(())
     overflow = None
-    if max_intersections is not None:  # Written by the kernel that emits, if it is launched: a comparison is a launch.
+    if max_intersections is not None:  # Written by the kernel that emits, if it is launched, which saves a launch.
         overflow = (torch.empty if count else torch.zeros)((), dtype=torch.bool, device=cumulative_counts.device)
-    length = check_intersection_count(
-        int(total) if max_intersections is None else max_intersections, count, columns, rows
-    )
-    keys, gaussians = emit_intersections(packed, offsets, depths, extents, columns, rows, length, overflow)
+    length = int(total) if max_intersections is None else max_intersections
+    check_intersection_count(length, count, grid)
+    keys, gaussians = emit_intersections(packed, offsets, depths, extents, grid, length, overflow)
     if order is None:
-        sort_pairs(keys, gaussians, length, kernels.DEPTH_BITS + (columns * rows).bit_length())
+        sort_pairs(keys, gaussians, length, kernels.DEPTH_BITS + grid.tiles.bit_length())
         gaussians = gaussians[:length]
-        tile_ranges, subtile_masks = find_tile_ranges(keys[:length], gaussians, packed, columns, rows)
+        tile_ranges, subtile_masks = find_tile_ranges(keys[:length], gaussians, packed, grid)
         return TileLists(tile_ranges, gaussians, subtile_masks, None, width, height, overflow, total)
     tile_ranges, gaussians, subtile_masks, emit_indices = lists_by_tile(
-        keys, gaussians, length, packed, columns, rows, keep_emit_order
+        keys, gaussians, length, packed, grid, keep_emit_order
     )
     emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
     return TileLists(tile_ranges, gaussians, subtile_masks, emit_order, width, height, overflow, total.clone())
@@ -260,19 +261,18 @@ def depth_order(depths: Tensor, extents: Tensor) -> Tensor:
     count = depths.shape[0]
     keys = depths.new_empty(2 * count)
     indices = torch.empty(2 * count, dtype=torch.int32, device=depths.device)
-    launch(tile_kernels(warp_scalar(depths.dtype)).key_by_depth, count, depths, extents, keys, indices)
+    launch(kernels.tile_kernels(warp_scalar(depths.dtype)).key_by_depth, count, depths, extents, keys, indices)
     sort_pairs(keys, indices, count)
     return indices[:count]
 
 
-def check_intersection_count(length: int, count: int, columns: int, rows: int) -> int:
-    """Return the number of intersections; raise SehdrError if there are too many to be counted in int32."""
+def check_intersection_count(length: int, count: int, grid: TileGrid) -> None:
+    """Raise SehdrError if there are too many intersections to be counted in int32."""
     if length > MAX_INTERSECTIONS:
         raise SehdrError(
-            f"{count} Gaussians touch {length} tiles of a {columns} x {rows} tile image, more than 2^31 - 1; "
+            f"{count} Gaussians touch {length} tiles of a {grid.columns} x {grid.rows} tile image, more than 2^31 - 1; "
             "render fewer Gaussians or a smaller image"
         )
-    return length
 
 
 def emit_intersections(
@@ -280,8 +280,7 @@ def emit_intersections(
     offsets: IntersectionOffsets,
     depths: Tensor,
     extents: Tensor,
-    columns: int,
-    rows: int,
+    grid: TileGrid,
     length: int,
     overflow: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -291,33 +290,29 @@ def emit_intersections(
     int64, the tile above the bits of the depth, and intersections follow the Gaussians' indices.
 
     Both are [2 * length], of which the first half is filled; the sort needs the rest. Unused intersections belong to
-    tile columns * rows. Writes to overflow, a scalar bool, whether there are more than `length`.
+    tile grid.tiles. Writes to overflow, a scalar bool, whether there are more than `length`.
     """
     order, cumulative_counts = offsets
     count, device = len(depths), depths.device
     keys = torch.empty(2 * length, dtype=torch.int64 if order is None else torch.int32, device=device)
     gaussians = torch.empty(2 * length, dtype=torch.int32, device=device)
     if not count:
-        keys[:length], gaussians[:length] = columns * rows << (kernels.DEPTH_BITS if order is None else 0), 0
+        keys[:length], gaussians[:length] = grid.tiles << (kernels.DEPTH_BITS if order is None else 0), 0
     elif length:
-        emit = tile_kernels(warp_scalar(packed.means_opacities.dtype))
-        launch(
-            emit.emit_keys if order is None else emit.emit_intersections,
-            count,
-            order,
-            packed.means_opacities,
-            packed.conics_cutoffs,
-            extents,
-            depths if order is None else None,
-            columns,
-            rows,
-            cumulative_counts,
-            length,
-            keys,
-            gaussians,
-            overflow,
-        )
+        emit = kernels.tile_kernels(warp_scalar(packed.means_opacities.dtype))
+        kernel, depths_in_keys = (emit.emit_keys, depths) if order is None else (emit.emit_intersections, None)
+        inputs = order, packed.means_opacities, packed.conics_cutoffs, extents, depths_in_keys, *grid
+        launch(kernel, count, *inputs, cumulative_counts, length, keys, gaussians, overflow)
     return keys, gaussians
+
+
+class SortedIntersections(NamedTuple):
+    """Intersections by tile: tile_ranges, gaussians and subtile_masks of TileLists, and emit_indices of EmitOrder."""
+
+    tile_ranges: Tensor
+    gaussians: Tensor
+    subtile_masks: Tensor | None
+    emit_indices: Tensor | None
 
 
 def lists_by_tile(
@@ -325,72 +320,66 @@ def lists_by_tile(
     gaussians: Tensor,
     length: int,
     packed: PackedSplats | None,
-    columns: int,
-    rows: int,
+    grid: TileGrid,
     keep_emit_order: bool,
-) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+) -> SortedIntersections:
     """Sort intersections, emitted front to back, by tile, stably.
 
-    Returns:
-        tile_ranges, gaussians and subtile_masks of TileLists, and EmitOrder.emit_indices if keep_emit_order.
-        subtile_masks are None on the CPU and without packed Gaussians.
+    subtile_masks are None on the CPU and without packed Gaussians, emit_indices unless keep_emit_order.
     """
-    if tiles.device.type == "cpu":
-        return _count_by_tile(tiles, gaussians, length, columns * rows, keep_emit_order)
-    return _sort_by_tile(tiles, gaussians, length, packed, columns, rows, keep_emit_order)
+    sort = _count_by_tile if tiles.device.type == "cpu" else _sort_by_tile
+    return sort(tiles, gaussians, length, packed, grid, keep_emit_order)
 
 
-def _sort_by_tile(tiles, gaussians, length: int, packed, columns: int, rows: int, keep_emit_order: bool):
-    bits, emit_indices = (columns * rows).bit_length(), None
+def _sort_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order) -> SortedIntersections:
+    emit_indices = None
     if keep_emit_order:
         emit_indices = torch.empty(2 * length, dtype=torch.int32, device=tiles.device)
         torch.arange(length, dtype=torch.int32, device=tiles.device, out=emit_indices[:length])
-    sort_pairs(tiles, gaussians if emit_indices is None else emit_indices, length, bits)
+    sort_pairs(tiles, gaussians if emit_indices is None else emit_indices, length, grid.tiles.bit_length())
     if emit_indices is None:
         gaussians = gaussians[:length].clone()
     else:
         emit_indices = emit_indices[:length].clone()
         gaussians = gaussians[:length][emit_indices] if length else gaussians
-    tile_ranges, subtile_masks = find_tile_ranges(tiles[:length], gaussians, packed, columns, rows)
-    return tile_ranges, gaussians, subtile_masks, emit_indices
+    tile_ranges, subtile_masks = find_tile_ranges(tiles[:length], gaussians, packed, grid)
+    return SortedIntersections(tile_ranges, gaussians, subtile_masks, emit_indices)
 
 
-def _count_by_tile(tiles, gaussians, length: int, tile_count: int, keep_emit_order: bool):
+def _count_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order) -> SortedIntersections:
     """Sort by counting: each thread takes a few chunks, and within a tile those of the first chunk come first."""
     tiles, gaussians = tiles[:length], gaussians[:length]
     chunks = max(1, min(2 * thread_count(), length // MIN_CHUNK))
-    counts = torch.zeros(chunks, tile_count + 1, dtype=torch.int32, device=tiles.device)
+    counts = torch.zeros(chunks, grid.tiles + 1, dtype=torch.int32, device=tiles.device)
     size = -(-length // chunks)
     spans = torch.arange(chunks + 1, dtype=torch.int32, device=tiles.device)
     launch(kernels.count_tiles, chunks, tiles, size, counts, ranges=spans)
     by_tile = counts.t().reshape(-1)
-    starts = (by_tile.cumsum(0) - by_tile).int().view(tile_count + 1, chunks).t().contiguous()
+    starts = (by_tile.cumsum(0) - by_tile).int().view(grid.tiles + 1, chunks).t().contiguous()
     tile_ranges = torch.stack([starts[0, :-1], starts[0, 1:]], 1)
     ordered = torch.empty_like(gaussians)
     emit_indices = torch.empty(length if keep_emit_order else 0, dtype=torch.int32, device=tiles.device)
     launch(kernels.place_intersections, chunks, tiles, gaussians, size, starts, ordered, emit_indices, ranges=spans)
-    return tile_ranges, ordered, None, emit_indices if keep_emit_order else None
+    return SortedIntersections(tile_ranges, ordered, None, emit_indices if keep_emit_order else None)
 
 
 def find_tile_ranges(
-    keys: Tensor, gaussians: Tensor, packed: PackedSplats | None, columns: int, rows: int
+    keys: Tensor, gaussians: Tensor, packed: PackedSplats | None, grid: TileGrid
 ) -> tuple[Tensor, Tensor | None]:
     """Return the tile_ranges [tiles, 2] and subtile_masks [M] of sorted intersections, as TileLists has them.
 
     Both numbers of an empty range are equal. subtile_masks are None without packed Gaussians. keys: of
     emit_intersections(), sorted.
     """
-    tile_ranges = torch.empty(columns * rows, 2, dtype=torch.int32, device=keys.device)
+    tile_ranges = (torch.empty if len(keys) else torch.zeros)(grid.tiles, 2, dtype=torch.int32, device=keys.device)
     subtile_masks = torch.empty(0 if packed is None else len(keys), dtype=torch.uint8, device=keys.device)
     if len(keys):
-        kind = (wp.int64, kernels.DEPTH_BITS) if keys.dtype == torch.int64 else (wp.int32, 0)
+        key_type = (wp.int64, kernels.DEPTH_BITS) if keys.dtype == torch.int64 else (wp.int32, 0)
         if packed is None:
             means_opacities = conics_cutoffs = torch.empty(0, 4, device=keys.device)
         else:
             means_opacities, conics_cutoffs = packed.means_opacities, packed.conics_cutoffs
-        kernel = kernels.tile_ranges_kernel(warp_scalar(means_opacities.dtype), *kind)
-        inputs = keys, gaussians, means_opacities, conics_cutoffs, columns, columns * rows
+        kernel = kernels.tile_ranges_kernel(warp_scalar(means_opacities.dtype), *key_type)
+        inputs = keys, gaussians, means_opacities, conics_cutoffs, grid.columns, grid.tiles
         launch(kernel, len(keys), *inputs, tile_ranges.view(-1), subtile_masks)
-    else:
-        tile_ranges.zero_()
     return tile_ranges, None if packed is None else subtile_masks

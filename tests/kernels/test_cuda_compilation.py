@@ -40,7 +40,6 @@ KERNELS: dict[str, Callable[[], Any]] = {
     "blend backward, 3 channels, deterministic": lambda: blend_cuda_backward.backward_kernel(REAL, 3, True, True),
     "blend backward, 9 channels": lambda: blend_cuda_backward.backward_kernel(REAL, 9, False, True),
     "copy features": lambda: blend_cuda_backward.copy_features_kernel(REAL),
-    "pad rows": lambda: blend_cuda.pad_rows_kernel(REAL, 3),
     "caller memory": lambda: caller_memory,
     "clipped light": lambda: clipped_light.clipped_light_patch_kernel(REAL, wp.uint8),
     "clipped logarithms": lambda: clipped_light.clipped_logarithms_kernel(REAL, wp.uint16),

@@ -10,6 +10,7 @@ from sehdr_warp.rasterizer import tile_lists
 from sehdr_warp.rasterizer.tile_lists import (
     IntersectionOffsets,
     PackedSplats,
+    TileGrid,
     build_tile_lists,
     depth_order,
     emit_intersections,
@@ -20,12 +21,12 @@ from sehdr_warp.rasterizer.warp_launch.launching import sort_pairs
 
 from .scenes import packed, random_scene
 
-COLUMNS, ROWS, UNWRITTEN = 20, 15, -7
+GRID, UNWRITTEN = TileGrid(columns=20, rows=15), -7
 
 
 def dense(device, count=20000):
     """A scene, packed, dense enough that many ellipses end just at a tile's border."""
-    return packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS).to(torch.float32, device))
+    return packed(random_scene(count=count, width=16 * GRID.columns, height=16 * GRID.rows).to(torch.float32, device))
 
 
 def counted(*scene):
@@ -37,7 +38,7 @@ def counted(*scene):
 
 def built(splats, depths, extents, max_intersections=None, *, keep_emit_order=True):
     offsets = order_intersections(splats.counts, depths, extents, keep_emit_order=keep_emit_order)
-    size = 16 * COLUMNS, 16 * ROWS
+    size = 16 * GRID.columns, 16 * GRID.rows
     return build_tile_lists(splats, offsets, depths, extents, *size, max_intersections, keep_emit_order=keep_emit_order)
 
 
@@ -48,7 +49,7 @@ def emit(arguments, counts, monkeypatch):
     room = int(counts.sum())
     order, splats, *others = arguments
     offsets = IntersectionOffsets(order, counts.cumsum(0))
-    tiles, gaussians = emit_intersections(splats, offsets, *others, COLUMNS, ROWS, room)
+    tiles, gaussians = emit_intersections(splats, offsets, *others, GRID, room)
     monkeypatch.undo()
     return tiles[:room], gaussians[:room]
 
@@ -57,9 +58,9 @@ def test_each_counted_tile_is_emitted_once(device, monkeypatch):
     arguments, counts = counted(device)
     assert int(counts.sum()) > 200_000
     tiles, gaussians = emit(arguments, counts, monkeypatch)
-    assert int(tiles.min()) >= 0 and int(tiles.max()) < COLUMNS * ROWS
+    assert int(tiles.min()) >= 0 and int(tiles.max()) < GRID.tiles
     assert torch.equal(gaussians, arguments[0].repeat_interleave(counts))
-    pairs = gaussians.long() * COLUMNS * ROWS + tiles
+    pairs = gaussians.long() * GRID.tiles + tiles
     assert len(pairs.unique()) == len(pairs)
 
 
@@ -73,12 +74,12 @@ def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gau
     wrong[second] -= 1
     tiles, gaussians = emit(arguments, wrong, monkeypatch)
     assert torch.equal(gaussians, arguments[0].repeat_interleave(wrong))
-    unused = tiles == COLUMNS * ROWS
+    unused = tiles == GRID.tiles
     assert int(unused.sum()) == 2 and set(gaussians[unused].tolist()) == {int(arguments[0][first])}
     dropped = int(counts[: second + 1].sum()) - 1
     assert torch.equal(tiles[~unused], torch.cat([true_tiles[:dropped], true_tiles[dropped + 1 :]]))
     ordered = tiles.sort(stable=True)
-    ranges, _ = find_tile_ranges(ordered.values, gaussians[ordered.indices], arguments[1], COLUMNS, ROWS)
+    ranges, _ = find_tile_ranges(ordered.values, gaussians[ordered.indices], arguments[1], GRID)
     assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
 
 
@@ -91,12 +92,12 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     lists = built(splats, depths, extents)
     room = lists.intersection_count + spare
     offsets = IntersectionOffsets(None, counts.cumsum(0))
-    keys, gaussians = emit_intersections(splats, offsets, depths, extents, COLUMNS, ROWS, room)
-    sort_pairs(keys, gaussians, room, DEPTH_BITS + (COLUMNS * ROWS).bit_length())
+    keys, gaussians = emit_intersections(splats, offsets, depths, extents, GRID, room)
+    sort_pairs(keys, gaussians, room, DEPTH_BITS + GRID.tiles.bit_length())
     keys, gaussians = keys[:room], gaussians[:room]
-    ranges, corners = find_tile_ranges(keys, gaussians, splats, COLUMNS, ROWS)
+    ranges, corners = find_tile_ranges(keys, gaussians, splats, GRID)
     if spare < 0:
-        assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < COLUMNS * ROWS
+        assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < GRID.tiles
         return
     assert torch.equal(gaussians[: lists.intersection_count], lists.gaussians)
     assert torch.equal(ranges, lists.tile_ranges)
@@ -127,7 +128,8 @@ def test_subtiles_are_those_that_an_ellipse_touches(device):
 @pytest.mark.parametrize("keep_emit_order", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 500])
 def test_overflow_is_more_entries_than_room(device, keep_emit_order, count):
-    scene = packed(random_scene(count=count, width=16 * COLUMNS, height=16 * ROWS, seed=3).to(torch.float32, device))
+    size = {"width": 16 * GRID.columns, "height": 16 * GRID.rows}
+    scene = packed(random_scene(count=count, **size, seed=3).to(torch.float32, device))
     intersections = built(*scene, keep_emit_order=keep_emit_order).intersection_count
     for room in {max(1, intersections + spare) for spare in (-1, 0, 1)}:
         lists = built(*scene, room, keep_emit_order=keep_emit_order)
@@ -154,7 +156,7 @@ def test_lists_keep_no_more_memory_than_they_use(device, keep_emit_order, spare)
     by_gaussian = intersections + 3 * 500 if keep_emit_order else 0
     one_sort = 0 if keep_emit_order else 4 * intersections + 8 * 500 - 8
     masks = 0 if lists.subtile_masks is None else intersections
-    total = 4 * (2 * COLUMNS * ROWS + intersections + by_gaussian) + masks + total_and_overflow + one_sort
+    total = 4 * (2 * GRID.tiles + intersections + by_gaussian) + masks + total_and_overflow + one_sort
     assert kept_bytes(lists) == total
 
 
@@ -163,15 +165,15 @@ def test_lists_keep_no_more_memory_than_they_use(device, keep_emit_order, spare)
 def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, keep_emit_order):
     monkeypatch.setattr(tile_lists, "MIN_CHUNK", max(1, count // chunks))
     monkeypatch.setenv("SEHDR_THREADS", str(chunks))
-    generator, tiles = torch.Generator().manual_seed(count), 40
+    generator, grid = torch.Generator().manual_seed(count), TileGrid(40, 1)
     # Some belong to no tile, and some tiles have none.
-    tile_keys = [torch.randint(3, tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
+    tile_keys = [torch.randint(3, grid.tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
     tile_keys.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
     splats = PackedSplats(torch.zeros(1000, 4), torch.full((1000, 4), -1.0), torch.zeros(1000, dtype=torch.int64))
-    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in tile_keys), count, tiles, keep_emit_order)
+    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in tile_keys), count, None, grid, keep_emit_order)
     copies = (tensor.clone() for tensor in tile_keys)
-    ranges, ones, corners, places = tile_lists._sort_by_tile(*tile_keys, count, splats, tiles, 1, keep_emit_order)
-    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, tiles, 1, keep_emit_order)
+    ranges, ones, corners, places = tile_lists._sort_by_tile(*tile_keys, count, splats, grid, keep_emit_order)
+    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, grid, keep_emit_order)
     assert torch.equal(alike, ranges) and without is None and len(corners) == count
     ours_ranges, ours_ones, _, ours_places = counted
     for ours, sorted_ones in zip((ours_ranges, ours_ones, ours_places), (ranges, ones, places), strict=True):
