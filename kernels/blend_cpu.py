@@ -21,8 +21,8 @@ state whatever the channel count: T, and R = the part of the loss's derivative t
 
 Front to back, R would be formed by subtraction, which loses the dim Gaussians behind bright ones.
 
-Each tile writes the gradients of its list intersections to rows of their own, and `gather_intersections` sums a
-Gaussian's rows in a fixed order: results do not depend on the number of threads.
+Each tile writes the gradients of its intersections, and `gather_intersections` sums a Gaussian's in a fixed order:
+results do not depend on the number of threads.
 """
 
 from functools import cache
@@ -113,13 +113,21 @@ def _options(dtype) -> dict:
 def forward_kernel(dtype, channels: int, exp_squarings: int):
     """Return blend_forward(), launched over tiles from `range_start` on; see the module's description.
 
-    exp_squarings: see row_functions
-    tile_ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians
-    means_opacities: [N] (x, y, opacity, half-height); conics_cutoffs: [N] (conic a, b, c, cutoff); features: [N, C]
-    columns: tiles across; width, height: of the image; lane_offsets: one row, 0 to 7
-    tile_transmittance, accumulated: scratch of [tiles, 32] rows and [tiles, C, 32] rows, 16 a half
-    last_contributor: [tiles, 32] rows, 1 + list position of the last Gaussian that contributes
-    image: [H W, C]; final_transmittance: [H W], of all Gaussians together
+    exp_squarings: see row_functions().
+
+    The kernel's arguments:
+        tile_ranges: [tiles] first and one past the last intersection.
+        intersections: [M] Gaussians.
+        means_opacities: [N] (x, y, opacity, half-height).
+        conics_cutoffs: [N] (conic a, b, c, cutoff).
+        features: [N, C].
+        columns: tiles across.
+        lane_offsets: one row, 0 to 7.
+        tile_transmittance: scratch, [tiles, 32] rows, 16 a half.
+        accumulated: scratch, [tiles, C, 32] rows.
+        last_contributor: [tiles, 32] rows, 1 + list position of the last Gaussian that contributes.
+        image: [H W, C].
+        final_transmittance: [H W], of all Gaussians together.
     """
     row, broadcast, step, exponential, halves = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
@@ -167,14 +175,14 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
                     p = in_x + dx * (-conic_cutoff[1] * dy) + broadcast(real(-0.5) * conic_cutoff[2] * dy * dy)
                     a = wp.min(exponential(wp.min(p, broadcast(real(0.0)))) * xy_opacity[2], broadcast(real(ALPHA_MAX)))
                     t = tile_transmittance[tile, at]
-                    counts = wp.cw_mul(step(a - broadcast(alpha_threshold)), step(t))
-                    weight = wp.cw_mul(wp.cw_mul(a, t), counts)
+                    eligible = wp.cw_mul(step(a - broadcast(alpha_threshold)), step(t))
+                    weight = wp.cw_mul(wp.cw_mul(a, t), eligible)
                     goes_on = step(t - weight - broadcast(real(TRANSMITTANCE_MIN)))
                     weight = wp.cw_mul(weight, goes_on)
-                    # The pixel that this Gaussian finishes keeps its T, negated; finished ones have counts = 0.
-                    finished = counts - wp.cw_mul(counts, goes_on)
+                    # The pixel that this Gaussian finishes keeps its T, negated; finished ones have eligible = 0.
+                    finished = eligible - wp.cw_mul(eligible, goes_on)
                     tile_transmittance[tile, at] = t - weight - wp.cw_mul(t, finished) * real(2.0)
-                    contributes = wp.cw_mul(counts, goes_on)
+                    contributes = wp.cw_mul(eligible, goes_on)
                     previous = last_contributor[tile, at]
                     change = broadcast(real(k - bounds[0] + 1)) - previous
                     last_contributor[tile, at] = previous + wp.cw_mul(contributes, change)
@@ -203,14 +211,17 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
 def backward_kernel(dtype, channels: int, exp_squarings: int):
     """Return the backward pass of forward_kernel(), whose arguments it shares.
 
-    emit_indices: [M] row of each intersection in grad_intersections. last_contributor: as the forward kernel left it.
-    grad_image: [H W, C]; grad_transmittance: [H W]. tile_transmittance: as the forward kernel left it; it is
-    overwritten.
-
-    Scratch: grad_from_behind [tiles, 32] rows, tile_grad_image [tiles, C, 32], weights and slopes [tiles, 16], sums
-    [tiles, C + 6].
-
-    grad_intersections: [M, C + 6] in the order of emission: features, conic a b c, x, y, opacity.
+    Its other arguments:
+        emit_indices: [M] index of each intersection in grad_intersections.
+        last_contributor: as the forward kernel left it.
+        grad_image: [H W, C].
+        grad_transmittance: [H W].
+        tile_transmittance: as the forward kernel left it; it is overwritten.
+        grad_from_behind: scratch, [tiles, 32] rows.
+        tile_grad_image: scratch, [tiles, C, 32] rows.
+        weights, slopes: scratch, [tiles, 16] rows.
+        sums: scratch, [tiles, C + 6] rows.
+        grad_intersections: [M, C + 6] in the order of emission: features, conic a b c, x, y, opacity.
     """
     row, broadcast, step, exponential, halves = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
@@ -280,18 +291,19 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
                     p = in_x + dx * (-conic_cutoff[1] * dy) + broadcast(real(-0.5) * conic_cutoff[2] * dy * dy)
                     unclamped = exponential(wp.min(p, broadcast(real(0.0)))) * xy_opacity[2]
                     a = wp.min(unclamped, broadcast(real(ALPHA_MAX)))
-                    counts = wp.cw_mul(step(a - broadcast(alpha_threshold)), step(last_contributor[tile, at] - order))
+                    not_behind = step(last_contributor[tile, at] - order)
+                    contributes = wp.cw_mul(step(a - broadcast(alpha_threshold)), not_behind)
                     inverse = wp.cw_div(ones, ones - a)
                     t = tile_transmittance[tile, at]
                     # As an addition: t * inverse would round each of many faint factors the same way.
-                    t = t + wp.cw_mul(wp.cw_mul(t, wp.cw_mul(a, inverse)), counts)
+                    t = t + wp.cw_mul(wp.cw_mul(t, wp.cw_mul(a, inverse)), contributes)
                     tile_transmittance[tile, at] = t
                     q = tile_grad_image[tile, 0, at] * features[i, 0]
                     for channel in range(1, wp.static(channels)):
                         q += tile_grad_image[tile, channel, at] * features[i, channel]
                     r = grad_from_behind[tile, at]
-                    weight = wp.cw_mul(wp.cw_mul(a, t), counts)
-                    from_a = wp.cw_mul(wp.cw_mul(t, q) - wp.cw_mul(r, inverse), counts)
+                    weight = wp.cw_mul(wp.cw_mul(a, t), contributes)
+                    from_a = wp.cw_mul(wp.cw_mul(t, q) - wp.cw_mul(r, inverse), contributes)
                     grad_from_behind[tile, at] = r + wp.cw_mul(weight, q)
                     weights[tile, j] = weight
                     # alpha = opacity exp(p): the derivative by p is alpha's own, and 0 where alpha is clamped to

@@ -48,8 +48,8 @@ BALLOT = """
     return 0u;
 #endif
 """
-ROW = """
-    const float4 four = reinterpret_cast<const float4*>(rows.data)[i];
+READ_QUAD = """
+    const float4 four = reinterpret_cast<const float4*>(quads.data)[i];
     return wp::vec_t<4, wp::float32>(four.x, four.y, four.z, four.w);
 """
 
@@ -61,10 +61,10 @@ def ballot(vote: bool, lane: int) -> wp.uint32:
 
 @cache
 def block_functions(dtype, cuda: bool) -> tuple:
-    """Return votes() and row() for one scalar type.
+    """Return votes() and read_quad() for one scalar type.
 
-    votes() is a word with a bit for each lane whose vote is true; row() reads a row of four numbers, on CUDA by one
-    access if they are float32.
+    votes() is a word with a bit for each lane whose vote is true; read_quad() reads four numbers, on CUDA by one access
+    if they are float32.
     """
     vec4 = geometry(dtype).vec4
 
@@ -82,16 +82,16 @@ def block_functions(dtype, cuda: bool) -> tuple:
 
     if dtype is wp.float32 and cuda:
 
-        @wp.func_native(ROW)
-        def row(rows: wp.array(dtype=vec4), i: int) -> vec4: ...
+        @wp.func_native(READ_QUAD)
+        def read_quad(quads: wp.array(dtype=vec4), i: int) -> vec4: ...
 
     else:
 
         @wp.func
-        def row(rows: wp.array(dtype=vec4), i: int) -> vec4:
-            return rows[i]
+        def read_quad(quads: wp.array(dtype=vec4), i: int) -> vec4:
+            return quads[i]
 
-    return votes, row
+    return votes, read_quad
 
 
 @cache
@@ -100,11 +100,17 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
 
     cuda: False for Warp's CPU block emulation.
 
-    tile_ranges: [tiles] first and one past the last intersection; intersections: [M] Gaussians; subtile_masks: [M] of
-    find_tile_ranges(); means_opacities: [N] (x, y, opacity, -); conics_cutoffs: [N] (conic a, b, c, cutoff);
-    features: [N padded_channels / 4] rows of four, flat
-    image: [H W] vectors of C; transmittance: [H W]; last_contributor: [H W] 1 + list position of the last Gaussian that
-    contributes
+    The kernel's arguments:
+        tile_ranges: [tiles] first and one past the last intersection.
+        intersections: [M] Gaussians.
+        subtile_masks: [M] of find_tile_ranges().
+        means_opacities: [N] (x, y, opacity, -).
+        conics_cutoffs: [N] (conic a, b, c, cutoff).
+        features: [N quads], padded to a multiple of four.
+        columns: tiles across.
+        image: [H W] vectors of C.
+        transmittance: [H W].
+        last_contributor: [H W], 1 + list position of the last Gaussian that contributes.
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
@@ -112,7 +118,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
     vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(UNROLL, dtype)
     vec_rounds = vector(ROUNDS, wp.int32)
     blocks_across = TILE_SIZE // SUBTILE[0]
-    votes, row = block_functions(dtype, cuda)
+    votes, read_quad = block_functions(dtype, cuda)
 
     @wp.kernel(
         module="unique", enable_backward=False, launch_bounds=BLOCK_DIM, grid_stride=False,
@@ -189,10 +195,10 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
             conic_cutoff = vec4()
             fetched = vec_padded()
             if lane < coming:
-                xy_opacity = row(means_opacities, own[0])
-                conic_cutoff = row(conics_cutoffs, own[0])
+                xy_opacity = read_quad(means_opacities, own[0])
+                conic_cutoff = read_quad(conics_cutoffs, own[0])
                 for e in range(wp.static(quads)):
-                    quad = row(features, own[0] * wp.static(quads) + e)
+                    quad = read_quad(features, own[0] * wp.static(quads) + e)
                     for h in range(wp.static(4)):
                         fetched[e * 4 + h] = quad[h]
             head = (head + coming) & wp.static(QUEUE - 1)

@@ -23,10 +23,10 @@ from .blend_cuda import (
 from .constants import ALPHA_MAX, NO_AUTODIFF, SUBTILE, TILE_SIZE
 from .geometry import geometry, vector
 
-ROWS = 4  # of pixels of one warp
+LINES = 4  # Of pixels of one warp
 
 
-ADD_ROW = """
+ADD_QUAD = """
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     atomicAdd(reinterpret_cast<float4*>(numbers.data) + i, make_float4(a, b, c, d));
 #elif defined(__CUDA_ARCH__)
@@ -38,13 +38,13 @@ ADD_ROW = """
 """
 
 
-@wp.func_native(ADD_ROW)
-def add_row(numbers: wp.array(dtype=wp.float32), i: int, a: float, b: float, c: float, d: float):
+@wp.func_native(ADD_QUAD)
+def add_quad(numbers: wp.array(dtype=wp.float32), i: int, a: float, b: float, c: float, d: float):
     """Add to four numbers, from number 4 i on, on CUDA; by one access if the GPU can."""
 
 
-def adds_rows(dtype, ordered: bool, cuda: bool) -> bool:
-    """Return whether gradients are added by rows of four numbers; they then have a multiple of four columns."""
+def adds_quads(dtype, ordered: bool, cuda: bool) -> bool:
+    """Return whether gradients are added four numbers at once; they then have a multiple of four columns."""
     return cuda and dtype is wp.float32 and not ordered
 
 
@@ -53,10 +53,10 @@ def copy_features_kernel(dtype):
     """Return copy_features() for one scalar type, launched over [N, C]."""
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def copy_features(rows: wp.array2d(dtype=dtype), features: wp.array2d(dtype=dtype)):
-        """Copy the first columns of rows [N, C + 6 or more], gradients by features, to features [N, C]."""
+    def copy_features(gradients: wp.array2d(dtype=dtype), features: wp.array2d(dtype=dtype)):
+        """Copy the first columns of gradients [N, C + 6 or more] to those of the features, [N, C]."""
         gaussian, channel = wp.tid()
-        features[gaussian, channel] = rows[gaussian, channel]
+        features[gaussian, channel] = gradients[gaussian, channel]
 
     return copy_features
 
@@ -65,14 +65,17 @@ def copy_features_kernel(dtype):
 def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
     """Return blend_backward(), launched over tiles x BLOCKS_PER_TILE x 32 threads.
 
-    As blend_cuda.forward_kernel, and grad_image: [H W] vectors of C; grad_transmittance: [H W], or [0] for 0;
-    rows: ROWS and gradient_count: C + 6, as arguments so that their loops stay loops;
-    gradients: [N (C + 6)], flat rows (features, conic a b c, x, y, opacity), added to
-
     ordered: the same sums in the same order every time, by one launch over tiles x 32 threads for each `only_subtile`
-    of the BLOCKS_PER_TILE, within which a row of gradients has one writer. emit_indices: [M] the row of each
-    intersection; gradients: [M (C + 6)], to be gathered by Gaussian. Unordered, neither is read: atomics add to the
-    Gaussians' rows.
+    of the BLOCKS_PER_TILE, within which each intersection has one writer. Unordered, atomics add to the Gaussians'.
+
+    The kernel's arguments beside those of blend_cuda.forward_kernel():
+        grad_image: [H W] vectors of C.
+        grad_transmittance: [H W], or [0] for 0.
+        lines: LINES; an argument, as the next, so that its loop stays a loop.
+        gradient_count: C + 6.
+        only_subtile: of an ordered launch; otherwise not read.
+        emit_indices: [M] index of each intersection in the gradients, if ordered; otherwise not read.
+        gradients: [N (C + 6)], flat (features, conic a b c, x, y, opacity), added to; if ordered, [M (C + 6)].
     """
     g = geometry(dtype)
     real, vec4 = g.real, g.vec4
@@ -80,13 +83,13 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
     vec_padded, vec_image, vec_many = vector(4 * quads, dtype), vector(channels, dtype), vector(UNROLL, dtype)
     vec_terms = vector(2 * UNROLL, dtype)
     vec_rounds = vector(ROUNDS, wp.int32)
-    votes, row = block_functions(dtype, cuda)
+    votes, read_quad = block_functions(dtype, cuda)
     gradient_columns = channels + 6
     staging_columns = gradient_columns + 1 - gradient_columns % 2  # odd, so that lanes fall on different banks
     blocks_across = TILE_SIZE // SUBTILE[0]
-    by_rows = adds_rows(dtype, ordered, cuda)
-    row_quads = padded_channels(gradient_columns) // 4
-    vec_row = vector(4 * row_quads, dtype)
+    by_quads = adds_quads(dtype, ordered, cuda)
+    gradient_quads = padded_channels(gradient_columns) // 4
+    vec_gradients = vector(4 * gradient_quads, dtype)
 
     @wp.kernel(
         module="unique", enable_backward=False, launch_bounds=BLOCK_DIM, grid_stride=False,
@@ -99,7 +102,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         columns: int, width: int, height: int, alpha_threshold: real,
         transmittance: wp.array(dtype=real), last_contributor: wp.array(dtype=wp.int32),
         grad_image: wp.array(dtype=vec_image), grad_transmittance: wp.array(dtype=real),
-        rows: int, gradient_count: int, only_subtile: int,
+        lines: int, gradient_count: int, only_subtile: int,
         emit_indices: wp.array(dtype=wp.int32), gradients: wp.array(dtype=real),
     ):
         thread = wp.tid()
@@ -183,10 +186,10 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
             conic_cutoff = vec4()
             fetched = vec_padded()
             if lane < coming:
-                xy_opacity = row(means_opacities, own[0])
-                conic_cutoff = row(conics_cutoffs, own[0])
+                xy_opacity = read_quad(means_opacities, own[0])
+                conic_cutoff = read_quad(conics_cutoffs, own[0])
                 for e in range(wp.static(quads)):
-                    quad = row(features, own[0] * wp.static(quads) + e)
+                    quad = read_quad(features, own[0] * wp.static(quads) + e)
                     for h in range(wp.static(4)):
                         fetched[e * 4 + h] = quad[h]
             head = (head + coming) & wp.static(QUEUE - 1)
@@ -244,11 +247,11 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 sum_xx = real(0.0)
                 sum_xy = real(0.0)
                 sum_yy = real(0.0)
-                for line in range(rows):
+                for line in range(lines):
                     dy = s[1] - (subtile_y + real(line))
-                    row_0 = real(0.0)
-                    row_x = real(0.0)
-                    row_xx = real(0.0)
+                    line_0 = real(0.0)
+                    line_x = real(0.0)
+                    line_xx = real(0.0)
                     for column in range(wp.static(8)):
                         at = line * 8 + column
                         terms = wp.tile_extract(pixel_terms, base + at)
@@ -257,18 +260,18 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                         from_pixel = wp.tile_extract(block_grad_channels, at)
                         dx = s[0] - (subtile_x + real(at - line * 8))
                         slope_dx = pixel_slope * dx
-                        row_0 += pixel_slope
-                        row_x += slope_dx
-                        row_xx += slope_dx * dx
+                        line_0 += pixel_slope
+                        line_x += slope_dx
+                        line_xx += slope_dx * dx
                         for channel in range(wp.static(channels)):
                             feature_sum[channel] += pixel_weight * from_pixel[channel]
-                    sum_0 += row_0
-                    sum_x += row_x
-                    sum_xx += row_xx
-                    sum_xy += row_x * dy
-                    sum_y += row_0 * dy
-                    sum_yy += row_0 * dy * dy
-                sums = vec_row()
+                    sum_0 += line_0
+                    sum_x += line_x
+                    sum_xx += line_xx
+                    sum_xy += line_x * dy
+                    sum_y += line_0 * dy
+                    sum_yy += line_0 * dy * dy
+                sums = vec_gradients()
                 for channel in range(wp.static(channels)):
                     sums[channel] = feature_sum[channel]
                 sums[wp.static(channels)] = real(-0.5) * sum_xx
@@ -277,11 +280,11 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                 sums[wp.static(channels + 3)] = real(2.0) * q[0] * sum_x + q[1] * sum_y
                 sums[wp.static(channels + 4)] = q[1] * sum_x + real(2.0) * q[2] * sum_y
                 sums[wp.static(channels + 5)] = sum_0 / s[2]
-                if wp.static(by_rows):
+                if wp.static(by_quads):
                     if lane < ready:
-                        for e in range(wp.static(row_quads)):
-                            add_row(
-                                gradients, ready_one[0] * wp.static(row_quads) + e,
+                        for e in range(wp.static(gradient_quads)):
+                            add_quad(
+                                gradients, ready_one[0] * wp.static(gradient_quads) + e,
                                 sums[4 * e], sums[4 * e + 1], sums[4 * e + 2], sums[4 * e + 3],
                             )
                 else:

@@ -27,11 +27,11 @@ def pixel_of_thread(thread: int, columns: int) -> wp.vec3i:
     return wp.vec3i(tile, x, (tile // columns) * TILE_SIZE + pixel // TILE_SIZE)
 
 
-WRITE_ROW = """
+WRITE_QUAD = """
 #if defined(__CUDA_ARCH__)
-    reinterpret_cast<float4*>(rows.data)[i] = make_float4(row[0], row[1], row[2], row[3]);
+    reinterpret_cast<float4*>(quads.data)[i] = make_float4(quad[0], quad[1], quad[2], quad[3]);
 #else
-    rows.data[i] = row;
+    quads.data[i] = quad;
 #endif
 """
 
@@ -67,27 +67,27 @@ def geometry(dtype) -> SimpleNamespace:
 
     @wp.func
     def ellipse_meets_rectangle(
-        x: real, y: real, a: real, b: real, c: real, cutoff: real, x_per_y: real, y_per_x: real,
-        left: real, top: real, width: real, height: real,
+        xy_opacity: vec4, conic_cutoff: vec4, left: real, top: real, width: real, height: real,
     ) -> bool:
         """Return whether the ellipse a dx^2 + 2 b dx dy + c dy^2 <= cutoff around (x, y) touches the rectangle.
 
-        x_per_y, y_per_x: -b / a and -b / c, which callers divide once for many rectangles.
-
-        The form is smallest on one of the edges nearest to the center. A small allowance keeps rounding from dropping a
-        border pixel.
+        Its values are (x, y, ...) and (a, b, c, cutoff). The form is smallest on one of the edges nearest to the
+        center. A small allowance keeps rounding from dropping a border pixel.
         """
-        x0 = left - x
+        a = conic_cutoff[0]
+        b = conic_cutoff[1]
+        c = conic_cutoff[2]
+        x0 = left - xy_opacity[0]
         x1 = x0 + width
-        y0 = top - y
+        y0 = top - xy_opacity[1]
         y1 = y0 + height
         nearest_x = wp.clamp(real(0.0), x0, x1)
         nearest_y = wp.clamp(real(0.0), y0, y1)
-        best_y = wp.clamp(y_per_x * nearest_x, y0, y1)
-        best_x = wp.clamp(x_per_y * nearest_y, x0, x1)
+        best_y = wp.clamp(-b / c * nearest_x, y0, y1)
+        best_x = wp.clamp(-b / a * nearest_y, x0, x1)
         along_vertical = a * nearest_x * nearest_x + real(2.0) * b * nearest_x * best_y + c * best_y * best_y
         along_horizontal = a * best_x * best_x + real(2.0) * b * best_x * nearest_y + c * nearest_y * nearest_y
-        return wp.min(along_vertical, along_horizontal) <= cutoff * real(1.0001) + real(1.0e-3)
+        return wp.min(along_vertical, along_horizontal) <= conic_cutoff[3] * real(1.0001) + real(1.0e-3)
 
     @wp.func
     def splat_exponent(a: real, b: real, c: real, dx: real, dy: real) -> real:
@@ -96,19 +96,19 @@ def geometry(dtype) -> SimpleNamespace:
 
     if dtype is wp.float32:
 
-        @wp.func_native(WRITE_ROW)
-        def write_row(rows: wp.array(dtype=vec4), i: int, row: vec4):
-            """Write a row of four numbers, on CUDA by one access."""
+        @wp.func_native(WRITE_QUAD)
+        def write_quad(quads: wp.array(dtype=vec4), i: int, quad: vec4):
+            """Write four numbers, on CUDA by one access."""
 
     else:
 
         @wp.func
-        def write_row(rows: wp.array(dtype=vec4), i: int, row: vec4):
-            """Write a row of four numbers."""
-            rows[i] = row
+        def write_quad(quads: wp.array(dtype=vec4), i: int, quad: vec4):
+            """Write four numbers."""
+            quads[i] = quad
 
     return SimpleNamespace(
         real=real, vec2=vector(2, dtype), vec3=vec3, vec4=vec4, mat33=mat33, mat44=matrix(4, 4, dtype),
         rotation_from_quaternion=rotation_from_quaternion, ellipse_meets_rectangle=ellipse_meets_rectangle,
-        splat_exponent=splat_exponent, write_row=write_row,
+        splat_exponent=splat_exponent, write_quad=write_quad,
     )

@@ -144,10 +144,10 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     ):
         """Count the tiles that each Gaussian touches and, if there is memory, list them.
 
-        Intersections of the Gaussian at `rank` in the order are written from starts[rank] on.
+        Intersections of the Gaussian at `nth` in the order are written from starts[nth] on.
         """
-        rank = range_start + wp.tid()
-        gaussian = order[rank]
+        nth = range_start + wp.tid()
+        gaussian = order[nth]
         cap = caps[gaussian]
         count = int(0)
         if cap[3] > real(0.0):
@@ -160,10 +160,10 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
                         for column in range(left, wp.min(left + BLOCK_TILES, columns)):
                             if caps_meet(cap, tile_caps[row * columns + column]):
                                 if tiles.shape[0] > 0:
-                                    tiles[starts[rank] + count] = row * columns + column
-                                    gaussians[starts[rank] + count] = gaussian
+                                    tiles[starts[nth] + count] = row * columns + column
+                                    gaussians[starts[nth] + count] = gaussian
                                 count += 1
-        counts[rank] = count
+        counts[nth] = count
 
     @wp.kernel(module="unique", module_options=options)
     def blend(

@@ -5,8 +5,8 @@ sum over the counts gives every Gaussian its range of intersections. There are t
 stable sorts. With many Gaussians, these are sorted by depth, `emit_intersections` fills their ranges in that order, and
 a sort by tile keeps it: the least work for a GPU. With few, `emit_keys` fills the ranges in the Gaussians' own order,
 and one sort by tile and depth follows: the fewest launches. `find_tile_ranges` finds where each tile's list begins and
-ends, and which subtiles of its tile each intersection touches. Backward passes write a row for each intersection, and
-`gather_intersections` sums the rows of a Gaussian in a fixed order, whatever the order of execution.
+ends, and which subtiles of its tile each intersection touches. Backward passes write the gradients of each intersection
+where it was emitted, and `gather_intersections` sums a Gaussian's, which are neighbors there, in a fixed order.
 """
 
 from functools import cache
@@ -42,13 +42,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
         return wp.vec2i(first, last)
 
     @wp.func
-    def tile_is_touched(
-        xy_opacity: vec4, conic_cutoff: vec4, x_per_y: real, y_per_x: real, column: int, row: int
-    ) -> bool:
+    def tile_is_touched(xy_opacity: vec4, conic_cutoff: vec4, column: int, row: int) -> bool:
         return g.ellipse_meets_rectangle(
-            xy_opacity[0], xy_opacity[1], conic_cutoff[0], conic_cutoff[1], conic_cutoff[2], conic_cutoff[3],
-            x_per_y, y_per_x,
-            real(column) * real(size) + real(0.5), real(row) * real(size) + real(0.5),
+            xy_opacity, conic_cutoff, real(column) * real(size) + real(0.5), real(row) * real(size) + real(0.5),
             real(wp.static(size - 1.0)), real(wp.static(size - 1.0)),
         )
 
@@ -67,7 +63,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
         extents: set to 0 for a Gaussian with a feature that is not finite, because the CPU blend multiplies what a
         pixel does not show by 0, and 0 times NaN would be visible.
 
-        padded: [N quads], the features in rows of four numbers, of which the last are filled with zeros; or None.
+        padded: [N quads], the features in quads of four numbers, of which the last are filled with zeros; or None.
         """
         i = range_start + wp.tid()
         if padded:
@@ -79,7 +75,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
                         four[k] = features[i, 4 * quad + k]
                         if not wp.isfinite(four[k]):
                             extents[i] = vec2(real(0.0), real(0.0))
-                g.write_row(padded, i * quads + quad, four)
+                g.write_quad(padded, i * quads + quad, four)
         else:
             for channel in range(channels):
                 if not wp.isfinite(features[i, channel]):
@@ -99,18 +95,15 @@ def tile_kernels(dtype) -> SimpleNamespace:
         if extent[0] > real(0.0):
             across = tile_span(xy_opacity[0], extent[0], columns)
             down = tile_span(xy_opacity[1], extent[1], rows)
-            x_per_y = -conic_cutoff[1] / conic_cutoff[0]
-            y_per_x = -conic_cutoff[1] / conic_cutoff[2]
             for row in range(down[0], down[1]):
                 for column in range(across[0], across[1]):
-                    if tile_is_touched(xy_opacity, conic_cutoff, x_per_y, y_per_x, column, row):
+                    if tile_is_touched(xy_opacity, conic_cutoff, column, row):
                         touched += 1
         counts[i] = wp.int64(touched)
 
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(
-        range_start: int,
-        depths: reals, extents: vec2s, keys: reals, indices: wp.array(dtype=int),
+        range_start: int, depths: reals, extents: vec2s, keys: reals, indices: wp.array(dtype=int),
     ):
         """Write keys that sort Gaussians nearest first and culled ones last, and their indices."""
         i = range_start + wp.tid()
@@ -128,44 +121,40 @@ def tile_kernels(dtype) -> SimpleNamespace:
             range_start: int,
             order: ints, means_opacities: vec4s, conics_cutoffs: vec4s, extents: vec2s,
             depths: wp.array(dtype=wp.float32),
-            columns: int, rows: int,
-            cumulative_counts: int64s,
-            max_intersections: int,
+            columns: int, rows: int, cumulative_counts: int64s, max_intersections: int,
             keys: wp.array(dtype=key), gaussians: ints, overflow: bools,
         ):
-            """Write the intersections of each Gaussian, which end at cumulative_counts[rank].
+            """Write the intersections of the nth Gaussian, which end at cumulative_counts[nth].
 
             If fewer tiles are touched than were counted, or no Gaussian is left, further intersections up to
             `max_intersections` get tile columns * rows, which does not exist. overflow: [1], whether more were counted
             than there is memory for; or None.
 
-            keys: tiles, of Gaussians in their order; or if by_depth, of Gaussians by index, tiles above DEPTH_BITS of
-            the depth, whose bits order as positive numbers do. Without by_depth `depths` is None, with it `order`.
+            keys: tiles, of Gaussians in their order, and `depths` is None. If by_depth, of Gaussians by index, and
+            `order` is None: tiles above DEPTH_BITS of the depth, whose bits order as positive numbers do.
             """
-            rank = range_start + wp.tid()
-            i = rank
+            nth = range_start + wp.tid()
+            i = nth
             depth = key(0)
             if wp.static(by_depth):
                 depth_bits = wp.cast(depths[i], wp.int32) - wp.static(DEPTH_OFFSET)
                 depth = key(wp.clamp(depth_bits, 0, wp.static((1 << DEPTH_BITS) - 1)))
             else:
-                i = order[rank]
+                i = order[nth]
             no_tile = key(columns * rows) << key(wp.static(bits))
             extent = extents[i]
             entry = int(0)
-            if rank > 0:
-                entry = int(wp.min(cumulative_counts[rank - 1], wp.int64(max_intersections)))
-            end = int(wp.min(cumulative_counts[rank], wp.int64(max_intersections)))
+            if nth > 0:
+                entry = int(wp.min(cumulative_counts[nth - 1], wp.int64(max_intersections)))
+            end = int(wp.min(cumulative_counts[nth], wp.int64(max_intersections)))
             if extent[0] > real(0.0) and end > entry:
                 xy_opacity = means_opacities[i]
                 conic_cutoff = conics_cutoffs[i]
                 across = tile_span(xy_opacity[0], extent[0], columns)
                 down = tile_span(xy_opacity[1], extent[1], rows)
-                x_per_y = -conic_cutoff[1] / conic_cutoff[0]
-                y_per_x = -conic_cutoff[1] / conic_cutoff[2]
                 for row in range(down[0], down[1]):
                     for column in range(across[0], across[1]):
-                        if entry < end and tile_is_touched(xy_opacity, conic_cutoff, x_per_y, y_per_x, column, row):
+                        if entry < end and tile_is_touched(xy_opacity, conic_cutoff, column, row):
                             keys[entry] = (key(row * columns + column) << key(wp.static(bits))) | depth
                             gaussians[entry] = i
                             entry += 1
@@ -174,9 +163,9 @@ def tile_kernels(dtype) -> SimpleNamespace:
                 gaussians[entry] = i
                 entry += 1
             count = cumulative_counts.shape[0]
-            if overflow and rank == 0:
+            if overflow and nth == 0:
                 overflow[0] = cumulative_counts[count - 1] > wp.int64(max_intersections)
-            unused = wp.min(cumulative_counts[count - 1], wp.int64(max_intersections)) + wp.int64(rank)
+            unused = wp.min(cumulative_counts[count - 1], wp.int64(max_intersections)) + wp.int64(nth)
             while unused < wp.int64(max_intersections):
                 keys[int(unused)] = no_tile
                 gaussians[int(unused)] = 0
@@ -187,21 +176,19 @@ def tile_kernels(dtype) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def gather_intersections(
         range_start: int,
-        order: ints, cumulative_counts: int64s, grad_intersections: reals2d,
-        columns: int,
-        rows: reals2d,
+        order: ints, cumulative_counts: int64s, grad_intersections: reals2d, columns: int, sums: reals2d,
     ):
-        """Write rows[order[rank]], the sum of Gaussian `rank`'s rows of grad_intersections [M, columns]."""
-        rank = range_start + wp.tid()
+        """Write sums[order[nth]], the sum over the nth Gaussian's intersections of grad_intersections [M, columns]."""
+        nth = range_start + wp.tid()
         begin = int(0)
-        if rank > 0:
-            begin = int(cumulative_counts[rank - 1])
-        i = order[rank]
+        if nth > 0:
+            begin = int(cumulative_counts[nth - 1])
+        i = order[nth]
         for column in range(columns):
             total = real(0.0)
-            for entry in range(begin, int(cumulative_counts[rank])):
+            for entry in range(begin, int(cumulative_counts[nth])):
                 total += grad_intersections[entry, column]
-            rows[i, column] = total
+            sums[i, column] = total
 
     return SimpleNamespace(
         pack_splats=pack_splats, key_by_depth=key_by_depth, gather_intersections=gather_intersections,
@@ -282,15 +269,12 @@ def tile_ranges_kernel(dtype, key, shift: int):
             gaussian = gaussians[entry]
             xy_opacity = means_opacities[gaussian]
             conic_cutoff = conics_cutoffs[gaussian]
-            x_per_y = -conic_cutoff[1] / conic_cutoff[0]
-            y_per_x = -conic_cutoff[1] / conic_cutoff[2]
             row = tile // columns
             left = real((tile - row * columns) * wp.static(TILE_SIZE)) + real(0.5)
             top = real(row * wp.static(TILE_SIZE)) + real(0.5)
             for subtile in range(wp.static(across * down)):
                 if g.ellipse_meets_rectangle(
-                    xy_opacity[0], xy_opacity[1], conic_cutoff[0], conic_cutoff[1], conic_cutoff[2], conic_cutoff[3],
-                    x_per_y, y_per_x,
+                    xy_opacity, conic_cutoff,
                     left + real((subtile % wp.static(across)) * wp.static(SUBTILE[0])),
                     top + real((subtile // wp.static(across)) * wp.static(SUBTILE[1])),
                     real(wp.static(SUBTILE[0] - 1)), real(wp.static(SUBTILE[1] - 1)),

@@ -109,7 +109,7 @@ class BlockBackward:
     def columns(self) -> int:
         """Columns of the gradients by Gaussian."""
         columns = self.channels + 6
-        if blend_cuda_backward.adds_rows(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
+        if blend_cuda_backward.adds_quads(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
             columns = blend_cuda.padded_channels(columns)
         return columns
 
@@ -131,7 +131,7 @@ class BlockBackward:
             *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
             pad_features(self.features).reshape(-1, 4),
             *(lists.grid.columns, width, height, self.alpha_threshold, self.transmittance, self.last_contributor),
-            *(grad_image, grad_transmittance, blend_cuda_backward.ROWS, self.channels + 6),
+            *(grad_image, grad_transmittance, blend_cuda_backward.LINES, self.channels + 6),
         )
 
 
@@ -140,11 +140,11 @@ class FixedBackward(NamedTuple):
 
     Attributes:
         fixed: its launch.
-        rows: a tensor like the gradients by Gaussian that BlockBackward returns.
+        gradients: a tensor like those by Gaussian that BlockBackward returns.
     """
 
     fixed: FixedLaunch
-    rows: Tensor
+    gradients: Tensor
 
 
 def blend_blocks(
