@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from sehdr_warp.arguments import parse_numbers, require_positive
-from sehdr_warp.errors import InputError
+from sehdr_warp.arguments import parse_numbers, parse_pairs, require_positive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,11 +54,10 @@ class Kernels(Timed):
     def measure(self):
         """Run the benchmark and return its result."""
         from .kernels import bench_kernels
-        from .splats import parse_size
 
         timing = self.timing()
         default = {"cuda": "50k@400x400,200k@800x800,1M@1600x1200", "cpu": "5k@200x200,20k@200x200"}
-        sizes = [parse_size(item) for item in (self.sizes or default[timing["device"].type]).split(",")]
+        sizes = _sizes(self.sizes or default[timing["device"].type])
         return bench_kernels(sizes, parse_numbers("--channels", self.channels, int, minimum=1), **timing)
 
 
@@ -92,13 +90,11 @@ class Workers(Timed):
 
     def measure(self):
         """Run the benchmark and return its result."""
-        from .splats import parse_size
         from .workers import bench_workers
 
         timing = self.timing()
         default = {"cuda": "1M@1600x1200", "cpu": "20k@200x200,100k@800x800"}
-        sizes = [parse_size(item) for item in (self.sizes or default[timing["device"].type]).split(",")]
-        return bench_workers(sizes, **timing)
+        return bench_workers(_sizes(self.sizes or default[timing["device"].type]), **timing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +147,7 @@ class Quality(Output):
         jobs = plan_jobs(
             **options, iterations=iterations, max_size=self.max_size, device=device, lpips=lpips is not None
         )
-        how = {"at_once": require_positive("--jobs", self.jobs), "slurm": _pairs("--slurm", self.slurm)}
+        how = {"at_once": require_positive("--jobs", self.jobs), "slurm": parse_pairs("--slurm", self.slurm)}
         rows = run_jobs(jobs, self.out, device=device, lpips=lpips and os.path.abspath(lpips), **how)
         result = new_result("quality", torch.device(device), {"jobs": self.jobs})
         result["rows"] = [row for row in rows if "error" not in row]
@@ -195,7 +191,7 @@ class Stability(Output):
 
     def measure(self):
         """Measure the cases and print each bound; checks are the cases."""
-        from sehdr_warp.check.run_cases import run_cases
+        from sehdr_warp.check.commands import run_cases
         from sehdr_warp.runs.device import pick_device
 
         from .results import new_result
@@ -238,12 +234,11 @@ def run_benchmark(options: Benchmarks) -> None:
     benchmark.report(result)
 
 
+def _sizes(text: str) -> list:
+    from .splats import parse_size
+
+    return [parse_size(item) for item in text.split(",")]
+
+
 def _words(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(item.strip() for item in text.split(",") if item.strip()))
-
-
-def _pairs(flag: str, text: str | None) -> dict[str, str] | None:
-    pairs = {name: value for name, _, value in (item.partition("=") for item in _words(text or ""))}
-    if not all(name and value for name, value in pairs.items()):
-        raise InputError(f"{flag} {text}", "not name=value pairs", f"write for example {flag} partition=gpu")
-    return None if text is None else pairs

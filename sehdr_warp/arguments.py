@@ -5,7 +5,9 @@ import inspect
 import io
 import itertools
 import math
+import os
 import re
+import shutil
 import typing
 from collections.abc import Iterator
 from contextlib import redirect_stderr, suppress
@@ -15,6 +17,8 @@ import tyro
 from .errors import InputError, UsageError, did_you_mean
 
 Options = typing.TypeVar("Options")
+MIN_COLUMNS = 40
+"""Columns of the narrowest terminal that help tables are laid out for; tyro takes minutes for a narrower one."""
 MARKERS = (
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.OmitArgPrefixes,
@@ -38,6 +42,8 @@ def parse(options: type[Options], words: list[str], program: str) -> Options:
         UsageError: for words that are not options, with the most similar option.
         SystemExit: after --help.
     """
+    if shutil.get_terminal_size().columns < MIN_COLUMNS:
+        os.environ["COLUMNS"] = str(MIN_COLUMNS)
     _hide_empty_defaults(options)
     long_groups = {name: hint for name, hint in _hints(options).items() if typing.is_typeddict(_unwrap(hint))}
     if long_groups and "--help-all" in words:
@@ -208,12 +214,10 @@ def parse_pairs(flag: str, text: str | None) -> dict[str, str] | None:
     """
     if text is None:
         return None
-    parts = [item.partition("=") for item in text.split(",")]
-    pairs = {name: value for name, _, value in parts}
+    pairs = {name: value for name, _, value in (item.partition("=") for item in text.split(","))}
     if not all(name and value for name, value in pairs.items()):
-        raise InputError(
-            f"{flag} {text}", "not NAME=VALUE separated by commas", f"write for example {flag}=partition=gpu"
-        )
+        example = f"write for example {flag}=partition=gpu"
+        raise InputError(f"{flag} {text}", "not NAME=VALUE separated by commas", example)
     return pairs
 
 

@@ -16,8 +16,6 @@ from . import __version__
 from .errors import SehdrError, UsageError, as_user_error, did_you_mean, flags_in_messages, visible
 
 PROGRAM = "sehdr-warp"
-MIN_COLUMNS = 40
-"""Columns of the narrowest terminal that help tables are laid out for; a narrower one takes minutes."""
 
 
 class Command(NamedTuple):
@@ -85,25 +83,30 @@ _reserve = [bytearray(4 << 20)]
 """Memory that is released to print an error when a command has run out of memory."""
 
 
-@flags_in_messages()
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command line and exit.
+    """Run a command line and exit, see run_program().
 
     Args:
         arguments: the words after the program's name; by default those of this process.
+    """
+    run_program(_run, list(sys.argv[1:] if arguments is None else arguments), PROGRAM)
+
+
+@flags_in_messages()
+def run_program(run: Callable[[list[str]], None], words: list[str], program: str) -> None:
+    """Call run(words) and exit; an error that the user can act on is one line that begins with `program`.
 
     Raises:
         SystemExit: with status 0 for success, 1 for an error that the user can act on, 2 for wrong usage, 130 for an
             interrupt, and 141 if nobody reads the output any more.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         try:
-            _run(words)
+            run(words)
         finally:
             sys.stdout.flush()
     except KeyboardInterrupt:
-        _print_error(f"{PROGRAM}: interrupted")
+        _print_error(f"{program}: interrupted")
         sys.exit(130)
     except BrokenPipeError:
         # The reader has gone, as in `sehdr-warp ... | head`. Python's own flush at exit would fail again.
@@ -118,7 +121,7 @@ def main(arguments: list[str] | None = None) -> None:
             import traceback
 
             traceback.print_exc()
-        _print_error(f"{PROGRAM}: {str(message).removeprefix(PROGRAM + ' ')}")
+        _print_error(f"{program}: {str(message).removeprefix(program + ' ')}")
         sys.exit(2 if isinstance(message, UsageError) else 1)
     sys.exit(0)
 
@@ -159,8 +162,6 @@ def _run(argv: list[str]) -> None:
 
     check_working_directory()
     calm_threads()
-    if shutil.get_terminal_size().columns < MIN_COLUMNS:
-        os.environ["COLUMNS"] = str(MIN_COLUMNS)
     from .console import show_logs, stages_on_terminal
     from .quiet import silence_exit
 
@@ -211,7 +212,7 @@ def _help() -> str:
     """Return the commands under their headings, each with its summary."""
     import textwrap
 
-    width = min(shutil.get_terminal_size().columns, 100)
+    width = max(40, min(shutil.get_terminal_size().columns, 100))
     lines = [f"usage: {PROGRAM} COMMAND ...", "", "Scene-linear HDR Gaussian scenes from photos of one exposure.", ""]
     for heading, group in COMMANDS.items():
         lines.append(f"{heading}:")

@@ -140,32 +140,30 @@ class _StageLines:
         self._bar, self._stage = None, None
 
     def _open(self, stage: Stage) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, ProgressColumn, TextColumn
-        from rich.progress import Progress as Bar
-
         parts = "{task.description}", "{task.completed}/{task.total}", "{task.fields[left]}", "{task.fields[training]}"
-        columns: list[ProgressColumn] = [TextColumn(part, markup=False) for part in parts]
-        columns.insert(1, BarColumn(20))
-        self._bar, self._stage = Bar(*columns, console=Console(file=sys.stderr)), stage
+        self._bar, self._stage = _new_bar(*parts, width=20), stage
         self._bar.add_task(stage.activity, total=stage.total or None, left="", training="")
         self._bar.start()
+
+
+def _new_bar(*parts: str, width: int | None) -> Any:
+    """Return a progress bar of rich with the bar, `width` columns wide, after the first part; None fills the line."""
+    from rich.console import Console
+    from rich.progress import BarColumn, ProgressColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    columns: list[ProgressColumn] = [TextColumn(part, markup=False) for part in parts]
+    columns.insert(1, BarColumn(width))
+    return Bar(*columns, console=Console(file=sys.stderr), expand=width is None)
 
 
 @contextmanager
 def _bar(total: int) -> Iterator[Callable[[Progress], None]]:
     """Show a bar, and yield the function that updates it."""
-    from rich.console import Console
-    from rich.progress import BarColumn, ProgressColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    console = Console(file=sys.stderr)
     # rich cuts columns on the right if the terminal is narrow, so the most important ones come first.
     parts = "{task.completed}/{task.total}", "{task.fields[rate]}", "{task.fields[left]} left", "{task.fields[figures]}"
-    columns: list[ProgressColumn] = [TextColumn(part, markup=False) for part in parts]
-    columns.insert(1, BarColumn(None))
-    with Bar(*columns, console=console, expand=True) as bar:
-        task = bar.add_task("train", total=total, rate="", left="-:--", figures="")
+    with _new_bar(*parts, width=None) as bar:
+        console, task = bar.console, bar.add_task("train", total=total, rate="", left="-:--", figures="")
 
         def show(progress: Progress) -> None:
             loss, psnr, gaussians = progress.loss, progress.psnr, progress.gaussians

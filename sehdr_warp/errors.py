@@ -88,12 +88,10 @@ class InputError(SehdrError):
         """Compose the message; remedy says what to do."""
         problem = " ".join(problem.split())  # Libraries' messages may have several lines.
         self.path, self.problem = str(path), problem
-        parts = [_shorten(self.path), _shorten(problem)]
-        super().__init__(" ".join(f"{parts[0]}: {parts[1]}; {remedy}".split()))
-
-
-def _shorten(text: str) -> str:
-    return text if len(text) <= MAX_MESSAGE_PART else text[:MAX_MESSAGE_PART] + " ..."
+        place, what = (
+            part[:MAX_MESSAGE_PART] + " ..." * (len(part) > MAX_MESSAGE_PART) for part in (self.path, problem)
+        )
+        super().__init__(" ".join(f"{place}: {what}; {remedy}".split()))
 
 
 def require_extra(module: str, purpose: str, extra: str) -> Any:

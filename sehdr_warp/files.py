@@ -141,9 +141,8 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """Return the whole file; raise InputError if it is missing, unreadable, empty or larger than `limit` bytes."""
     try:
         if (size := plain_size(path)) > limit:
-            raise InputError(
-                path, f"{size} bytes is more than the limit of {limit}", "check that this is the right file"
-            )
+            problem = f"{size} bytes is more than the limit of {limit}"
+            raise InputError(path, problem, "check that this is the right file")
         data = path.read_bytes()
     except FileNotFoundError:
         raise InputError(path, "file not found", "check the name") from None
@@ -240,7 +239,12 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
         SehdrError: If it cannot be written.
     """
     path = Path(path)
-    _check_place(path)
+    require_text(path)
+    parent = next(parent for parent in path.absolute().parents if parent.exists())
+    if not parent.is_dir():
+        raise InputError(parent, "is a file, or in one, and not a folder", "choose another place")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise SehdrError(f"{path}: cannot be written (nothing may be made in {parent}); choose another folder")
     if not (path.exists() or path.is_symlink()):
         return
     if path.is_dir() != folder or path.is_symlink() or not (path.is_dir() or path.is_file()):
@@ -264,16 +268,6 @@ def require_text(name: Path | str) -> None:
         str(name).encode()
     except UnicodeEncodeError:
         raise InputError(ascii(str(name)), "is a name that is not UTF-8 text", "rename it") from None
-
-
-def _check_place(path: Path) -> None:
-    """Raise InputError if the parent of `path` is a file, SehdrError if nothing may be written there."""
-    require_text(path)
-    parent = next(parent for parent in path.absolute().parents if parent.exists())
-    if not parent.is_dir():
-        raise InputError(parent, "is a file, or in one, and not a folder", "choose another place")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise SehdrError(f"{path}: cannot be written (nothing may be made in {parent}); choose another folder")
 
 
 @contextmanager

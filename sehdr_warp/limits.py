@@ -9,6 +9,14 @@ from pathlib import Path
 
 PROC, MOUNT = Path("/proc"), Path("/sys/fs/cgroup")
 _NO_LIMIT = 1 << 60  # Bytes; version 1 states a number of about 2^63 if there is no limit
+_MEMORY_FILES = {
+    1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    2: ("memory.max", "memory.high", "memory.current", "inactive_file"),
+}
+"""Files of a cgroup by its version: limits, usage, and the field of idle file pages in memory.stat.
+
+Above memory.high, processes are slowed down until they hardly go on.
+"""
 
 
 def memory_left(proc: Path = PROC, mount: Path = MOUNT, environment: Mapping[str, str] | None = None) -> int | None:
@@ -24,14 +32,13 @@ def memory_left(proc: Path = PROC, mount: Path = MOUNT, environment: Mapping[str
     Returns:
         Bytes, at least 0; None without a limit.
     """
-    environment = os.environ if environment is None else environment
-    free = [
-        limit - max(0, usage - _number(group / "memory.stat", field))
-        for group, names, field in _memory_groups(proc, mount)
-        if (limit := min(_number(group / name) for name in names[:-1])) < _NO_LIMIT
-        and (usage := _number(group / names[-1])) < _NO_LIMIT
-    ]
-    if (job := _slurm_memory(environment)) is not None:
+    free = []
+    for version, group in _groups(proc, mount, "memory"):
+        *limits, usage, idle_pages = _MEMORY_FILES[version]
+        limit, used = min(_number(group / name) for name in limits), _number(group / usage)
+        if max(limit, used) < _NO_LIMIT:
+            free.append(limit - max(0, used - _number(group / "memory.stat", idle_pages)))
+    if (job := _slurm_memory(os.environ if environment is None else environment)) is not None:
         free.append(job - _resident(proc))
     return max(0, min(free)) if free else None
 
@@ -81,23 +88,9 @@ def _groups(proc: Path, mount: Path, controller: str) -> Iterator[tuple[int, Pat
                 continue
             below = Path(path.lstrip("/"))
             for root in roots:
-                for place in (
-                    below,
-                    *below.parents,
-                ):  # In a container the path may be the host's
+                for place in (below, *below.parents):  # In a container the path may be the host's.
                     if (root / place).is_dir():
                         yield version, root / place
-
-
-def _memory_groups(proc: Path, mount: Path) -> Iterator[tuple[Path, tuple[str, ...], str]]:
-    """Yield the folder of each memory cgroup, its files of limits and of usage, and the field of idle file pages."""
-    # Above memory.high, processes are slowed down until they hardly go on.
-    names = {
-        1: ("memory.limit_in_bytes", "memory.usage_in_bytes"),
-        2: ("memory.max", "memory.high", "memory.current"),
-    }
-    for version, group in _groups(proc, mount, "memory"):
-        yield group, names[version], "total_inactive_file" if version == 1 else "inactive_file"
 
 
 def _number(path: Path, field: str | None = None) -> int:

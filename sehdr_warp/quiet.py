@@ -57,12 +57,12 @@ def silence_exit() -> None:
 
     colour-science loads it if it is installed, and it lists what Python still held.
     """
-    atexit.unregister(_silence_if_loaded)
-    atexit.register(_silence_if_loaded, "OpenImageIO")
+    atexit.unregister(_silence_openimageio)
+    atexit.register(_silence_openimageio)
 
 
-def _silence_if_loaded(module: str) -> None:
-    if module in sys.modules:
+def _silence_openimageio() -> None:
+    if "OpenImageIO" in sys.modules:
         sys.stderr.flush()
         with open(os.devnull, "wb") as nothing:
             os.dup2(nothing.fileno(), 2)

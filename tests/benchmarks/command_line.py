@@ -17,5 +17,5 @@ def refused(capfd, *words) -> str:
     capfd.readouterr()
     assert call(*words, "-q") == 1
     lines = capfd.readouterr().err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("benchmarks: "), lines
+    assert len(lines) == 1 and lines[0].startswith("python -m benchmarks: "), lines
     return lines[0]

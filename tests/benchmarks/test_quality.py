@@ -115,7 +115,7 @@ def test_what_cannot_be_planned_is_named(capfd, tmp_path):
         (["--methods", "truth", "--responses", "blind"], "there is nothing to train"),
         (["--scenes", tmp_path / "nowhere"], "no such folder"),
         (["--jobs", "0"], "--jobs 0: not positive"),
-        (["--slurm", "gpu"], "not name=value pairs"),
+        (["--slurm", "gpu"], "not NAME=VALUE separated by commas"),
     ):
         line = refused(capfd, *[*SMALL, "--out", tmp_path / "out", *arguments])
         assert message in line, line
