@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.request import Request, urlopen
 
 import torch
@@ -58,33 +58,37 @@ COPY_SECONDS, VIEW_SECONDS = 30.0, 22.0  # That must be left for them
 
 @dataclass(frozen=True)
 class Study:
-    """Sizes of the study, and what it has found.
+    """Options of the study, and what it has found."""
 
-    Attributes:
-        out: Folder for the photos, the runs and rows.jsonl.
-        views: Photos, of which one in eight is held out.
-        size: Their width in pixels.
-        gaussians: Most Gaussians of the whole, and of all blocks together.
-        steps: Of the whole.
-        count: Blocks.
-        copies: Gaussians of the copies of the merged run.
-        device: The first device; the GPUs that follow it are used, too.
-        seconds: Time for the study; what does not fit into it is left out.
-        began: Start of the study, monotonic seconds.
-        rows: What was found.
-    """
+    out: tyro.conf.Positional[Path]
+    """New folder for the photos, the runs and rows.jsonl."""
+    views: int = 400
+    """Photos, of which one in eight is held out."""
+    size: int = 560
+    """Their width in pixels."""
+    gaussians: int = 2_300_000
+    """Most Gaussians of the whole, and of all blocks together."""
+    steps: int = 8700
+    """Of the whole."""
+    count: int = 4
+    """Blocks."""
+    copies: int = 20_000_000
+    """Gaussians of the copies of the merged run."""
+    device_name: Annotated[str, tyro.conf.arg(name="device")] = "cuda:0" if torch.cuda.is_available() else "cpu"
+    """cpu or cuda:N; the GPUs that follow it are used, too."""
+    seconds: float = 1e9
+    """Time for the study; what does not fit into it is left out."""
+    json: Path | None = None
+    """Result, which is written even if a part of the study fails."""
+    began: tyro.conf.Suppress[float] = field(default_factory=time.monotonic)
+    """Start of the study, monotonic seconds."""
+    rows: tyro.conf.Suppress[list[dict[str, Any]]] = field(default_factory=list)
+    """What was found."""
 
-    out: Path
-    views: int
-    size: int
-    gaussians: int
-    steps: int
-    count: int
-    copies: int
-    device: torch.device
-    seconds: float
-    began: float = field(default_factory=time.monotonic)
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    @property
+    def device(self) -> torch.device:
+        """The first device."""
+        return torch.device(self.device_name)
 
     def add(self, what: str, **values: Any) -> None:
         """Add a row, and write it."""
@@ -136,7 +140,7 @@ class _Spans(logging.Handler):
 def run_study(study: Study) -> None:
     """Train the survey in both ways, and add what is found."""
     survey = study.out / "survey"
-    write_survey(survey, study.views, study.size, study.gaussians * 13 // 10, study.device)
+    write_survey(survey, study.views, study.size, study.gaussians * 13 // 10, study.device_name)
     data: LoadArguments = {"path": str(survey.absolute()), "exposure_index": None, "max_size": None, "holdout": None}
     config = _config(study)
     plan = make_block_plan(data, config, study.device, study.count)
@@ -366,34 +370,21 @@ def _milliseconds(times: Sequence[float]) -> dict[str, float]:
     return {"median_ms": 1e3 * later[len(later) // 2], "slowest_ms": 1e3 * later[-1]}
 
 
-def main(
-    out: tyro.conf.Positional[Path],
-    /,
-    views: int = 400,
-    size: int = 560,
-    gaussians: int = 2_300_000,
-    steps: int = 8700,
-    count: int = 4,
-    copies: int = 20_000_000,
-    device: str = "cuda" if torch.cuda.is_available() else "cpu",
-    seconds: float = 1e9,
-    json: Path | None = None,
-) -> None:
-    """Run the study in a new folder; `json` is written even if a part of it fails."""
+def main(study: Study) -> None:
+    """Run the study."""
     calm_threads()  # For the processes that this one starts
     logging.basicConfig(level=logging.INFO, format="%(relativeCreated)7d %(message)s", stream=sys.stdout)
-    out.mkdir(parents=True, exist_ok=True)
-    first = torch.device("cuda:0" if device == "cuda" else device)
-    study = Study(out, views, size, gaussians, steps, count, copies, first, seconds)
-    settings = {"views": views, "size": size, "gaussians": gaussians, "steps": steps, "blocks": count}
-    result = new_result("blocks", first, {**settings, "GPUs": len(study.devices) if first.type == "cuda" else 0})
+    study.out.mkdir(parents=True, exist_ok=True)
+    settings = {"views": study.views, "size": study.size, "gaussians": study.gaussians, "steps": study.steps}
+    settings |= {"blocks": study.count, "GPUs": len(study.devices) if study.device.type == "cuda" else 0}
+    result = new_result("blocks", study.device, settings)
     try:
         run_study(study)
     finally:
         result["rows"] = study.rows
-        if json is not None:
-            write_json(json, result, overwrite=True)
+        if study.json is not None:
+            write_json(study.json, result, overwrite=True)
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(tyro.cli(Study))

@@ -72,10 +72,9 @@ def compare(
     scene: Scene, seed: int, lpips: Path | None, strategies: tuple[str, ...] = STRATEGIES, device: str = "cuda:0"
 ) -> list[dict]:
     """Return a row of held-out figures for each method."""
-    metric = load_lpips(lpips, torch.device(device))[0]
-    photos, size = f"{len(scene.train_views)} + {len(scene.test_views)}", max(scene.views[0].codes.shape)
-    place = {"capture": scene.name, "photos": photos, "size": size, "seed": seed}
-    rows = []
+    metric, rows = load_lpips(lpips, torch.device(device))[0], []
+    place = {"capture": scene.name, "photos": f"{len(scene.train_views)} + {len(scene.test_views)}"}
+    place |= {"size": max(scene.views[0].codes.shape), "seed": seed}
 
     def add(method: str, response: Response, render: Callable[[View], Tensor], **values) -> None:
         with torch.no_grad():
@@ -88,10 +87,10 @@ def compare(
     scratch = Path(tempfile.mkdtemp())
     forget_peaks(torch.device(device))
     run = train(scene, scratch / "run", load_config("default", {"seed": seed}), device=device)
-    figures_of_run = {"iterations": run.iterations, "seconds": run.train_seconds, "gaussians": run.gaussian_count}
     scores = [(line["seconds"], line["psnr_ldr"]) for line in run.metrics()]
-    figures_of_run["best"] = max(score for _, score in scores)
-    add("sehdr-warp", run.response, lambda view: photograph(run, view), **figures_of_run)
+    values = {"iterations": run.iterations, "seconds": run.train_seconds, "gaussians": run.gaussian_count}
+    values["best"] = max(score for _, score in scores)
+    add("sehdr-warp", run.response, lambda view: photograph(run, view), **values)
     shutil.rmtree(scratch)
     response, normalized = response_for_training(scene, load_config("default")), normalization_of(scene)
     for strategy in strategies:

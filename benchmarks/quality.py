@@ -13,14 +13,13 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import cycle, product
+from itertools import chain, cycle, product
 from pathlib import Path
 
 import torch
 from filelock import FileLock, Timeout
 
-from benchmarks.irradiance import irradiance_errors, read_light_maps
-from benchmarks.stored_light import LIGHT, store_light
+from benchmarks.irradiance import LIGHT, irradiance_errors, read_light_maps, store_light
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.metrics import REGIONS
@@ -120,7 +119,7 @@ def plan_jobs(
         raise SehdrError(f"exposure {item} is not one of 0 to {EXPOSURES - 1}")
     for item in set(responses) - {KNOWN, BLIND}:
         raise SehdrError(f"response {item!r} is not one of {KNOWN}, {BLIND}")
-    for note in (note for curve in curves for note in response_by_name(curve).notes):
+    for note in chain.from_iterable(response_by_name(curve).notes for curve in curves):
         LOG.info("%s", note)
     titles = [place.removeprefix("embedded:") if is_embedded(place) else Path(place).resolve().name for place in scenes]
     for what, names, file in (("scenes", titles, "folder"), ("methods", [Path(m).stem for m in methods], "TOML file")):
@@ -154,10 +153,8 @@ def plan_jobs(
         }
         jobs.append(Job(decided, place if is_embedded(place) else str(Path(place).absolute())))
     if not jobs:
-        raise SehdrError(
-            f"there is nothing to train: choose methods from {', '.join(preset_names())}; those that take nothing from "
-            "photos need known in --responses"
-        )
+        remedy = f"choose methods from {', '.join(preset_names())}; those that take nothing from photos need known"
+        raise SehdrError(f"there is nothing to train: {remedy} in --responses")
     return jobs
 
 
@@ -189,9 +186,7 @@ def _digest(place: str) -> str:
         raise InputError(place, "no such folder", "give folders with HDR truth, or embedded")
     digest = hashlib.sha256()
     for path in sorted(path for path in [folder, *folder.rglob("*")] if path.is_file()):
-        digest.update(str(path.relative_to(folder)).encode() + b"\0")
-        with open(path, "rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+        digest.update(str(path.relative_to(folder)).encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 
 
@@ -214,15 +209,17 @@ def run_jobs(
     for job in open_jobs:
         (job.folder(out) / FAILURE).unlink(missing_ok=True)
     at_once = max(1, min(at_once, len(open_jobs)))
-    if open_jobs and at_once == 1 and slurm is None:
+    if at_once == 1 and slurm is None:
         work(open_jobs, out, device, 1, lpips)
     elif open_jobs:
         _submit(open_jobs, out, device, at_once, slurm, lpips)
     rows = []
     for job in jobs:
-        result, failure = job.result(out), _read(job.folder(out) / FAILURE)
-        error = failure.get("error", "no worker was left to run it")
-        rows.append(row_of(result) if result else {"label": job.label, "error": error})
+        if result := job.result(out):
+            rows.append(row_of(result))
+        else:
+            error = _read(job.folder(out) / FAILURE).get("error", "no worker was left to run it")
+            rows.append({"label": job.label, "error": error})
     return rows
 
 
@@ -265,15 +262,12 @@ def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpip
     for index in range(at_once):
         if slurm is None:
             executor = submitit.LocalExecutor(folder=out / "logs")
-            executor.update_parameters(timeout_min=MONTH)
-            if gpus:
-                executor.update_parameters(gpus_per_node=1, visible_gpus=[index % gpus])
+            parameters = {"gpus_per_node": 1, "visible_gpus": [index % gpus]} if gpus else {}
         else:
             executor = submitit.AutoExecutor(folder=out / "logs", cluster="slurm")
-            executor.update_parameters(timeout_min=MONTH, name="sehdr-warp")
-            one = {"gpus_per_node": 1} if device == "cuda" else {}
-            own = {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
-            executor.update_parameters(**one | own)
+            parameters = {"name": "sehdr-warp"} | ({"gpus_per_node": 1} if device == "cuda" else {})
+            parameters |= {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
+        executor.update_parameters(**{"timeout_min": MONTH} | parameters)
         workers.append(executor.submit(work, jobs, out.absolute(), device, shared, lpips))
     try:
         for worker in workers:
@@ -326,8 +320,8 @@ def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
     scene = exposed(job.place, config["scene"]["max_size"], config["curve"], config["exposure"])
     training = config_from_dict(config["training"], job.label)
     # A method that learns from photos alone sees no truth in the training views.
-    views = tuple(replace(view, hdr=None) if view.split == "train" else view for view in scene.views)
-    train_scene = scene if config["sees_truth"] else replace(scene, views=views)
+    views = [replace(view, hdr=None) if view.split == "train" else view for view in scene.views]
+    train_scene = scene if config["sees_truth"] else replace(scene, views=tuple(views))
     _warm_up(train_scene, training, folder / "warm-up", device)
     shutil.rmtree(out, ignore_errors=True)
     forget_peaks(torch.device(device))

@@ -8,7 +8,7 @@ from .quality import EXPOSURES, KNOWN, LEARNED, UPPER_BOUND
 from .report_tables import PAGES, pivot
 from .results import groups, markdown_table, parted
 
-FIRST_TITLE = "trained by"  # Of the README's table
+FIRST_TITLE, ENERGY_TITLE = "trained by", "light energy: median, 5th to 95th percentile"  # Of the README's table
 NOTHING_CLIPS = 0.001  # Of the pixels
 
 
@@ -46,12 +46,13 @@ def quality_tables(result: dict) -> Iterable[str]:
             yield "Means are over the scenes and exposures at which every method was trained."
         yield markdown_table(table, columns)
         yield "gt-max by scene and exposure, mean over seeds, dB:"
-        fields = ("scene", "exposure", "method")
-        means = [
-            dict(zip(fields, key)) | {"dB": fmean(row["gt_max"] for row in here)}
-            for key, here in groups(members, *fields).items()
-        ]
-        yield pivot(means, {"scene": "", "exposure": "d"}, "method", "dB", ".2f")
+        yield pivot(
+            _means(members, "gt_max", "scene", "exposure", "method"),
+            {"scene": "", "exposure": "d"},
+            "method",
+            "gt_max",
+            ".2f",
+        )
         yield from _whole_by_seed(members)
     shared = max(row["shared_by"] for row in rows)
     if shared > 1:
@@ -60,10 +61,8 @@ def quality_tables(result: dict) -> Iterable[str]:
 
 def _rows_of_all_methods(rows: Sequence[Mapping]) -> Sequence[Mapping]:
     """Return the rows of the scenes and exposures that every method has; all, if there are none."""
-    places = ("scene", "exposure")
-    by_method = [groups(mine, *places).keys() for mine in groups(rows, "method").values()]
-    shared = set.intersection(*map(set, by_method))
-    return [row for row in rows if tuple(row[field] for field in places) in shared] or rows
+    shared = set.intersection(*(set(groups(mine, "scene", "exposure")) for mine in groups(rows, "method").values()))
+    return [row for row in rows if (row["scene"], row["exposure"]) in shared] or rows
 
 
 def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
@@ -139,18 +138,14 @@ def _energy_tables(rows: Sequence[Mapping]) -> Iterable[str]:
     for (method, exposure), mine in sorted(groups(rows, "method", "exposure").items()):
         energies = [energy for row in mine for energy in row.get("light_energies") or ()]
         if energies:
-            near = (sum(0.5 <= energy <= 2 for energy in energies)) / len(energies)
-            counts = {
-                "lost": sum(row["lights_lost"] for row in mine),
-                "lights": sum(row["lights_count"] for row in mine),
-            }
-            table.append({"method": method, "exposure": exposure, "n": len(energies), "near": near} | counts)
-            table[-1] |= _light_energy(mine)
+            near = sum(0.5 <= energy <= 2 for energy in energies) / len(energies)
+            line = {"method": method, "exposure": exposure, "n": len(energies), "near": near} | _light_energy(mine)
+            table.append(line | {name: sum(row[f"lights_{name}"] for row in mine) for name in ("lost", "count")})
     if table:
         yield "## Energy of the lights that photos clip, over the truth's"
         columns = {"method": "", "exposure": "d", "lights that clip=n": "d", "median=light energy": ".2f"}
         columns |= {"percentiles=5th to 95th percentile": "", "half to twice=near": ".0%"}
-        columns |= {"all lights=lights": "d", "lost": "d"}
+        columns |= {"all lights=count": "d", "lost": "d"}
         yield markdown_table(table, columns)
 
 
@@ -166,38 +161,30 @@ def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
         medians += [f"{method} {median(whole):.1%} ({len(whole)} trainings)"] if whole else []
     if medians:
         yield f"Where less than {NOTHING_CLIPS:.1%} of the pixels clip, in the median: {', '.join(medians)}."
-    means = [
-        {"scene": scene, "exposure": exposure, "method": method, "off": fmean(row["irradiance"] for row in here)}
-        for (scene, exposure, method), here in groups(rows, "scene", "exposure", "method").items()
-    ]
-    clipped = [
-        {"scene": row["scene"], "exposure": row["exposure"], "method": "clipped pixels", "off": row["clipped_share"]}
-        for row in {(row["scene"], row["exposure"]): row for row in rows}.values()
-    ]
-    yield pivot([*clipped, *means], {"scene": "", "exposure": "d"}, "method", "off", ".1%")
+    clipped = {
+        (row["scene"], row["exposure"]): {**row, "method": "clipped pixels", "irradiance": row["clipped_share"]}
+        for row in rows
+    }
+    means = _means(rows, "irradiance", "scene", "exposure", "method")
+    yield pivot([*clipped.values(), *means], {"scene": "", "exposure": "d"}, "method", "irradiance", ".1%")
+
+
+def _means(rows: Sequence[Mapping], value: str, *fields: str) -> list[dict]:
+    """Return a row for each combination of fields, with the mean of a value."""
+    each = groups(rows, *fields).items()
+    return [dict(zip(fields, key, strict=True)) | {value: fmean(row[value] for row in mine)} for key, mine in each]
 
 
 def readme_table(rows: Sequence[Mapping]) -> str:
-    """Return the rows of in_short() that the README shows, as Markdown; figures that no row has are left out."""
+    """Return the rows of in_short() that the README shows, as Markdown."""
     labels = PAGES["quality"]["readme"]
-    short = {row["method"]: row for row in in_short(rows) if row["method"] in labels}
-    irradiance = any(row["irradiance off"] is not None for row in short.values())
-    titles = [FIRST_TITLE, "HDR", "photos", "lights below half", *["irradiance off: mean, worst"] * irradiance]
-    titles += ["light energy: median, 5th to 95th percentile"]
-    lines = []
-    for method, label in labels.items():
-        if (row := short.get(method)) is None:
-            continue
-        off = "-" if row["irradiance off"] is None else f"{row['irradiance off']:.0%}, {row['worst room']:.0%}"
-        energy = "-" if row["light energy"] is None else f"{row['light energy']:.2f}, {row['5th to 95th percentile']}"
-        lights_lost = row["lost"].removesuffix(" lights")
-        cells = [
-            label,
-            f"{row['HDR dB']:.1f} dB",
-            f"{row['photos dB']:.1f} dB",
-            lights_lost,
-            *[off] * irradiance,
-            energy,
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([f"| {' | '.join(titles)} |", f"| ---{' | -:' * (len(titles) - 1)} |", *lines])
+    short = {row["method"]: row for row in in_short(rows)}
+    titles = FIRST_TITLE, "HDR", "photos", "lights below half", "irradiance off: mean, worst", ENERGY_TITLE
+    lines = [f"| {' | '.join(titles)} |", f"| ---{' | -:' * (len(titles) - 1)} |"]
+    for row, label in ((short[method], label) for method, label in labels.items() if method in short):
+        off, energy = f"{row['irradiance off']:.0%}, {row['worst room']:.0%}", f"{row['light energy']:.2f}"
+        lines.append(
+            f"| {label} | {row['HDR dB']:.1f} dB | {row['photos dB']:.1f} dB | {row['lost'].removesuffix(' lights')} | "
+            f"{off} | {energy}, {row['5th to 95th percentile']} |"
+        )
+    return "\n".join(lines)

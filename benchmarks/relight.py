@@ -25,10 +25,9 @@ from sehdr_warp.output.images import quantize, write_picture
 from sehdr_warp.output.tonemap import encode_srgb
 from sehdr_warp.scene import embedded_folder, look_at
 
-from .irradiance import LightMap, read_light_maps
+from .irradiance import LIGHT, LightMap, read_light, read_light_maps
 from .quality import KNOWN, RESULT
 from .results import finish, new_result
-from .stored_light import LIGHT, read_light
 
 LOG = logging.getLogger("relight")
 SIZE, SAMPLES, DEPTH = 96, 256, 3  # Pixels of a ball, paths of a pixel, and surfaces of a path

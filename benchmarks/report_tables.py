@@ -18,11 +18,8 @@ def pivot(rows: Sequence[Mapping], places: dict[str, str], over: str, value: str
 
     places: as columns of a table.
     """
-    fields = [field for _, field, _ in parted(places)]
-    row_groups = groups(rows, *fields).items()
-    pivoted = [
-        dict(zip(fields, key, strict=True)) | {row[over]: row[value] for row in here} for key, here in row_groups
-    ]
+    by_place = groups(rows, *(field for _, field, _ in parted(places))).values()
+    pivoted = [{**here[0], **{row[over]: row[value] for row in here}} for here in by_place]
     return markdown_table(pivoted, places | dict.fromkeys((row[over] for row in rows), form))
 
 
@@ -176,18 +173,14 @@ def _trust_tables(result: dict) -> Iterable[str]:
         yield "By somebody who had seen neither sources nor trial; *held*: at first, *failing*: after the mends."
         yield markdown_table([*rows, total], {"family": "", **dict.fromkeys(counts, "d"), "found": ""})
     if "fuzz" in result:
-        rows = []
+        counts, rows = ("inputs", "findings"), []
         for (reader,), each in groups(result["fuzz"], "reader").items():
-            seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in each}))
-            rows.append(
-                {"reader": reader, "seeds": seeds} | {n: sum(r[n] for r in each) for n in ("inputs", "findings")}
-            )
-        sums = {name: sum(row[name] for row in rows) for name in ("inputs", "findings")}
+            seeds = ", ".join(map(str, sorted({row["seed"] for row in each})))
+            rows.append({"reader": reader, "seeds": seeds} | {name: sum(row[name] for row in each) for name in counts})
+        rows.append({"reader": "all"} | {name: sum(row[name] for row in rows) for name in counts})
         yield "## Damaged files"
         yield "Made by `python -m tests.fuzz`. A finding is anything but a refusal in one line."
-        yield markdown_table(
-            [*rows, {"reader": "all"} | sums], {"reader": "", "inputs": ",d", "seeds": "", "findings": "d"}
-        )
+        yield markdown_table(rows, {"reader": "", "inputs": ",d", "seeds": "", "findings": "d"})
 
 
 def _relight_tables(result: dict) -> Iterable[str]:

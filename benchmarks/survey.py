@@ -1,11 +1,11 @@
 """A synthetic survey of any size: a town of coloured blobs, photographed from above along lanes as a drone does.
 
-Run `python -m benchmarks.survey FOLDER --views 400 --size 640 --gaussians 2000000`. The truth is a field of Gaussians
-on ground, roofs and walls, rendered by the package itself; photos, poses and sparse points are written as a set in the
-layout of nerfstudio (transforms.json).
+python -m benchmarks.survey FOLDER --views 400 --device cuda
+
+The truth is a field of Gaussians on ground, roofs and walls, rendered by the package itself; photos, poses and sparse
+points are written as a set in the layout of nerfstudio (transforms.json).
 """
 
-import argparse
 import json
 import math
 from collections import deque
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import tyro
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
@@ -96,17 +97,24 @@ def make_cameras(views: int, size: int, length: float, width: float) -> list[Cam
 
 
 def write_survey(
-    folder: Path,
-    views: int,
-    size: int,
-    gaussians: int,
-    device: torch.device | str = "cpu",
+    folder: tyro.conf.Positional[Path],
+    views: int = 400,
+    size: int = 640,
+    gaussians: int = 2_000_000,
+    device: str = "cpu",
     aspect: float = 4.0,
     seed: int = 0,
 ) -> None:
     """Write photos, poses and points.
 
-    aspect: length of the town by its width. Its area grows with the photos, so that each shows as much.
+    Args:
+        folder: of the set.
+        views: number of photos.
+        size: width of the photos, pixels.
+        gaussians: of the truth.
+        device: that renders.
+        aspect: length of the town over its width. Its area grows with the photos, so that each shows as much.
+        seed: of the town.
     """
     area = views * 1.2
     width = math.sqrt(area / aspect)
@@ -147,9 +155,4 @@ def _write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    for name, default in (("views", 400), ("size", 640), ("gaussians", 2_000_000)):
-        parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    write_survey(**vars(parser.parse_args()))
+    tyro.cli(write_survey)

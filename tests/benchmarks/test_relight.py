@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.irradiance import LightMap
-from benchmarks.stored_light import read_light, store_light
+from benchmarks.irradiance import LightMap, read_light, store_light
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.environment_map import latlong

@@ -42,7 +42,8 @@ def test_the_pages_are_what_the_results_make(tmp_path):
         (tmp_path / name).write_bytes((REPORTS / name).read_bytes())
     write_reports(tmp_path)
     for page in sorted(REPORTS.glob("*.md")):
-        assert page.read_text() == (tmp_path / page.name).read_text(), page.name
+        remedy = "edit the result or benchmarks/pages.toml, then run python -m benchmarks.report_pages"
+        assert page.read_text() == (tmp_path / page.name).read_text(), f"{page.name} is made of results: {remedy}"
     pages = [
         {path.name for path in folder.iterdir() if path.suffix in (".md", ".png")} for folder in (tmp_path, REPORTS)
     ]
@@ -55,7 +56,7 @@ def test_the_readme_shows_the_page_of_quality(tmp_path):
     (copy := tmp_path / "README.md").write_text(re.sub(r"\d dB \|", "0 dB |", readme.read_text()))
     assert copy.read_text() != readme.read_text()
     write_readme(copy, stored)
-    assert copy.read_text() == readme.read_text()
+    assert copy.read_text() == readme.read_text(), "run python -m benchmarks.report_pages"
 
 
 def test_quality_is_paired_with_the_upper_bound(tmp_path):

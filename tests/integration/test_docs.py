@@ -117,12 +117,14 @@ def test_links_lead_somewhere(page):
         assert file.exists(), f"{page.name} points at {target}"
         if anchor:
             titles = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE)
-            assert anchor in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, target
+            anchors = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+            assert anchor in anchors, f"{page.name} points at {target}; {file.name} has {sorted(anchors)}"
 
 
 def test_the_site_lists_every_page():
     listed = (ROOT / "mkdocs.yml").read_text()
-    assert [page.name for page in GUIDE if page.name not in listed] == []
+    missing = [page.name for page in GUIDE if page.name not in listed]
+    assert not missing, f"add them to nav in mkdocs.yml: {missing}"
 
 
 # Words on one page. A page that outgrows its budget is split by topic or shortened.
@@ -148,7 +150,8 @@ def test_image_keeps_its_size(image):
 def test_guide_keeps_no_diary():
     for page in [*GUIDE, ROOT / "README.md"]:
         text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
-        assert not re.search(r"20[0-9]{2}-[0-9]{2}|\b[0-9a-f]{7}\b(?<![0-9]{7})", text), page.name
+        diary = re.search(r"20[0-9]{2}-[0-9]{2}|\b[0-9a-f]{7,8}\b(?<![0-9]{7})", text)
+        assert not diary, f"{page.name}: {diary and diary[0]}: dates and builds belong into docs/reports"
 
 
 def test_changelog_and_citation_state_the_version():
