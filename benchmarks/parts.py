@@ -40,7 +40,7 @@ KERNELS = {
     "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*"),
     "blend, backward": ("blend_backward_*",),
     "projection, backward": ("project_*_backward",),
-    "optimizer": ("update_*", "find_nonfinite_*", "check_finite_*"),
+    "optimizer": ("update_*", "find_nonfinite_*", "decide_step_*"),
     "densification": ("add_position_noise_*", "add_gradient_statistics_*"),
     OTHER: ("*",),
 }

@@ -17,7 +17,7 @@ from .geometry import geometry, pixel_of_thread
 def absolute_gradient_kernel(dtype):
     """Return the kernel for one scalar type, launched over 256 threads for each tile.
 
-    rows: added to at emit_indices[intersection]: |dL/dx|, |dL/dy| in units of the loss per pixel.
+    gradients: added to at emit_indices[intersection]: |dL/dx|, |dL/dy| in units of the loss per pixel.
     """
     g = geometry(dtype)
     real, vec2, vec4 = g.real, g.vec2, g.vec4
@@ -31,7 +31,7 @@ def absolute_gradient_kernel(dtype):
         columns: int, width: int, height: int, alpha_threshold: real,
         grad_image: wp.array2d(dtype=real), grad_transmittance: wp.array(dtype=real),
         # outputs
-        rows: wp.array(dtype=vec2),
+        gradients: wp.array(dtype=vec2),
     ):
         tile_x_y = pixel_of_thread(range_start + wp.tid(), columns)
         column = tile_x_y[1]
@@ -81,6 +81,6 @@ def absolute_gradient_kernel(dtype):
                         grad_mean = vec2(
                             slope * wp.abs(conic[0] * dx + conic[1] * dy), slope * wp.abs(conic[1] * dx + conic[2] * dy)
                         )
-                        wp.atomic_add(rows, emit_indices[end], grad_mean)
+                        wp.atomic_add(gradients, emit_indices[end], grad_mean)
 
     return absolute_gradient

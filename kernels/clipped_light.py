@@ -18,18 +18,19 @@ def _terms_function(dtype):
 
     @wp.func
     def terms_of(
-        v: real, total: real, clipped: real, smoothness: real, expected: real, precision: real, hold: real,
+        v: real, total: real, clipped: real, smoothness: real, expected: real, precision: real, estimate_weight: real,
     ):
         """Return the energy of a clipped value with logarithm v, and its derivative by v.
 
         `clipped` values around it, itself included, are clipped; `total` is the sum of their logarithms and m their
-        mean, which is held constant. The energy is smoothness / 2 (v - m)^2 + hold / 2 (precision (v - expected))^2.
-        Below white, where v is 0, only the last part has a derivative.
+        mean, which is held constant. The energy is
+        smoothness / 2 (v - m)^2 + estimate_weight / 2 (precision (v - expected))^2. Below white, where v is 0, only the
+        last part has a derivative.
         """
         away = v - total / clipped
         off = precision * (v - expected)
-        energy = real(0.5) * (smoothness * away * away + hold * off * off)
-        grad_v = hold * precision * off
+        energy = real(0.5) * (smoothness * away * away + estimate_weight * off * off)
+        grad_v = estimate_weight * precision * off
         if v > real(0.0):
             grad_v += smoothness * away
         return energy, grad_v
@@ -98,13 +99,13 @@ def clipped_light_kernel(dtype):
     def clipped_light(
         range_start: int,
         image: wp.array(dtype=real), logarithms: wp.array(dtype=real), white: real, height: int, width: int,
-        smoothness: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
-        terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
+        smoothness: real, estimate_weight: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
+        terms: wp.array(dtype=real), gradient: wp.array(dtype=real),
     ):
-        """Add terms_of() each clipped value, and its derivative.
+        """Add terms_of() each clipped value to terms, and its derivative to the gradient.
 
-        image: [H, W, 3], flat. Neighbors are the values of the same channel within REACH. terms: [H W 3]. slopes:
-        derivatives by the values; may be None.
+        image: [H, W, 3], flat. Neighbors are the values of the same channel within REACH. terms: [H W 3]. gradient:
+        with respect to the values; may be None.
         """
         i = range_start + wp.tid()
         v = logarithms[i]
@@ -122,10 +123,10 @@ def clipped_light_kernel(dtype):
             expected, precision = estimate_of(
                 estimates, rows, columns, row, column, i - 3 * (i // 3), height, width
             )
-            energy, grad_v = terms_of(v, total, clipped, smoothness, expected, precision, hold)
+            energy, grad_v = terms_of(v, total, clipped, smoothness, expected, precision, estimate_weight)
             terms[i] = terms[i] + energy
-            if slopes:
-                slopes[i] = slopes[i] + grad_v / wp.max(image[i], white)
+            if gradient:
+                gradient[i] = gradient[i] + grad_v / wp.max(image[i], white)
 
     return clipped_light
 
@@ -144,8 +145,8 @@ def clipped_light_patch_kernel(dtype, code):
     def clipped_light_in_patches(
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
         mask: wp.array(dtype=real), white_code: int, white: real, height: int, width: int,
-        smoothness: real, hold: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
-        terms: wp.array(dtype=real), slopes: wp.array(dtype=real),
+        smoothness: real, estimate_weight: real, estimates: wp.array(dtype=wp.float16), rows: int, columns: int,
+        terms: wp.array(dtype=real), gradient: wp.array(dtype=real),
     ):
         """Do what the two kernels above do; a patch's energy is added to its term of terms [patches]."""
         block, thread, top, left, _ = patch_of(wp.tid(), width, 3)
@@ -190,10 +191,10 @@ def clipped_light_patch_kernel(dtype, code):
                     for k in range(wp.static(2 * REACH + 1)):
                         figures += wp.tile_extract(sums, row, at + wp.static(CHANNELS) * k)
                     expected, precision = estimate_of(estimates, rows, columns, y, x, channel, height, width)
-                    term, grad_v = terms_of(v, figures[0], figures[1], smoothness, expected, precision, hold)
+                    term, grad_v = terms_of(v, figures[0], figures[1], smoothness, expected, precision, estimate_weight)
                     energy += term
-                    if slopes:
-                        slopes[i] = slopes[i] + grad_v / wp.max(image[i], white)
+                    if gradient:
+                        gradient[i] = gradient[i] + grad_v / wp.max(image[i], white)
         of_patch = wp.tile_extract(wp.tile_sum(wp.tile(energy)), 0)
         if thread == 0:
             terms[block] = terms[block] + of_patch

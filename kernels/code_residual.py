@@ -12,7 +12,7 @@ from .geometry import vector
 def code_residual_kernel(dtype, code, mu_law: bool):
     """Return the kernel for one scalar type and one type of codes, wp.uint8 or wp.uint16.
 
-    mu_law: compare gain * log(1 + scale * image) in place of the image.
+    mu_law: compare per_log * log(1 + mu_over_white * image) in place of the image.
     """
     real = dtype
     vec3 = vector(3, dtype)
@@ -32,23 +32,23 @@ def code_residual_kernel(dtype, code, mu_law: bool):
     def code_residual(
         range_start: int,
         image: wp.array(dtype=real), codes: wp.array2d(dtype=code), index: wp.array(dtype=wp.int64),
-        table: wp.array(dtype=vec3), scale: real, gain: real,
-        rendered: wp.array(dtype=real), slopes: wp.array(dtype=real), truth: wp.array(dtype=real),
+        table: wp.array(dtype=vec3), mu_over_white: real, per_log: real,
+        prediction: wp.array(dtype=real), slopes: wp.array(dtype=real), target: wp.array(dtype=real),
     ):
         """Compare an image with photo index[0] of a stack of codes.
 
         table: value of each code, and the ends of the interval of values that map to it. Values are exposures in the
-        mu-law, or encoded values. truth: values of the photo. rendered: truth plus the image's distance from the
-        interval. slopes: derivatives of rendered by the image.
+        mu-law, or encoded values. target: values of the photo. prediction: the target plus the image's distance from
+        the interval. slopes: derivatives of the prediction with respect to the image.
         """
         i = range_start + wp.tid()
         row = table[int(codes[wp.int32(index[0]), i])]
         value = image[i]
         slope = real(1.0)
         if wp.static(mu_law):
-            x = value * scale
-            value = gain * log1p(x)
-            slope = gain * scale / (real(1.0) + x)
+            x = value * mu_over_white
+            value = per_log * log1p(x)
+            slope = per_log * mu_over_white / (real(1.0) + x)
         # What is not a number is in no branch, and stays, as does what is beside a code that stands for one value.
         if row[1] < row[2]:
             if value < row[1]:
@@ -58,8 +58,8 @@ def code_residual_kernel(dtype, code, mu_law: bool):
             elif value >= row[1]:
                 value = row[0]
                 slope = real(0.0)
-        rendered[i] = value
+        prediction[i] = value
         slopes[i] = slope
-        truth[i] = row[0]
+        target[i] = row[0]
 
     return code_residual

@@ -47,7 +47,7 @@ def share_opacities(
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-def number_places(
+def number_slots(
     range_start: int,
     dead: wp.array(dtype=wp.bool), numbers: wp.array(dtype=wp.int64), slots: wp.array(dtype=wp.int32),
 ):

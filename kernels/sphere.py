@@ -215,9 +215,9 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
         columns: int, width: int, height: int, alpha_threshold: real,
         transmittance: wp.array(dtype=real), ends: wp.array(dtype=wp.int32), emit_indices: wp.array(dtype=wp.int32),
         grad_image: wp.array(dtype=features_type), grad_transmittance: wp.array(dtype=real),
-        rows: wp.array2d(dtype=real),
+        gradients: wp.array2d(dtype=real),
     ):
-        """Add to rows[emit_indices[k]] the gradients of cap direction, across, along (3 each), opacity, features."""
+        """Add to gradients[emit_indices[k]] those of cap direction, across, along (3 each), opacity, features."""
         tile_x_y = pixel_of_thread(range_start + wp.tid(), columns)
         if tile_x_y[1] < width and tile_x_y[2] < height:
             pixel = tile_x_y[2] * width + tile_x_y[1]
@@ -247,14 +247,14 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
                     weight = alpha * t
                     grad_from_behind += weight * through
                     for channel in range(wp.static(channels)):
-                        wp.atomic_add(rows, row, 10 + channel, weight * grad_pixel[channel])
+                        wp.atomic_add(gradients, row, 10 + channel, weight * grad_pixel[channel])
                     if unclamped < real(ALPHA_MAX):
                         slope = alpha * grad_alpha / (forward * forward)
                         grad_forward = slope * (a * a + b * b) / forward
                         for axis in range(3):
-                            wp.atomic_add(rows, row, axis, grad_forward * d[axis])
-                            wp.atomic_add(rows, row, 3 + axis, -slope * a * d[axis])
-                            wp.atomic_add(rows, row, 6 + axis, -slope * b * d[axis])
-                        wp.atomic_add(rows, row, 9, value * grad_alpha)
+                            wp.atomic_add(gradients, row, axis, grad_forward * d[axis])
+                            wp.atomic_add(gradients, row, 3 + axis, -slope * a * d[axis])
+                            wp.atomic_add(gradients, row, 6 + axis, -slope * b * d[axis])
+                        wp.atomic_add(gradients, row, 9, value * grad_alpha)
 
     return SimpleNamespace(list_tiles=list_tiles, blend=blend, blend_backward=blend_backward)

@@ -23,21 +23,21 @@ _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-def check_finite(
-    loss: wp.array(dtype=wp.float32), norms: wp.array(dtype=wp.float32), overflow: wp.array(dtype=wp.bool),
+def decide_step(
+    loss: wp.array(dtype=wp.float32), finiteness: wp.array(dtype=wp.float32), overflow: wp.array(dtype=wp.bool),
     step_counters: wp.array(dtype=wp.int64), intersections: wp.array(dtype=wp.int64),
     step_flags: wp.array(dtype=wp.float32),
 ):
-    """Decide whether a step is skipped because its loss or a gradient is not finite; one thread.
+    """Decide whether a step is skipped: if its loss or a gradient is not finite, or on overflow. One thread.
 
-    step_flags: [2], 1 or 0: skipped, not skipped. norms: [K], not all finite if a gradient is not. overflow: [1],
+    step_flags: [2], 1 or 0: skipped, applied. finiteness: [K], not all finite if a gradient is not. overflow: [1],
     whether there were more intersections than memory, or [0] if there cannot be. step_counters: [3] or [0], counts
     steps that are not finite and, with intersections ([1] or [0]), holds the most intersections and counts the steps
     with overflow.
     """
     finite = wp.isfinite(loss[0])
-    for i in range(norms.shape[0]):
-        finite = finite and wp.isfinite(norms[i])
+    for i in range(finiteness.shape[0]):
+        finite = finite and wp.isfinite(finiteness[i])
     complete = bool(True)
     if overflow.shape[0] > 0:
         complete = not overflow[0]
@@ -200,7 +200,7 @@ def harmonics_adam_kernel(count: int):
         final = active_values(parameters, active_count, wp.static(3 * count)) - 1
         if skipped[0] == 0.0 and index_in_turn(thread, turn, turns) <= final:
             owners = whole_numbers()
-            rows = whole_numbers()
+            orders = whole_numbers()
             channels = whole_numbers()
             gradients = numbers()
             means = numbers()
@@ -213,14 +213,14 @@ def harmonics_adam_kernel(count: int):
                 values[k] = parameters[i]
                 owners[k] = i // wp.static(3 * count)
                 rest = i - owners[k] * wp.static(3 * count)
-                rows[k] = start + rest // 3
+                orders[k] = start + rest // 3
                 channels[k] = rest % 3
-            degrees = basis.shape[1]
+            basis_count = basis.shape[1]
             for view in range(basis.shape[0]):
                 for k in range(wp.static(VALUES_PER_THREAD)):
-                    basis_value = basis[view, wp.min(rows[k], degrees - 1), owners[k]]
+                    basis_value = basis[view, wp.min(orders[k], basis_count - 1), owners[k]]
                     grad_color = grad_colors[view, owners[k], channels[k]]
-                    gradients[k] += wp.where(rows[k] < degrees, basis_value, 0.0) * grad_color
+                    gradients[k] += wp.where(orders[k] < basis_count, basis_value, 0.0) * grad_color
             turn_count = wp.ceil(step[0] / float(turns))
             length = rate[0] / bias_correction(first_decay_log, turn_count)
             enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, turn_count))

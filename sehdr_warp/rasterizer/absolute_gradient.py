@@ -51,27 +51,15 @@ class _Watch(torch.autograd.Function):
         features, means_opacities, conics_cutoffs = ctx.saved_tensors
         lists, channels = ctx.lists, features.shape[1]
         emit_order = lists.emit_order
-        # On the CPU each intersection has a row, and whole tiles go to a thread: sums keep one order.
+        # On the CPU each intersection has gradients, and whole tiles go to a thread: sums keep one order.
         emit_indices = lists.gaussians if emit_order is None else emit_order.emit_indices
-        rows = features.new_zeros(len(features) if emit_order is None else len(emit_indices), 2)
-        tiles = lists.grid.tiles
-        launch(
-            absolute_gradient_kernel(warp_scalar(features.dtype)),
-            tiles * _PIXELS,
-            lists.tile_ranges,
-            lists.gaussians,
-            emit_indices,
-            means_opacities,
-            conics_cutoffs,
-            features,
-            lists.grid.columns,
-            lists.width,
-            lists.height,
-            ctx.alpha_threshold,
-            grad_image.contiguous().view(-1, channels),
-            grad_transmittance.contiguous().view(-1),
-            rows,
-            ranges=even_ranges(tiles, 1) * _PIXELS,
-        )
-        ctx.store(rows if emit_order is None else emit_order.sum_by_gaussian(rows))
+        gradients = features.new_zeros(len(features) if emit_order is None else len(emit_indices), 2)
+        tiles, threshold = lists.grid.tiles, ctx.alpha_threshold
+        inputs = lists.tile_ranges, lists.gaussians, emit_indices, means_opacities, conics_cutoffs, features
+        sizes = lists.grid.columns, lists.width, lists.height
+        upstream = grad_image.contiguous().view(-1, channels), grad_transmittance.contiguous().view(-1)
+        arguments = *inputs, *sizes, threshold, *upstream, gradients
+        kernel = absolute_gradient_kernel(warp_scalar(features.dtype))
+        launch(kernel, tiles * _PIXELS, *arguments, ranges=even_ranges(tiles, 1) * _PIXELS)
+        ctx.store(gradients if emit_order is None else emit_order.sum_by_gaussian(gradients))
         return grad_image, grad_transmittance, None, None, None, None, None

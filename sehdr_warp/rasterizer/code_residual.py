@@ -24,7 +24,7 @@ WHITE = {torch.uint8: 255, torch.int16: 65535}  # The largest code, by the type 
 
 
 def code_tensor(codes: np.ndarray, device: torch.device | str) -> Tensor:
-    """uint8 or uint16 codes on a device: uint8, or int16 of the same bits. On the CPU in the array's own memory."""
+    """Return uint8 or uint16 codes on a device: uint8, or int16 of the same bits. On the CPU they share memory."""
     codes = np.require(codes, requirements=("C", "W"))
     return torch.from_numpy(codes.view(np.int16) if codes.dtype == np.uint16 else codes).to(device)
 
@@ -103,12 +103,12 @@ def check_codes(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | 
 
 
 def residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """code_residual()'s two of a contiguous image, and the derivatives of the first by it, [H, W, 3], with no graph."""
+    """Return prediction, target and the slopes d prediction / d image, [H, W, 3], of a contiguous image, detached."""
     prediction, slopes, target = (torch.empty_like(image) for _ in range(3))
     photos, index = photo_stack(codes, index)
-    law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.compares_exposures else (0.0, 0.0)
+    mu_law = (scale.mu / scale.white, 1 / math.log1p(scale.mu)) if scale.compares_exposures else (0.0, 0.0)
     kernel = code_residual_kernel(warp_scalar(image.dtype), CODES[codes.dtype], scale.compares_exposures)
-    launch(kernel, image.numel(), image, photos, index, scale.table, *law, prediction, slopes, target)
+    launch(kernel, image.numel(), image, photos, index, scale.table, *mu_law, prediction, slopes, target)
     return prediction, target, slopes
 
 
@@ -158,9 +158,9 @@ def sample_residual_pixels(
     inputs = rendered.contiguous().view(-1, 3), photos, index, float(WHITE[codes.dtype]), mask, least
     launch(kernels.error_weights_kernel(CODES[codes.dtype]), len(weights), *inputs, weights)
     steps = weights.cumsum(0)
-    places = torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(steps) - 1)
-    pixels = torch.empty(len(places), 3, dtype=torch.int32, device=rendered.device)
-    is_sample = torch.empty(len(places), dtype=torch.bool, device=rendered.device)
+    indices = torch.searchsorted(steps, uniform * steps[-1]).clamp_max_(len(steps) - 1)
+    pixels = torch.empty(len(indices), 3, dtype=torch.int32, device=rendered.device)
+    is_sample = torch.empty(len(indices), dtype=torch.bool, device=rendered.device)
     resized = size[0] / width, size[1] / height, *size, BORDER
-    launch(kernels.sampled_pixels, len(places), places, steps[-1], width, view, *resized, pixels, is_sample)
+    launch(kernels.sampled_pixels, len(indices), indices, steps[-1], width, view, *resized, pixels, is_sample)
     return pixels, is_sample

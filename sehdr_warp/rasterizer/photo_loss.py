@@ -109,10 +109,10 @@ def clipped_light_energy(
     return _ClippedLight.apply(image, codes, white, weights, index, mask, estimates)
 
 
-def add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, slopes) -> None:
-    """Add the terms that clipped_light_energy() is the sum of to terms, and its derivatives to slopes.
+def add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, gradient) -> None:
+    """Add the terms that clipped_light_energy() is the sum of to terms, and its gradient to gradient.
 
-    slopes: [H, W, 3], contiguous; may be None.
+    gradient: [H, W, 3], contiguous; may be None.
     """
     photos, index = photo_stack(codes, index)
     mask = None if mask is None else mask.contiguous().view(-1)
@@ -121,12 +121,11 @@ def add_clipped_light(image, codes, white, weights, index, mask, estimates, term
     estimates = None if estimates is None else estimates.contiguous().view(-1)
     # The mean is in the weights: it costs no launch, here and for the gradient.
     scaled = [weight / image.numel() for weight in (weights.smoothness, weights.estimate)]
-    energy = [image.shape[0], image.shape[1], *scaled, estimates, rows, columns, terms, slopes]
+    energy = [image.shape[0], image.shape[1], *scaled, estimates, rows, columns, terms, gradient]
     scalar, code = warp_scalar(image.dtype), CODES[codes.dtype]
     if patches.in_patches(image.device):
-        kernel = clipped_light_patch_kernel(scalar, code)
-        arguments = [*photo, *energy]
-        patches.launch_patches(kernel, image, *arguments)
+        arguments = *photo, *energy
+        patches.launch_patches(clipped_light_patch_kernel(scalar, code), image, *arguments)
         return
     logarithms = torch.empty_like(image)
     launch(clipped_logarithms_kernel(scalar, code), image.numel(), *photo, logarithms)
@@ -137,13 +136,13 @@ class _ClippedLight(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, codes, white, weights, index, mask, estimates):
         image = image.detach().contiguous()
-        terms, slopes = patches.new_terms(image).zero_(), torch.zeros_like(image)
-        add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, slopes)
-        ctx.save_for_backward(slopes)
+        terms, gradient = patches.new_terms(image).zero_(), torch.zeros_like(image)
+        add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, gradient)
+        ctx.save_for_backward(gradient)
         return patches.total(terms)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_energy):
-        (slopes,) = ctx.saved_tensors
-        return scale_gradient(slopes, grad_energy), None, None, None, None, None, None
+        (gradient,) = ctx.saved_tensors
+        return scale_gradient(gradient, grad_energy), None, None, None, None, None, None

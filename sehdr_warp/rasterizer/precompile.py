@@ -48,16 +48,11 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
         *(shared_ranges.share_ranges, plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),
         *(*blend, projection_kernel(real, antialiased), distance.compare),
         *(harmonics.harmonics_kernel(real, 0), lists.pack_splats, lists.key_by_depth, lists.emit_intersections),
-        *(
-            tiles.count_tiles,
-            tiles.place_intersections,
-            distance.blur_columns,
-            distance.blur_derivatives,
-            distance.gradient,
-        ),
+        *(tiles.count_tiles, tiles.place_intersections, distance.blur_columns),
+        *(distance.blur_derivatives, distance.gradient),
         *(lists.gather_intersections, harmonics.harmonics_backward_kernel(real, 0, True)),
-        *(training_step.check_finite, training_step.add_position_noise),
-        *(relocation.number_places, relocation.count_copies, relocation.share_opacities, relocation.copy_rows),
+        *(training_step.decide_step, training_step.add_position_noise),
+        *(relocation.number_slots, relocation.count_copies, relocation.share_opacities, relocation.copy_rows),
         *(relocation.scale_rows, residual_sampling.error_weights_kernel(wp.uint8), residual_sampling.sampled_pixels),
     ]
 

@@ -29,23 +29,22 @@ def share_opacities(logits: Tensor, log_scales: Tensor, copies: Tensor, *, least
 
 
 @torch.no_grad()
-def number_places(dead: Tensor, added: int) -> tuple[Tensor, Tensor]:
-    """Assign numbers to the places to fill: of dead Gaussians and then of as many rows behind them.
+def number_slots(dead: Tensor, added: int) -> tuple[Tensor, Tensor]:
+    """Assign numbers to the slots to fill: those of dead Gaussians and then `added` rows behind them.
 
-    Returns places [N + added] int32, -1 for living ones, and the number of dead ones, an int64 scalar. dead: [N] bool,
-    N >= 1.
+    Returns [N + added] int32, -1 for living ones, and the number of dead ones, an int64 scalar. dead: [N] bool, N >= 1.
     """
     numbers = dead.cumsum(0)
-    places = torch.empty(len(dead) + added, dtype=torch.int32, device=dead.device)
-    launch(kernels.number_places, len(places), dead, numbers, places)
-    return places, numbers[-1]
+    slots = torch.empty(len(dead) + added, dtype=torch.int32, device=dead.device)
+    launch(kernels.number_slots, len(slots), dead, numbers, slots)
+    return slots, numbers[-1]
 
 
 @torch.no_grad()
 def count_copies(samples: "SampledRows", begin: Tensor, end: Tensor, changed: Tensor) -> Tensor:
-    """Return [N] int32: for how many of the places from begin to end each row was drawn.
+    """Return [N] int32: for how many of the slots from begin to end each row was sampled.
 
-    begin, end: int64 scalars. Rows that were drawn are marked in changed [N] bool.
+    begin, end: int64 scalars; none if begin is not below end. Sampled rows are marked in changed [N] bool.
     """
     copies = torch.zeros(len(changed), dtype=torch.int32, device=changed.device)
     count = len(samples.rows)
@@ -57,26 +56,26 @@ def count_copies(samples: "SampledRows", begin: Tensor, end: Tensor, changed: Te
 def copy_rows(
     values: Sequence[Tensor],
     sources: Sequence[Tensor],
-    places: Tensor,
+    slots: Tensor,
     begin: Tensor,
     end: Tensor,
     *,
     samples: "SampledRows | None" = None,
     changed: Tensor | None = None,
 ) -> None:
-    """Fill the rows whose place is begin + k, below end, with source row k, or with the k-th drawn row, in place.
+    """Fill the rows whose slot is begin + k, below end, with source row k, or with the k-th sampled row, in place.
 
     values: [N, ...] each; sources: [M, ...] each, contiguous float32. Sources may be the values if no row is both read
-    and written. places: [N] int32, negative for rows that stay. begin, end: int64 scalars. changed: [N] bool, marks
+    and written. slots: [N] int32, negative for rows that stay. begin, end: int64 scalars. changed: [N] bool, marks
     filled rows.
     """
     if samples is None:
-        samples = SampledRows(places.new_empty(0, dtype=torch.int64), places.new_empty(0, dtype=torch.float64))
-    marked = torch.empty(0, dtype=torch.bool, device=places.device) if changed is None else changed
+        samples = SampledRows(slots.new_empty(0, dtype=torch.int64), slots.new_empty(0, dtype=torch.float64))
+    marked = torch.empty(0, dtype=torch.bool, device=slots.device) if changed is None else changed
     for start in range(0, len(values), kernels.AT_ONCE):
         group = slice(start, start + kernels.AT_ONCE)
         rows = [*_rows(sources[group]), *_rows(values[group])]
-        launch(kernels.copy_rows, len(places), places, begin, end, samples.rows, samples.total, *rows, marked)
+        launch(kernels.copy_rows, len(slots), slots, begin, end, *samples, *rows, marked)
 
 
 @torch.no_grad()

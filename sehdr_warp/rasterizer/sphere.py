@@ -171,11 +171,11 @@ class _Blend(torch.autograd.Function):
         splats = tuple(tensor.detach() for tensor in (caps, across, along, opacities, features))
         image, transmittance = features.new_empty(height, width, channels), features.new_empty(height, width)
         ends = torch.empty(height, width, dtype=torch.int32, device=image.device)
-        ctx.frame = lists.columns, width, height, alpha_threshold
+        ctx.sizes = lists.columns, width, height, alpha_threshold
         ctx.kernels, ctx.lists = sphere_kernels(warp_scalar(features.dtype), channels), lists
         ctx.pixels = lists.tile_ranges.shape[0] * _PIXELS
         ctx.inputs = lists.tile_ranges, lists.gaussians, lists.directions.view(-1, 3)
-        arguments = *ctx.inputs, *splats, *ctx.frame, image.view(-1, channels), transmittance, ends
+        arguments = *ctx.inputs, *splats, *ctx.sizes, image.view(-1, channels), transmittance, ends
         launch(ctx.kernels.blend, ctx.pixels, *arguments, min_range=_PIXELS)
         ctx.save_for_backward(caps, across, along, opacities, features, transmittance, ends)
         return image, transmittance
@@ -185,16 +185,16 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, grad_image, grad_transmittance):
         *splats, transmittance, ends = ctx.saved_tensors
         lists, emit_order, (count, channels) = ctx.lists, ctx.lists.emit_order, splats[-1].shape
-        # On the CPU each entry has a row, and whole tiles go to a thread: sums keep one order.
+        # On the CPU each intersection has gradients, and whole tiles go to a thread: sums keep one order.
         emit_indices = lists.gaussians if emit_order is None else emit_order.emit_indices
-        rows = grad_image.new_zeros(count if emit_order is None else len(emit_indices), channels + 10)
-        gradients = grad_image.contiguous().view(-1, channels), grad_transmittance.contiguous()
-        arguments = *ctx.inputs, *splats, *ctx.frame, transmittance, ends, emit_indices, *gradients, rows
+        gradients = grad_image.new_zeros(count if emit_order is None else len(emit_indices), channels + 10)
+        upstream = grad_image.contiguous().view(-1, channels), grad_transmittance.contiguous()
+        arguments = *ctx.inputs, *splats, *ctx.sizes, transmittance, ends, emit_indices, *upstream, gradients
         ranges = even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS
         launch(ctx.kernels.blend_backward, ctx.pixels, *arguments, ranges=ranges)
         if emit_order is not None:
-            rows = emit_order.sum_by_gaussian(rows)
-        grad_axis, grad_across, grad_along, grad_opacity, grad_features = rows.split((3, 3, 3, 1, channels), dim=1)
+            gradients = emit_order.sum_by_gaussian(gradients)
+        grad_axis, grad_across, grad_along, grad_opacity, grad_features = gradients.split((3, 3, 3, 1, channels), dim=1)
         grad_caps = torch.nn.functional.pad(grad_axis, (0, 1))
         return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None
 

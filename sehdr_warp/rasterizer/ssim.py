@@ -137,7 +137,7 @@ def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -
 def _gradient(
     a, b, derivatives, scale: Tensor, weights: tuple[float, float] | None = None, slopes: Tensor | None = None
 ) -> Tensor:
-    """scale, and with weights slopes, times the gradient by `a`, [H, W, C], of the sum of what _compare() gives."""
+    """Return scale, and with weights slopes, times the gradient of the sum of _compare()'s values with respect to a."""
     result = torch.empty_like(a)
     if patches.in_patches(a.device):
         inputs = derivatives, a.flatten(1), b.flatten(1), scale, None if slopes is None else slopes.flatten(1)
@@ -156,36 +156,35 @@ def _launch_patches(name: str, image: Tensor, weights: tuple[float, float] | Non
 
 
 def _compare_in_runs(a, b, weights, similarity, derivatives) -> None:
-    runs = _Runs(a, weights)
+    runs = _Runs(a, weights is not None)
     moments = runs.view(runs.padded(4))
     images = runs.view(a), runs.view(b)
     runs.launch(runs.kernels.blur_columns, images, [moments])
-    compared = *images, *runs.weights_of_both, runs.view(similarity), runs.view(derivatives)
+    compared = *images, *(weights or (0.0, 0.0)), runs.view(similarity), runs.view(derivatives)
     runs.launch(runs.kernels.compare, [moments], compared)
 
 
 def _gradient_in_runs(a, b, derivatives, scale, weights, slopes, result) -> None:
-    runs = _Runs(a, weights)
+    runs = _Runs(a, weights is not None)
     blurred = runs.view(runs.padded(3))
     runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred])
-    scaled = scale, None if slopes is None else runs.view(slopes), *runs.weights_of_both, runs.view(result)
+    scaled = scale, None if slopes is None else runs.view(slopes), *(weights or (0.0, 0.0)), runs.view(result)
     runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled)
 
 
 class _Runs:
     """One image size's launches: rows of W C numbers, taken `lanes` at a time."""
 
-    def __init__(self, image: Tensor, weights: tuple[float, float] | None = None):
+    def __init__(self, image: Tensor, distance: bool):
         self.rows, width, self.channels = image.shape
         self.length = width * self.channels
         self.like = image
         self.lanes = CPU_LANES if self.length >= CPU_LANES else 1
-        self.kernels = ssim_kernels(warp_scalar(image.dtype), self.lanes, weights is not None)
-        self.weights_of_both = weights or (0.0, 0.0)
-        self.weights = constant(tuple(window()), image.dtype, image.device)
+        self.kernels = ssim_kernels(warp_scalar(image.dtype), self.lanes, distance)
+        self.taps = constant(tuple(window()), image.dtype, image.device)
 
     def padded(self, count: int) -> Tensor:
-        """[count, rows, ...] uninitialized rows with the zeros that the horizontal blur finds beyond the border."""
+        """Return [count, rows, ...] uninitialized rows between the zeros that the blur finds beyond the border."""
         margin = RADIUS * self.channels
         buffer = self.like.new_empty(count, self.rows, self.length + 2 * margin)
         buffer[..., :margin] = 0
@@ -201,5 +200,5 @@ class _Runs:
 
     def launch(self, kernel, inputs, results) -> None:
         """Launch a kernel over the whole image."""
-        arguments = *inputs, self.weights, self.length, self.channels, *results
+        arguments = *inputs, self.taps, self.length, self.channels, *results
         launch(kernel, self.rows * -(-self.length // self.lanes), *arguments, min_range=STEPS_PER_THREAD)

@@ -15,37 +15,43 @@ from .warp_launch.launching import launch
 from .warp_launch.threads import torch_threads
 
 
+class StepFlags(NamedTuple):
+    """Two scalars, 1 or 0: whether a step is skipped, and whether it is applied."""
+
+    skipped: Tensor
+    applied: Tensor
+
+
 @torch.no_grad()
-def check_finite(
+def decide_step(
     loss: Tensor,
-    finite: Tensor,
+    finiteness: Tensor,
     overflow: Tensor | None = None,
     step_counters: Tensor | None = None,
     intersections: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return two scalars, 1 or 0: whether a step is skipped, and whether it is made.
+) -> StepFlags:
+    """Return whether a step is skipped: if its loss or a value of `finiteness` is not finite, or `overflow` is true.
 
-    It is skipped if the loss or one of the values of `finite` is not finite, or if `overflow` is true. loss: float32
-    scalar; finite: [K] float32, the result of finiteness(); overflow: bool scalar.
-
-    step_counters: [3] int64, counts steps that are not finite; with intersections, an int64 scalar, it also holds the
-    most intersections and counts the steps with overflow.
+    Args:
+        loss: float32 scalar.
+        finiteness: [K] float32, finiteness_of() the gradients.
+        overflow: bool scalar.
+        step_counters: [3] int64, counts steps that are not finite; with intersections it also holds the most
+            intersections and counts the steps with overflow.
+        intersections: int64 scalar.
     """
-    step_flags = finite.new_empty(2)
+    step_flags, device = finiteness.new_empty(2), finiteness.device
     if overflow is None:
-        overflow = torch.empty(0, dtype=torch.bool, device=finite.device)
-    none = (
-        torch.empty(0, dtype=torch.int64, device=finite.device)
-        if step_counters is None or intersections is None
-        else None
-    )
-    counters = (none if step_counters is None else step_counters), (none if intersections is None else intersections)
-    launch(kernels.check_finite, 1, loss.detach(), finite, overflow, *counters, step_flags)
-    return step_flags[0], step_flags[1]
+        overflow = torch.empty(0, dtype=torch.bool, device=device)
+    counters = [
+        torch.empty(0, dtype=torch.int64, device=device) if t is None else t for t in (step_counters, intersections)
+    ]
+    launch(kernels.decide_step, 1, loss.detach(), finiteness, overflow, *counters, step_flags)
+    return StepFlags(*step_flags)
 
 
 @torch.no_grad()
-def finiteness(gradients: Sequence[Tensor]) -> Tensor:
+def finiteness_of(gradients: Sequence[Tensor]) -> Tensor:
     """Return [K] float32, all finite if all gradients are: on a CPU their norms; on a GPU one number, 0 or infinity."""
     if gradients[0].device.type == "cuda":
         return _nonfinite_by_kernel(gradients)
@@ -59,8 +65,7 @@ def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
     flat = [gradient.reshape(-1) for gradient in gradients if gradient.numel()]
     for start in range(0, len(flat), kernels.TENSORS_PER_CHECK):
         group = flat[start : start + kernels.TENSORS_PER_CHECK]
-        empty = [result[:0]] * (kernels.TENSORS_PER_CHECK - len(group))
-        arguments = group + empty
+        arguments = group + [result[:0]] * (kernels.TENSORS_PER_CHECK - len(group))
         launch(kernels.find_nonfinite, max(map(len, group)), *arguments, result)
     return result
 
@@ -145,15 +150,13 @@ def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, active_
     nothing, active_count = [skipped.view(1)[:0]] * 6, _active_count(active_count, skipped)
     for start in range(0, len(steps), kernels.PARAMETERS_PER_LAUNCH):
         group = steps[start : start + kernels.PARAMETERS_PER_LAUNCH]
-        arguments = []
+        absent = kernels.PARAMETERS_PER_LAUNCH - len(group)
+        arguments = [*(step.width for step in group), *[0] * absent, *_decays(betas), epsilon]
         for parameter, gradient, first_moment, second_moment, step, rate, _ in group:
             flat = (tensor.view(-1) for tensor in (parameter, first_moment, second_moment))
             arguments += [gradient.view(-1), step.view(1), _rate(rate, skipped).view(1), *flat]
-        arguments += nothing * (kernels.PARAMETERS_PER_LAUNCH - len(group))
+        arguments += nothing * absent
         most = max(step.parameter.numel() for step in group)
-        widths = [step.width for step in group] + [0] * (kernels.PARAMETERS_PER_LAUNCH - len(group))
-        numbers = *widths, *_decays(betas), epsilon
-        arguments = [*numbers, *arguments]
         launch(kernels.update_by_adam, most, skipped.view(1), active_count, *arguments)
 
 
@@ -183,9 +186,9 @@ def harmonics_adam_step(
     options = step, _rate(rate, skipped), skipped, _active_count(active_count, skipped), *_decays(betas), epsilon
     values = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
-    in_turn = (
-        parameter.numel() if turns == 1 else -(-parameter.numel() // (kernels.SH_BLOCK * turns)) * kernels.SH_BLOCK
-    )
+    in_turn = parameter.numel()
+    if turns > 1:
+        in_turn = -(-in_turn // (kernels.SH_BLOCK * turns)) * kernels.SH_BLOCK
     stride = -(-in_turn // kernels.VALUES_PER_THREAD)
     arguments = gradients.basis, gradients.grad_colors, start, stride, turns, *options, *values
     launch(kernel, stride, *arguments)

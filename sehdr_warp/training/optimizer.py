@@ -15,7 +15,7 @@ from ..model.adam import BETAS, FIRST_HARMONIC, Adam
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients
-from ..rasterizer.training_step import check_finite, finiteness
+from ..rasterizer.training_step import decide_step, finiteness_of
 from ..runs.checkpoint import under
 from ..runs.config import Config
 
@@ -83,8 +83,8 @@ def guarded_step(
         loss: Scalar loss.
         overflow: Scalar bool, whether there were more intersections than memory.
         harmonics: Gradients of the harmonics in factored form.
-        step_counters: As in check_finite().
-        intersections: As in check_finite().
+        step_counters: As in decide_step().
+        intersections: As in decide_step().
         active_count: As in Adam.step().
 
     Returns:
@@ -92,7 +92,7 @@ def guarded_step(
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.grad_colors]
-    skipped, applied = check_finite(loss, finiteness(gradients), overflow, step_counters, intersections)
+    skipped, applied = decide_step(loss, finiteness_of(gradients), overflow, step_counters, intersections)
     optimizer.step(skipped, applied, harmonics, active_count)
     return applied
 

@@ -1,4 +1,4 @@
-"""What moves Gaussians on the device: shares as equation 9 has them, and rows in their places."""
+"""What moves Gaussians on the device: shares as equation 9 has them, and rows in their slots."""
 
 import torch
 
@@ -7,7 +7,7 @@ from sehdr_warp.rasterizer.relocation import (
     SampledRows,
     copy_rows,
     count_copies,
-    number_places,
+    number_slots,
     relocation_sums,
     scale_rows,
     share_opacities,
@@ -38,15 +38,15 @@ def scalar(value, device):
     return torch.tensor(value, device=device)
 
 
-def test_places_are_those_of_the_dead_and_then_of_the_new(device):
+def test_slots_are_those_of_the_dead_and_then_of_the_new(device):
     dead = torch.tensor([False, True, True, False, True], device=device)
-    places, gone = number_places(dead, 2)
-    assert places.tolist() == [-1, 0, 1, -1, 2, 3, 4] and int(gone) == 3
-    places, gone = number_places(~dead & dead, 0)
-    assert places.tolist() == [-1] * 5 and int(gone) == 0
+    slots, gone = number_slots(dead, 2)
+    assert slots.tolist() == [-1, 0, 1, -1, 2, 3, 4] and int(gone) == 3
+    slots, gone = number_slots(~dead & dead, 0)
+    assert slots.tolist() == [-1] * 5 and int(gone) == 0
 
 
-def test_rows_are_copied_to_their_places_alone(device):
+def test_rows_are_copied_to_their_slots_alone(device):
     for shape in ((), (3,), (2, 3), (0, 3)):
         start = torch.arange(5.0, device=device).view(5, *[1] * len(shape)).expand(5, *shape).contiguous()
 
@@ -55,19 +55,19 @@ def test_rows_are_copied_to_their_places_alone(device):
 
         # More tensors than one launch takes.
         values, changed = [start.clone() for _ in range(8)], torch.zeros(5, dtype=torch.bool, device=device)
-        places = torch.tensor([-1, 2, -1, 1, 0], dtype=torch.int32, device=device)
+        slots = torch.tensor([-1, 2, -1, 1, 0], dtype=torch.int32, device=device)
         begin, end = scalar(1, device), scalar(3, device)
-        copy_rows(values, [10 + each[:2] for each in values], places, begin, end, changed=changed)
+        copy_rows(values, [10 + each[:2] for each in values], slots, begin, end, changed=changed)
         assert all(torch.equal(each, expected(0, 11, 2, 10, 4)) for each in values)
         assert changed.tolist() == [False, True, False, True, False]
         for total, rows in ((1.0, (0, 2, 2, 0, 4)), (0.0, (0, 1, 2, 3, 4))):
             values, chosen = start.clone(), torch.tensor([0, 2], device=device)
             sampled = SampledRows(chosen, torch.tensor(total, dtype=torch.float64, device=device))
-            copy_rows([values], [values], places, begin, end, samples=sampled)
+            copy_rows([values], [values], slots, begin, end, samples=sampled)
             assert torch.equal(values, expected(*rows))
 
 
-def test_copies_are_counted_of_the_places_there_are(device):
+def test_copies_are_counted_of_the_slots_there_are(device):
     sampled = SampledRows(torch.tensor([2, 0, 2, 1], device=device), torch.ones((), dtype=torch.float64, device=device))
     changed = torch.zeros(4, dtype=torch.bool, device=device)
     copies = count_copies(sampled, scalar(5, device), scalar(8, device), changed)

@@ -13,9 +13,9 @@ from sehdr_warp.rasterizer.training_step import (
     adam_steps,
     add_gradient_statistics,
     add_position_noise,
-    check_finite,
+    decide_step,
     differentiate,
-    finiteness,
+    finiteness_of,
     harmonics_adam_step,
 )
 
@@ -81,7 +81,7 @@ def test_many_parameters_step_as_each_by_itself(device, function):
         assert all(torch.equal(a, b) for a, b in zip(together[:4], alone[:4], strict=True))
 
 
-@pytest.mark.parametrize("function", [finiteness, training_step._nonfinite_by_kernel])
+@pytest.mark.parametrize("function", [finiteness_of, training_step._nonfinite_by_kernel])
 @pytest.mark.parametrize("place", [None, 0, 9])
 def test_one_number_that_is_not_finite_shows_in_the_result(device, place, function):
     gradients = [torch.ones(7 * k + 1, 3, device=device) for k in range(10)]
@@ -140,7 +140,7 @@ def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
         skipped = nonfinite or bool(incomplete)
         tally, pairs = (torch.tensor(values, device=device) for values in ([4, 7, 2], 9))
         for counted in (None, pairs):
-            flags = check_finite(torch.tensor(loss, device=device), inputs, overflow, tally, counted)
+            flags = decide_step(torch.tensor(loss, device=device), inputs, overflow, tally, counted)
             assert [float(value) for value in flags] == [skipped, not skipped]
         assert tally.tolist() == [4 + 2 * nonfinite, 9, 2 + bool(incomplete)]
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.rasterizer.training_step import check_finite
+from sehdr_warp.rasterizer.training_step import decide_step
 from sehdr_warp.training.step_graphs import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
 
 from .recorded import check_recorded_like_launched
@@ -20,7 +20,7 @@ def replay(capacity, pairs):
     loss = torch.zeros((), device=capacity.step_counters.device)
     for needed in pairs:
         fixed_capacity, needed = capacity.capacity(), torch.tensor(needed, device=loss.device)
-        check_finite(loss, loss[None], needed > fixed_capacity, capacity.step_counters, needed)
+        decide_step(loss, loss[None], needed > fixed_capacity, capacity.step_counters, needed)
     return fixed_capacity
 
 
@@ -66,7 +66,7 @@ def test_looks_that_do_not_wait_tell_what_the_one_before_asked_for(device):
     capacity, nan = GraphCapacity(device), torch.full((1,), float("nan"), device=device)
     capacity.observe(MANY)
     pairs = torch.tensor(5 * MANY, device=device)
-    check_finite(nan[0], nan, pairs > capacity.capacity(), capacity.step_counters, pairs)
+    decide_step(nan[0], nan, pairs > capacity.capacity(), capacity.step_counters, pairs)
     late = [capacity.poll(wait=False) for _ in range(2)]
     assert late[-1 if capacity.step_counters.is_cuda else 0] == (1, True)
     assert capacity.overflows == 1

@@ -11,7 +11,7 @@ from ...rasterizer.relocation import (
     SampledRows,
     copy_rows,
     count_copies,
-    number_places,
+    number_slots,
     scale_rows,
     share_opacities,
 )
@@ -93,7 +93,7 @@ class McmcStrategy(Strategy):
         added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
         dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
-        slot_of_row, dead_count = number_places(dead, added)
+        slot_of_row, dead_count = number_slots(dead, added)
         gaussians.resize(count + added, optimizer)
         slots = RelocationSlots(slot_of_row, torch.zeros_like(slot_of_row, dtype=torch.bool))
         seeded = self.fill_proposals(gaussians, slots, dead_count, added, count, propose)
