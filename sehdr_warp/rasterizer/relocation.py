@@ -74,8 +74,8 @@ def copy_rows(
     marked = torch.empty(0, dtype=torch.bool, device=slots.device) if changed is None else changed
     for start in range(0, len(values), kernels.AT_ONCE):
         group = slice(start, start + kernels.AT_ONCE)
-        rows = [*_rows(sources[group]), *_rows(values[group])]
-        launch(kernels.copy_rows, len(slots), slots, begin, end, *samples, *rows, marked)
+        arguments = *samples, *_rows(sources[group]), *_rows(values[group])
+        launch(kernels.copy_rows, len(slots), slots, begin, end, *arguments, marked)
 
 
 @torch.no_grad()
