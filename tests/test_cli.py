@@ -80,7 +80,7 @@ def test_what_needs_no_scene_is_refused_before_one_is_opened(line, message, tmp_
     assert message in capsys.readouterr().err
 
 
-def test_a_missing_folder_is_told_without_torch(tmp_path):
+def test_a_missing_folder_is_named_without_loading_torch(tmp_path):
     code = (
         "import sys\nfrom sehdr_warp.cli import main\ntry: main(sys.argv[1:])\nfinally: print('torch' in sys.modules)"
     )
@@ -176,7 +176,7 @@ def test_existing_run_is_refused_and_resume_continues(run, capsys):
     assert "views differ" in capsys.readouterr().err
 
 
-def test_a_run_in_place_of_photos_is_told_how_to_go_on(run, tmp_path, capsys):
+def test_train_with_a_run_in_place_of_photos_suggests_resume(run, tmp_path, capsys):
     for words in (("--resume",), ("--out", tmp_path / "other", "--iterations", "60")):
         assert call("train", run, *words) == 2
         steps = " --iterations 60" if "60" in words else ""

@@ -117,7 +117,7 @@ def test_a_terminal_obeys_nothing_of_what_files_say(monkeypatch):
     assert stream.getvalue() == "photo a\\x1b[2J\\x0d\\u202egpj\\x9b Größe 写真\n".replace("\\x0d", "\\r")
 
 
-def test_libraries_say_nothing_between_our_lines():
+def test_messages_of_libraries_are_silenced():
     """Pillow tells of damaged photos, which the package names itself."""
     console.show_logs()
     assert not logging.getLogger("PIL.TiffImagePlugin").isEnabledFor(logging.ERROR)

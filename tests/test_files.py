@@ -97,7 +97,7 @@ def test_what_has_the_name_of_a_file_is_not_taken_for_a_missing_one(tmp_path):
             has_file(tmp_path / name)
 
 
-def test_a_sealed_folder_tells_when_it_is_damaged(tmp_path):
+def test_damage_to_a_sealed_folder_is_found(tmp_path):
     def make_folder():
         folder = tmp_path / "set"
         shutil.rmtree(folder, ignore_errors=True)

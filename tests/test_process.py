@@ -25,13 +25,13 @@ from sehdr_warp.training.machine import interruptible
         ("frobnicate 2> /dev/full", 2, ""),
     ],
 )
-def test_streams(line, code, message):
+def test_closed_and_full_streams(line, code, message):
     call = f"{sys.executable} -m sehdr_warp {line}"
     ended = subprocess.run(["bash", "-c", call], capture_output=True, text=True, check=False)
     assert ended.returncode == code and ended.stderr.startswith(message) and ended.stderr.count("\n") == bool(message)
 
 
-def test_what_is_said_of_the_work_never_ends_it():
+def test_a_failed_write_to_stderr_does_not_end_the_work():
     class Full:
         def write(self, text):
             raise OSError(28, "No space left on device")
@@ -47,7 +47,7 @@ def test_what_is_said_of_the_work_never_ends_it():
     os.close(read)
 
 
-def test_the_first_look_for_garbage_is_late_and_others_are_as_ever(monkeypatch):
+def test_only_the_first_garbage_collection_is_late(monkeypatch):
     gc.collect()  # What the tests themselves put off
     monkeypatch.setattr(process, "_collects_late", False)
     usual, frozen, begun = gc.get_threshold(), gc.get_freeze_count(), len(gc.callbacks)
@@ -68,7 +68,7 @@ def test_the_first_look_for_garbage_is_late_and_others_are_as_ever(monkeypatch):
         gc.unfreeze()
 
 
-def test_a_program_that_loads_the_package_collects_as_it_did():
+def test_importing_the_package_leaves_garbage_collection_alone():
     program = """
 import gc
 before = gc.get_threshold(), len(gc.callbacks), gc.get_freeze_count()
@@ -185,7 +185,7 @@ except KeyboardInterrupt:
         (RuntimeError("shapes differ"), None),
     ],
 )
-def test_what_the_surroundings_refuse_is_one_line(error, message):
+def test_errors_of_the_system_are_one_line(error, message):
     user_error = as_user_error(error)
     assert user_error is None if message is None else str(user_error).startswith(message)
 
@@ -217,7 +217,7 @@ def test_names_are_utf8_in_any_locale(tmp_path):
     assert done.returncode == 0 and b"seed = 7" in done.stdout, done.stderr
 
 
-def test_a_working_directory_that_is_gone_is_told(tmp_path):
+def test_a_deleted_working_directory_is_an_error(tmp_path):
     code = "import os, sys; os.rmdir(os.getcwd()); sys.argv = ['sehdr-warp', 'presets']; "
     code += "from sehdr_warp.__main__ import run; run()"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -53,5 +53,5 @@ def test_quiet_shows_nothing():
 
 
 @pytest.mark.parametrize("seconds,text", [(None, "-:--"), (5, "0:05"), (63.4, "1:03"), (3723, "1:02:03")])
-def test_seconds(seconds, text):
+def test_seconds_are_minutes_and_hours(seconds, text):
     assert progress.format_seconds(seconds) == text

@@ -11,7 +11,7 @@ from sehdr_warp import __version__
 from sehdr_warp.quiet import silent_output, silent_stderr
 
 
-def test_threads_that_are_silent_at_once_leave_what_they_found(capfd):
+def test_threads_that_silence_at_once_restore_the_streams(capfd):
     both, done = threading.Barrier(2), threading.Event()
 
     def silent():

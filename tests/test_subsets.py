@@ -9,7 +9,7 @@ from sehdr_warp.subsets import every_nth
 @pytest.mark.parametrize(
     "count, most, left", [(0, 4, 0), (1, 4, 1), (4, 4, 4), (5, 4, 3), (9, 4, 3), (12, 4, 4), (1000, 24, 24)]
 )
-def test_as_many_as_fit_are_left_evenly(count, most, left):
+def test_every_nth_item_leaves_at_most_the_limit(count, most, left):
     subset = every_nth(range(count), most)
     assert len(subset) == left <= most and list(subset[:1]) == [0][:count]
     assert len(set(np.diff(subset))) <= 1

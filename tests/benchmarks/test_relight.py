@@ -39,7 +39,7 @@ def map_of(shape, radiance):
 
 
 @pytest.mark.parametrize("shape", [PANEL, BALL])
-def test_a_light_shines_from_where_its_map_does(mi, shape, monkeypatch):
+def test_an_emitter_lights_as_its_map_does(mi, shape, monkeypatch):
     from benchmarks import relight
 
     monkeypatch.setattr(relight, "SIZE", 16)

@@ -85,7 +85,7 @@ def test_what_is_no_result_is_named(tmp_path):
         write_reports(tmp_path)
 
 
-def test_means_over_the_whole_are_told_by_seed(tmp_path):
+def test_means_over_all_scenes_are_listed_by_seed(tmp_path):
     rows = [
         *trained("default", (30, 28), exposures=(1, 2), seeds=(0,)),
         *trained("default", (31, 29), exposures=(1, 2), seeds=(1,)),

@@ -9,7 +9,7 @@ from sehdr_warp.kernels.constants import ALPHA_THRESHOLD
 from sehdr_warp.rasterizer import rasterize
 
 
-def test_what_warps_draw_is_counted(device, monkeypatch):
+def test_pairs_are_counted_as_the_block_kernels_blend_them(device, monkeypatch):
     scene = make_splat_scene(Size(400, 40, 24), 3, device)
     means, log_scales, quaternions, opacities, features = scene.leaves
     pose, lens = scene.world_to_camera, scene.intrinsics

@@ -11,7 +11,7 @@ problem_of = runpy.run_path(str(Path(__file__).resolve().parents[2] / ".ci" / "s
 @pytest.mark.parametrize(
     "subject", ["tiles: report overflow", "scene, training: train on panoramas", "Merge branch 'x'", "ci: run 3.13"]
 )
-def test_accepted(subject):
+def test_good_subjects_are_accepted(subject):
     assert problem_of(subject) is None
 
 
@@ -24,5 +24,5 @@ def test_accepted(subject):
         ("tiles: " + "x" * 66, "has 73 characters"),
     ],
 )
-def test_refused(subject, problem):
+def test_bad_subjects_are_refused(subject, problem):
     assert problem in problem_of(subject)

@@ -147,7 +147,7 @@ def test_image_keeps_its_size(image):
     assert size <= IMAGE_BYTES, f"{image.relative_to(ROOT)} has {size} of at most {IMAGE_BYTES} bytes: compress it"
 
 
-def test_guide_keeps_no_diary():
+def test_guide_states_neither_dates_nor_builds():
     for page in [*GUIDE, ROOT / "README.md"]:
         text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
         diary = re.search(r"20[0-9]{2}-[0-9]{2}|\b[0-9a-f]{7,8}\b(?<![0-9]{7})", text)

@@ -79,7 +79,7 @@ def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["ldr"] == result["ldr"]
 
 
-def test_score_parts_photos_into_the_regions_of_eval(run, tmp_path, capsys):
+def test_eval_of_pictures_divides_photos_into_the_regions_of_eval_of_the_run(run, tmp_path, capsys):
     """They are reduced through the run's response: the pictures lie in the run, or a training would choose it."""
 
     def shares(*words):

@@ -79,7 +79,7 @@ def test_import_loads_nothing_but_the_standard_library():
     assert len(output.split()) < 30
 
 
-def test_pins_with_known_holes_are_told(tmp_path):
+def test_pins_with_advisories_are_listed(tmp_path):
     """Versions from the first with the hole to before the first without; another package's do not count."""
     folder = tmp_path / "vulns" / "pillow"
     folder.mkdir(parents=True)
@@ -95,7 +95,7 @@ def test_pins_with_known_holes_are_told(tmp_path):
     assert completed.stdout.endswith("2 advisories about them, the newest of 2026-01-02: 1 holes\n")
 
 
-def test_the_pins_are_compared_with_listed_versions(tmp_path):
+def test_pins_are_compared_with_ranges_of_safety_db(tmp_path):
     (tmp_path / "data").mkdir()
     listed = {"$meta": {"timestamp": 1775023247}, "Pillow": ["<1.0", ">=9,<10000"], "numpy": ["<1.22"], "other": [">0"]}
     (tmp_path / "data" / "insecure.json").write_text(json.dumps(listed))
