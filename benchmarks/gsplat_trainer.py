@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.rasterizer.ssim import image_distance
-from sehdr_warp.scene import Camera, Scene, View
+from sehdr_warp.scene import Camera, Scene
 from sehdr_warp.training.initialization import random_points
 
 STEPS = 30_000  # simple_trainer.py's max_steps
@@ -135,13 +135,14 @@ def train_gsplat(
         state = rule.initialize_state(scene_scale=SCENE_SCALE)
     rule.check_sanity(model.splats, adam)
     views = scene.train_views
-    photos = [_Photo.of(view, device) for view in views]
+    codes = [torch.tensor(view.codes, device=device) for view in views]
+    masks = [None if view.mask is None else torch.tensor(view.mask, device=device)[..., None] for view in views]
     order, seconds, started = [], 0.0, time.perf_counter()
     for step in range(steps):
         if not order:
             order = torch.randperm(len(views)).tolist()
         index = order.pop()
-        photo, mask = photos[index].values(), photos[index].mask
+        photo, mask = codes[index].float() / views[index].levels, masks[index]
         image, info = model.render(views[index].camera, min(step // scaled(SH_INTERVAL), 3))
         if strategy == "default":
             rule.step_pre_backward(model.splats, adam, state, step, info)
@@ -164,21 +165,3 @@ def train_gsplat(
             look(model, Snapshot(step + 1, seconds))
             started = time.perf_counter()
     return model
-
-
-@dataclass(frozen=True)
-class _Photo:
-    """Codes [H, W, 3] of a photo on the device, their white, and its mask [H, W, 1]."""
-
-    codes: Tensor
-    white: int
-    mask: Tensor | None
-
-    @staticmethod
-    def of(view: View, device: str) -> "_Photo":
-        mask = None if view.mask is None else torch.tensor(view.mask, device=device)[..., None]
-        return _Photo(torch.tensor(view.codes, device=device), view.levels, mask)
-
-    def values(self) -> Tensor:
-        """Return the encoded values [H, W, 3] in [0, 1]."""
-        return self.codes.float() / self.white

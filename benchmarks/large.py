@@ -50,7 +50,9 @@ def main(sizes: tyro.conf.Positional[tuple[str, ...]], /, json: Path, photos: in
 
 def compare(size: Size, photos: int, iterations: int, device: str = "cuda:0") -> list[dict]:
     """Train by ours and by gsplat's rasterizer; return a row for each."""
-    scene = _scene(size, photos, device)
+    scene = make_photo_scene(size, photos, device)
+    views = (replace(view, split="train" if k % HELD_OUT else "test") for k, view in enumerate(scene.views))
+    scene = replace(scene, views=tuple(views))
     fixed = {"densification.cap_max": size.gaussians, "mcmc.cap_density": 0, "model.initial_density": 0}
     fixed |= {"response.name": RESPONSE, "plan.enabled": False, "schedule.iterations": iterations}
     config = load_config("default", fixed)
@@ -107,12 +109,6 @@ def _means(render: Callable, scene: Scene, device: str) -> dict[str, float]:
     response = response_by_name(RESPONSE)
     values = [figures(render(view), view, response, None, device) for view in scene.test_views]
     return {name: float(np.mean([each[name] for each in values])) for name in ("psnr", "ssim")}
-
-
-def _scene(size: Size, photos: int, device: str) -> Scene:
-    scene = make_photo_scene(size, photos, device)
-    views = [replace(view, split="train" if k % HELD_OUT else "test") for k, view in enumerate(scene.views)]
-    return replace(scene, views=tuple(views))
 
 
 if __name__ == "__main__":

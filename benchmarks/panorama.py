@@ -64,7 +64,8 @@ def main(
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     work.mkdir(parents=True, exist_ok=True)
-    cameras = [_camera(size, PLACE + SPREAD * offset, out) for offset, out in _around(views)]
+    places = PLACE + SPREAD * np.random.default_rng(0).uniform(-1, 1, (views, 3))
+    cameras = [_camera(size, place, out) for place, out in zip(places, sphere_directions(views), strict=True)]
     judged = [_camera(size, PLACE, out) for out in sphere_directions(12)]
     truth = work / "truth.npz"
     if not truth.is_file():
@@ -109,12 +110,6 @@ def main(
     result["notes"].append(f"Irradiance of surfaces that face {len(off)} directions: {error_text}.")
     result["notes"].append(f"{run.gaussian_count:,} Gaussians; the truth's peak is {peak:.3g}.")
     finish(result, json, overwrite=True)
-
-
-def _around(count: int):
-    """Offsets in [-1, 1]^3 and directions that cover the sphere."""
-    random = np.random.default_rng(0)
-    return zip(random.uniform(-1, 1, (count, 3)), sphere_directions(count), strict=True)
 
 
 def _camera(size: int, position: np.ndarray, out: np.ndarray) -> Camera:
@@ -202,13 +197,10 @@ def _even(image: np.ndarray) -> np.ndarray:
     return result
 
 
-def _mu(image: np.ndarray, peak: float) -> np.ndarray:
-    return mu_law(torch.from_numpy(np.ascontiguousarray(image)) / peak).numpy()
-
-
 def _squared_distance(image: np.ndarray, truth: np.ndarray, peak: float) -> np.ndarray:
     """[...] squared mu-law error, mean over channels."""
-    return ((_mu(image, peak) - _mu(truth, peak)) ** 2).mean(axis=-1)
+    values = (mu_law(torch.from_numpy(np.ascontiguousarray(each)) / peak) for each in (image, truth))
+    return (next(values) - next(values)).square().mean(-1).numpy()
 
 
 if __name__ == "__main__":

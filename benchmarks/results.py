@@ -18,14 +18,10 @@ COLUMNS: dict[str, dict[str, str]] = tomllib.loads(Path(__file__).with_name("col
 
 
 def new_result(benchmark: str, device: torch.device, settings: dict) -> dict[str, Any]:
-    """Return a result to be filled, see sehdr_warp.check.result.new_result()."""
-    return new_package_result(benchmark, device, settings, ("python", "-m", _module()))
-
-
-def _module() -> str:
-    """Return the name under which this process was started by `python -m`."""
+    """Return a result to be filled, see check.result.new_result(), of the module that `python -m` started."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
-    return spec.name.removesuffix(".__main__") if spec else "benchmarks"
+    module = spec.name.removesuffix(".__main__") if spec else "benchmarks"
+    return new_package_result(benchmark, device, settings, ("python", "-m", module))
 
 
 def machine_line(result: dict) -> str:

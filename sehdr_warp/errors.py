@@ -19,22 +19,12 @@ MOST_LISTED = 2000
 NOT_FINITE_REMEDY = "it is not written; train again from an earlier checkpoint or with another seed"
 
 _ARGUMENTS = {
-    "--resume": "resume=True",
-    "--overwrite": "overwrite=True",
-    "--max-size": "max_size",
-    "--holdout": "holdout",
-    "--device cpu": 'device="cpu"',
-    "--inpaint": "inpaint=True",
-    "--evs": "evs",
-    "--axes": "axes",
-    "--up": "up",
-    "--scale": "scale",
-    "--crop": "crop",
-    "--at": "at",
-    "--beyond": "beyond",
+    **{f"--{name}": f"{name}=True" for name in ("resume", "overwrite", "inpaint")},
+    **{f"--{name}": name for name in ("holdout", "evs", "axes", "up", "scale", "crop", "at", "beyond", "ocio")},
     "--camera": "camera",
     "--cameras": "cameras",
-    "--ocio": "ocio",
+    "--max-size": "max_size",
+    "--device cpu": 'device="cpu"',
     "--schedule.use-cuda-graph=false": "schedule.use_cuda_graph = False",
 }
 """Python names of the flags in messages."""
