@@ -1,5 +1,4 @@
-"""Makes the pictures of README and guide: trains a scene through a camera that clips, shows what the photo lost, and
-looks at it in the viewer.
+"""Make the pictures of README and guide from a scene that is photographed by a camera that clips.
 
 python docs/pictures.py [SCENE] [RUN] [VIEW]            minutes on two cores; a RUN that exists is not trained again
 python docs/pictures.py --photos FOLDER RUN VIEW        drone.jpg, of github.com/pierotofy/drone_dataset_brighton_beach
@@ -33,7 +32,7 @@ REST = 3000  # Milliseconds until a page in software WebGL is whole
 
 
 def main(name: str = "embedded:lamps", folder: str = "runs/hero", view: str = "") -> None:
-    """Writes hero.jpg and viewer.jpg of one held-out view of an embedded scene."""
+    """Write hero.jpg and viewer.jpg of one held-out view of an embedded scene."""
     truth, camera = sw.load_scene(name), sw.response_by_name("camera")
     scene = expose(truth, camera, exposure_ladder(truth, camera)[2])
     run = sw.load_run(folder) if Path(folder).exists() else sw.train(scene, folder, {"response.name": "camera"})
@@ -46,7 +45,7 @@ def main(name: str = "embedded:lamps", folder: str = "runs/hero", view: str = ""
 
 
 def photographed(photos: str, folder: str, view: str) -> None:
-    """Writes drone.jpg: a photo and the scene there; that a stop and a half darker, and half-way to the next photo."""
+    """Write drone.jpg: a photo, the scene there, the same 1.5 stops darker, the scene half-way to the next photo."""
     if not Path(folder).exists():
         sw.train(sw.load_scene(photos, max_size=360), folder)
     run = sw.load_run(folder)

@@ -1,4 +1,4 @@
-"""What a lighting department takes over: brackets in ACEScg from cameras of its own, and the Gaussians as PLY.
+"""Deliver a scene to lighting: exposure brackets in ACEScg from cameras of your own.
 
 python examples/hand_off.py RUN [OUT]        RUN is the folder of a training, such as runs/quickstart/run
 """
@@ -11,7 +11,7 @@ import sehdr_warp as sw
 
 
 def main(run_folder: Path, out: Path) -> list[Path]:
-    """Writes `shot/` (EXR brackets, previews, brackets.json), cameras.json and scene_hdr.ply; the bracket files."""
+    """Write `shot/` (EXR brackets, previews, brackets.json) and cameras.json; return the EXR files."""
     run = sw.load_run(run_folder)
     out.mkdir(parents=True, exist_ok=True)
 

@@ -10,7 +10,7 @@ import sehdr_warp as sw
 
 
 def main(out: Path, max_size: int = 96, iterations: int = 600) -> sw.Run:
-    """Writes a run, and the held-out views at five exposures, into the folder `out`."""
+    """Write a run, and its held-out views at five exposures, into the folder `out`."""
     scene = sw.load_scene("embedded", max_size=max_size)  # or a folder of your photos
     config = sw.load_config("demo", {"schedule.iterations": iterations, "response.name": "hdr-nerf"})
     run = sw.train(scene, out / "run", config, overwrite=True)

@@ -1,4 +1,4 @@
-"""An object lit by a trained scene: photos in, environment map out, Mitsuba's picture beside the one that truth lights.
+"""Light an object by a trained scene: photos in, environment map out, beside the same object lit by the truth.
 
 python examples/relighting.py [OUT]        needs `pip install mitsuba`
 
@@ -25,8 +25,11 @@ FACES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
 def main(out: Path, *, views: int = 72, size: int = 48, samples: int = 32, iterations: int = 900) -> float:
-    """Writes photos/, run/, env.exr, truth.exr and relighting.png (truth, ours, four times the difference); returns the
-    mean error of the light on the balls, as part of it."""
+    """Write photos/, run/, env.exr, truth.exr and relighting.png (truth, ours, four times the difference).
+
+    Returns:
+        The mean error of the light on the balls, over the mean light.
+    """
     import mitsuba
 
     mi: Any = mitsuba
@@ -51,12 +54,7 @@ def main(out: Path, *, views: int = 72, size: int = 48, samples: int = 32, itera
 
     # The walls are matt: harmonics of a higher degree would only learn from where few photos saw the lamp.
     config = sw.load_config("default", {"schedule.iterations": iterations, "model.sh_degree": 1})
-    run = sw.train(
-        sw.load_scene(out / "photos", holdout=0),
-        out / "run",
-        config,
-        overwrite=True,
-    )
+    run = sw.train(sw.load_scene(out / "photos", holdout=0), out / "run", config, overwrite=True)
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))
     sw.write_environment_map(run, out / "env.exr", at=at, size=4 * size, axes="scene", overwrite=True)
     write(out / "truth.exr", true_map(mi, room, size, 4 * samples))
@@ -76,7 +74,7 @@ def camera_of(size: int, degrees: float, place: np.ndarray, ahead: np.ndarray, u
 
 
 def picture(mi: Any, scene: Any, camera: sw.Camera, samples: int) -> np.ndarray:
-    """[H, W, 3] radiance from a camera of ours; Mitsuba's has +x left and +y up."""
+    """Return [H, W, 3] radiance from a camera; Mitsuba's cameras have +x left and +y up."""
     film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
     pose = mi.ScalarTransform4f(camera.camera_to_world @ np.diag([-1.0, -1, 1, 1]))
     angle = float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx)))
@@ -89,7 +87,7 @@ def write(path: Path, radiance: np.ndarray) -> None:
 
 
 def true_map(mi: Any, room: Any, size: int, samples: int) -> np.ndarray:
-    """[2 size, 4 size, 3] of the faces of a cube around the place."""
+    """Return [2 size, 4 size, 3], the true map, from the faces of a cube around the place."""
     directions = latlong(4 * size)
     latlong_map = np.zeros(directions.shape, np.float32)
     for axis in FACES:
@@ -103,7 +101,7 @@ def true_map(mi: Any, room: Any, size: int, samples: int) -> np.ndarray:
 
 
 def lit_balls(mi: Any, env: Path, size: int, samples: int) -> np.ndarray:
-    """[size / 2, size, 3]: what two balls show of the light in a map."""
+    """Return [size / 2, size, 3], two balls lit by a map."""
     gold = {"type": "roughconductor", "material": "Au", "alpha": 0.15}
     lacquer = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0.1, 0.2, 0.6]}}
     scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 4}}
