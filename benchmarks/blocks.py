@@ -17,11 +17,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
+from unittest.mock import patch
 from urllib.request import Request, urlopen
 
 import torch
@@ -154,7 +154,9 @@ def run_study(study: Study) -> None:
     whole = multiprocessing.get_context("spawn").Process(target=_train_whole, args=arguments, daemon=True)
 
     def start_whole() -> None:
-        with _one_visible(devices[-1]):
+        # The process sees one GPU alone, as the job of a block does.
+        visible = {"CUDA_VISIBLE_DEVICES": visible_gpus(devices[-1], 1)[0]} if devices[-1].type == "cuda" else {}
+        with patch.dict(os.environ, visible):
             whole.start()
 
     # The two longest blocks train first, beside each other and without the whole, which would make them slower.
@@ -225,21 +227,6 @@ def _warm_up(study: Study, plan: BlockPlan, at_once: int) -> None:
     out.mkdir(exist_ok=True)
     plan.write(out)
     run_blocks(out, plan, device=study.device, gpus=at_once)
-
-
-@contextmanager
-def _one_visible(device: torch.device) -> Iterator[None]:
-    """Let processes that start within the block see one GPU alone, as the job of a block does."""
-    before = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if device.type == "cuda":
-        os.environ["CUDA_VISIBLE_DEVICES"] = visible_gpus(device, 1)[0]
-    try:
-        yield
-    finally:
-        if before is not None:
-            os.environ["CUDA_VISIBLE_DEVICES"] = before
-        elif device.type == "cuda":
-            del os.environ["CUDA_VISIBLE_DEVICES"]
 
 
 def _train_whole(data: LoadArguments, config: Mapping[str, Any], out: Path, device: str) -> None:

@@ -4,9 +4,10 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import patch
 
 import torch
 import torch.multiprocessing as processes
@@ -64,7 +65,7 @@ def doubled(most: int) -> list[int]:
 
 def time_threads(size: Size, count: int, repetitions: int) -> dict:
     """Time a step on `count` threads; also return the loss after the same few steps."""
-    with _threads(count):
+    with patch.dict(os.environ, SEHDR_THREADS=str(count)):
         trainer = make_trainer(make_photo_scene(size, PHOTOS), _config(size), torch.device("cpu"))
         variant = step_variant(trainer)
         with torch_settings(trainer.config.deterministic):
@@ -125,16 +126,3 @@ def _config(size: Size) -> Config:
     most = size.gaussians * 11 // 10 + 1
     changes = {"densification.cap_max": most, "model.initial_density": 0, "response.name": "srgb"}
     return load_config(PRESET, changes)
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = os.environ.get("SEHDR_THREADS")
-    os.environ["SEHDR_THREADS"] = str(count)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["SEHDR_THREADS"]
-        else:
-            os.environ["SEHDR_THREADS"] = before
