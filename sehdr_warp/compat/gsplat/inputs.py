@@ -109,6 +109,8 @@ class Inputs(NamedTuple):
         if sh_degree is not None:
             check_degree("sh_degree", integer("sh_degree", sh_degree, 0, 4))
             inner = ("N", "K", 3)
+            if isinstance(colors, Tensor) and colors.ndim == 3:  # gsplat 1.6 shares coefficients among scenes.
+                colors = colors.expand(*batch, *colors.shape)
 
         def by_camera(features: Any, inner: tuple) -> bool:
             return isinstance(features, Tensor) and features.ndim == len(batch) + len(inner) + 1
@@ -139,8 +141,11 @@ class Inputs(NamedTuple):
                 f"colors has shape {list(colors.shape)}, but sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} "
                 "coefficients"
             )
-        if not viewmats.shape[-3]:
-            raise ValueError("viewmats has no camera, expected [..., C, 4, 4] with C >= 1")
+        if not math.prod(viewmats.shape[:-2]):
+            raise ValueError(f"viewmats has shape {list(viewmats.shape)}, which has no camera")
+        for name, features in (("colors", colors), ("extra_signals", extra_signals)):
+            if features is not None and not features.shape[-1]:
+                raise ValueError(f"{name} has shape {list(features.shape)}, which has no channel")
 
         def flat(tensor: Tensor | None) -> Tensor | None:
             if tensor is None or len(batch) == 1:

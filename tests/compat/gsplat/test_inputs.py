@@ -46,11 +46,14 @@ def test_wrong_shapes_types_and_devices_are_named():
         (5, place[0][0], "viewmats has shape"),
         (6, place[1].half(), "Ks is torch.float16, expected torch.float32 or torch.float64"),
         (6, [[1.0]], "Ks is a builtins.list"),
+        (4, leaves[4][:, :0], r"colors has shape \[200, 0\], which has no channel"),
     ):
         arguments = [*leaves, *place]
         arguments[index] = bad
         with pytest.raises((ValueError, TypeError), match=message):
             rasterization(*arguments)
+    with pytest.raises(ValueError, match=r"viewmats has shape \[0, 2, 4, 4\], which has no camera"):
+        rasterization(*(tensor[None][:0] for tensor in (*leaves, place[0], place[1])), *place[2:])
 
 
 @pytest.mark.parametrize("options", [{}, {"camera_model": "ortho"}, {"sh_degree": 1}])

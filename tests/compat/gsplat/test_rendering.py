@@ -110,6 +110,16 @@ def test_batch_axes_are_scenes_of_their_own(device):
             assert (info["means2d"].grad != 0).any(-1).any(-1).all()
 
 
+def test_scenes_can_share_coefficients(device):
+    leaves, place = scene(device, coefficients=4)
+    *splats, coefficients = [torch.stack([leaf, leaf * 0.9]) for leaf in leaves]
+    cameras = {"viewmats": place[0].expand(2, *place[0].shape), "Ks": place[1].expand(2, *place[1].shape)}
+    size = {"width": WIDTH, "height": HEIGHT, "sh_degree": 1}
+    shared, _, _ = rasterization(*splats, leaves[-1], **cameras, **size)
+    truth, _, _ = rasterization(*splats, coefficients[:1].expand_as(coefficients), **cameras, **size)
+    assert torch.equal(shared, truth)
+
+
 def test_colors_of_each_camera(device):
     leaves, place = scene(device, coefficients=4)
     coefficients = torch.stack([leaves[4].detach(), -leaves[4].detach()])
