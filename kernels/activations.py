@@ -47,6 +47,31 @@ def exposures_backward_kernel(dtype):
 
 
 @cache
+def _penalty_functions(dtype):
+    real = dtype
+
+    @wp.func
+    def weight_of_each(weight: real, count: int, active_count: wp.array(dtype=wp.int32)) -> real:
+        """Return the weight over the number of Gaussians: active_count [1], or count if that is None."""
+        part = weight / real(count)
+        if active_count:
+            part = weight / real(active_count[0])
+        return part
+
+    @wp.func
+    def counts_in_penalty(i: int, extents: wp.array2d(dtype=real), moments: wp.array(dtype=real)) -> bool:
+        """Return whether a Gaussian is in view or has moments; extents are None if all count."""
+        counts = bool(True)
+        if extents:
+            counts = extents[i, 0] > real(0.0)
+            if moments and moments[i] > real(0.0):
+                counts = True
+        return counts
+
+    return weight_of_each, counts_in_penalty
+
+
+@cache
 def opacity_penalty_kernel(dtype):
     """Return the kernel of the shares of `weight` times the mean of the opacities that count, launched over T threads.
 
@@ -55,6 +80,7 @@ def opacity_penalty_kernel(dtype):
     part. active_count: [1] number that the mean divides by, of which those behind have an opacity of 0; None for N.
     """
     real = dtype
+    weight_of_each, counts_in_penalty = _penalty_functions(dtype)
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def sum_opacities(
@@ -63,19 +89,11 @@ def opacity_penalty_kernel(dtype):
         active_count: wp.array(dtype=wp.int32), shares: wp.array(dtype=real),
     ):
         thread = range_start + wp.tid()
-        part = weight / real(opacities.shape[0])
-        if active_count:
-            part = weight / real(active_count[0])
         total = real(0.0)
         for i in range(thread, opacities.shape[0], shares.shape[0]):
-            counts = bool(True)
-            if extents:
-                counts = extents[i, 0] > real(0.0)
-                if moments and moments[i] > real(0.0):
-                    counts = True
-            if counts:
+            if counts_in_penalty(i, extents, moments):
                 total += opacities[i]
-        shares[thread] = total * part
+        shares[thread] = total * weight_of_each(weight, opacities.shape[0], active_count)
 
     return sum_opacities
 
@@ -87,6 +105,7 @@ def opacity_penalty_backward_kernel(dtype):
     opacity_gradients: [N] from penalty_gradient [1]. The other arguments are those of opacity_penalty_kernel().
     """
     real = dtype
+    weight_of_each, counts_in_penalty = _penalty_functions(dtype)
 
     @wp.kernel(module="unique", module_options=NO_AUTODIFF)
     def sum_opacities_backward(
@@ -96,17 +115,9 @@ def opacity_penalty_backward_kernel(dtype):
         opacity_gradients: wp.array(dtype=real),
     ):
         i = range_start + wp.tid()
-        part = weight / real(opacity_gradients.shape[0])
-        if active_count:
-            part = weight / real(active_count[0])
-        counts = bool(True)
-        if extents:
-            counts = extents[i, 0] > real(0.0)
-            if moments and moments[i] > real(0.0):
-                counts = True
         gradient = real(0.0)
-        if counts:
-            gradient = part * penalty_gradient[0]
+        if counts_in_penalty(i, extents, moments):
+            gradient = weight_of_each(weight, opacity_gradients.shape[0], active_count) * penalty_gradient[0]
         opacity_gradients[i] = gradient
 
     return sum_opacities_backward

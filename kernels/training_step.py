@@ -130,6 +130,15 @@ def update_by_adam(
             )  # fmt: skip
 
 
+@wp.func
+def is_finite(values: _floats, index: int) -> bool:
+    """Return whether a number is finite; true beyond the end."""
+    finite = bool(True)
+    if index < values.shape[0]:
+        finite = wp.isfinite(values[index])
+    return finite
+
+
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def find_nonfinite(
     range_start: int,
@@ -138,33 +147,12 @@ def find_nonfinite(
     result: _floats,
 ):
     """Set result[0] to infinity if one of the numbers is not finite. Launched over the longest."""
-    index = range_start + wp.tid()
-    finite = bool(True)
-    if index < a.shape[0]:
-        finite = finite and wp.isfinite(a[index])
-    if index < b.shape[0]:
-        finite = finite and wp.isfinite(b[index])
-    if index < c.shape[0]:
-        finite = finite and wp.isfinite(c[index])
-    if index < d.shape[0]:
-        finite = finite and wp.isfinite(d[index])
-    if index < e.shape[0]:
-        finite = finite and wp.isfinite(e[index])
-    if index < f.shape[0]:
-        finite = finite and wp.isfinite(f[index])
-    if index < g.shape[0]:
-        finite = finite and wp.isfinite(g[index])
-    if index < h.shape[0]:
-        finite = finite and wp.isfinite(h[index])
-    if index < i.shape[0]:
-        finite = finite and wp.isfinite(i[index])
-    if index < j.shape[0]:
-        finite = finite and wp.isfinite(j[index])
-    if index < k.shape[0]:
-        finite = finite and wp.isfinite(k[index])
-    if index < m.shape[0]:
-        finite = finite and wp.isfinite(m[index])
-    if not finite:
+    n = range_start + wp.tid()
+    if not (
+        is_finite(a, n) and is_finite(b, n) and is_finite(c, n) and is_finite(d, n) and is_finite(e, n)
+        and is_finite(f, n) and is_finite(g, n) and is_finite(h, n) and is_finite(i, n) and is_finite(j, n)
+        and is_finite(k, n) and is_finite(m, n)
+    ):
         result[0] = wp.inf
 
 

@@ -32,9 +32,8 @@ class _BoundedExponential(torch.autograd.Function):
     def forward(ctx, values, bound):
         values = values.detach().contiguous()
         exponentials = torch.empty_like(values)
-        launch(
-            exposures_kernel(warp_scalar(values.dtype)), values.numel(), values.view(-1), bound, exponentials.view(-1)
-        )
+        kernel = exposures_kernel(warp_scalar(values.dtype))
+        launch(kernel, values.numel(), values.view(-1), bound, exponentials.view(-1))
         ctx.bound = bound
         ctx.save_for_backward(values, exponentials)
         return exponentials
@@ -44,11 +43,8 @@ class _BoundedExponential(torch.autograd.Function):
     def backward(ctx, upstream):
         values, exponentials = ctx.saved_tensors
         result = torch.empty_like(values)
-        kernel, inputs = (
-            exposures_backward_kernel(warp_scalar(values.dtype)),
-            (values.view(-1), ctx.bound, exponentials.view(-1)),
-        )
-        launch(kernel, values.numel(), *inputs, upstream, result.view(-1))
+        kernel = exposures_backward_kernel(warp_scalar(values.dtype))
+        launch(kernel, values.numel(), values.view(-1), ctx.bound, exponentials.view(-1), upstream, result.view(-1))
         return result, None
 
 

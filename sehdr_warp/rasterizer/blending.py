@@ -90,7 +90,7 @@ def with_gradient(
 ) -> tuple[Tensor, Tensor]:
     """Return a result's image and transmittance as differentiable functions of what they were blended from.
 
-    others: the tensors whose gradients the result's backward pass returns after those by means2d and features.
+    others: the tensors whose gradients the result's backward pass returns after those of means2d and features.
     """
     if not torch.is_grad_enabled():
         return result.image, result.transmittance

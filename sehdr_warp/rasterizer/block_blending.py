@@ -125,14 +125,9 @@ class BlockBackward:
         return blend_cuda_backward.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
 
     def _arguments(self, grad_image: Tensor, grad_transmittance: Tensor) -> tuple:
-        lists, packed = self.lists, self.packed
-        height, width = self.transmittance.shape
-        return (
-            *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
-            pad_features(self.features).reshape(-1, 4),
-            *(lists.grid.columns, width, height, self.alpha_threshold, self.transmittance, self.last_contributor),
-            *(grad_image, grad_transmittance, blend_cuda_backward.LINES, self.channels + 6),
-        )
+        inputs = _inputs(pad_features(self.features), self.lists, self.packed, self.transmittance, self.alpha_threshold)
+        outputs_and_gradients = self.transmittance, self.last_contributor, grad_image, grad_transmittance
+        return *inputs, *outputs_and_gradients, blend_cuda_backward.LINES, self.channels + 6
 
 
 class FixedBackward(NamedTuple):
@@ -170,14 +165,19 @@ def fixed_blend_blocks(
 
 def _forward(padded, lists, packed, image, transmittance, alpha_threshold) -> tuple[Any, tuple[Any, ...]]:
     """Return the forward kernel and its arguments, of which the last is the last Gaussian of each pixel."""
+    kernel = blend_cuda.forward_kernel(warp_scalar(padded.dtype), image.shape[2], padded.device.type == "cuda")
+    last_contributor = torch.empty(transmittance.numel(), dtype=torch.int32, device=padded.device)
+    inputs = _inputs(padded, lists, packed, transmittance, alpha_threshold)
+    return kernel, (*inputs, image, transmittance, last_contributor)
+
+
+def _inputs(padded, lists, packed, transmittance, alpha_threshold) -> tuple[Any, ...]:
+    """Return the arguments that both kernels take first."""
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
-    height, width, channels = image.shape
-    kernel = blend_cuda.forward_kernel(warp_scalar(padded.dtype), channels, padded.device.type == "cuda")
-    last_contributor = torch.empty(height * width, dtype=torch.int32, device=padded.device)
-    return kernel, (
+    height, width = transmittance.shape
+    return (
         *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
         *(padded.reshape(-1, 4), lists.grid.columns, width, height, alpha_threshold),
-        *(image, transmittance, last_contributor),
     )
 
 

@@ -114,8 +114,8 @@ def check_opacities(opacities: Tensor) -> None:
 
 def check_position(position: Tensor) -> None:
     """Raise ValueError for a position [3] on the CPU that is not finite."""
-    if position.device.type == "cpu" and not all(map(math.isfinite, place := position.detach().tolist())):
-        raise ValueError(f"position is {place}, expected finite numbers")
+    if position.device.type == "cpu" and not all(map(math.isfinite, numbers := position.detach().tolist())):
+        raise ValueError(f"position is {numbers}, expected finite numbers")
 
 
 def check_directions(directions: Tensor) -> None:

@@ -89,17 +89,9 @@ class _Fusion(torch.autograd.Function):
         units = 3, -(-encoded.shape[1] // POINTS_PER_THREAD), weights[0].shape[2]
         by_unit = encoded, exposedness, grad_output, *learned, POINTS_PER_THREAD, *_flat(grad_weights)
         launch(kernels.unit_backward, units, *by_unit)
-        by_point = (
-            encoded,
-            exposedness,
-            grad_exposedness,
-            grad_output,
-            log_sigma,
-            MAX_LOG_SIGMA,
-            MAX_DEVIATION,
-            *learned,
-        )
-        launch(kernels.point_backward, encoded.shape, *by_point, grad_log_sigma)
+        by_point = encoded, exposedness, grad_exposedness, grad_output, log_sigma, MAX_LOG_SIGMA, MAX_DEVIATION
+        arguments = *by_point, *learned, grad_log_sigma
+        launch(kernels.point_backward, encoded.shape, *arguments)
         return None, grad_log_sigma.sum(1), *grad_weights, None
 
 

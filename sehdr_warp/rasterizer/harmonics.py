@@ -75,12 +75,12 @@ def check_harmonics(degree: int, coefficients: Any, means: Any, camera_position:
 
 @dataclass(frozen=True)
 class HarmonicsGradients:
-    """Gradients by coefficients of harmonics as their factors: 3 numbers for a Gaussian and view in place of 48.
+    """Gradients of harmonics' coefficients as their factors: 3 numbers for a Gaussian and view in place of 48.
 
     The gradients are sums over the views.
 
     Attributes:
-        grad_colors: [V, N, 3] gradients by the values of each view.
+        grad_colors: [V, N, 3] gradients with respect to the values of each view.
         positions: [V, 3] of the views' cameras, world coordinates.
         means: [N, 3] of the Gaussians when the views were rendered.
         degree: of the evaluation.
@@ -101,7 +101,7 @@ class HarmonicsGradients:
         return basis
 
     def coefficient_gradients(self, like: Tensor, start: int) -> Tensor:
-        """Return the gradients [N, K, 3], like a tensor of that shape, by the coefficients from number `start` on."""
+        """Return the gradients of the coefficients from number `start` on, like a tensor [N, K, 3]."""
         gradients = torch.empty_like(like)
         if gradients.numel():
             kernel = coefficient_backward_kernel(warp_scalar(gradients.dtype), gradients.shape[1])
@@ -118,11 +118,8 @@ class _Evaluation(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, degree, constant, rest, means, camera_position):
-        scalar, inputs, values = (
-            warp_scalar(means.dtype),
-            (constant, rest, means, camera_position),
-            torch.empty_like(means),
-        )
+        scalar, values = warp_scalar(means.dtype), torch.empty_like(means)
+        inputs = constant, rest, means, camera_position
         # A GPU is bound by memory: with a stored 3 x 3 Jacobian the backward pass need not read 48 coefficients again.
         with_jacobian = writes_jacobian(means.device) and any(ctx.needs_input_grad[3:])
         mean_jacobian = means.new_empty(len(means) if with_jacobian else 0, 3, 3)
@@ -159,6 +156,6 @@ class _Evaluation(torch.autograd.Function):
 def writes_jacobian(device: torch.device) -> bool:
     """Return whether the forward pass on a device has one thread for each channel.
 
-    That pass also writes what the gradient by the means needs.
+    That pass also writes what the gradient with respect to the means needs.
     """
     return device.type == "cuda"

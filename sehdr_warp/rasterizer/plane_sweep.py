@@ -62,19 +62,8 @@ def matching_costs(photos: PhotoSet, pixels: Tensor, depths: Tensor) -> Tensor:
         codes = photos.codes.view(torch.int32)[:, 0]
     else:
         kernel, threads, codes = plane_sweep.sweep, depths.numel(), photos.codes
-    launch(
-        kernel,
-        threads,
-        codes,
-        photos.offsets,
-        photos.sizes,
-        photos.intrinsics,
-        photos.neighbors,
-        photos.between,
-        pixels.contiguous(),
-        depths.contiguous(),
-        costs,
-    )
+    views = photos.offsets, photos.sizes, photos.intrinsics, photos.neighbors, photos.between
+    launch(kernel, threads, codes, *views, pixels.contiguous(), depths.contiguous(), costs)
     return costs
 
 

@@ -40,6 +40,4 @@ class RenderOptions(NamedTuple):
         check_render_options(self.near_plane, self.alpha_threshold, **flags)
         width = integer("width", self.width, 1, MAX_SIDE)
         height = integer("height", self.height, 1, MAX_SIDE)
-        if width is self.width and height is self.height and limit is self.max_intersections:
-            return self
         return self._replace(width=width, height=height, max_intersections=limit)

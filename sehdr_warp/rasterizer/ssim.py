@@ -77,7 +77,7 @@ def distance_terms(
 ) -> tuple[Tensor, Tensor | None]:
     """Return the terms whose total() is image_distance() of contiguous images, and if needs_gradient their derivatives.
 
-    Derivatives [H, W, C] are by the variable of which `a` has the slopes, or by `a` itself.
+    Derivatives [H, W, C] are with respect to the variable of which `a` has the slopes, or to `a` itself.
     """
     weights = distance_weight / a.numel(), dissimilarity_weight / a.numel()
     terms, derivatives = _compare(a, b, weights)
@@ -119,7 +119,7 @@ def _check(a: Tensor, b: Tensor) -> None:
 
 
 def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
-    """Return the similarity [H, W, C] and its derivatives [3, H, W C] by the windowed moments.
+    """Return the similarity [H, W, C] and its derivatives [3, H, W C] with respect to the moments.
 
     weights: of |a - b| and of the dissimilarity; if given, the terms of their sum take the place of the similarity.
     """

@@ -91,7 +91,7 @@ class AdamStep(NamedTuple):
 
     Attributes:
         parameter: contiguous float32, as the next three of one shape.
-        gradient: by the parameter.
+        gradient: of the parameter.
         first_moment: changed in place.
         second_moment: changed in place.
         step: float32 of one element, the number of this step, from 1.
@@ -211,7 +211,7 @@ def _decays(betas: tuple[float, float]) -> tuple[float, ...]:
 def add_gradient_statistics(
     gradients: Tensor, radii: Tensor, usable: Tensor, width: int, height: int, gradient_sum: Tensor, visits: Tensor
 ) -> None:
-    """Add the lengths of gradients [N, 2] by the projected centers to gradient_sum [N], and 1 to visits [N].
+    """Add the lengths of gradients [N, 2] of projected centers to gradient_sum [N], and 1 to visits [N].
 
     Lengths are in normalized screen units (the screen is 2 wide). Only Gaussians with radii [N] above 0 count, and
     nothing is added if the scalar usable is 0. width, height: of the image in pixels. All float32 on one device.

@@ -53,22 +53,23 @@ def launch(
     """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
-    has_first = takes_range_start(kernel)
-    device, values = _packed_values(has_first, arguments, gradients)
+    device, values = _all_values(kernel, arguments, gradients)
     packed = _packed_launch(kernel, device, block_dim, gradients is not None, dim, values)
-    if has_first and device.type == "cpu" and isinstance(dim, int):
+    if device.type == "cpu" and isinstance(dim, int) and takes_range_start(kernel):
         packed.launch_ranges(threads.even_ranges(dim, min_range) if ranges is None else ranges, values)
     else:
         packed.launch(dim, values, warp_stream(device))
 
 
-def _packed_values(
-    has_first: bool, arguments: Sequence[Any], gradients: Sequence[Tensor | None] | None
+def _all_values(
+    kernel: Any, arguments: Sequence[Any], gradients: Sequence[Tensor | None] | None
 ) -> tuple[torch.device, list]:
+    """Return the device, and the arguments with 0 for `range_start`, for an adjoint followed by their gradients."""
     device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
-    values = [0, *arguments] if has_first else list(arguments)
+    start = takes_range_start(kernel)
+    values = [0, *arguments] if start else list(arguments)
     if gradients is not None:
-        values += [None, *gradients] if has_first else gradients
+        values += [None, *gradients] if start else gradients
     return device, values
 
 
@@ -92,7 +93,7 @@ def fixed_launch(
         whole: those whose addresses each launch gives.
         block_dim: threads per block.
     """
-    device, values = _packed_values(takes_range_start(kernel), arguments, gradients)
+    device, values = _all_values(kernel, arguments, gradients)
     packed = PackedLaunch(kernel, device, block_dim, gradients is not None, dim, values)
     return FixedLaunch(packed, dim, values, rows, whole)
 

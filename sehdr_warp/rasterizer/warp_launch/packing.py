@@ -40,8 +40,8 @@ class PackedLaunch:
         self.packed: list[Any] = [...] * len(self.kinds)  # The last launch's values, and of tensors the layouts.
         count = len(self.arguments)
         initial = [
-            type(kind.__ctype__())() if hasattr(kind, "__ctype__") else values[place % count]
-            for place, kind in enumerate(self.kinds)
+            type(kind.__ctype__())() if hasattr(kind, "__ctype__") else values[index % count]
+            for index, kind in enumerate(self.kinds)
         ]
         options = {"adj_inputs": initial[count:], "adjoint": adjoint, "block_dim": block_dim}
         self.command = launch_object(kernel, dim, initial[:count], wp.device_from_torch(device), **options)
@@ -117,15 +117,15 @@ class PackedLaunch:
 
     def _label(self, index: int) -> str:
         """Return a parameter's name as error messages give it."""
-        part, place = divmod(index, len(self.arguments))
-        name = f"{self.kernel}(): {self.arguments[place].label}"
-        return f"the gradient of {name}" if part else name
+        is_gradient, argument = divmod(index, len(self.arguments))
+        name = f"{self.kernel}(): {self.arguments[argument].label}"
+        return f"the gradient of {name}" if is_gradient else name
 
     def _set(self, index: int, value: Any) -> None:
         self.command.set_param_at_index(index, value)
         if self.structures:
-            part, place = divmod(index, len(self.arguments))
-            setattr(self.structures[part], self.arguments[place].label, self.command.params[index + 1])
+            is_gradient, argument = divmod(index, len(self.arguments))
+            setattr(self.structures[is_gradient], self.arguments[argument].label, self.command.params[index + 1])
 
 
 class FixedLaunch:
@@ -151,8 +151,8 @@ class FixedLaunch:
         packed.prepare(dim, values)
 
         def slots(tensors: Sequence[Tensor]) -> list[_Slot]:
-            places = [next(k for k, value in enumerate(values) if value is tensor) for tensor in tensors]
-            return [_Slot(packed.arrays[place], tensor) for place, tensor in zip(places, tensors, strict=True)]
+            indices = (next(k for k, value in enumerate(values) if value is tensor) for tensor in tensors)
+            return [_Slot(packed.arrays[index], tensor) for index, tensor in zip(indices, tensors, strict=True)]
 
         self._rows, self._whole = slots(rows), slots(whole)
         self._packed = packed
@@ -169,8 +169,9 @@ class FixedLaunch:
                     slot.step, slot.strides[0] = step, step * slot.size
             for slot, address in zip(self._whole, addresses, strict=True):
                 slot.put(address)
+            # Of a launch that failed, Warp's own launch raises the error.
             if self._on_stream is None or stream is None or self._on_stream(stream.cuda_stream, None):
-                self._packed.run(stream)  # After a launch that failed, for Warp's error.
+                self._packed.run(stream)
 
 
 def _on_stream(command: Any) -> Callable[[int, None], int]:

@@ -56,11 +56,11 @@ def run_ranges(function: Any, bounds: ctypes.Structure, structures: Sequence[cty
     kernel = ctypes.cast(function, ctypes.c_void_p)
     parameters, gradients = (*addresses, 0)[:2]
     work = shared_ranges.Work(kernel, ctypes.addressof(bounds), parameters, gradients, size, ranges.data_ptr(), count)
-    once = _share_ranges()
+    share = _share_ranges()
 
     def run_worker(gomp_parallel: int = 0) -> None:
         arguments = shared_ranges.Arguments(ctypes.addressof(work), gomp_parallel, threads)
-        once.hooks.forward(ctypes.byref(once.params[0]), ctypes.byref(arguments))
+        share.hooks.forward(ctypes.byref(share.params[0]), ctypes.byref(arguments))
 
     if min(count, threads) < 2:
         run_worker()
