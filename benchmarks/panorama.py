@@ -14,6 +14,7 @@ import numpy as np
 import torch
 import tyro
 
+from scenes.generator.light import map_rays
 from scenes.generator.recipes import RECIPES
 from scenes.generator.render import _sensor, load_mitsuba
 from scenes.generator.stage import Stage
@@ -157,24 +158,14 @@ def _render(path: Path, cameras: list[Camera], judged: list[Camera], width: int,
 
 def _panorama(mi: Any, scene: Any, tracer: Any, width: int, samples: int) -> np.ndarray:
     """[H, W, 3] by rays of its own: Mitsuba has no camera for it."""
-    import drjit as dr
-
-    height, total = width // 2, np.zeros((width // 2 * width, 3))
-    launch = min(samples, max(1, BATCH // total.shape[0]))
-    for turn in range(-(-samples // launch)):
+    pixels = width * width // 2
+    launch = min(samples, max(1, BATCH // pixels))
+    turns, total = -(-samples // launch), np.zeros((pixels, 3))
+    for turn in range(turns):
         LOG.info("panorama, launch %d", turn)
-        count = total.shape[0] * launch
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(turn, count)
-        place = mi.UInt32(np.tile(np.arange(total.shape[0], dtype=np.uint32), launch))
-        longitude = np.pi - 2 * np.pi * (mi.Float(place % width) + sampler.next_1d()) / width
-        latitude = np.pi / 2 - np.pi * (mi.Float(place // width) + sampler.next_1d()) / height
-        sin, cos = dr.sincos(longitude)
-        up, flat = dr.sincos(latitude)
-        ray = mi.RayDifferential3f(mi.Point3f(*PLACE.tolist()), mi.Vector3f(flat * sin, up, flat * cos))
-        light = np.array(tracer.sample(scene, sampler, ray)[0]).reshape(3, launch, -1)
-        total += light.sum(1).T / (launch * -(-samples // launch))
-    return total.reshape(height, width, 3).astype(np.float32)
+        sampler, ray = map_rays(mi, PLACE, width, launch, turn)
+        total += np.array(tracer.sample(scene, sampler, ray)[0]).reshape(3, launch, -1).sum(1).T / (launch * turns)
+    return total.reshape(width // 2, width, 3).astype(np.float32)
 
 
 def _irradiance(image: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:

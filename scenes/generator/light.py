@@ -102,12 +102,7 @@ def _map(mi, scene, tracer, position: np.ndarray, cameras: list[Camera], samples
     while traced < samples:
         # The first launch is a small one, whose rays are also asked who sees what they meet.
         launch = min(largest, samples - traced) if traced else min(SEEN_SAMPLES, samples)
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(traced, height * width * launch)
-        place = mi.UInt32(np.tile(np.arange(height * width, dtype=np.uint32), launch))
-        longitude = np.pi - 2 * np.pi * (mi.Float(place % width) + sampler.next_1d()) / width
-        latitude = np.pi / 2 - np.pi * (mi.Float(place // width) + sampler.next_1d()) / height
-        ray = mi.RayDifferential3f(mi.Point3f(*position.tolist()), _direction(mi, longitude, latitude))
+        sampler, ray = map_rays(mi, position, width, launch, traced)
         if not traced:
             coverage = np.array(_coverage(mi, scene, ray, cameras), np.float64).reshape(launch, -1).mean(0)
         light = np.array(tracer.sample(scene, sampler, ray)[0]).reshape(3, launch, -1)
@@ -116,12 +111,17 @@ def _map(mi, scene, tracer, position: np.ndarray, cameras: list[Camera], samples
     return (total / samples).reshape(height, width, 3).astype(np.float32), coverage.reshape(height, width)
 
 
-def _direction(mi, longitude, latitude):
+def map_rays(mi, position: np.ndarray, width: int, launch: int, seed: int):
+    """Return a sampler and `launch` random rays through each pixel of a lat-long map of this width at a position."""
     import drjit as dr
 
-    sin, cos = dr.sincos(longitude)
-    up, flat = dr.sincos(latitude)
-    return mi.Vector3f(flat * sin, up, flat * cos)
+    pixels = width * width // 2
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, pixels * launch)
+    place = mi.UInt32(np.tile(np.arange(pixels, dtype=np.uint32), launch))
+    sin, cos = dr.sincos(np.pi - 2 * np.pi * (mi.Float(place % width) + sampler.next_1d()) / width)
+    up, flat = dr.sincos(np.pi / 2 - 2 * np.pi * (mi.Float(place // width) + sampler.next_1d()) / width)
+    return sampler, mi.RayDifferential3f(mi.Point3f(*position.tolist()), mi.Vector3f(flat * sin, up, flat * cos))
 
 
 def _coverage(mi, scene, ray, cameras: list[Camera]):
