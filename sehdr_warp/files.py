@@ -66,8 +66,9 @@ def atomic_folder(path: Path | str, overwrite: bool = False, *, internal: bool =
 
 @contextmanager
 def _written_beside(path: Path, overwrite: bool, internal: bool, folder: bool) -> Iterator[Path]:
-    remove_stale(path)
-    internal = internal or any(_NAMES.fullmatch(part.name) for part in (path, *path.absolute().parents))
+    if not (in_temporary := any(_TEMPORARY_NAME.fullmatch(part.name) for part in (path, *path.absolute().parents))):
+        remove_stale(path)  # A new folder has no leftovers, and listing it for each of its files takes time.
+    internal = internal or in_temporary
     check_absent(path, overwrite, folder=folder, internal=internal)
     with writing(path):
         new_parents, temporary = make_parents(path), _beside(path)
@@ -282,7 +283,7 @@ def writing(path: Path | str) -> Iterator[None]:
         raise SehdrError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
 
 
-_NAMES = re.compile(r"\.(.*)\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.(tmp|old)(\.[^.]*)?", re.ASCII | re.DOTALL)
+_TEMPORARY_NAME = re.compile(r"\.(.*)\.([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.(tmp|old)(\.[^.]*)?", re.ASCII | re.DOTALL)
 
 
 def _beside(path: Path, kind: str = "tmp") -> Path:
@@ -314,7 +315,7 @@ def remove_stale(path: Path) -> None:
     still run, and of other machines, stay.
     """
     try:
-        names = [match for name in os.listdir(path.parent) if (match := _NAMES.fullmatch(name))]
+        names = [match for name in os.listdir(path.parent) if (match := _TEMPORARY_NAME.fullmatch(name))]
     except OSError:  # No such folder yet, or not readable.
         return
     for match in (match for match in names if match[2] == _process_space() and not _runs(int(match[3]))):

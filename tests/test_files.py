@@ -246,6 +246,16 @@ with files.atomic_folder(Path("set"), overwrite=True) as folder:
     assert listing(tmp_path) == ["set", content]
 
 
+def test_a_long_sequence_does_not_list_its_folder_for_each_file(tmp_path, monkeypatch):
+    listed, real = [], os.listdir
+    monkeypatch.setattr(os, "listdir", lambda path: listed.append(path) or real(path))
+    with atomic_folder(tmp_path / "pictures") as folder:
+        for index in range(5):
+            with atomic_path(folder / f"{index}.txt") as temporary:
+                temporary.write_text("x")
+    assert len(listed) == 1 and len(list((tmp_path / "pictures").glob("*.txt"))) == 5
+
+
 def test_what_another_process_is_writing_is_left_alone(tmp_path):
     code = """
 with files.atomic_path(Path("a.txt"), overwrite=True) as file:
