@@ -5,7 +5,7 @@
 TILE_SIZE = 16
 # Width and height in pixels of a subtile, which one warp of a GPU blends; a tile has eight of them.
 SUBTILE = 8, 4
-# Contributions below this opacity are left out: the step of an 8-bit display; for HDR output it can be lowered.
+# Contributions below this opacity are left out: the step of an 8-bit display.
 ALPHA_THRESHOLD = 1.0 / 255.0
 # A single Gaussian never hides everything behind it: 1 / (1 - alpha) stays bounded in the backward pass.
 ALPHA_MAX = 0.999

@@ -41,6 +41,12 @@ def first_foreign(path: Path) -> Path | None:
     return None
 
 
+def is_own(path: Path) -> bool:
+    """Return whether this program wrote a file, or all files of a folder, and nobody changed them since."""
+    listed = not path.is_symlink() and read_list(path if path.is_dir() else path.parent)
+    return bool(listed) and first_foreign(path) is None
+
+
 def hash_line(file: Path, name: str) -> bytes:
     """Return the line of a list for a file, without the end of the line."""
     with open(file, "rb") as opened:

@@ -75,7 +75,8 @@ def gaussians_of(
 
     Args:
         field: A trained field.
-        color_model: "log" or "linear" for scene-linear radiance, "display" for values encoded by the field's response.
+        color_model: "log" or "linear" for scene-linear radiance, "display" for values encoded by the field's response,
+            or by sRGB if colors are converted to Rec.709.
         camera_positions: [C, 3] positions that the scene was photographed from.
         exposure_time: Seconds for "display", by default the base time.
         color_matrix: [3, 3] from the field's colors to linear Rec.709, if they are not Rec.709.
@@ -126,9 +127,8 @@ def _in_colors(
         if arrays.color_model == "display" and time == field.base_time and color_matrix is None:
             return arrays
         radiance = to_radiance or (lambda exposure: exposure / field.base_time)
-        encoded = bake(
-            arrays, lambda colors: field.response.encode(radiance(colors) * time), "display", camera_positions
-        )
+        response = field.response if color_matrix is None else response_by_name("srgb")
+        encoded = bake(arrays, lambda colors: response.encode(radiance(colors) * time), "display", camera_positions)
         return replace(encoded, base_time=time)  # The exposure that readers need to recover radiance.
     if to_radiance is None and color_model == arrays.color_model:
         harmonics = arrays.harmonics.astype(np.float64)

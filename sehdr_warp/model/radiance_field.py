@@ -269,7 +269,7 @@ class RadianceField(nn.Module):
     @without_replays()
     def render_mean(self, camera: Camera, values: Tensor) -> Tensor:
         """Render the mean [H, W] in [0, 1] of values [N] of the Gaussians, 0 if alpha is at most 0.001."""
-        # Three channels like a training's features, so that no further kernel is compiled.
+        # Three channels like the features of a training, whose kernel is then compiled already.
         features = values[:, None].expand(-1, 3).contiguous()
         rendering = self._rasterize(self.camera_tensors(camera), features)
         return _unpremultiply(rendering.image[..., 0], rendering.alpha).clamp(0, 1)

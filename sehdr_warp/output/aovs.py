@@ -14,46 +14,60 @@ from ..scene import Camera
 from ..scene.wide_camera import pixel_directions
 from .exr import Part, as_data
 from .images import as_array
+from .world_transform import WorldTransform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
 
 
 @dataclass(frozen=True)
-class ViewData:
-    """A rendered view.
+class ViewImages:
+    """A rendered view on the CPU.
 
     Attributes:
         run: Scene that it shows.
         camera: In the scene's coordinates.
         camera_in_file: The same camera in the coordinates of the file.
+        hdr: [H, W, 3] linear Rec.709 radiance.
         alpha: [H, W] coverage.
-        depth: [H, W] in the file's units, along the camera's axis; 0 where nothing is.
+        depth: [H, W] in the file's units, along the camera's axis, of a wide camera the distance; 0 where nothing is.
+        confidence: [H, W] in [0, 1]; None if it was not measured.
     """
 
     run: "RenderableScene"
     camera: Camera
     camera_in_file: Camera
+    hdr: np.ndarray
     alpha: np.ndarray
     depth: np.ndarray
+    confidence: np.ndarray | None
+
+
+def render_images(run: "RenderableScene", camera: Camera, transform: WorldTransform) -> ViewImages:
+    """Render a view from a camera in the scene's coordinates; `transform` leads to those of the file."""
+    view, confidence = run.render(camera), run.render_confidence(camera)
+    confidence = None if confidence is None else as_array(confidence)
+    hdr, alpha, depth = (as_array(values) for values in (view.hdr, view.alpha, view.depth))
+    depth = depth * np.float32(transform.scale)
+    return ViewImages(run, camera, transform.camera(camera), hdr, alpha, depth, confidence)
 
 
 Channels = Mapping[str, np.ndarray]
 
 
-def _depth(view: ViewData) -> Channels:
-    """Return Z along the camera's axis and the distance from the camera; 0 where nothing is."""
+def _depth(view: ViewImages) -> Channels:
+    """Return Z and the distance from the camera; 0 where nothing is."""
     depth = view.depth
     return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(view.camera_in_file), axis=2)}
 
 
-def _position(view: ViewData) -> Channels:
+def _position(view: ViewImages) -> Channels:
     points = _points(view)
     return {f"position.{axis}": points[..., i] for i, axis in enumerate("XYZ")}
 
 
-def _normals(view: ViewData) -> Channels:
-    """Return surface normals from depth, towards the camera, in world axes; 0 where empty and at borders."""
+def _normals(view: ViewImages) -> Channels:
+    """Return surface normals from depth, towards the camera, in the file's axes; 0 where empty and at borders."""
     points = _points(view)
     down, right = (np.gradient(points, axis=axis) if points.shape[axis] > 1 else 0 * points for axis in (0, 1))
     normal = np.cross(down, right)
@@ -67,31 +81,33 @@ def _normals(view: ViewData) -> Channels:
     return {f"N.{axis}": normal[..., i] for i, axis in enumerate("XYZ")}
 
 
-def _alpha(view: ViewData) -> Channels:
+def _alpha(view: ViewImages) -> Channels:
     return {"A": view.alpha}
 
 
-def _confidence(view: ViewData) -> Channels:
-    return {"confidence": _require_values(view.run, view.run.render_confidence(view.camera))}
+def _confidence(view: ViewImages) -> Channels:
+    return {"confidence": _require_values(view, "confidence", view.confidence)}
 
 
-def _clipped_part(view: ViewData) -> Channels:
-    return {"clipped": _require_values(view.run, view.run.render_clipped(view.camera))}
+def _clipped(view: ViewImages) -> Channels:
+    return {"clipped": _require_values(view, "clipped", view.run.render_clipped(view.camera))}
 
 
-def _require_values(run: "RenderableScene", values) -> np.ndarray:
+def _require_values(view: ViewImages, name: str, values: Any) -> np.ndarray:
+    """Return the values of an AOV as an array; raise SehdrError if they were not measured."""
     if values is None:
-        raise SehdrError(f"{run.path}: its confidence was not measured; `sehdr-warp report` does, from the photos")
+        remedy = "`sehdr-warp report` measures it for a run, from the photos; else leave the AOV out"
+        raise SehdrError(f"{view.run.path}: AOV {name} was not measured; {remedy}")
     return as_array(values)
 
 
-AOVS: Mapping[str, Callable[[ViewData], Channels]] = {
+AOVS: Mapping[str, Callable[[ViewImages], Channels]] = {
     "depth": _depth,
     "position": _position,
     "normals": _normals,
     "alpha": _alpha,
     "confidence": _confidence,
-    "clipped": _clipped_part,
+    "clipped": _clipped,
 }
 
 
@@ -113,7 +129,7 @@ def read_aovs(names: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(requested)
 
 
-def data_parts(names: Sequence[str], view: ViewData, header: Mapping[str, Any]) -> list[Part]:
+def data_parts(names: Sequence[str], view: ViewImages, header: Mapping[str, Any]) -> list[Part]:
     """Return the parts of a file that hold AOVs of a rendered view; `header` is that of its picture."""
     return [Part(AOVS[name](view), as_data(header), name) for name in names]
 
@@ -126,8 +142,8 @@ def _rays(camera: Camera) -> np.ndarray:
     return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2)
 
 
-def _points(view: ViewData) -> np.ndarray:
-    """Return [H, W, 3] world coordinates of the visible surface; 0 where nothing is."""
+def _points(view: ViewImages) -> np.ndarray:
+    """Return [H, W, 3] coordinates of the visible surface in the file; 0 where nothing is."""
     camera, depth = view.camera_in_file, view.depth[..., None]
     points = (_rays(camera) * depth) @ camera.world_to_camera[:3, :3] + camera.position
     return np.where(depth > 0, points, 0)

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -13,18 +14,19 @@ from typing import Any
 import numpy as np
 
 from ..errors import SehdrError
-from ..files import atomic_folder, atomic_path, write_json
+from ..files import atomic_folder, atomic_path, remove, write_json
 from ..model.exposure import Exposure, Items, read_exposures
+from ..own_files import is_own
 from ..scene import Camera
 from .colorspace import color_space, from_rec709
 from .exr import (
     PAST_HALF,
     Part,
     check_finite,
+    check_pixel_type,
     exr_header,
     rgb_channels,
     stored_pixel_type,
-    write_exr,
     write_multipart_exr,
 )
 from .images import exposure_exif, quantize, safe_names, write_picture
@@ -113,7 +115,7 @@ def write_brackets(
         group_by: "view" or "exposure": what one folder holds.
         ldr: "jpeg", "png" or "png16" adds simulated photos through the response.
         response: Camera response for ldr.
-        overwrite: Replace folders that an earlier call wrote.
+        overwrite: Replace the files that an earlier call wrote.
 
     Raises:
         SehdrError: For unusable exposures or options.
@@ -132,7 +134,22 @@ def write_brackets(
     with brackets.open(Path(out), overwrite) as writer:
         for file_name, (name, radiance) in zip(safe_names(list(radiances)), radiances.items(), strict=True):
             writer.write(file_name, radiance, (cameras or {}).get(name))
+    if overwrite and ldr is None:
+        remove_earlier(Path(out), ["brackets_ldr"])
     return writer.files()
+
+
+def remove_earlier(out: Path, names: Iterable[str]) -> None:
+    """Remove files and folders of `out` that an earlier call wrote and this one does not.
+
+    What was changed since, or is not this program's, stays, and a warning names it.
+    """
+    for path in (out / name for name in names):
+        if is_own(path):
+            remove(path)
+            log.info("%s: removed, because an earlier call wrote it and this one does not", path)
+        elif os.path.lexists(path):
+            log.warning("%s: stays, though it is not of these pictures: it is yours, or was changed", path)
 
 
 @dataclass(frozen=True)
@@ -157,11 +174,11 @@ class PictureHeader:
         """Raise SehdrError for an unknown color space."""
         color_space(self.colorspace)
 
-    def of(self, view: str, exposure_time: float, camera: Camera | None, **facts: str) -> dict[str, Any]:
+    def of(self, view: str, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
         """Return the EXR attributes of a picture."""
-        facts = {**self.provenance, **facts, "view": view, "baseExposureTime": repr(self.base_time)}
+        values = {**self.provenance, **provenance, "view": view, "baseExposureTime": repr(self.base_time)}
         luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
-        return exr_header(self.colorspace, exposure_time, camera, self.captured, facts, luminance)
+        return exr_header(self.colorspace, exposure_time, camera, self.captured, values, luminance)
 
 
 @dataclass(frozen=True)
@@ -188,7 +205,7 @@ class Brackets:
 
     def __post_init__(self):
         """Raise SehdrError for options that contradict each other."""
-        stored_pixel_type((), self.pixel)
+        check_pixel_type(self.pixel)
         if self.group_by not in ("view", "exposure"):
             raise SehdrError(f"group_by {self.group_by!r} is not one of view, exposure")
         if self.multipart and self.group_by == "exposure":
@@ -253,7 +270,10 @@ class BracketWriter:
         return [self.out / name for name in names]
 
     def write(self, name: str, radiance: np.ndarray, camera: Camera | None) -> None:
-        """Write the bracket of a view: its radiance, [H, W, 3] scene-linear Rec.709; `name` is safe for files."""
+        """Write the bracket of a view: its radiance, [H, W, 3] scene-linear Rec.709; `name` is safe for files.
+
+        Simulated photos encode this radiance, so that merging them by the response gives it back.
+        """
         options = self.brackets
         radiance = np.asarray(radiance, np.float64)
         if radiance.shape[2:] != (3,):
@@ -271,14 +291,14 @@ class BracketWriter:
         for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
             label = f"b{index:0{digits}d}_{exposure.label}"
             header = options.header.of(name, exposure.time, camera, ev=repr(exposure.ev)) | reason
-            parts.append(Part(rgb_channels(image), header, label))
+            parts.append(Part(rgb_channels(image), header, label if options.multipart else ""))
             place = f"{name}/{name}_{label}" if options.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if options.multipart else f"{place}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
             if options.multipart:
                 entry["part"] = index
             else:
-                write_exr(self.folder / file, parts[-1].channels, pixel=pixel, header=header)
+                write_multipart_exr(self.folder / file, parts[-1:], pixel=pixel)
             if options.ldr:
                 photo = f"{place}.{'jpg' if options.ldr == 'jpeg' else 'png'}"
                 exif = exposure_exif(exposure.time, bias=exposure.ev, captured=options.header.captured)

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from ..scene import Camera
 from ..scene.exchange_cameras import CHAN_ROTATION, USD_SIZE, USD_WORLD_MATRIX
-from .world_transform import WorldTransform
 
 _APERTURE = 36.0  # Of a full-frame camera, mm: USD's lens lengths are relative to it
 _STAGE = """#usda 1.0
@@ -70,7 +69,8 @@ class CameraPath(NamedTuple):
 def camera_path(views: Sequence[tuple[str, Camera]]) -> CameraPath | None:
     """Return named cameras as one that moves; None if they are several.
 
-    They are one if all have the same size and names that end in ascending numbers, such as orbit_000, orbit_001.
+    They are one if two or more have one size and names that end in consecutive numbers of three digits or more, such as
+    orbit_000, orbit_001.
     """
     numbered = [re.fullmatch(r"(.*?)_?(\d{3,})", name) for name, _ in views]
     matches = [match for match in numbered if match]
@@ -84,20 +84,20 @@ def camera_path(views: Sequence[tuple[str, Camera]]) -> CameraPath | None:
 
 
 def usd_cameras(
-    views: Sequence[tuple[str, Camera]], transform: WorldTransform, *, path: CameraPath | None = None, fps: float = 24
+    views: Sequence[tuple[str, Camera]], matrix: np.ndarray, *, path: CameraPath | None = None, fps: float = 24
 ) -> str:
     """Return the text of a stage with a UsdGeomCamera for each camera, or one with time samples for a path.
 
-    The size in pixels, which USD does not have, is stored in attributes of this package, and the transform from the
-    scene's own coordinates in the stage's customLayerData.
+    The size in pixels, which USD does not have, is stored in attributes of this package, and the matrix in the stage's
+    customLayerData.
 
     Args:
-        views: Names and cameras in the file's coordinates.
-        transform: From the scene's own coordinates to the file's.
+        views: Names and pinhole cameras in the file's coordinates.
+        matrix: [4, 4] from the photos' coordinates to the file's.
         path: The same cameras as one that moves.
         fps: Frames a second of the path.
     """
-    world = ", ".join(repr(float(value)) for value in transform.matrix.ravel())
+    world = ", ".join(repr(float(value)) for value in matrix.ravel())
     if path is None:
         groups = zip(_identifiers([name for name, _ in views]), ([camera] for _, camera in views), strict=True)
         times = ""
@@ -110,7 +110,10 @@ def usd_cameras(
 
 
 def chan_cameras(path: CameraPath) -> str:
-    """Return a moving camera as Nuke's .chan: frame, translation, rotation in degrees, vertical field of view."""
+    """Return a moving camera as Nuke's .chan: frame, translation, rotation in degrees, vertical field of view.
+
+    The format has neither size nor principal point.
+    """
     lines = []
     for frame, camera in zip(path.frames, path.cameras, strict=True):
         pose = _opengl(camera)
@@ -121,24 +124,23 @@ def chan_cameras(path: CameraPath) -> str:
     return "\n".join(lines) + "\n"
 
 
-def nerfstudio_path(path: CameraPath, fps: float = 24) -> str:
-    """Return a moving camera, in the set's own coordinates, as nerfstudio's camera_path.json.
+def nerfstudio_path(cameras: Sequence[Camera], fps: float = 24) -> str:
+    """Return a moving camera, in the photos' coordinates, as nerfstudio's camera_path.json.
 
-    The principal point is taken as the middle.
+    The format has no principal point.
     """
-    first = path.cameras[0]
     entries = [
         {
             "camera_to_world": _opengl(camera).ravel().tolist(),
             "fov": math.degrees(2 * math.atan(camera.height / 2 / camera.fy)),
             "aspect": camera.width / camera.height,
         }
-        for camera in path.cameras
+        for camera in cameras
     ]
     values = {
         "camera_type": "perspective",
-        "render_width": first.width,
-        "render_height": first.height,
+        "render_width": cameras[0].width,
+        "render_height": cameras[0].height,
         "fps": fps,
         "seconds": len(entries) / fps,
         "camera_path": entries,
@@ -150,9 +152,7 @@ def _usd_camera(name: str, cameras: Sequence[Camera], frames: Sequence[int] | No
     """Return the text of one camera: values, or a sample for each frame."""
 
     def values(texts: list[str]) -> str:
-        if frames is None:
-            return f" = {texts[0]}"
-        if len(set(texts)) == 1:
+        if frames is None or len(set(texts)) == 1:
             return f" = {texts[0]}"
         lines = "".join(f"            {frame}: {text},\n" for frame, text in zip(frames, texts, strict=True))
         return f".timeSamples = {{\n{lines}        }}"

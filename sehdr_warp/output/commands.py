@@ -1,15 +1,18 @@
-"""Command lines of `sehdr-warp render`, `report`, `envmap`, `lights` and `meter`. torch is imported when they run."""
+"""Command lines of `sehdr-warp render`, `report`, `envmap`, `lights` and `meter`. torch is imported when they run.
+
+Names of options are those of the arguments of render_views(), write_film(), write_environment_map() and write_lights().
+"""
 
 import json
 import logging
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from tyro.conf import Positional
 
-from ..arguments import parse_numbers, require_positive
+from ..arguments import parse_numbers
 from ..errors import InputError, UsageError
 from ..files import check_absent
 from ..runs.open import load_run_scene_with_confidence, open_run, open_scene
@@ -25,12 +28,12 @@ class WorldOptions:
     """Coordinates of the files."""
 
     axes: Literal["upright", "scene"] = "upright"
-    """upright: +Y is up (in PLY -Y, as its viewers expect), the subject is in the middle. scene: the photos' own
+    """upright: +Y is up (in PLY -Y, as its viewers expect), the subject is in the middle. scene: the photos'
     coordinates."""
     up: str | None = None
-    """The scene's up direction in its own coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
+    """Up direction in the photos' coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
     scale: float | None = None
-    """Meters for each unit of the scene; by default as kept by the viewer, else 1."""
+    """Meters for each unit of the scene; by default as kept by the viewer, else by GPS, else 1; of axes scene 1."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class ViewFileOptions:
 
     aovs: str = ""
     """Further parts of the EXR files, such as depth,normals: depth, position, normals, alpha, confidence, clipped, or
-    all."""
+    all; the last three need a run with confidence."""
     evs: str | None = None
     """Brackets in stops from the photos' exposure, such as --evs=-4,-2,0,2,4."""
     exposures: str | None = None
@@ -53,7 +56,8 @@ class ViewFileOptions:
     colorspace: str = "rec709"
     """Primaries of the EXR files, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
     reference_white: float | None = None
-    """Value of the photos' white in hdr/, such as 1; without it the files hold radiance."""
+    """Value of display white in hdr/, such as 1, as the photos' middle grey tells it; without it the files hold
+    radiance."""
     pixel: Literal["half", "float"] = "half"
     """Pixel type of the EXR files."""
     ocio: str | None = None
@@ -98,14 +102,14 @@ class Render:
     count: int | None = None
     """Views of an orbit or interpolation; by default 60, or 144 for a film alone, which are six seconds."""
     size: str | None = None
-    """Width and height in pixels, such as 1920x1080; by default the cameras' own."""
+    """Width and height in pixels, such as 1920x1080; by default the cameras' own, of orbit and interpolate 16:9."""
     overwrite: bool = False
     """Replace files that exist."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
     json: bool = False
     """Print the written files as JSON on standard output."""
-    world: WorldOptions = field(default_factory=WorldOptions)
+    world: WorldOptions = WorldOptions()
     pictures: ViewFileOptions = ViewFileOptions()
     film: FilmOptions = FilmOptions()
 
@@ -137,13 +141,13 @@ class EnvironmentMap:
     out: Path
     """The file: .exr, or .hdr without alpha and confidence."""
     at: str = "center"
-    """x,y,z in the coordinates of exported files (0,0,0: what most photos look at), camera:NAME, or center: the middle
-    of the training cameras, or what they walk around."""
+    """x,y,z in upright coordinates or those of --axes (0,0,0: what most photos look at), camera:NAME, or center: the
+    middle of the training cameras, or what they walk around."""
     size: int = 2048
     """Pixels across; for a cube those of one face."""
     layout: Literal["latlong", "cube"] = "latlong"
     """Latitude and longitude, twice as wide as high; or OpenEXR's six faces, one above the other."""
-    world: WorldOptions = field(default_factory=WorldOptions)
+    world: WorldOptions = WorldOptions()
     beyond: float | None = None
     """Leave out what is nearer than this distance, in the units of --at: a CG object then stands in the place of the
     photographed one. By default 0, or, for the center of a walk around something, half the distance of the nearest
@@ -153,8 +157,7 @@ class EnvironmentMap:
     colorspace: str = "rec709"
     """Primaries, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
     reference_white: float | None = None
-    """Value of the photos' white in the file, such as 1, which suits a dome light; without it the file holds
-    radiance."""
+    """Value of display white in the file, such as 1, which suits a dome light; without it the file holds radiance."""
     pixel: Literal["half", "float"] = "half"
     """Pixel type of an EXR file."""
     overwrite: bool = False
@@ -174,7 +177,7 @@ class Lights:
     """Folder of a run."""
     out: Path | None = None
     """The file: .json, or .usda, with a map of the rest beside it. Without it the lights are only listed."""
-    world: WorldOptions = field(default_factory=WorldOptions)
+    world: WorldOptions = WorldOptions()
     at: str = "center"
     """Place of the map, as of envmap: that of a CG object, so that what is near it fits."""
     beyond: float | None = None
@@ -257,10 +260,11 @@ def run_environment_map(args: EnvironmentMap) -> None:
     from .colorspace import color_space
     from .map_center import check_place
 
-    color_space(args.colorspace)  # Both are checked before the scene is opened.
+    color_space(args.colorspace)  # Before anything is loaded
     check_place(args.at)
-    from .environment_map import write_environment_map
+    from .environment_map import check_map, write_environment_map
 
+    check_map(args.out, args.size, args.layout, args.world.axes, args.beyond)
     options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
     print(write_environment_map(open_scene(args.run, args.device), args.out, **options, **vars(args.world)))
 
@@ -270,6 +274,8 @@ def run_render(args: Render) -> None:
     from .colorspace import color_space
 
     color_space(args.pictures.colorspace)  # Before anything is loaded
+    from .aovs import read_aovs
+    from .film import check_rate, film_format, film_library, write_film
     from .render_views import PATHS, SPLITS, check_cameras, read_size, reframe, render_views, select_cameras
     from .world_transform import world_transform
 
@@ -287,11 +293,12 @@ def run_render(args: Render) -> None:
     check_cameras(args.cameras)
     if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
-    files, ramp, summary = [], _ramp(args.film.ev_ramp), ""
-    fps = require_positive("--fps", args.film.fps)
+    files, ramp, summary, fps = [], _ramp(args.film.ev_ramp), "", args.film.fps
+    check_rate(fps)
+    if args.pictures.aovs:
+        read_aovs(args.pictures.aovs)
+    size = None if args.size is None else read_size(args.size)
     if args.video is not None:
-        from .film import film_format, film_library
-
         film_library()
         film_format(args.video)
         check_absent(args.video, args.overwrite)
@@ -301,15 +308,13 @@ def run_render(args: Render) -> None:
     selection = {"cameras": args.cameras, "camera": args.camera, "count": count}
     if args.out is not None:
         options = selection | vars(args.world) | vars(args.pictures)
-        files = render_views(run, args.out, size=args.size, overwrite=args.overwrite, fps=fps, **options)
+        files = render_views(run, args.out, size=size, overwrite=args.overwrite, fps=fps, **options)
         summary = f"{args.out}: {len(files)} files"
     if args.video is not None:
-        from .film import write_film
-
         transform = world_transform(run, **vars(args.world))
         cameras = [camera for _, camera in select_cameras(run, **selection, transform=transform, up=args.world.up)]
-        if args.size is not None:
-            cameras = [reframe(camera, *read_size(args.size)) for camera in cameras]
+        if size is not None:
+            cameras = [reframe(camera, *size) for camera in cameras]
         film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}
         files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
         if len(cameras) == 1:
@@ -346,5 +351,5 @@ def run_report(args: Report) -> None:
 
 def changed_flags(options: Any) -> list[str]:
     """Return the flags of a dataclass of options whose values are not the default."""
-    names = [field.name for field in fields(options) if getattr(options, field.name) != field.default]
+    names = [each.name for each in fields(options) if getattr(options, each.name) != each.default]
     return ["--" + name.replace("_", "-") for name in names]

@@ -22,7 +22,7 @@ from .light_unit import EFFICACY, luminance_of_one
 from .map_center import find_center
 from .render_views import provenance
 from .tonemap import exposure_of_white
-from .world_transform import AXES, describe, world_transform
+from .world_transform import AXES, stored_matrix, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -30,9 +30,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 LAYOUTS = ("latlong", "cube")
 SUFFIXES = (".exr", ".hdr")
-# A direction counts as covered above this alpha. A covered share below _LEAST_COVERED gives a warning, as do surfaces
-# nearer than _NEAR times the spread of the cameras in more than half of all directions: the point is inside something.
-COVERED, _LEAST_COVERED, _NEAR, _LARGEST = 0.5, 0.1, 0.02, 1 << 15
+COVERED = 0.5  # Alpha above which a direction counts as covered
+_LEAST_COVERED = 0.1  # Covered share of all directions below which a warning names the point
+_NEAR = 0.02  # Spread of the cameras: surfaces that near in most directions mean that the point is inside something
+_LARGEST = 1 << 15  # Pixels across
 _WHOLE = 99.5  # Per cent of all directions that count as all
 _FINEST = {"latlong": 4096, "cube": 1024}  # Most pixels across that are rendered for a map that is smaller
 _MOST_PIXELS = 1 << 21  # Of those, at once
@@ -81,7 +82,7 @@ def write_environment_map(
             "cube": OpenEXR's six faces, one above the other.
         axes: "upright": turned as render and export turn the scene (see world_transform), so that the map lights its
             Gaussians as they stand: +Y is up, +Z is ahead of the middle camera, and 0, 0, 0 is the point that most
-            photos look at. "scene": the scene's coordinates.
+            photos look at, or else the mean place of the cameras. "scene": the photos' coordinates.
         up: As in world_transform.
         scale: As in world_transform.
         beyond: Leave out what is nearer than this distance, in the units of `at`, so that a CG object can stand in the
@@ -100,23 +101,22 @@ def write_environment_map(
         InputError: If the file exists or a pixel is not finite.
     """
     path = Path(path)
-    _check_options(path, size, layout, axes, beyond)
+    check_map(path, size, layout, axes, beyond)
     color_space(colorspace)
     transform = world_transform(run, axes, up=up, scale=scale)
     exposure = exposure_of_white(run, reference_white)
     check_absent(path, overwrite)
     photos = training_cameras(run)
     center = find_center(run, photos, at, beyond, transform)
-    to_world = transform.rotation.T
-    directions = (latlong if layout == "latlong" else cube)(size) @ to_world.T
     focal = typical_focal_length(photos) if photos else 0.0
     options = {"beyond": center.beyond, "shares": run.clipped_share()}
-    rendered = render_map(run, center.position, size, layout, to_world.T, focal, **options)
+    rendered = render_map(run, center.position, size, layout, transform.rotation, focal, **options)
     weight = solid_angles(size, layout)
     place = transform.points(center.position)
     _judge(run, place, photos, rendered.alpha, rendered.distance, weight)
     added = np.zeros_like(rendered.hdr)
     if inpaint:
+        directions = (latlong if layout == "latlong" else cube)(size) @ transform.rotation
         light = inpainted_light(rendered.hdr, rendered.alpha, directions, weight)
         added = (1 - rendered.alpha[..., None]) * light
     shares = light_shares(rendered.hdr, added, rendered.clipped, weight, run.response.white / run.base_time)
@@ -133,10 +133,10 @@ def write_environment_map(
     beyond = center.beyond * transform.scale if beyond is None else beyond
     facts = {**provenance(run), "position": json.dumps(place.tolist()), "axes": axes}
     facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(shares.to_dict())}
-    facts |= {"worldMatrix": describe(transform)}
+    facts |= {"worldMatrix": json.dumps(stored_matrix(run, transform).tolist())}
     white_luminance = None if luminance is None else luminance / exposure
     header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
-    header |= {"sehdr:mapToWorld": json.dumps(to_world.tolist()), "envmap": envmap(layout)}
+    header |= {"sehdr:mapToWorld": json.dumps(transform.rotation.T.tolist()), "envmap": envmap(layout)}
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
     data = {
         "distance.Z": rendered.distance * transform.scale,
@@ -151,8 +151,8 @@ def write_environment_map(
     return path
 
 
-def _check_options(path: Path, size: int, layout: str, axes: str, beyond: float | None) -> None:
-    """Raise SehdrError for options that are out of range."""
+def check_map(path: Path, size: int, layout: str, axes: str, beyond: float | None) -> None:
+    """Raise the errors of write_environment_map() about options that need no scene."""
     if path.suffix.lower() not in SUFFIXES:
         raise SehdrError(f"{path}: an environment map is one of {', '.join(SUFFIXES)}; choose a suffix")
     for name, value, allowed in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):

@@ -27,7 +27,8 @@ from ..splats import (
 from ..subsets import every_nth
 from .camera_paths import training_cameras
 from .splat_edits import SplatEdits, most_visible, without_strays
-from .world_transform import WorldTransform, file_transform, is_y_down, world_transform
+from .tonemap import display_gain
+from .world_transform import WorldTransform, file_transform, is_y_down, stored_matrix, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -89,7 +90,9 @@ def export(
     for file in (path, *[beside] * cameras):
         check_absent(file, overwrite)  # Before minutes of fitting.
     upright, to_file = _file_coordinates(run, path, axes, up, scale)
-    time = run.base_time if exposure_time is None else float(exposure_time)
+    seconds = run.base_time if exposure_time is None else float(exposure_time)
+    # Colors that are converted to Rec.709 are shown with middle grey as the photos have it.
+    time = seconds if run.color_matrix is None else seconds * display_gain(run.response)
     radiance = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
     color_model = "display" if kind == "ldr" else radiance
     means = run.field.gaussians.means.detach().cpu().numpy()
@@ -99,11 +102,11 @@ def export(
     gaussians = _select_rows(run, whole, mask, edits, time)
     file_gaussians = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
     if run.world_matrix is not None:
-        file_gaussians = replace(file_gaussians, world_matrix=to_file.matrix @ run.world_matrix)
+        file_gaussians = replace(file_gaussians, world_matrix=stored_matrix(run, to_file))
     write_gaussians(path, file_gaussians.padded(degree or 0), overwrite=overwrite)
     if cameras:
         _write_cameras(beside, run, to_file, overwrite)
-    meaning = f"display colors of {shutter(time)}" if kind == "ldr" else "scene-linear radiance"
+    meaning = f"display colors of {shutter(seconds)}" if kind == "ldr" else "scene-linear radiance"
     count, harmonics = file_gaussians.count, max(file_gaussians.degree, degree or 0)
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, count, harmonics, meaning)
     reference = gaussians if edits.shows_part else None
@@ -114,7 +117,12 @@ def export(
 
 
 class _FileCoordinates(NamedTuple):
-    """Maps from the scene's own coordinates to upright ones, which edits are in, and to those of the file."""
+    """Transforms from the scene's coordinates.
+
+    Attributes:
+        upright: To those that edits are in: upright ones, or those that export() was asked for.
+        to_file: To those of the file.
+    """
 
     upright: WorldTransform
     to_file: WorldTransform
@@ -143,13 +151,13 @@ def _select_rows(
     part, most = gaussians.rows(mask), edits.max_gaussians
     if most is not None and part.count > most:
         subset = gaussians.rows(most_visible(mask, most, run))
-        picture = _gaussians_renderer(part, time) if edits.changes_pictures else _photo_renderer(run, time)
+        picture = _gaussians_renderer(part, time, run) if edits.changes_pictures else _photo_renderer(run, time)
         part = refine(subset, picture, training_cameras(run)) if gaussians.color_model == "display" else subset
     return without_strays(part, training_cameras(run))
 
 
 def _gaussians_in_colors(run: "RenderableScene", color_model: str, time: float) -> GaussianArrays:
-    """Return the Gaussians of a run in its own coordinates and in the colors of a file.
+    """Return the Gaussians of a run in the scene's coordinates and in the colors of a file.
 
     Display colors are those of a photo of `time` seconds.
     """
@@ -158,9 +166,9 @@ def _gaussians_in_colors(run: "RenderableScene", color_model: str, time: float) 
     if color_model != "display":
         return gaussians_of(run.field, color_model, positions, color_matrix=run.color_matrix)
     gaussians = gaussians_of(run.field, "display", positions, time, run.color_matrix)
-    if gaussians.color_model != run.field.color_model.name:
-        return refine(gaussians, _photo_renderer(run, time), photos)
-    return gaussians
+    if run.field.color_model.name == "display" and time == run.base_time and run.color_matrix is None:
+        return gaussians  # They are the run's own.
+    return refine(gaussians, _photo_renderer(run, time), photos)
 
 
 def _check(path: Path, kind: str, file_model: str | None, exposure_time: float | None, degree: int | None) -> None:
@@ -186,7 +194,7 @@ def loss_in_words(decibels: float) -> str:
 
 
 def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, time: float, *, is_part: bool) -> None:
-    """Measure and log how well Gaussians in the scene's own coordinates show the scene.
+    """Measure and log how well Gaussians in the scene's coordinates show the scene.
 
     is_part: The file holds a part of the scene, so these are all of its Gaussians.
     """
@@ -225,7 +233,7 @@ def _log_file_loss(
     if reference is None:
         picture, beside = _photo_renderer(run, time), "the scene"
     else:
-        picture, beside = _gaussians_renderer(reference, time), "what was exported"
+        picture, beside = _gaussians_renderer(reference, time, run), "what was exported"
     decibels = agreement(gaussians, picture, views, time)
     files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
     size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
@@ -243,9 +251,9 @@ def _photo_renderer(run: "RenderableScene", time: float) -> Callable:
     return _display_renderer(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
 
-def _gaussians_renderer(gaussians: GaussianArrays, time: float) -> Callable:
-    """Return a function that renders simulated photos of Gaussians in the scene's own coordinates."""
-    field = field_of(gaussians)
+def _gaussians_renderer(gaussians: GaussianArrays, time: float, run: "RenderableScene") -> Callable:
+    """Return a function that renders simulated photos of Gaussians in the scene's coordinates, on the run's device."""
+    field = field_of(gaussians).to(run.device)
     return lambda camera: field.render_ldr(camera, time)
 
 

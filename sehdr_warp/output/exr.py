@@ -89,10 +89,15 @@ PAST_HALF = "float, since half would overflow 65504"
 """Value of `sehdr:pixelType` where half was asked for."""
 
 
-def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
-    """Return the type that holds all values unclipped: `pixel`, or "float" if half would overflow."""
+def check_pixel_type(pixel: str) -> None:
+    """Raise ValueError unless a pixel type is "half" or "float"."""
     if pixel not in _TYPES:
         raise ValueError(f"pixel type {pixel!r} is not one of {', '.join(_TYPES)}")
+
+
+def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
+    """Return the type that holds all values unclipped: `pixel`, or "float" if half would overflow."""
+    check_pixel_type(pixel)
     fits = all(np.abs(array).max() <= np.finfo(np.float16).max for array in arrays)
     return "half" if pixel == "half" and fits else "float"
 
@@ -180,7 +185,7 @@ def check_finite(path: Path, image: np.ndarray, what: str) -> None:
 
 
 def _is_depth(name: str) -> bool:
-    """Return whether a channel holds depth or positions, for which half is too coarse."""
+    """Return whether a channel holds depth, distance or positions, for which half is too coarse."""
     return name in ("Z", "distance.Z") or name.startswith("position.")
 
 

@@ -114,8 +114,7 @@ def write_film(
     """
     av, kind = film_library(), TRANSFERS[transfer]
     out, first, container_format = Path(out), cameras[0], film_format(out)
-    if not _SLOWEST <= fps <= _FASTEST:
-        raise SehdrError(f"{fps} frames a second are not between {_SLOWEST} and {_FASTEST}")
+    check_rate(fps)
     # Chroma of 4:2:0 covers two by two pixels.
     width, height = (max(2, side - side % 2) for side in (first.width, first.height))
     gain = run.base_time * display_gain(run.response)
@@ -169,6 +168,12 @@ def film_format(out: Path | str) -> str:
     if suffix not in FORMATS:
         raise InputError(out, f"{suffix or 'no suffix'} is not the suffix of a film", f"use one of {' '.join(FORMATS)}")
     return FORMATS[suffix]
+
+
+def check_rate(fps: float) -> None:
+    """Raise SehdrError for frames a second that no film has."""
+    if not _SLOWEST <= fps <= _FASTEST:
+        raise SehdrError(f"{fps} frames a second are not between {_SLOWEST} and {_FASTEST}")
 
 
 def encode(light: np.ndarray, transfer: str) -> np.ndarray:

@@ -15,7 +15,7 @@ from ..model.color_models import rec709_of
 from ..scene import View
 from .html import EMPTY, data_block, join, markup
 from .images import as_array, quantize
-from .tonemap import encode_srgb
+from .tonemap import display_gain, encode_srgb
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -44,17 +44,17 @@ def photo_light(run: "RenderableScene", view: View) -> np.ndarray:
 
 
 def photo_for_display(run: "RenderableScene", view: View) -> np.ndarray:
-    """Return [H, W, 3] in [0, 1] as a photo is looked at: encoded values, or the light of a RAW photo as sRGB."""
+    """Return [H, W, 3] in [0, 1] as a photo is looked at: encoded values, or light in a RAW photo's colors as sRGB."""
     if run.color_matrix is None:
         return view.image
-    return encode_srgb(np.clip(photo_light(run, view) * view.exposure_time, 0, 1))
+    return simulated_photo(run, photo_light(run, view) * view.exposure_time)
 
 
 def simulated_photo(run: "RenderableScene", exposure: np.ndarray) -> np.ndarray:
     """Return [H, W, 3] in [0, 1]: Rec.709 exposures as a photo of the run would show them (see photo_for_display)."""
     if run.color_matrix is None:
         return np.clip(run.response.encode(exposure), 0, 1)
-    return encode_srgb(np.clip(exposure, 0, 1))
+    return encode_srgb(exposure * np.float32(display_gain(run.response)))
 
 
 def jpeg(encoded: np.ndarray, quality: int = 88) -> bytes:

@@ -14,7 +14,7 @@ from ..runs.run import RenderableScene, on_device
 from ..splats import GaussianArrays
 from ..splats.arrays import join_gaussians
 from .camera_paths import training_cameras
-from .world_transform import WorldTransform
+from .world_transform import WorldTransform, from_photos
 
 
 class MergedScene(RenderableScene):
@@ -72,20 +72,17 @@ def merge_scenes(run: RenderableScene, *others: RenderableScene) -> MergedScene:
 
 def _to_coordinates_of(first: RenderableScene, scene: RenderableScene) -> WorldTransform:
     """Return the map from a scene's coordinates to those of the first scene, by what their files state."""
-    to_first, back = (
-        WorldTransform.identity() if each.world_matrix is None else WorldTransform.from_matrix(each.world_matrix)
-        for each in (first, scene)
-    )
     if scene is first:
         return WorldTransform.identity()
-    return WorldTransform.from_matrix(to_first.matrix @ back.inverse().matrix)
+    return WorldTransform.from_matrix(from_photos(first).matrix @ from_photos(scene).inverse().matrix)
 
 
 def _joined_gaussians(scenes: Sequence[RenderableScene], moves: Sequence[WorldTransform]) -> GaussianArrays:
     """Return the moved Gaussians of all scenes in one color model."""
     names = {scene.field.color_model.name for scene in scenes}
-    if "display" in names and len({json.dumps(scene.response.to_dict()) for scene in scenes}) > 1:
-        names.add("log")  # Codes of different responses have light alone in common.
+    responses = {json.dumps(scene.response.to_dict()) for scene in scenes}
+    if "display" in names and (len(responses) > 1 or any(scene.color_matrix is not None for scene in scenes)):
+        names.add("log")  # Codes of different responses or primaries have light alone in common.
     color_model = names.pop() if len(names) == 1 else "log"
     time = scenes[0].base_time if color_model == "display" else None
     pairs = zip(scenes, moves, strict=True)

@@ -4,6 +4,7 @@ Depth of the training views is fused (see depth_fusion) and scikit-image extract
 mean radiance there.
 """
 
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ from .depth_fusion import (
 )
 from .splat_edits import Box, Sphere, read_region
 from .tonemap import encode_srgb
-from .world_transform import WorldTransform, describe, world_transform
+from .world_transform import WorldTransform, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -315,7 +316,8 @@ def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "Ren
     """Write an OBJ file with vertex colors, in sRGB with the exposure of the photos."""
     colors = encode_srgb(np.clip(mesh.radiance * run.base_time, 0, 1))
     with path.open("w", encoding="utf-8") as file:
-        file.write(f"# sehdr-warp proxy mesh, +Y up\n# sehdr:world_matrix {describe(transform)}\no Proxy\n")
+        world_matrix = json.dumps(transform.matrix.tolist())
+        file.write(f"# sehdr-warp proxy mesh, +Y up\n# sehdr:world_matrix {world_matrix}\no Proxy\n")
         np.savetxt(file, np.hstack([mesh.vertices, colors]), "v %.6g %.6g %.6g %.4f %.4f %.4f")
         np.savetxt(file, mesh.faces + 1, "f %d %d %d")
         if mesh.ground is not None:

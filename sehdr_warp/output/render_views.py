@@ -1,15 +1,17 @@
-"""Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
+"""Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras.
 
+`sehdr-warp render` calls render_views(): the names of its options are those of the arguments.
+"""
+
+import json
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, SehdrError, did_you_mean
 from ..files import atomic_folder, atomic_path
@@ -18,19 +20,20 @@ from ..progress import track_progress
 from ..scene import Camera, load_cameras
 from ..scene.exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
 from ..scene.images import MAX_PIXELS
+from ..splats import cameras_beside
 from ..subsets import first_names
-from .aovs import ViewData, data_parts, read_aovs
-from .brackets import Brackets, PictureHeader, bracket_exposures
+from .aovs import ViewImages, data_parts, read_aovs, render_images
+from .brackets import Brackets, PictureHeader, bracket_exposures, remove_earlier
 from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .camera_paths import evenly, interpolate, training_cameras
 from .colorspace import from_rec709
-from .exr import Part, rgb_channels, stored_pixel_type, write_multipart_exr
+from .exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
 from .framing import default_path, film_camera
 from .images import as_array, quantize, safe_names, write_picture
 from .light_unit import luminance_of_one, read_light_unit
 from .ocio import ocio_view
 from .tonemap import ToneMap, exposure_of_white, fit_tone_map
-from .world_transform import WorldTransform, describe, world_transform
+from .world_transform import WorldTransform, from_photos, stored_matrix, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -41,6 +44,8 @@ PATHS = ("orbit", "interpolate")
 
 _FIT_VIEWS, _FIT_SIZE = 4, 160  # Number and longest side of the pictures that a tone map is fitted to
 _LEAST_ALPHA = 0.01  # Mean coverage below which a picture counts as empty: stray Gaussians are nearly everywhere
+# Written only on request, or only for a path of cameras.
+_OPTIONAL = ("brackets", "brackets_ldr", "brackets.json", "cameras.usda", "cameras.chan", "camera_path.json")
 
 
 def render_views(
@@ -71,9 +76,9 @@ def render_views(
     """Render views of a run into files and return their paths. All files appear when the last view is complete.
 
     Always written: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where
-    empty; confidence, if the run has it), `preview/<view>.png` (tone-mapped, sRGB) and `cameras.usda`, in which a path
-    of cameras is one moving camera. For a path also `cameras.chan` (Nuke) and `camera_path.json` (nerfstudio, in the
-    set's own coordinates). A warning names cameras that show nothing of the scene.
+    empty; confidence, if the run has it), `preview/<view>.png` (tone-mapped, sRGB) and, for pinholes, `cameras.usda`,
+    in which a path of two or more cameras is one moving camera. For such a path also `cameras.chan` (Nuke) and
+    `camera_path.json` (nerfstudio, in the photos' coordinates). A warning names cameras that show nothing of the scene.
 
     Args:
         run: From load_run, train or load_splats.
@@ -81,15 +86,16 @@ def render_views(
         cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
         camera: Only this camera of a file, by its name there; a moving one with all its frames.
         count: Views of an orbit or interpolation.
-        evs: Brackets, as in write_brackets, through the run's response.
-        exposures: Brackets, as in write_brackets.
-        multipart: As in write_brackets.
-        group_by: As in write_brackets.
+        evs: Brackets in stops from the base exposure, such as "-4,-2,0" or [-4, -2, 0]. Set either evs or exposures.
+        exposures: Brackets in seconds, stops or multiples of the base exposure, such as "1/125, -2ev, 8x".
+        multipart: Write one EXR file with all exposures of a view.
+        group_by: "view" or "exposure": what one folder of brackets holds.
         colorspace: Primaries of the EXR files.
         reference_white: Value of the photos' white in `hdr/`; `expTime` states the exposure. None leaves radiance.
         pixel: "half" or "float".
-        overwrite: Replace the folders hdr, preview and brackets of an earlier render. Other files in `out` stay.
-        ldr_brackets: As ldr in write_brackets.
+        overwrite: Replace what an earlier render wrote to `out`, and remove its brackets and camera files that this
+            one does not write. What was changed since, and other files, stay.
+        ldr_brackets: "jpeg", "png" or "png16": also write the brackets as simulated photos, through the response.
         aovs: Any of depth, position, normals, alpha, confidence and clipped, or "all". Each is a part of its own in
             `hdr/<view>.exr`.
         size: Width and height in pixels, or "1920x1080", instead of the cameras' own. The vertical field of view stays.
@@ -97,7 +103,7 @@ def render_views(
         view: View of that config, or "DISPLAY/VIEW"; required with ocio.
         axes: Coordinates of camera matrices, positions, normals and depths in the files, and of cameras read from
             OpenUSD and .chan files: "upright" (see world_transform) or "scene". Camera files of other kinds are in the
-            scene's own coordinates.
+            photos' coordinates.
         up: As in world_transform.
         scale: As in world_transform.
         fps: Frames a second of a path, which its camera files state.
@@ -123,11 +129,11 @@ def render_views(
         )
     elif multipart or ldr_brackets or group_by != "view":
         raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
-    stored_pixel_type((), pixel)
+    check_pixel_type(pixel)
     exposure = exposure_of_white(run, reference_white)
     if (ocio is None) != (view is None):
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
-    display_transform = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
+    ocio_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
     aovs = read_aovs(aovs) if aovs else ()
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
@@ -135,7 +141,8 @@ def render_views(
         width, height = read_size(size)
         views = [(name, reframe(camera, width, height)) for name, camera in views]
     are_photos = str(cameras) in SPLITS or (str(cameras) not in PATHS and Path(cameras).is_dir())
-    camera_files = _camera_files(views, transform, fps, moving=not are_photos)
+    camera_files = _camera_files(run, views, transform, fps, moving=not are_photos)
+    world_matrix = json.dumps(stored_matrix(run, transform).tolist())
     empty = []
     with ExitStack() as stack:
         for name, text in camera_files.items():
@@ -143,17 +150,19 @@ def render_views(
         hdr_folder = stack.enter_context(atomic_folder(out / "hdr", overwrite))
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
         bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if brackets else None
-        tone_map = display_transform or shared_tone_map(run, [camera for _, camera in views])
-        hdr_writer = _HdrWriter(run, hdr_folder, header, exposure, transform, pixel, aovs)
+        to_display = shared_tone_map(run, [each for _, each in views]) if ocio_display is None else ocio_display
         for index, (name, view_camera) in track_progress("rendering views", views, log):
-            rendered = _render(run, view_camera)
-            if rendered.confidence is None and index == 0:
+            images = render_images(run, view_camera, transform)
+            if images.confidence is None and index == 0:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            hdr_writer.write(name, view_camera, rendered)
-            write_picture(preview_folder / f"{name}.png", quantize(tone_map(rendered.hdr)))
+            attributes = header.of(name, exposure, images.camera_in_file, worldMatrix=world_matrix)
+            parts = _hdr_parts(images, attributes, colorspace, exposure, aovs)
+            if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
+                log.info("%s: holds values above 65504, which half cannot; written as float", name)
+            write_picture(preview_folder / f"{name}.png", quantize(to_display(images.hdr)))
             if bracket_writer is not None:
-                bracket_writer.write(name, rendered.hdr, transform.camera(view_camera))
-            if rendered.alpha.mean() < _LEAST_ALPHA:
+                bracket_writer.write(name, images.hdr, images.camera_in_file)
+            if images.alpha.mean() < _LEAST_ALPHA:
                 empty.append(name)
     if empty:
         names = first_names(empty, 5)
@@ -162,80 +171,49 @@ def render_views(
     files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
     if bracket_writer is not None:
         files += [*bracket_writer.files(), out / "brackets.json"]
-    return [*files, *(out / name for name in camera_files)]
+    files += [out / name for name in camera_files]
+    if overwrite:
+        written = {file.relative_to(out).parts[0] for file in files}
+        remove_earlier(out, [name for name in _OPTIONAL if name not in written])
+    return files
 
 
-class _ViewImages(NamedTuple):
-    """A rendered view; [H, W, 3] linear Rec.709 radiance, and [H, W] of the others, as in RenderedView."""
-
-    hdr: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
-    confidence: np.ndarray | None
-
-
-def _render(run: "RenderableScene", camera: Camera) -> _ViewImages:
-    """Render a view and copy it to the CPU."""
-    view, confidence = run.render(camera), run.render_confidence(camera)
-    confidence = None if confidence is None else as_array(confidence)
-    return _ViewImages(as_array(view.hdr), as_array(view.alpha), as_array(view.depth), confidence)
-
-
-@dataclass(frozen=True)
-class _HdrWriter:
-    """Writes the EXR files of `hdr/`.
-
-    Attributes:
-        run: Scene to render AOVs of.
-        folder: Folder for the files.
-        header: EXR attributes of all views.
-        exposure: Factor from radiance to the file's values.
-        transform: To the coordinates of files.
-        pixel: "half" (float if half would overflow) or "float".
-        aovs: Names of AOVS.
-    """
-
-    run: "RenderableScene"
-    folder: Path
-    header: PictureHeader
-    exposure: float
-    transform: WorldTransform
-    pixel: str
-    aovs: Sequence[str]
-
-    def write(self, name: str, camera: Camera, rendered: _ViewImages) -> None:
-        """Write a view, whose camera is in the scene's own coordinates."""
-        camera_in_file = self.transform.camera(camera)
-        depth = rendered.depth * np.float32(self.transform.scale)
-        attributes = self.header.of(name, self.exposure, camera_in_file, worldMatrix=describe(self.transform))
-        channels = rgb_channels(from_rec709(rendered.hdr, self.header.colorspace) * self.exposure)
-        channels |= {"A": rendered.alpha, "Z": depth}
-        if rendered.confidence is not None:
-            channels["confidence"] = rendered.confidence
-        parts = [Part(channels, attributes, "rgba" if self.aovs else "")]
-        parts += data_parts(self.aovs, ViewData(self.run, camera, camera_in_file, rendered.alpha, depth), attributes)
-        if write_multipart_exr(self.folder / f"{name}.exr", parts, pixel=self.pixel) != self.pixel:
-            log.info("%s: holds values above 65504, which half cannot; written as float", name)
+def _hdr_parts(
+    images: ViewImages, attributes: Mapping[str, Any], colorspace: str, exposure: float, aovs: Sequence[str]
+) -> list[Part]:
+    """Return the parts of a file of `hdr/`: the picture, whose colors are radiance times exposure, and its AOVs."""
+    channels = rgb_channels(from_rec709(images.hdr, colorspace) * exposure) | {"A": images.alpha, "Z": images.depth}
+    if images.confidence is not None:
+        channels["confidence"] = images.confidence
+    return [Part(channels, attributes, "rgba" if aovs else ""), *data_parts(aovs, images, attributes)]
 
 
 def _camera_files(
-    views: Sequence[tuple[str, Camera]], transform: WorldTransform, fps: float, *, moving: bool
+    run: "RenderableScene", views: Sequence[tuple[str, Camera]], transform: WorldTransform, fps: float, *, moving: bool
 ) -> dict[str, str]:
-    """Return the names and texts of the files that hold the cameras of a render.
+    """Return the names and texts of the files that hold the cameras of a render, as far as they are pinholes.
 
     Args:
-        views: Names and cameras in the scene's own coordinates.
+        run: The scene.
+        views: Names and cameras in the scene's coordinates.
         transform: To the coordinates of files.
         fps: Frames a second of a camera that moves.
-        moving: Whether the cameras may be frames of one that moves; photos are not, whatever their names.
+        moving: Whether the cameras may be frames of one that moves.
     """
-    cameras = [(name, transform.camera(camera)) for name, camera in views]
+    pinholes = [view for view in views if view[1].is_pinhole]
+    if len(pinholes) < len(views):
+        wide = first_names([name for name, camera in views if not camera.is_pinhole], 5)
+        log.info("cameras.usda: without %s, because OpenUSD has neither panoramas nor fisheye cameras", wide)
+    if not pinholes:
+        return {}
+    cameras = [(name, transform.camera(camera)) for name, camera in pinholes]
     path = camera_path(cameras) if moving else None
-    files = {"cameras.usda": usd_cameras(cameras, transform, path=path, fps=fps)}
+    files = {"cameras.usda": usd_cameras(cameras, stored_matrix(run, transform), path=path, fps=fps)}
     if path is not None:
         files["cameras.chan"] = chan_cameras(path)
-        # In the set's own coordinates, which nerfstudio's dataparser_transforms.json starts from.
-        files["camera_path.json"] = nerfstudio_path(path._replace(cameras=[camera for _, camera in views]), fps)
+        # nerfstudio's dataparser_transforms.json starts from the photos' coordinates.
+        to_photos = from_photos(run).inverse()
+        files["camera_path.json"] = nerfstudio_path([to_photos.camera(camera) for _, camera in pinholes], fps)
     return files
 
 
@@ -258,8 +236,10 @@ def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
 def reframe(camera: Camera, width: int, height: int) -> Camera:
     """Return a camera of another size with the same vertical field of view and pixel aspect ratio.
 
-    The picture shows more or less at the sides.
+    The picture shows more or less at the sides. Raises SehdrError for a panorama that is not twice as wide as high.
     """
+    if camera.projection == "equirectangular" and width != 2 * height:
+        raise SehdrError(f"size {width}x{height} would distort a panorama; write one twice as wide as high")
     scale = height / camera.height
     cx = width / 2 + (camera.cx - camera.width / 2) * scale
     intrinsics = {"fx": camera.fx * scale, "fy": camera.fy * scale, "cx": cx, "cy": camera.cy * scale}
@@ -283,7 +263,7 @@ def select_cameras(
     transform: WorldTransform | None = None,
     up: str | Sequence[float] | None = None,
 ) -> list[tuple[str, Camera]]:
-    """Return named cameras in the scene's own coordinates; the names are safe for files and all different.
+    """Return named cameras in the scene's coordinates; the names are safe for files and all different.
 
     Args:
         run: From load_run, train or load_splats.
@@ -329,17 +309,21 @@ def select_cameras(
 
 
 def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
-    """Return the cameras of a file in the scene's own coordinates."""
-    views = load_cameras(path)
-    if path.suffix.lower() not in EXCHANGE_SUFFIXES:
+    """Return the cameras of a file in the scene's coordinates."""
+    views, photos_to_scene = load_cameras(path), from_photos(run)
+    if path.suffix.lower() in EXCHANGE_SUFFIXES:
+        matrix = read_exchange_cameras(path).world_matrix
+        if matrix is None:
+            to_scene = (transform or world_transform(run)).inverse()
+            return [(name, to_scene.camera(camera)) for name, camera in views]
+        try:
+            to_photos = WorldTransform.from_matrix(matrix).inverse()
+        except ValueError as error:
+            raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
+        views = [(name, to_photos.camera(camera)) for name, camera in views]
+    elif (beside := cameras_beside(Path(run.path))) is not None and beside.samefile(path):
         return views
-    matrix = read_exchange_cameras(path).world_matrix
-    try:
-        to_file = None if matrix is None else WorldTransform.from_matrix(matrix)
-    except ValueError as error:
-        raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
-    back = (to_file or transform or world_transform(run)).inverse()
-    return [(name, back.camera(camera)) for name, camera in views]
+    return [(name, photos_to_scene.camera(camera)) for name, camera in views]
 
 
 def provenance(run: "RenderableScene") -> dict[str, str]:

@@ -95,7 +95,10 @@ def display_gain(response: Any) -> float:
 
 
 def exposure_of_white(run: "RenderableScene", white: float | None) -> float:
-    """Return the seconds to multiply radiance by so that a file shows the photos' white as `white`; 1 for None.
+    """Return the seconds to multiply radiance by so that a file holds display white as `white`; 1 for None.
+
+    Display white is 1 / MIDDLE_GREY times the light that photos show as middle grey (see display_gain): for a camera
+    whose curve is sRGB, the photos' white; for a logarithm less than that.
 
     Raises:
         SehdrError: For a white outside 0.001 to 10000.

@@ -1,11 +1,12 @@
-"""The one similarity between a scene's own coordinates and those of delivered files: upright, and scaled to meters.
+"""The similarity from a scene's coordinates to those of files: upright, and scaled to meters.
 
-render, export, envmap and cameras.usda share it, so that pictures, Gaussians, maps and cameras line up in another
-program. It depends on the cameras of the scene alone, so that it stays the same when a training goes on. Every file
-stores it; its inverse leads back to the scene's own coordinates.
+A scene's coordinates are those of its cameras and renders: the photos' own for a run, the file's for a file of
+Gaussians. Pictures, Gaussians, maps, lights, meshes, cameras.usda and .chan share the transform, so that they line up
+in another program; PLY, SOG and SPZ are turned over, and JSON cameras stay in the photos' coordinates. It depends on
+the cameras of the scene alone, so it stays the same when a training goes on. Files store the matrix from the photos'
+coordinates to theirs.
 """
 
-import json
 import logging
 import math
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ _LARGEST_SCALE = 1e6
 
 @dataclass(frozen=True)
 class WorldTransform:
-    """A similarity: y = scale * rotation @ x + translation, from a scene's own coordinates to a file's.
+    """A similarity: y = scale * rotation @ x + translation, from a scene's coordinates to a file's.
 
     Attributes:
         rotation: [3, 3] float64, proper.
@@ -80,7 +81,7 @@ class WorldTransform:
         return bool(np.array_equal(self.matrix, np.eye(4)))
 
     def inverse(self) -> "WorldTransform":
-        """Return the transform back to the scene's own coordinates."""
+        """Return the transform back to the scene's coordinates."""
         rotation = self.rotation.T
         return WorldTransform(rotation, -rotation @ self.translation / self.scale, 1 / self.scale)
 
@@ -105,7 +106,7 @@ def world_transform(
     up: str | Sequence[float] | None = None,
     scale: float | None = None,
 ) -> WorldTransform:
-    """Return the transform from a scene's own coordinates to those of its files.
+    """Return the transform from a scene's coordinates to those of its files.
 
     upright: +Y is up, and the origin is the point that most cameras look at, or else their middle. The camera in the
     middle looks along +Z, as far as that is horizontal. Gaussians from a file that states its transform are upright
@@ -113,8 +114,8 @@ def world_transform(
 
     Args:
         run: From load_run, train or load_splats.
-        axes: "upright" or "scene", the scene's own coordinates.
-        up: The scene's up direction in its own coordinates, as "x,y,z", three numbers, or an axis such as "-y"; None
+        axes: "upright", or "scene" for the photos' coordinates.
+        up: The up direction in the scene's coordinates, as "x,y,z", three numbers, or an axis such as "-y"; None
             for the one kept with the run, or else gravity as photos and cameras show it.
         scale: Meters for each unit of the scene; None for the one kept with the run, that of the photos' GPS, or 1.
 
@@ -124,19 +125,17 @@ def world_transform(
     if axes not in AXES:
         raise SehdrError(f"axes {axes!r} is not one of {', '.join(AXES)}")
     run = run.reference or run
-    matrix = run.world_matrix
     orientation = read_orientation(run)
     if axes == "scene":
         if up is not None:
             raise SehdrError("--up turns the scene upright, and --axes scene leaves it as it is; leave one of them out")
-        factor = _checked_scale(scale)
-        back = WorldTransform.identity() if matrix is None else WorldTransform.from_matrix(matrix).inverse()
+        factor, back = _checked_scale(scale), from_photos(run).inverse()
         return WorldTransform(back.rotation, factor * back.translation, factor * back.scale)
     by_gps = None if run.up is None else run.up.unit
     factor = _checked_scale(next((each for each in (scale, orientation.scale, by_gps) if each is not None), None))
     direction = _known_up(run, up, orientation)
     cameras = training_cameras(run) or [e.camera for e in run.cameras]
-    if direction is None and (matrix is not None or not cameras):
+    if direction is None and (run.world_matrix is not None or not cameras):
         # Turned about the axis of view, so that what is ahead stays ahead.
         rotation = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) else np.eye(3)
         return WorldTransform(rotation, np.zeros(3), factor)
@@ -158,8 +157,18 @@ def world_transform(
     return WorldTransform(rotation, -factor * (rotation @ origin), factor)
 
 
+def from_photos(run: "RenderableScene") -> WorldTransform:
+    """Return the transform from the photos' coordinates to the scene's, which a file of Gaussians may state."""
+    return WorldTransform.identity() if run.world_matrix is None else WorldTransform.from_matrix(run.world_matrix)
+
+
+def stored_matrix(run: "RenderableScene", transform: WorldTransform) -> np.ndarray:
+    """Return the [4, 4] that a file states: from the photos' coordinates to its own, which `transform` leads to."""
+    return transform.matrix if run.world_matrix is None else transform.matrix @ run.world_matrix
+
+
 def scene_up(run: "RenderableScene", up: str | Sequence[float] | None = None) -> np.ndarray:
-    """Return the up direction [3] in the scene's own coordinates, as world_transform takes it; says nothing."""
+    """Return the up direction [3] in the scene's coordinates, as world_transform takes it; log nothing."""
     run = run.reference or run
     direction = _known_up(run, up, read_orientation(run))
     if direction is None and run.world_matrix is None and (cameras := training_cameras(run)):
@@ -213,7 +222,7 @@ def read_direction(text: str | Sequence[float]) -> np.ndarray:
 
 
 class Orientation(NamedTuple):
-    """Up direction [3] in a scene's own coordinates, and meters for each unit of it; None if not set."""
+    """Up direction [3] in a scene's coordinates, and meters for each unit of it; None if not set."""
 
     up: np.ndarray | None = None
     scale: float | None = None
@@ -242,7 +251,7 @@ def write_orientation(run: "RenderableScene", *, up: Sequence[float] | None = No
 
     Args:
         run: From load_run or train.
-        up: Direction [3] in the scene's own coordinates; None leaves what is kept.
+        up: Direction [3] in the scene's coordinates; None leaves what is kept.
         scale: Meters for each unit of the scene; None leaves what is kept.
 
     Raises:
@@ -259,11 +268,6 @@ def write_orientation(run: "RenderableScene", *, up: Sequence[float] | None = No
     }
     write_json(path, values, internal=True)
     return path
-
-
-def describe(transform: WorldTransform) -> str:
-    """Return a transform as the text of its 4 x 4 matrix that files store."""
-    return json.dumps(transform.matrix.tolist())
 
 
 def _checked_scale(scale: Any) -> float:

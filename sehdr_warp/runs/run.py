@@ -25,7 +25,7 @@ from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.gravity import UpDirection
 from ..scene.normalization import Normalization
-from ..splats import read_gaussians
+from ..splats import cameras_beside, read_gaussians
 from .checkpoint import PICTURE, Checkpoint, under
 from .config import Config
 from .device import pick_device
@@ -54,7 +54,8 @@ class RenderableScene:
         degree: SH degree to render with.
         base_time: Exposure time of the photos, seconds.
         color_matrix: [3, 3] from the field's colors to linear Rec.709, if it was trained on sensor RGB; else None.
-        world_matrix: [4, 4] from the scene's own coordinates to those of its file of Gaussians, if stated; else None.
+        world_matrix: [4, 4] from the photos' coordinates to those of a file of Gaussians, which its cameras and renders
+            are in, if the file states it; else None.
         exposure_compensation: Exposure compensation of the training photos, if there was one.
         up: Up direction that photos and poses show; None if it was not looked for.
         reference: Scene whose upright coordinates are those of this one; None for its own.
@@ -76,7 +77,7 @@ class RenderableScene:
 
     @property
     def model(self) -> RadianceField:
-        """Former name of `field`."""
+        """The same as `field`."""
         return self.field
 
     @property
@@ -196,11 +197,10 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
     path = Path(path)
     gaussians = read_gaussians(path)
     model = on_device(field_of(gaussians), pick_device(device))
-    own, shared, cameras = path.with_name(f"{path.stem}.cameras.json"), path.with_name("cameras.json"), ()
-    beside = next((file for file in (own, shared) if file.is_file()), None)
+    beside, cameras = cameras_beside(path), ()
     if beside is not None:
         views = load_cameras(beside)
-        if beside == shared:
+        if beside.name == "cameras.json":
             log.info(
                 "%s: %d cameras from %s beside it, which does not say what it belongs to", path, len(views), beside
             )

@@ -1,4 +1,4 @@
-"""The pinhole camera that every part of the package shares."""
+"""The camera that every part of the package shares: a pinhole, a panorama or a fisheye lens."""
 
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -63,10 +63,10 @@ class ProjectedPoints(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Camera:
-    """A camera in COLMAP's (OpenCV's) convention: +x right, +y down, +z into the scene. Almost all are pinholes.
+    """A camera in COLMAP's (OpenCV's) convention: +x right, +y down, +z into the scene.
 
-    A world point X lands at pixel (fx x/z + cx, fy y/z + cy) with (x, y, z) = (world_to_camera @ [X, 1])[:3]; the
-    centre of the top left pixel is at (0.5, 0.5).
+    For a pinhole, a world point X lands at pixel (fx x/z + cx, fy y/z + cy) with (x, y, z) = (world_to_camera @ [X,
+    1])[:3]; the centre of the top left pixel is at (0.5, 0.5).
 
     Attributes:
         width: of the image in pixels, at least 1.

@@ -23,7 +23,7 @@ EXCHANGE_SUFFIXES = (*USD_SUFFIXES, ".chan")
 USD_SIZE = ("sehdr:width", "sehdr:height")
 """Attributes of a UsdGeomCamera that state its picture's size in pixels, which USD itself does not."""
 USD_WORLD_MATRIX = "sehdr:worldMatrix"
-"""Entry of a stage's customLayerData: 16 numbers by rows, from the scene's own coordinates to the stage's."""
+"""Entry of a stage's customLayerData: 16 numbers by rows, from the photos' coordinates to the stage's."""
 CHAN_ROTATION = "zxy"
 """Order of a .chan file's rotations about fixed axes, as Nuke and Blender take it by default."""
 _SIZE = (1920, 1080)  # Pixels of a camera whose file states none
@@ -35,7 +35,7 @@ class ExchangeCameras(NamedTuple):
 
     Attributes:
         cameras: Name and camera, in the file's order; a moving camera is one for each frame, NAME_0001 and so on.
-        world_matrix: [4, 4] from the scene's own coordinates to the file's, if the file states it; else None.
+        world_matrix: [4, 4] from the photos' coordinates to the file's, if the file states it; else None.
         up_stated: Whether the file states its up axis, or needs none.
     """
 

@@ -90,6 +90,12 @@ def color_model_of(path: Path | str) -> str | None:
     return FORMATS[check_suffix(path)].color_model
 
 
+def cameras_beside(path: Path) -> Path | None:
+    """Return the file beside a file of Gaussians that holds cameras in its coordinates; None if there is none."""
+    names = (f"{path.stem}.cameras.json", "cameras.json")
+    return next((file for name in names if (file := path.with_name(name)).is_file()), None)
+
+
 def read_gaussians(path: Path | str) -> GaussianArrays:
     """Read the Gaussians in a file of one of FORMATS.
 
@@ -129,6 +135,7 @@ __all__ = [
     "SUFFIXES",
     "USD_SUFFIXES",
     "GaussianArrays",
+    "cameras_beside",
     "check_suffix",
     "color_model_of",
     "path_is_lossy",

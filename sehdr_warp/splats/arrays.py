@@ -39,7 +39,7 @@ class GaussianArrays:
             0).
         base_time: Seconds at which the scene was photographed; for display colors, the exposure time of the photo that
             they show.
-        world_matrix: [4, 4] float64 from the scene's own coordinates to these; None if they are the same.
+        world_matrix: [4, 4] float64 from the photos' coordinates to these; None if they are the same.
         compensated: trained with opacity compensation (antialiased, "mip"): renderers of the common mode show small
             Gaussians brighter than they were trained.
     """

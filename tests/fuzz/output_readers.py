@@ -13,7 +13,6 @@ from scipy.io import savemat
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.camera_exchange import usd_cameras
 from sehdr_warp.output.ocio import ocio_view
-from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.own_files import LIST
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_cameras
@@ -58,9 +57,7 @@ def make_splats(*suffixes: str) -> Callable[[Path], None]:
                 GaussianArrays(*arrays, "display" if suffix in (".glb", *LOSSY_SUFFIXES) else "linear", 0.5),
             )
         if ".usda" in suffixes:
-            (folder / "b.usda").write_text(
-                usd_cameras([("a", camera(16, 12)), ("b", camera(8, 8))], WorldTransform.identity())
-            )
+            (folder / "b.usda").write_text(usd_cameras([("a", camera(16, 12)), ("b", camera(8, 8))], np.eye(4)))
         (folder / LIST).unlink()
 
     return make

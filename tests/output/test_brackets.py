@@ -93,6 +93,12 @@ def test_multipart_holds_all_exposures_of_a_view(tmp_path):
         assert spec.get_float_attribute("ExposureTime") == exposure["exposure_time"]
 
 
+def test_photos_of_an_earlier_call_do_not_stay_beside_new_brackets(tmp_path):
+    write_brackets(tmp_path, {"v": radiance()}, 0.5, evs=[0], ldr="png", response=GammaResponse())
+    write_brackets(tmp_path, {"v": radiance()}, 0.5, evs=[1], overwrite=True)
+    assert not (tmp_path / "brackets_ldr").exists()
+
+
 @pytest.mark.parametrize("multipart", [False, True])
 def test_one_exposure_past_half_makes_the_whole_bracket_float(tmp_path, multipart):
     files = write_brackets(tmp_path, {"v": radiance() * 100}, 0.5, evs=[-2, 8], multipart=multipart)

@@ -253,6 +253,18 @@ def test_beyond_changes_the_distance_and_not_the_center(tmp_path, run):
     assert other["sehdr:position"] == plain["sehdr:position"] and float(other["sehdr:beyond"]) == 1.5
 
 
+def test_directions_of_a_whole_map_are_computed_for_inpainting_alone(tmp_path, run, monkeypatch):
+    """They are float64: 13 GB of a map of 32768 pixels."""
+    whole, real = [], environment_map.latlong
+    monkeypatch.setattr(
+        environment_map, "latlong", lambda size, *rows: (rows or whole.append(size), real(size, *rows))[1]
+    )
+    write_environment_map(run, tmp_path / "a.exr", size=256)
+    assert not whole
+    write_environment_map(run, tmp_path / "b.exr", size=256, inpaint=True)
+    assert 256 in whole
+
+
 @pytest.mark.parametrize("beyond", [-1.0, np.inf, np.nan])
 def test_a_distance_that_is_none_is_refused(tmp_path, run, beyond):
     with pytest.raises(SehdrError, match="not a distance"):

@@ -2,11 +2,14 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.model.baking import field_of
-from sehdr_warp.output.export import export
+from sehdr_warp.model.baking import field_of, gaussians_of
+from sehdr_warp.output.export import _gaussians_renderer, export
 from sehdr_warp.output.splat_commands import Export, run_export
+from sehdr_warp.output.tonemap import display_gain, encode_srgb
+from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras
 from sehdr_warp.splats import LOSSY_SUFFIXES, read_gaussians, write_gaussians
@@ -51,6 +54,37 @@ def test_exposure_of_display_colors(tmp_path, run, logged):
     export(run, tmp_path / "dark.ply", exposure_time=0.125)
     light = [each.render(camera()).hdr.mean() for each in (load_splats(tmp_path / "dark.ply"), run)]
     np.testing.assert_allclose(*light, rtol=0.1)
+
+
+def test_own_display_colors_are_fitted_at_another_exposure(tmp_path, logged):
+    cameras = [Entry(str(i), "train", camera(position=(i, 0, -6))) for i in range(3)]
+    colors = gaussians(degree=1).with_colors(np.zeros((50, 4, 3), np.float32), "display")
+    run = Splats(tmp_path / "run", field_of(colors), tuple(cameras))
+    export(run, tmp_path / "a.ply", exposure_time=run.base_time)
+    assert not any(line.startswith("fitting colors and opacities") for line in logged)
+    export(run, tmp_path / "b.ply", exposure_time=4 * run.base_time)
+    assert any(line.startswith("fitting colors and opacities") for line in logged)
+
+
+def test_colors_of_other_primaries_are_shown_as_srgb(tmp_path, run, logged):
+    """A clip in logarithmic codes and its own primaries: viewers take what is exported for sRGB in Rec.709."""
+    run.color_matrix = np.array([[0.9, 0.1, 0], [0.05, 0.9, 0.05], [0, 0.1, 0.9]])
+    run.field.response = run.response = response_by_name("colour:S-Log3")
+    view = run.cameras[1].camera
+    exported = load_splats(export(run, tmp_path / "a.ply", exposure_time=0.02))
+    gain = display_gain(run.response)
+    assert exported.base_time == pytest.approx(0.02 * gain) and not 0.9 < gain < 1.1
+    light = encode_srgb(run.render(view).hdr.numpy() * 0.02 * gain)
+    assert np.abs(exported.render_ldr(view).numpy() - light).mean() < 0.02
+    assert exported.render(view).hdr.numpy().mean() == pytest.approx(run.render(view).hdr.numpy().mean(), rel=0.1)
+    assert any("display colors of 1/50 s" in line for line in logged)
+    baked = gaussians_of(run.field, "display", np.zeros((1, 3)), 0.02 * gain, run.color_matrix)
+    assert np.abs(field_of(baked).render_ldr(view).numpy() - light).mean() < 0.05, "the fit starts from sRGB"
+
+
+def test_colors_are_fitted_on_the_device_of_the_run(tmp_path, device):
+    renderer = _gaussians_renderer(gaussians(degree=1), 0.5, Splats(tmp_path, field_of(gaussians()).to(device), ()))
+    assert renderer(camera()).device == torch.device(device)
 
 
 def test_cameras_beside_are_read_again(tmp_path, run):

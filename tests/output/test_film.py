@@ -13,7 +13,15 @@ from sehdr_warp.cli import parse_command
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.output import film
 from sehdr_warp.output.colorspace import color_space
-from sehdr_warp.output.commands import FilmOptions, Render, ViewFileOptions, _ramp, run_render
+from sehdr_warp.output.commands import (
+    EnvironmentMap,
+    FilmOptions,
+    Render,
+    ViewFileOptions,
+    _ramp,
+    run_environment_map,
+    run_render,
+)
 from sehdr_warp.output.film import encode, write_film
 from sehdr_warp.output.render_views import shared_tone_map
 from sehdr_warp.output.splat_commands import Convert, Export, run_convert, run_export
@@ -185,6 +193,19 @@ def test_names_that_ffmpeg_takes_for_more_are_names(tmp_path, monkeypatch, name)
 def test_rates_that_no_film_has_are_refused(tmp_path, fps):
     with pytest.raises(SehdrError, match="frames a second are not between"):
         write_film(AnalyticRun(), tmp_path / "f.mp4", [AnalyticRun().cameras[0].camera], fps=fps)
+    for films in ({}, {"video": tmp_path / "f.mp4"}):  # Before the scene, which is not there, is opened.
+        with pytest.raises(SehdrError, match="frames a second are not between"):
+            run_render(Render(run=tmp_path, out=tmp_path / "o", cameras="orbit", film=FilmOptions(fps=fps), **films))
+
+
+def test_values_that_cannot_be_are_refused_before_a_scene_is_opened(tmp_path):
+    options = {"run": tmp_path / "run", "out": tmp_path / "out"}
+    with pytest.raises(SehdrError, match="did you mean depth"):
+        run_render(Render(**options, pictures=ViewFileOptions(aovs="depht")))
+    with pytest.raises(SehdrError, match="such as 1920x1080"):
+        run_render(Render(**options, size="64"))
+    with pytest.raises(SehdrError, match="choose a suffix"):
+        run_environment_map(EnvironmentMap(run=tmp_path / "run", out=tmp_path / "map.png"))
 
 
 def test_small_hevc_films_leave_memory_whole(tmp_path):

@@ -110,6 +110,28 @@ def test_nothing_is_replaced_unless_asked_and_rendering_does_not_start(tmp_path)
     assert (tmp_path / "note.txt").read_text() == "mine"
 
 
+def test_an_earlier_render_leaves_nothing_beside_a_new_one(tmp_path, logged):
+    run = AnalyticRun()
+    earlier = {"cameras": "orbit", "count": 2, "evs": [0], "ldr_brackets": "png"}
+    render_views(run, tmp_path, **earlier)
+    (tmp_path / "note.txt").write_text("mine")
+    files = render_views(run, tmp_path, overwrite=True)
+    assert tree(tmp_path) == sorted([*(str(file.relative_to(tmp_path)) for file in files), "note.txt"])
+    assert f"{tmp_path / 'cameras.chan'}: removed, because an earlier call wrote it and this one does not" in logged
+    # What somebody changed or added is theirs, and so is a folder or a link of their own.
+    render_views(run, tmp_path, overwrite=True, **earlier)
+    (tmp_path / "cameras.chan").write_text("1 0 0 0 0 0 0 50\n")
+    (tmp_path / "brackets" / "note.txt").write_text("mine")
+    (tmp_path / "camera_path.json").rename(tmp_path / "path.json")
+    (tmp_path / "camera_path.json").symlink_to("path.json")
+    kept = [*(tmp_path / "brackets").rglob("*.*"), tmp_path / "path.json", tmp_path / "cameras.chan"]
+    render_views(run, tmp_path, overwrite=True)
+    assert all(path.exists() for path in kept) and (tmp_path / "camera_path.json").is_symlink()
+    assert not (tmp_path / "brackets_ldr").exists() and not (tmp_path / "brackets.json").exists()
+    for name in ("brackets", "cameras.chan", "camera_path.json"):
+        assert any(line.startswith(f"{tmp_path / name}: stays, though") for line in logged)
+
+
 @pytest.mark.parametrize("multipart", [False, True])
 def test_a_bad_pixel_leaves_nothing_new(tmp_path, multipart):
     run = AnalyticRun()
@@ -217,8 +239,9 @@ def test_aovs_are_parts_of_their_own(tmp_path):
     np.testing.assert_allclose(normal @ -view.world_to_camera[2, :3], 1, atol=2e-3)
     assert (pixels["clipped"] == 0.25).all()
     run.confident = False
-    with pytest.raises(SehdrError, match="was not measured"):
-        render_views(run, tmp_path, aovs="clipped", overwrite=True)
+    for name in ("clipped", "confidence"):
+        with pytest.raises(SehdrError, match=f"AOV {name} was not measured"):
+            render_views(run, tmp_path, aovs=name, overwrite=True)
     for aovs, words in (("depht", "did you mean depth"), ("alpha,alpha", "named twice")):
         with pytest.raises(SehdrError, match=words):
             render_views(run, tmp_path, aovs=aovs, overwrite=True)

@@ -6,7 +6,7 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.charts import training_chart
 from sehdr_warp.output.comparison import Comparison, compare
 from sehdr_warp.output.report import check_report_folder, comparison_figure, stops_figure, write_report
-from sehdr_warp.output.tonemap import encode_srgb
+from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.scene import Scene, View, codes_of
 
 from .helpers import AnalyticRun
@@ -91,8 +91,8 @@ def test_photos_in_a_sensors_colors_are_shown_as_the_scene_is(tmp_path):
     run.base_time = 0.5 / plain.from_photo.max()  # What is white in a channel counts as clipped: see rec709_of().
     compared = compare(run, view, scene.views)
     np.testing.assert_allclose(compared.from_photo, plain.from_photo[..., ::-1], rtol=1e-5, atol=1e-6)
-    exposure = np.clip(compared.from_photo * view.exposure_time, 0, 1)
-    np.testing.assert_allclose(compared.photo, encode_srgb(exposure), atol=1e-6)
+    light = compared.from_photo * view.exposure_time * display_gain(run.response)
+    np.testing.assert_allclose(compared.photo, encode_srgb(light), atol=1e-6)
 
 
 @pytest.mark.parametrize("caption", ["", "Several lines of text. " * 20])

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.camera_exchange import camera_path
 from sehdr_warp.output.camera_paths import orbit
+from sehdr_warp.output.environment_map import write_environment_map
 from sehdr_warp.output.export import export
 from sehdr_warp.output.render_views import render_views, select_cameras
-from sehdr_warp.output.world_transform import WorldTransform, world_transform, write_orientation
+from sehdr_warp.output.world_transform import WorldTransform, from_photos, world_transform, write_orientation
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera, load_cameras, load_scene, look_at
 from sehdr_warp.scene.gravity import is_pitch_known, up_direction
@@ -182,6 +184,60 @@ def test_pictures_and_cameras_are_in_one_space(tmp_path):
         frame = world_transform(run, axes)
         back = select_cameras(run, tmp_path / "cameras.usda", transform=frame)
         np.testing.assert_allclose(back[0][1].position, source.position, atol=1e-6)
+
+
+@pytest.mark.parametrize("axes", ["upright", "scene"])
+def test_pictures_of_a_turned_file_state_the_way_from_the_photos(tmp_path, axes):
+    """A run and a file of its Gaussians, turned, moved and scaled: cameras of one fit the other."""
+    cameras = tuple(Entry(str(i), "train", camera(position=(0.3 * i, 0.2, -6))) for i in range(3))
+    run = Splats(tmp_path / "run", field_of(gaussians(degree=1)), cameras)
+    export(run, tmp_path / "turned.ply", kind="hdr", cameras=True, scale=2.0)
+    file = load_splats(tmp_path / "turned.ply")
+    assert not np.allclose(file.world_matrix, np.eye(4))
+    render_views(file, tmp_path / "out", cameras="interpolate", count=3, size="32x24", axes=axes)
+    header = read_exr(tmp_path / "out" / "hdr" / "interpolate_000.exr")[2]
+    stored = Camera.from_dict(json.loads(header["sehdr:camera"])).position
+    photos = WorldTransform.from_matrix(json.loads(header["sehdr:worldMatrix"])).inverse()
+    np.testing.assert_allclose(photos.points(stored), cameras[0].camera.position, atol=1e-6)
+    path = [each for _, each in select_cameras(file, "interpolate", count=3)]
+    to_photos, own = from_photos(file).inverse(), [entry.camera for entry in file.cameras]
+    for source, scene, expected in (
+        ("out/cameras.usda", file, path),
+        ("out/camera_path.json", file, path),
+        ("out/cameras.usda", run, map(to_photos.camera, path)),
+        ("out/camera_path.json", run, map(to_photos.camera, path)),
+        ("turned.cameras.json", file, own),
+    ):
+        for (_, a), b in zip(select_cameras(scene, tmp_path / source), expected, strict=True):
+            np.testing.assert_allclose(a.world_to_camera, b.world_to_camera, atol=1e-5)
+
+
+def test_maps_of_a_turned_file_state_the_way_from_the_photos(tmp_path):
+    cameras = tuple(Entry(str(i), "train", camera(position=(0.3 * i, 0.2, -6))) for i in range(3))
+    run = Splats(tmp_path / "run", field_of(gaussians(degree=1)), cameras)
+    export(run, tmp_path / "turned.ply", kind="hdr", cameras=True, scale=2.0)
+    for name, scene in (("a.exr", run), ("b.exr", load_splats(tmp_path / "turned.ply"))):
+        write_environment_map(scene, tmp_path / name, size=32, at="camera:1")
+        header = read_exr(tmp_path / name)[2]
+        photos = WorldTransform.from_matrix(json.loads(header["sehdr:worldMatrix"])).inverse()
+        place = photos.points(json.loads(header["sehdr:position"]))
+        np.testing.assert_allclose(place, cameras[1].camera.position, atol=1e-6)
+
+
+def test_panoramas_are_not_pinholes_of_usd(tmp_path, logged):
+    run = AnalyticRun()
+    panorama = replace(run.cameras[0].camera, width=64, height=32, projection="equirectangular")
+    entries = [{"name": "pano", **panorama.to_dict()}, {"name": "pinhole", **camera().to_dict()}]
+    for name, chosen in (("both", entries), ("one", entries[:1])):
+        (tmp_path / f"{name}.json").write_text(json.dumps({"cameras": chosen}))
+        files = render_views(run, tmp_path / name, cameras=tmp_path / f"{name}.json")
+        stage = tmp_path / name / "cameras.usda"
+        assert stage.exists() == (stage in files) == (name == "both")
+    text = (tmp_path / "both" / "cameras.usda").read_text()
+    assert 'Camera "pinhole"' in text and "pano" not in text
+    assert sum(line.startswith("cameras.usda: without pano, because OpenUSD has neither") for line in logged) == 2
+    with pytest.raises(SehdrError, match="64x48 would distort a panorama; write one twice as wide as high"):
+        render_views(run, tmp_path / "size", cameras=tmp_path / "one.json", size="64x48")
 
 
 def test_kept_orientation_and_options(tmp_path):
