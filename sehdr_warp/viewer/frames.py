@@ -17,7 +17,7 @@ from ..output.light_unit import luminance_of_one
 from ..output.merged_scene import merge_scenes
 from ..output.splat_edits import SplatEdits
 from ..output.tonemap import display_gain
-from ..output.world_transform import world_transform
+from ..output.world_transform import from_photos, world_transform
 from ..scene import Camera
 from .edits import EditedOpacities, LightGains
 from .scene_lock import SceneLock
@@ -241,8 +241,8 @@ def frame_bytes(camera: Camera, clipped: bool) -> int:
     return 2 * (6 if clipped else 5) * camera.width * camera.height
 
 
-def camera_file(cameras: Sequence[Camera]) -> str:
-    """Return cameras as JSON that `render --cameras` reads."""
-    digits = max(3, len(str(len(cameras) - 1)))
-    views = [{"name": f"view_{i:0{digits}d}"} | camera.to_dict() for i, camera in enumerate(cameras)]
+def camera_file(run: Any, cameras: Sequence[Camera]) -> str:
+    """Return cameras of a page as JSON that `render --cameras` reads, in the photos' coordinates."""
+    digits, to_photos = max(3, len(str(len(cameras) - 1))), from_photos(run).inverse()
+    views = [{"name": f"view_{i:0{digits}d}"} | to_photos.camera(camera).to_dict() for i, camera in enumerate(cameras)]
     return json.dumps({"cameras": views}, indent=1)

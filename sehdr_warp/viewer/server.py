@@ -133,7 +133,7 @@ class Viewer:
             if request.get("count"):
                 cameras = interpolate(cameras, min(int(request["count"]), MOST_VIEWS))
             if path == "/path":
-                return "application/json", camera_file(cameras).encode()
+                return "application/json", camera_file(self._run(request), cameras).encode()
             saved = SavedRun(self.on_renderer, self._run(request), client)
             return self._save(saved, cameras, str(request["kind"]), request)
         raise Refusal(404, "no such page")
@@ -213,7 +213,7 @@ class Viewer:
                     options = {"ev_ramp": (stops, stops), "exposed": True, "tell": self._tell}
                     return "video/mp4", write_film(run, Path(folder, "film.mp4"), cameras, **options).read_bytes()
                 camera_path = Path(folder, "cameras.json")
-                camera_path.write_text(camera_file(cameras), encoding="utf-8")
+                camera_path.write_text(camera_file(run, cameras), encoding="utf-8")
                 files = render_views(run, Path(folder, "views"), cameras=camera_path, evs=evs)
                 if kind == "exr" and len(cameras) == 1:
                     return "image/x-exr", files[0].read_bytes()
@@ -265,9 +265,8 @@ class Server(ThreadingHTTPServer):
                 break
             except OSError as error:
                 if error.errno != errno.EADDRINUSE:
-                    raise SehdrError(
-                        f"{host}:{tried}: cannot be served from ({error.strerror}); choose another"
-                    ) from None
+                    problem = f"cannot be served from ({error.strerror})"
+                    raise SehdrError(f"{host}:{tried}: {problem}; choose another") from None
                 log.info("port %d is in use", tried)
         else:
             raise SehdrError(f"--port {port}: no port from there on is free; choose another")
@@ -346,19 +345,16 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             return
         with connections.answering(connection):
-            self._send(
-                connection,
-                *self._result_of(partial(find, own_path(self.path), Client(connections, connection))),
-            )
+            answer = self._result_of(partial(find, own_path(self.path), Client(connections, connection)))
+            self._send(connection, *answer)
 
     def _result_of(self, find: Callable[[], tuple[str, bytes | memoryview]]) -> tuple[int, str, bytes | memoryview]:
         """Return status, content type and content of an answer."""
         try:
             if not self.server.allowed(self.headers.get("Host", ""), self.headers.get("Origin")):
                 self.close_connection = True
-                raise Refusal(
-                    403, "only pages of this server may ask; behind a proxy, start it with --origin https://ITS.NAME"
-                )
+                remedy = "behind a proxy, start it with --origin https://ITS.NAME"
+                raise Refusal(403, f"only pages of this server may ask; {remedy}")
             return 200, *find()
         except Refusal as error:
             return error.status, "text/plain", str(error).encode()

@@ -17,8 +17,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp.output.render_views import select_cameras
+from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.runs.open import open_scene
-from sehdr_warp.scene import look_at
+from sehdr_warp.scene import load_cameras, look_at
 from sehdr_warp.training.train import train
 from sehdr_warp.viewer.server import MOST_BODY, MOST_VIEWS
 from sehdr_warp.viewer.watching import Watch
@@ -46,6 +48,19 @@ def frame(server, view, **options):
     assert status == 200, content
     planes, size = np.frombuffer(content, "<f2").astype(np.float32), view.width * view.height
     return planes[: 4 * size].reshape(view.height, view.width, 4), planes[4 * size : 5 * size], planes[5 * size :]
+
+
+def test_cameras_of_a_turned_file_are_saved_in_the_photos_coordinates(serve, tmp_path):
+    server, view = serve(), camera(33, 21)
+    matrix = WorldTransform(np.diag([-1.0, -1.0, 1.0]), np.array([1.0, 2.0, 3.0]), 2.0).matrix
+    run = server.viewer.runs[0].run
+    run.world_matrix, run.path = matrix, str(tmp_path / "turned.ply")
+    saved = ask(server, "/path", {"cameras": [view.to_dict()]})[2]
+    (tmp_path / "path.json").write_bytes(saved)
+    [(_, photo)] = load_cameras(tmp_path / "path.json")
+    np.testing.assert_allclose(matrix[:3] @ [*photo.position, 1], view.position, atol=1e-9)
+    [(_, back)] = select_cameras(run, tmp_path / "path.json")
+    np.testing.assert_allclose(back.world_to_camera, view.world_to_camera, atol=1e-9)
 
 
 def test_a_frame_is_the_render(serve):
