@@ -131,9 +131,14 @@ def write_environment_map(
         write_radiance(path, hdr, exposure=exposure * absolute, overwrite=overwrite)
         return path
     beyond = center.beyond * transform.scale if beyond is None else beyond
-    facts = {**provenance(run), "position": json.dumps(place.tolist()), "axes": axes}
-    facts |= {"beyond": repr(float(beyond)), "lightShares": json.dumps(shares.to_dict())}
-    facts |= {"worldMatrix": json.dumps(stored_matrix(run, transform).tolist())}
+    facts = {
+        **provenance(run),
+        "position": json.dumps(place.tolist()),
+        "axes": axes,
+        "beyond": repr(float(beyond)),
+        "lightShares": json.dumps(shares.to_dict()),
+        "worldMatrix": json.dumps(stored_matrix(run, transform).tolist()),
+    }
     white_luminance = None if luminance is None else luminance / exposure
     header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
     header |= {"sehdr:mapToWorld": json.dumps(transform.rotation.T.tolist()), "envmap": envmap(layout)}

@@ -250,7 +250,7 @@ def _in_front_of_obstacles(
     """Return the cameras, moved towards the focus if what is near fills the middle of their pictures."""
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-    checked = [path[i] for i in sorted({round(i) for i in np.linspace(0, len(path) - 1, min(len(path), 60))})]
+    checked = evenly(path, 60)
     advance = []
     for camera in checked:
         distance = float(np.linalg.norm(camera.position - focus))

@@ -284,23 +284,19 @@ def _log_agreement(mesh: ProxyMesh, run: "RenderableScene", transform: WorldTran
     held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
     cameras = evenly(held_out or [entry.camera for entry in run.cameras], _CHECKED)
     low, high = mesh.vertices.min(0) - mesh.voxel, mesh.vertices.max(0) + mesh.voxel
-    differences, total, covered = [], 0, 0
-    views = [view for camera in cameras for view in depth_views(run, camera, transform, 120)]
-    for view in views:
+    differences, total = [np.zeros(0)], 0
+    for view in (view for camera in cameras for view in depth_views(run, camera, transform, 120)):
         points, depth = surface_points(view), view.depth.numpy()
-        rows, columns = np.nonzero(depth)
         inside = ((points >= low) & (points <= high)).all(axis=1)
-        rows, columns = rows[inside], columns[inside]
-        depth_of_mesh = mesh_depth(mesh, view.camera)[rows, columns]
-        total, covered = total + len(depth_of_mesh), covered + int((depth_of_mesh > 0).sum())
-        differences.append(
-            np.abs(depth_of_mesh - depth[rows, columns])[depth_of_mesh > 0] / depth[rows, columns][depth_of_mesh > 0]
-        )
-    values = np.concatenate(differences) if differences else np.zeros(0)
+        pixels = tuple(index[inside] for index in np.nonzero(depth))
+        of_mesh, of_scene = mesh_depth(mesh, view.camera)[pixels], depth[pixels]
+        total += len(of_mesh)
+        differences.append((np.abs(of_mesh - of_scene) / of_scene)[of_mesh > 0])
+    values = np.concatenate(differences)
     if values.size:
         text = "depth beside the scene, %d views: %.1f %% off in the median, %.0f %% within 3 %%, %.0f %% not covered"
         close = float((values < _CLOSE).mean())
-        log.info(text, len(cameras), 100 * float(np.median(values)), 100 * close, 100 * (1 - covered / total))
+        log.info(text, len(cameras), 100 * float(np.median(values)), 100 * close, 100 * (1 - len(values) / total))
 
 
 def _ground_line(ground: Ground, transform: WorldTransform) -> str:

@@ -126,13 +126,6 @@ def _with_masks(edits: "SplatEdits", options: EditOptions, run: "Run | Splats") 
     return replace(edits, mask_views=load_run_scene(run, options.data).views)
 
 
-def _merged(run: "Run | Splats", others: tuple[Path, ...], device: str | None) -> "RenderableScene":
-    """Return a scene with the Gaussians of other runs and files added."""
-    from .merged_scene import merge_scenes
-
-    return merge_scenes(run, *(open_scene(path, device) for path in others)) if others else run
-
-
 def run_mesh(args: Mesh) -> None:
     """Run `sehdr-warp mesh`."""
     from .proxy_mesh import check_mesh, write_proxy_mesh
@@ -148,31 +141,28 @@ def run_export(args: Export) -> None:
 
     if args.out.suffix.lower() in _MESH_SUFFIXES:
         raise UsageError(f"{args.out}: meshes are written by sehdr-warp mesh {args.run} --out {args.out.stem}.usdc")
-    if check_suffix(args.out, ".html") == ".html":
+    is_page = check_suffix(args.out, ".html") == ".html"
+    if is_page:
         from ..files import check_absent
-        from .scene_page import write_scene_page
 
         if flags := [*changed_flags(args.world), *changed_flags(args.file), *["--cameras"] * args.cameras]:
             refused = ", ".join(flags)
             raise UsageError(f"{refused}: without effect on a page, which has its own exposure, cameras and axes")
         check_absent(args.out, args.overwrite)
-        edits = _splat_edits(args.edits)
-        run = open_scene(args.run, args.device)
-        edits = _with_masks(edits, args.edits, run)
-        run = _merged(run, args.merge, args.device)
+    edits = _splat_edits(args.edits)
+    run = open_scene(args.run, args.device)
+    edits = _with_masks(edits, args.edits, run)
+    if args.merge:
+        from .merged_scene import merge_scenes
+
+        run = merge_scenes(run, *(open_scene(path, args.device) for path in args.merge))
+    if is_page:
+        from .scene_page import write_scene_page
+
         print(write_scene_page(run, args.out, edits=edits, overwrite=args.overwrite))
-        return
-    _export(
-        args.run,
-        args.out,
-        args.file,
-        args.device,
-        world=args.world,
-        edits=args.edits,
-        merge=args.merge,
-        cameras=args.cameras,
-        overwrite=args.overwrite,
-    )
+    else:
+        options = vars(args.world) | {"edits": edits, "cameras": args.cameras, "overwrite": args.overwrite}
+        _export(run, args.out, args.file, options)
 
 
 def run_convert(args: Convert) -> None:
@@ -187,35 +177,18 @@ def run_convert(args: Convert) -> None:
         )
     check_suffix(args.source)
     check_suffix(args.out)
-    _export(args.source, args.out, args.file, args.device, overwrite=args.overwrite)
-
-
-def _export(
-    source: Path,
-    out: Path,
-    options: SplatFileOptions,
-    device: str | None,
-    *,
-    world: WorldOptions | None = None,
-    edits: EditOptions | None = None,
-    merge: tuple[Path, ...] = (),
-    **flags: Any,
-) -> None:
-    from ..model.exposure import exposure_times
-    from ..splats import check_suffix
-    from .export import export
     from .splat_edits import SplatEdits
 
-    check_suffix(out)  # Before the scene is opened.
-    splat_edits = _splat_edits(edits) if edits else SplatEdits(min_opacity=0)
-    run = open_scene(source, device)
-    if edits:
-        splat_edits = _with_masks(splat_edits, edits, run)
-    run = _merged(run, merge, device)
-    times = () if options.exposure is None else exposure_times(run.base_time, options.exposure)
+    options = {"axes": None, "edits": SplatEdits(min_opacity=0), "overwrite": args.overwrite}
+    _export(open_scene(args.source, args.device), args.out, args.file, options)
+
+
+def _export(run: "RenderableScene", out: Path, file: SplatFileOptions, options: dict[str, Any]) -> None:
+    """Export a scene with the options of export(), and print the path."""
+    from ..model.exposure import exposure_times
+    from .export import export
+
+    times = () if file.exposure is None else exposure_times(run.base_time, file.exposure)
     if len(times) > 1:
-        raise UsageError(f"--exposure {options.exposure}: a splat file holds the colors of one exposure; name one")
-    time = times[0] if times else None
-    arguments: dict[str, Any] = {"kind": options.kind, "exposure_time": time, "degree": options.degree}
-    arguments |= ({"axes": None} if world is None else vars(world)) | flags
-    print(export(run, out, edits=splat_edits, **arguments))
+        raise UsageError(f"--exposure {file.exposure}: a splat file holds the colors of one exposure; name one")
+    print(export(run, out, kind=file.kind, exposure_time=next(iter(times), None), degree=file.degree, **options))

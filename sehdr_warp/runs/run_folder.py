@@ -21,8 +21,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from pydantic import BaseModel
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
@@ -109,16 +110,8 @@ class RunFolder:
 
         What has the name of one of its files must be a plain file: a pipe or a device would be taken for a missing one.
         """
-        files = (
-            self.config_file,
-            self.scene_file,
-            self.info_file,
-            self.plan_file,
-            self.summary_file,
-            self.metrics,
-            self.confidence,
-        )
-        files += (self.extension, self.orientation, self.light_unit, self.blocks)
+        files = self.config_file, self.scene_file, self.info_file, self.plan_file, self.summary_file, self.metrics
+        files += self.confidence, self.extension, self.orientation, self.light_unit, self.blocks
         for path in files:
             refuse_links(path, self.path)
             has_file(path)
@@ -145,6 +138,10 @@ class RunFolder:
         refuse_links(path, self.path)
         return read(path)
 
+    def _values(self, path: Path, model: type[BaseModel], remedy: str = REMEDY) -> dict[str, Any]:
+        """Return the object in a JSON file of the run; see read_values()."""
+        return self._read(path, lambda file: read_values(file, model, remedy))
+
     def hashes(self) -> dict[str, str]:
         """Return hashes of the files that decide the picture beside the checkpoint, by their names.
 
@@ -170,7 +167,7 @@ class RunFolder:
 
     def read_info(self) -> dict:
         """Return the values of run.json; see RunValues."""
-        info = self._read(self.info_file, lambda path: read_values(path, RunValues))
+        info = self._values(self.info_file, RunValues)
         try:
             Response.from_dict(info["response"])
         except SehdrError as error:
@@ -179,8 +176,7 @@ class RunFolder:
 
     def read_scene(self) -> dict:
         """Return the values of scene.json, see describe_scene()."""
-        values = self._read(self.scene_file, lambda path: read_values(path, SceneValues))
-        return {"notes": []} | values
+        return {"notes": []} | self._values(self.scene_file, SceneValues)
 
     def read_cameras(self) -> tuple[CameraEntry, ...]:
         """Return the views of the scene, in its order."""
@@ -205,13 +201,13 @@ class RunFolder:
         """Return the decisions of the run's plan, see DecisionValues; none without a plan."""
         if not self.plan_file.exists():
             return []
-        return self._read(self.plan_file, lambda path: read_values(path, PlanValues, _REMOVE_FILE))["decisions"]
+        return self._values(self.plan_file, PlanValues, _REMOVE_FILE)["decisions"]
 
     def read_summary(self) -> dict:
         """Return times, memory and counts of the training, see SummaryValues; empty if it has not ended."""
         if not self.summary_file.exists():
             return {}
-        return self._read(self.summary_file, lambda path: read_values(path, SummaryValues, _REMOVE_FILE))
+        return self._values(self.summary_file, SummaryValues, _REMOVE_FILE)
 
     def read_metrics(self) -> list[dict]:
         """Return the evaluations during the training, see MetricsValues; lines that a kill cut are left out."""

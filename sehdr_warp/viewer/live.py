@@ -5,6 +5,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from typing import Any
 
@@ -39,7 +40,7 @@ class LiveTraining(ViewerScene):
         self.paused = self.ended = False
         self._thread: threading.Thread | None = None
         self._steps = 0
-        self._requests: queue.Queue[_Picture] = queue.Queue()
+        self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
         self._credit = self._spent = 0.0
         self._curve: list[tuple] = []
         self._progress: dict[str, Any] = {}
@@ -78,14 +79,20 @@ class LiveTraining(ViewerScene):
         """Call `make` in the training's thread and return its result; other threads wait for it."""
         if threading.current_thread() is self._thread:
             return make()
-        picture = _Picture(make)
-        self._requests.put(picture)
-        while not picture.done.wait(_WAIT):
+        picture: Future[Any] = Future()
+
+        def answer() -> None:
+            try:
+                with torch.no_grad():
+                    picture.set_result(make())
+            except Exception as error:  # noqa: BLE001  It is raised where the picture was asked for.
+                picture.set_exception(error)
+
+        self._requests.put(answer)
+        while not wait([picture], _WAIT).done:
             if self.ended:
                 raise SehdrError("the training has ended; `sehdr-warp view` shows the run")
-        if picture.error is not None:
-            raise picture.error
-        return picture.result
+        return picture.result()
 
     def render_confidence(self, camera: Camera) -> None:
         """Return None: confidence is measured at the end of a training."""
@@ -133,9 +140,9 @@ class LiveTraining(ViewerScene):
             except queue.Empty:
                 continue
 
-    def _make(self, picture: "_Picture") -> None:
+    def _make(self, answer: Callable[[], None]) -> None:
         started = time.perf_counter()
-        picture.make()
+        answer()
         duration = time.perf_counter() - started
         if not self.paused:
             self._spent += duration
@@ -149,23 +156,6 @@ class LiveTraining(ViewerScene):
         remaining = None if step.seconds_left is None else format_seconds(step.seconds_left)
         share = self._spent / max(elapsed, 1e-9)
         self._progress = {"iteration": step.iteration, "total": step.total, "left": remaining, "share": share} | figures
-
-
-class _Picture:
-    """A computation for another thread."""
-
-    def __init__(self, function: Callable[[], Any]):
-        self.function, self.done = function, threading.Event()
-        self.result: Any = None
-        self.error: Exception | None = None
-
-    def make(self) -> None:
-        try:
-            with torch.no_grad():
-                self.result = self.function()
-        except Exception as error:  # noqa: BLE001  It is raised where it was asked for.
-            self.error = error
-        self.done.set()
 
 
 @contextmanager
