@@ -23,8 +23,8 @@ from .visibility import blending_weights
 
 log = logging.getLogger(__name__)
 
-CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels, stops
-PARTLY_CLIPPED_STOPS = 0.25  # Uncertainty of a clipped channel next to unclipped ones, which bound the brightness
+CLIPPED_STOPS = 1.0  # Uncertainty of a pixel that is clipped in all channels and has no estimate, stops
+PARTLY_CLIPPED_STOPS = 0.25  # Uncertainty of a clipped channel beside unclipped ones, stops
 MAX_STOPS = 4.0  # Largest misfit that counts; a confidence of 1/16 already means unknown
 HALF_CONFIDENCE_PIXELS = 0.01  # Sum of blending weights over all photos, in pixels, at which the confidence is halved
 MIN_CONTRIBUTION = 1 / 255  # Blending weight in one photo, pixels; a Gaussian with less is not part of the scene
@@ -70,9 +70,9 @@ def pixel_uncertainty(
 
         unclipped channel   |log2(exposure / decoded value)|, the misfit, plus a quarter of the width of its 8-bit
                             code's interval in stops (the mean distance from its middle), at most 1
-        clipped channel     the stops by which the exposure falls short of white, plus, if all channels are clipped, the
-                            deviation of the estimate of its light, or CLIPPED_STOPS without an estimate; else
-                            PARTLY_CLIPPED_STOPS
+        clipped channel     the stops by which the exposure falls short of white, plus the deviation of the estimate of
+                            its light; without an estimate CLIPPED_STOPS, or PARTLY_CLIPPED_STOPS beside unclipped
+                            channels
         black channel       the stops by which the exposure is above half a code, plus 1
 
     Args:
@@ -94,9 +94,9 @@ def pixel_uncertainty(
     misfit = torch.where(black, (lifted / half_code).log2(), misfit).clamp_max(MAX_STOPS)
     low, high = (response.decode((photo + offset).clamp(0, 1)) for offset in (-HALF_CODE, HALF_CODE))
     rounding = ((high.clamp_min(1e-12) / low.clamp_min(1e-12)).log2() / 4).clamp(0, 1)
-    guess = photo.new_full((1, 1, 3), CLIPPED_STOPS) if deviation is None else deviation
-    guess = torch.where(guess.isfinite(), guess.clamp_max(MAX_STOPS), CLIPPED_STOPS)
-    unknown = torch.where(clipped.all(2, keepdim=True), guess, PARTLY_CLIPPED_STOPS).expand_as(photo)
+    unknown = torch.where(clipped.all(2, keepdim=True), CLIPPED_STOPS, PARTLY_CLIPPED_STOPS)
+    if deviation is not None:
+        unknown = torch.where(deviation.isfinite(), deviation.clamp_max(MAX_STOPS), unknown)
     stops = misfit + torch.where(clipped, unknown, rounding)
     return stops.mean(2), clipped.to(photo).mean(2)
 

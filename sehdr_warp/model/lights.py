@@ -59,7 +59,8 @@ class Light:
         shape: its place and size.
         radiance: [3] in the field's colors; with the shape it gives the light that the training views show.
         lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
-        deviation: of log2 radiance, stops, from the confidence of its Gaussians; None if that was not measured.
+        deviation: of log2 radiance, stops, of what photos clip, from the confidence of its Gaussians; None if that was
+            not measured. Edges and colors that do not clip make a light no surer, because all its photos may err alike.
         share: of the light that reaches the middle of the training cameras.
         members: [K] int64, its Gaussians.
     """
@@ -106,6 +107,7 @@ def find_lights(
     widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
     confidence = None if field.confidence is None else field.confidence.to(members.device)[members].cpu().numpy()
+    shares = clipped.to(members.device)[members].cpu().numpy()
     covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
     total = max(_light_at(field, middle, cameras, degree), 1e-30)
     lights = []
@@ -119,7 +121,7 @@ def find_lights(
         deviation = None
         if confidence is not None:
             stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
-            deviation = float(np.average(stops, weights=weights[group]))
+            deviation = float(weights[group] @ stops / (weights[group] @ shares[group]))
         share = float(radiance.mean() * shape.solid_angle(middle)) / total
         if share >= LEAST_SHARE:
             bound = np.minimum(white, radiance)

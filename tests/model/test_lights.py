@@ -113,3 +113,6 @@ def test_deviation_follows_the_confidence():
     scene.confidence = torch.full((scene.gaussians.count,), 0.5)
     (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views())
     assert light.deviation == pytest.approx(1.0)
+    # Values that do not clip, at its edges, say nothing of those that do.
+    (light,) = find_lights(scene, torch.full((scene.gaussians.count,), 0.5), views())
+    assert light.deviation == pytest.approx(2.0)

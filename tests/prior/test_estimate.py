@@ -9,7 +9,13 @@ from safetensors.torch import save_file
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.prior import LightPrior, coarse_size, combined_estimates, load_prior
-from sehdr_warp.prior.estimate import ESTIMATE_DEVIATION, VARIANCE_SHARE, WEIGHTS, LightEstimate
+from sehdr_warp.prior.estimate import (
+    ESTIMATE_DEVIATION,
+    LARGE_DEVIATION_POWER,
+    VARIANCE_SHARE,
+    WEIGHTS,
+    LightEstimate,
+)
 from sehdr_warp.prior.network import LightNetwork
 
 
@@ -41,16 +47,19 @@ def test_any_size_is_estimated(size):
     assert (estimate.mean >= 0).all() and (estimate.deviation > 0).all()
 
 
-def test_estimates_are_there_where_the_photo_clips_alone():
+@pytest.mark.parametrize(("scale", "power"), [(0.5, 1.0), (3.0, LARGE_DEVIATION_POWER)])
+def test_estimates_are_there_where_the_photo_clips_alone(scale, power):
     exposure, clipped = photo()
-    known = combined_estimates(exposure, clipped, small_prior())
+    known = combined_estimates(exposure, clipped, small_prior(scale))
     assert torch.equal(known.certainty > 0, clipped) and torch.equal(known.log_light[..., 3:] > 0, clipped)
-    estimate = small_prior().estimate(exposure, clipped)
+    estimate = small_prior(scale).estimate(exposure, clipped)
     inside = clipped[..., 0]
     deviation = math.log(2) * estimate.deviation[inside]
     expected = math.log(2) * estimate.mean[inside] + VARIANCE_SHARE * deviation.square() / 2
     assert torch.allclose(known.log_light[..., :3][inside].float(), expected, rtol=2e-3)
-    assert torch.allclose(1 / known.certainty[inside].float(), math.log(2) * estimate.deviation[inside], rtol=2e-3)
+    # Large deviations are widened, but the light that is expected does not rise with that.
+    widened = math.log(2) * estimate.deviation[inside] ** power
+    assert torch.allclose(1 / known.certainty[inside].float(), widened, rtol=2e-3)
 
 
 def test_what_a_file_states_counts_by_its_precision():
