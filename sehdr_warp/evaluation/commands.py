@@ -88,7 +88,11 @@ def run_evaluate(options: Evaluate) -> None:
     if file is not None:
         check_absent(file, result.overwrite)
     if options.pictures.truth is None:
-        figures = _evaluate_run(options)
+        from .evaluate import evaluate
+
+        run = open_run(options.run, options.scene.device)
+        scene = load_run_scene_with_confidence(run, options.scene.data)
+        figures = evaluate(run, scene, lpips_weights=result.lpips)
     else:
         figures = _evaluate_pictures(options, options.pictures.truth)
     if file is not None:
@@ -101,14 +105,6 @@ def _refuse_unused(group: Any, defaults: Any, problem: str) -> None:
     for name, value in vars(group).items():
         if value != getattr(defaults, name):
             raise UsageError(f"--{name.replace('_', '-')} {problem}")
-
-
-def _evaluate_run(options: Evaluate) -> dict[str, Any]:
-    from .evaluate import evaluate
-
-    run = open_run(options.run, options.scene.device)
-    scene = load_run_scene_with_confidence(run, options.scene.data)
-    return evaluate(run, scene, lpips_weights=options.result.lpips)
 
 
 def _evaluate_pictures(options: Evaluate, truth_path: str) -> dict[str, Any]:

@@ -114,9 +114,8 @@ def _cells(rows: Sequence[ComparedRuns]) -> list[list[str]]:
         cells.append([row.label, row.scene, str(row.count)])
         for column, (_, digits) in COLUMNS.items():
             deviation = row.deviation(column)
-            cells[-1].append(
-                format_figure(row.mean(column), digits) + (f" ± {deviation:.{digits}f}" if deviation else "")
-            )
+            spread = f" ± {deviation:.{digits}f}" if deviation else ""
+            cells[-1].append(format_figure(row.mean(column), digits) + spread)
     return cells
 
 
@@ -139,7 +138,7 @@ def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
 
 
 def columns(rows: Sequence[Sequence[str]], texts: int = 1) -> list[str]:
-    """Return one line for each row, with aligned cells: the first `left` flush left, the others flush right."""
+    """Return one line for each row, with aligned cells: the first `texts` flush left, the others flush right."""
     widths = [max(map(len, cells)) for cells in zip_longest(*rows, fillvalue="")]
     sides = [str.ljust] * texts + [str.rjust] * (len(widths) - texts)
     return ["  ".join(side(cell, width) for side, cell, width in zip(sides, row, widths)) for row in rows]
@@ -169,10 +168,8 @@ def format_table(result: dict) -> str:
         correlations = f"{ranking['spearman_log2']:.2f} (log2), {ranking['spearman_mu']:.2f} (mu-law)"
         lines += ["", f"confidence ranks errors: {correlations}; mean confidence {ranking['mean']:.2f}"]
     if result["lights"]["count"]:
-        lines += [
-            "",
-            "lights: {count} in the truth, {lost} lost".format(**result["lights"]) + _energies(result["lights"]),
-        ]
+        counts = "lights: {count} in the truth, {lost} lost".format(**result["lights"])
+        lines += ["", counts + _energies(result["lights"])]
     return "\n".join([*lines, "", *_notes(result, bool(names))])
 
 

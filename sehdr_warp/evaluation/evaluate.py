@@ -168,6 +168,7 @@ class Evaluation:
         ldr = _mean([row["ldr"] for row in rows], "psnr", "ssim", "lpips")
         without_photos = {"reason": "the folder holds radiance, no simulated photos"}
         ldr |= without_photos if ldr["psnr"] is None else self._lpips_reason(ldr)
+        no_lights = dict.fromkeys(("count", "lost", "energies")) | {"reason": missing}
         result = {
             "scene": self.scene.name,
             "split": self.split,
@@ -175,9 +176,7 @@ class Evaluation:
             "pu21": pu21 | {"peak_luminance": PEAK_LUMINANCE},
             "ldr": ldr,
             "regions": {region: self._region(region, missing) for region in metrics.REGIONS},
-            "lights": dict.fromkeys(("count", "lost", "energies")) | {"reason": missing}
-            if missing
-            else count_lights(self.lights),
+            "lights": no_lights if missing else count_lights(self.lights),
             "confidence": self.ranking.result() | ({"reason": missing} if missing else {}),
             "views": rows,
             "lpips_backbone": BACKBONE if self.lpips else None,

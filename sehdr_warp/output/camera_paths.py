@@ -100,7 +100,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float, up: np.n
     # From the air the pictures keep their heading: they would spin with the azimuth.
     above = -middle.world_to_camera[1, :3] if looks_down(cameras, up) else up
     places = focus + ring[:, None] * directions + height[:, None] * up
-    return [_move(middle, look_at_pose(place, focus, above)) for place in places]
+    return [moved(middle, look_at_pose(place, focus, above)) for place in places]
 
 
 def walk(cameras: Sequence[Camera]) -> list[Camera]:
@@ -151,7 +151,7 @@ def walk_path(cameras: Sequence[Camera], count: int) -> list[Camera]:
     places, forward = smooth(positions, _SMOOTH), smooth(_axes(cameras, 2), _SMOOTH)
     up = smooth(-_axes(cameras, 1), _SMOOTH_UP)
     rows = zip(places, forward, up, strict=True)
-    return [_move(cameras[0], look_at_pose(place, place + ahead, above)) for place, ahead, above in rows]
+    return [moved(cameras[0], look_at_pose(place, place + ahead, above)) for place, ahead, above in rows]
 
 
 def surround(cameras: Sequence[Camera], focus: np.ndarray, up: np.ndarray | None = None) -> bool:
@@ -204,7 +204,7 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = RotationSpline(times, Rotation.from_matrix(axes[keep]))(at).as_matrix()
     poses[:, :3, 3] = CubicSpline(times, positions[keep])(at)
-    return [_move(cameras[0], pose) for pose in poses]
+    return [moved(cameras[0], pose) for pose in poses]
 
 
 def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
@@ -261,5 +261,6 @@ def look_at_pose(position: np.ndarray, focus: np.ndarray, up: np.ndarray) -> np.
     return pose
 
 
-def _move(camera: Camera, camera_to_world: np.ndarray) -> Camera:
+def moved(camera: Camera, camera_to_world: np.ndarray) -> Camera:
+    """Return a camera with another pose [4, 4]."""
     return replace(camera, world_to_camera=np.linalg.inv(camera_to_world))

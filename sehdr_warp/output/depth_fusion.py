@@ -58,19 +58,12 @@ def _depth_view(run: "RenderableScene", camera: Camera, transform: WorldTransfor
     rendered = run.render(camera)
     depth = np.where(as_array(rendered.alpha) > _LEAST_ALPHA, as_array(rendered.depth), 0) * transform.scale
     flat = np.ones(depth.shape, bool)
-    for axis in (0, 1):
-        step = np.abs(np.diff(depth, axis=axis)) > _EDGE * np.minimum(*_neighbors(depth, axis))
-        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
-        before[axis], after[axis] = (0, 1), (1, 0)
-        flat &= ~(np.pad(step, before) | np.pad(step, after))
+    for values, smooth in ((depth, flat), (depth.T, flat.T)):
+        step = np.abs(np.diff(values, axis=0)) > _EDGE * np.minimum(values[:-1], values[1:])
+        smooth[:-1] &= ~step
+        smooth[1:] &= ~step
     depth = torch.from_numpy(np.where(flat, depth, 0).astype(np.float32))
     return DepthView(transform.camera(camera), depth, torch.from_numpy(np.array(as_array(rendered.hdr))))
-
-
-def _neighbors(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return values without the last and without the first along an axis."""
-    count = values.shape[axis]
-    return np.take(values, range(count - 1), axis), np.take(values, range(1, count), axis)
 
 
 def surface_points(view: DepthView) -> np.ndarray:

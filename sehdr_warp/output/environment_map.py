@@ -341,6 +341,5 @@ def _judge(
     spread = np.linalg.norm(np.ptp([camera.position for camera in photos], axis=0)) if len(photos) > 1 else 0.0
     near = weight[(alpha > COVERED) & (distance < _NEAR * spread)].sum() / weight.sum()
     if near > 0.5:
-        log.warning(
-            "from (%s) %.0f %% of all directions are blocked at once: is it inside of something?", place, 100 * near
-        )
+        text = "from (%s) %.0f %% of all directions are blocked at once: is it inside of something?"
+        log.warning(text, place, 100 * near)

@@ -205,9 +205,8 @@ def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, time
     elif kind == "ldr":
         decibels = agreement(gaussians, _photo_renderer(run, time), views, time)
         words = loss_in_words(decibels)
-        log.info(
-            "kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white", decibels, where, words
-        )
+        text = "kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white"
+        log.info(text, decibels, where, words)
     else:
         dark = time / 2**_DARKER
         bright, dim = (agreement(gaussians, _display_renderer(run, t), views, t) for t in (time, dark))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..scene import Camera
-from .camera_paths import common_focus, evenly, look_at_pose, orbit, surround, training_cameras, walk, walk_path
+from .camera_paths import common_focus, evenly, look_at_pose, moved, orbit, surround, training_cameras, walk, walk_path
 from .images import as_array
 from .world_transform import scene_up, world_transform
 
@@ -22,26 +22,17 @@ FILM_SIZES = ((640, 360), (1280, 720), (1920, 1080))
 _WIDEST = math.radians(75)  # Vertical field of view to which a path opens for its subject
 _MOST_ZOOM = 2.0  # Times that it then shows more than the photos do: photos show most of a subject, fog looks larger
 _MARGIN = 1.25  # Of the picture around the subject, whose surface is thick
-_VIEWS, _SIZE = 12, 96  # Renders that the subject is found on; longest side of these and of the checks for obstacles
-_REACH = 0.7  # Surfaces within this part of the cameras' distance from the focus are the subject
-_EXTENT = 90  # Percentile of their distances from the focus that the picture holds
-_OPENINGS, _WITNESSES = 16, 32  # Photos among which an opening view is chosen, and those that may show what it shows
-_SEVERAL = 3  # Photos that show a point which an opening view should show
-# Distances of a view of Gaussians without cameras, over the radius that holds half of them, and its height over these.
-_OUTSIDE, _ABOVE, _OUTSIDE_FOV = (2.8, 2.0, 1.3, 0.8, 0.5), 0.15, math.radians(50)
-_FRAMED = 0.6  # Part of half a photo's field of view within which the focus lies in a photo that framed its subject
-_CLOSER = 0.6  # Tangent of the field of view of an opening view, at least this part of its photo's
-# Parts of the picture that an opening view may show less if it is nearer to the middle of the photos by their extent,
-# if it looks as most of them do by a right angle, and if it holds the whole subject instead of nothing of it.
-_ASIDE, _TURNED, _WHOLE = 0.4, 0.4, 0.8
-_STEEP = 0.9  # Sine of the pitch from which a camera looks down, and level is not a direction of its picture
-_NEAR, _BLOCKED = 0.3, 10  # A view is blocked if this per cent of its middle is nearer than this part of the distance
 
 
 def film_size(photos: Sequence[Camera]) -> tuple[int, int]:
     """Return width and height for a path among photos: 16:9, at least as high as their short side, at most 1080."""
     short = float(np.median([min(camera.width, camera.height) for camera in photos]))
     return next((size for size in FILM_SIZES if size[1] >= short), FILM_SIZES[-1])
+
+
+_VIEWS, _SIZE = 12, 96  # Renders that the subject is found on; longest side of these and of the checks for obstacles
+_REACH = 0.7  # Surfaces within this part of the cameras' distance from the focus are the subject
+_EXTENT = 90  # Percentile of their distances from the focus that the picture holds
 
 
 def subject_radius(run: "RenderableScene", photos: Sequence[Camera], focus: np.ndarray) -> float | None:
@@ -85,6 +76,13 @@ def default_path(run: "RenderableScene", count: int, up: str | Sequence[float] |
         return [film_camera(camera, photos) for camera in walk_path(way, count)]
     path = orbit(photos, count, _focus_distance(run, photos), scene_up(run, up))
     return frame_subject(run, [film_camera(camera, photos) for camera in path], photos)
+
+
+_OPENINGS, _WITNESSES = 16, 32  # Photos among which an opening view is chosen, and those that may show what it shows
+_SEVERAL = 3  # Photos that show a point which an opening view should show
+# Parts of the picture that an opening view may show less if it is nearer to the middle of the photos by their extent,
+# if it looks as most of them do by a right angle, and if it holds the whole subject instead of nothing of it.
+_ASIDE, _TURNED, _WHOLE = 0.4, 0.4, 0.8
 
 
 def opening_view(run: "RenderableScene") -> Camera | None:
@@ -143,6 +141,10 @@ def _means(run: "RenderableScene") -> np.ndarray:
     return run.field.normalization.scene_points(run.field.gaussians.means.detach().cpu().numpy())
 
 
+# Distances of a view of Gaussians without cameras, over the radius that holds half of them, and its height over these.
+_OUTSIDE, _ABOVE, _OUTSIDE_FOV = (2.8, 2.0, 1.3, 0.8, 0.5), 0.15, math.radians(50)
+
+
 def _view_from_outside(run: "RenderableScene") -> Camera:
     """Return a camera for Gaussians without cameras, from as far away as nothing stands before their middle.
 
@@ -162,6 +164,9 @@ def _view_from_outside(run: "RenderableScene") -> Camera:
     return camera
 
 
+_NEAR, _BLOCKED = 0.3, 10  # A view is blocked if this per cent of its middle is nearer than this part of the distance
+
+
 def _nearest_depth(run: "RenderableScene", camera: Camera) -> float:
     """Return the depth than which a tenth of the middle of a camera's picture is nearer; infinity if it is empty."""
     small = camera.within(_SIZE)
@@ -170,6 +175,11 @@ def _nearest_depth(run: "RenderableScene", camera: Camera) -> float:
     depth = as_array(rendered.depth)[rows, columns]
     depth = depth[(depth > 0) & (as_array(rendered.alpha)[rows, columns] > 0.5)]
     return float(np.percentile(depth, _BLOCKED)) if depth.size else math.inf
+
+
+_FRAMED = 0.6  # Part of half a photo's field of view within which the focus lies in a photo that framed its subject
+_CLOSER = 0.6  # Tangent of the field of view of an opening view, at least this part of its photo's
+_STEEP = 0.9  # Sine of the pitch from which a camera looks down, and level is not a direction of its picture
 
 
 def _opening_of(
@@ -184,8 +194,7 @@ def _opening_of(
     if not around and own @ ahead > distance * math.cos(_FRAMED * math.atan(photo.height / 2 / photo.fy)):
         ahead = own * distance
     if abs(ahead @ up) < _STEEP * distance:
-        pose = look_at_pose(photo.position, photo.position + ahead, up)
-        camera = replace(camera, world_to_camera=np.linalg.inv(pose))
+        camera = moved(camera, look_at_pose(photo.position, photo.position + ahead, up))
     if focus is None or radius is None:
         return camera
     present = camera.height / 2 / camera.fy
@@ -200,9 +209,7 @@ def _visible_share(run: "RenderableScene", camera: Camera, witnesses: Sequence[C
     points = _surface(run, camera)
     if not len(points):
         return 0.0
-    counts = np.zeros(len(points))
-    for witness in witnesses:
-        counts += witness.project(points).inside
+    counts = np.sum([witness.project(points).inside for witness in witnesses], axis=0)
     return float((counts >= min(_SEVERAL, len(witnesses))).sum() / (camera.width * camera.height))
 
 
@@ -235,13 +242,13 @@ def frame_subject(run: "RenderableScene", path: Sequence[Camera], photos: Sequen
 
 def _far_enough(path: Sequence[Camera], focus: np.ndarray, least: float) -> list[Camera]:
     """Return the cameras, moved away from the focus to at least this distance."""
-    moved = []
+    result = []
     for camera in path:
         offset = camera.position - focus
         pose = camera.camera_to_world.copy()
         pose[:3, 3] = focus + offset * max(1.0, least / max(float(np.linalg.norm(offset)), 1e-12))
-        moved.append(replace(camera, world_to_camera=np.linalg.inv(pose)))
-    return moved
+        result.append(moved(camera, pose))
+    return result
 
 
 def _in_front_of_obstacles(
@@ -264,10 +271,11 @@ def _in_front_of_obstacles(
     parts = np.interp(np.linspace(0, len(checked) - 1, len(path)), np.arange(len(checked)), smooth)
     blocked = np.count_nonzero(advance)
     log.info("orbit: something near blocked %d of %d views; they come in front of it", blocked, len(checked))
-    up = [-camera.world_to_camera[1, :3] for camera in path]
-    positions = [camera.position + part * (focus - camera.position) for camera, part in zip(path, parts, strict=True)]
-    poses = [look_at_pose(place, focus, direction) for place, direction in zip(positions, up, strict=True)]
-    return [replace(camera, world_to_camera=np.linalg.inv(pose)) for camera, pose in zip(path, poses, strict=True)]
+    result = []
+    for camera, part in zip(path, parts, strict=True):
+        place = camera.position + part * (focus - camera.position)
+        result.append(moved(camera, look_at_pose(place, focus, -camera.world_to_camera[1, :3])))
+    return result
 
 
 def _focus_distance(run: "RenderableScene", cameras: Sequence[Camera]) -> float:

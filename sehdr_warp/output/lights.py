@@ -123,9 +123,8 @@ def write_lights(
     exposure_of_white(run, reference_white)  # Before minutes of looking for lights
     lights = run.find_lights()
     if not lights:
-        log.warning(
-            "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest", run.path
-        )
+        text = "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest"
+        log.warning(text, run.path)
     unit = luminance_of_one(run) if reference_white is None else None
     factor = unit or exposure_of_white(run, reference_white)
     relative = "relative radiance" if reference_white is None else f"white is {reference_white:g}"

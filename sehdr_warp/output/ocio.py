@@ -74,9 +74,8 @@ def _check_archive(path: Path) -> None:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise InputError(
-            path, f"is not an archive of a config ({error!s:.80})", "archive it again with ocioarchive"
-        ) from None
+        problem = f"is not an archive of a config ({error!s:.80})"
+        raise InputError(path, problem, "archive it again with ocioarchive") from None
     if size > _LARGEST:
         raise InputError(path, f"unpacks to {size} bytes, more than {_LARGEST}", "use the config without an archive")
 

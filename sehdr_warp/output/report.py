@@ -20,8 +20,7 @@ from ..scene.images import LDR_SUFFIXES, RAW_SUFFIXES
 from .camera_paths import evenly
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare, darker_stops
-from .report_page import STOPS, report_page
-from .report_page import stops_text as _stops
+from .report_page import STOPS, report_page, stops_text
 from .tonemap import expose, fit_tone_map
 
 if TYPE_CHECKING:
@@ -116,7 +115,7 @@ def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, c
     for name, key in (("Photo", "from_photo"), ("HDR scene", "hdr"), ("Truth", "truth")):
         radiances = [getattr(c, key) for c in comparisons]
         if all(radiance is not None for radiance in radiances):
-            columns[f"{name} at {_stops(darker)}"] = [expose(r, darker, scale=exposure_time) for r in radiances]
+            columns[f"{name} at {stops_text(darker)}"] = [expose(r, darker, scale=exposure_time) for r in radiances]
     new = [c.new for c in comparisons if c.new is not None]
     if len(new) == len(comparisons):
         columns["New view, tone-mapped"] = list(map(fit_tone_map(new), new))
@@ -133,7 +132,7 @@ def stops_figure(comparison: Comparison, exposure_time: float):
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}
     rows = [[None, *(expose(radiance, stop, scale=exposure_time) for stop in STOPS)] for radiance in sources.values()]
     rows[0][0] = comparison.photo
-    titles = ["Photo", *map(_stops, STOPS)]
+    titles = ["Photo", *map(stops_text, STOPS)]
     caption = (
         f"View {comparison.name}, re-exposed from {shutter(exposure_time)} (0 EV) and shown on a plain sRGB display. "
         "What the photo clipped stays flat."

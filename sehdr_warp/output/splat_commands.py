@@ -172,9 +172,8 @@ def run_convert(args: Convert) -> None:
     if args.out.suffix.lower() == ".html":
         raise UsageError(f"{args.out}: pages are written by sehdr-warp export {args.source} --out {args.out}")
     if args.source.is_dir():
-        raise UsageError(
-            f"{args.source}: is a folder; runs are written by sehdr-warp export {args.source} --out {args.out}"
-        )
+        command = f"sehdr-warp export {args.source} --out {args.out}"
+        raise UsageError(f"{args.source}: is a folder; runs are written by {command}")
     check_suffix(args.source)
     check_suffix(args.out)
     from .splat_edits import SplatEdits

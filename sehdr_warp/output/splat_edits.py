@@ -149,10 +149,7 @@ class SplatEdits:
 
     def check_regions(self, upright_means: np.ndarray) -> None:
         """Raise SehdrError if crop and cut leave none of the Gaussians at upright_means [N, 3]."""
-        removed = np.zeros(len(upright_means), bool)
-        for outside in self._outside(upright_means).values():
-            removed |= outside
-        if removed.all():
+        if np.any([np.zeros(len(upright_means), bool), *self._outside(upright_means).values()], axis=0).all():
             raise _empty_file_error(upright_means)
 
     def _outside(self, upright_means: np.ndarray) -> dict[str, np.ndarray]:
@@ -216,11 +213,6 @@ def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> Gaus
         means=(center + offsets * factor[:, None]).astype(np.float32),
         log_scales=(gaussians.log_scales + np.log(factor)[:, None]).astype(np.float32),
     )
-    log.info(
-        "strays: %d Gaussians beyond %.3g units: %d faint ones left out, %d moved there",
-        far.sum(),
-        limit,
-        faint.sum(),
-        (far & ~faint).sum(),
-    )
+    text = "strays: %d Gaussians beyond %.3g units: %d faint ones left out, %d moved there"
+    log.info(text, far.sum(), limit, faint.sum(), (far & ~faint).sum())
     return moved.rows(~faint)

@@ -45,15 +45,11 @@ def _edges(length: int) -> list[tuple[int, int]]:
 
 
 def _differ(first: str, second: str) -> bool:
-    parts = first.split("/"), second.split("/")
-    if len(parts[0]) != len(parts[1]):
-        return True
-    return any(map(_cells_differ, *parts))
-
-
-def _cells_differ(first: str, second: str) -> bool:
+    """Return whether signatures have other parts, or cells that differ by more than _TOLERANCE."""
     try:
-        cells = [np.frombuffer(bytes.fromhex(text), np.uint8).astype(int) for text in (first, second)]
+        one, other = ([np.frombuffer(bytes.fromhex(part), np.uint8) for part in s.split("/")] for s in (first, second))
     except ValueError:
         return True
-    return cells[0].shape != cells[1].shape or bool((np.abs(cells[0] - cells[1]) > _TOLERANCE).any())
+    if [cells.shape for cells in one] != [cells.shape for cells in other]:
+        return True
+    return any((np.abs(a.astype(int) - b) > _TOLERANCE).any() for a, b in zip(one, other, strict=True))

@@ -87,11 +87,8 @@ class RenderableScene:
 
     def normalize_photos(self, scene: Scene) -> Scene:
         """Return a scene with the exposure compensation that the run was trained with."""
-        return (
-            scene
-            if self.exposure_compensation is None
-            else self.exposure_compensation.normalize_photos(scene, self.field.response)
-        )
+        compensation = self.exposure_compensation
+        return scene if compensation is None else compensation.normalize_photos(scene, self.field.response)
 
     def __repr__(self) -> str:
         """Return path, number of Gaussians, views and device in one line."""
@@ -201,9 +198,8 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
     if beside is not None:
         views = load_cameras(beside)
         if beside.name == "cameras.json":
-            log.info(
-                "%s: %d cameras from %s beside it, which does not say what it belongs to", path, len(views), beside
-            )
+            text = "%s: %d cameras from %s beside it, which does not say what it belongs to"
+            log.info(text, path, len(views), beside)
         cameras = tuple(CameraEntry(name, "train", camera, model.base_time) for name, camera in views)
     return Splats(path, model, cameras, gaussians.world_matrix)
 
@@ -324,10 +320,8 @@ def on_device(model: RadianceField, device: torch.device, budget: int | None = N
     paged = None if budget is None else PagedField(model, device, budget)
     if paged is None or paged.row_bytes * model.gaussians.count <= paged.budget:
         return model.to(device)
-    log.info(
-        "%d Gaussians do not fit into %.1f GB of %s: those in view are copied to it, far ones at less detail",
-        *(model.gaussians.count, paged.budget / 1e9, device),
-    )
+    text = "%d Gaussians do not fit into %.1f GB of %s: those in view are copied to it, far ones at less detail"
+    log.info(text, model.gaussians.count, paged.budget / 1e9, device)
     return paged.requires_grad_(False)
 
 
