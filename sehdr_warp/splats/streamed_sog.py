@@ -14,7 +14,7 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_folder, read_bytes, read_json, resolve_inside
-from .arrays import GaussianArrays
+from .arrays import GaussianArrays, join_gaussians, warn_of_compensation
 from .sog import gaussians_of_files, refusing_damage, sog_files
 
 NAME = "lod-meta.json"
@@ -80,7 +80,9 @@ def read_streamed_sog(path: Path) -> GaussianArrays:
             chunks[chunk] = gaussians.rows(_rows(ranges, gaussians.count))
         if not chunks:
             raise ValueError("no node has Gaussians of level 0")
-    return merged_chunks([*chunks.values()])
+    gaussians = join_gaussians([*chunks.values()])
+    warn_of_compensation(path, gaussians.compensated, "the meta.json of its chunks says antialias")
+    return gaussians
 
 
 def _rows(ranges: list[tuple[int, int]], count: int) -> np.ndarray:
@@ -93,18 +95,6 @@ def _rows(ranges: list[tuple[int, int]], count: int) -> np.ndarray:
     if sum(number for _, number in ranges) > count:
         raise ValueError(f"more Gaussians than a chunk of {count} has")
     return np.concatenate([np.arange(first, first + number) for first, number in ranges])
-
-
-def merged_chunks(parts: list[GaussianArrays]) -> GaussianArrays:
-    """Return the Gaussians of all chunks, with the highest degree of any of them."""
-    degree = max(part.degree for part in parts)
-    parts = [part.padded(degree) for part in parts]
-    arrays = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
-    first = parts[0]
-    return GaussianArrays(
-        **joined, color_model=first.color_model, base_time=first.base_time, world_matrix=first.world_matrix
-    )
 
 
 def _walk(nodes: list[dict]):

@@ -130,7 +130,7 @@ def test_what_a_small_file_loses_is_measured_on_the_file(tmp_path, run, logged, 
     assert float(line.split()[1]) > 25
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog", "/lod-meta.json"])
 def test_the_mark_of_opacity_compensation_passes_through_a_conversion(tmp_path, suffix):
     for name, mode in (("mip", "mip"), ("common", "default")):
         scene = load_splats(write_ply(tmp_path / f"{name}.ply", [f"SplatRenderMode: {mode}"]))
