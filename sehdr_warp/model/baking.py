@@ -120,23 +120,23 @@ def _in_colors(
 ) -> GaussianArrays:
     """Return gaussians_of() in the field's own coordinates, like camera_positions."""
     arrays, to_radiance = _arrays_of(field)
+    is_exact = to_radiance is None and color_matrix is None  # But for the unit
+    radiance = to_radiance or (lambda exposure: exposure / field.base_time)
     if color_matrix is not None:
-        to_radiance = _in_rec709(to_radiance or (lambda x: x / field.base_time), color_matrix, field.white)
+        radiance = _in_rec709(radiance, color_matrix, field.white)
     time = exposure_time or field.base_time
     if color_model == "display":
         if arrays.color_model == "display" and time == field.base_time and color_matrix is None:
             return arrays
-        radiance = to_radiance or (lambda exposure: exposure / field.base_time)
         response = field.response if color_matrix is None else response_by_name("srgb")
         encoded = bake(arrays, lambda colors: response.encode(radiance(colors) * time), "display", camera_positions)
         return replace(encoded, base_time=time)  # The exposure that readers need to recover radiance.
-    if to_radiance is None and color_model == arrays.color_model:
+    if is_exact and color_model == arrays.color_model:
         harmonics = arrays.harmonics.astype(np.float64)
         if color_model == "linear":
             return arrays.with_colors(harmonics / field.base_time, "linear")
         harmonics[:, 0] -= np.log(field.base_time) / HARMONIC_0
         return arrays.with_colors(harmonics, "log")
-    radiance = to_radiance or (lambda exposure: exposure / field.base_time)
     if color_model == "linear":
         return bake(arrays, radiance, "linear", camera_positions)
     return bake(arrays, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", camera_positions)

@@ -280,9 +280,8 @@ def run_render(args: Render) -> None:
     from .world_transform import world_transform
 
     if args.out is None and args.video is None:
-        raise UsageError(
-            "render needs --out, a folder for the pictures, or --video, a film; see sehdr-warp render --help"
-        )
+        problem = "render needs --out, a folder for the pictures, or --video, a film"
+        raise UsageError(f"{problem}; see sehdr-warp render --help")
     flags = changed_flags(args.film)
     if args.out is not None and args.cameras not in SPLITS:
         flags = [flag for flag in flags if flag != "--fps"]

@@ -1,7 +1,4 @@
-"""Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras.
-
-`sehdr-warp render` calls render_views(): the names of its options are those of the arguments.
-"""
+"""Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
 import json
 import logging
@@ -141,7 +138,7 @@ def render_views(
         width, height = read_size(size)
         views = [(name, reframe(camera, width, height)) for name, camera in views]
     are_photos = str(cameras) in SPLITS or (str(cameras) not in PATHS and Path(cameras).is_dir())
-    camera_files = _camera_files(run, views, transform, fps, moving=not are_photos)
+    camera_files = _camera_files(run, views, transform, fps, moves=not are_photos)
     world_matrix = json.dumps(stored_matrix(run, transform).tolist())
     empty = []
     with ExitStack() as stack:
@@ -189,7 +186,12 @@ def _hdr_parts(
 
 
 def _camera_files(
-    run: "RenderableScene", views: Sequence[tuple[str, Camera]], transform: WorldTransform, fps: float, *, moving: bool
+    run: "RenderableScene",
+    views: Sequence[tuple[str, Camera]],
+    transform: WorldTransform,
+    fps: float,
+    *,
+    moves: bool,
 ) -> dict[str, str]:
     """Return the names and texts of the files that hold the cameras of a render, as far as they are pinholes.
 
@@ -198,7 +200,7 @@ def _camera_files(
         views: Names and cameras in the scene's coordinates.
         transform: To the coordinates of files.
         fps: Frames a second of a camera that moves.
-        moving: Whether the cameras may be frames of one that moves.
+        moves: Whether the cameras may be frames of one that moves.
     """
     pinholes = [view for view in views if view[1].is_pinhole]
     if len(pinholes) < len(views):
@@ -207,10 +209,10 @@ def _camera_files(
     if not pinholes:
         return {}
     cameras = [(name, transform.camera(camera)) for name, camera in pinholes]
-    path = camera_path(cameras) if moving else None
-    files = {"cameras.usda": usd_cameras(cameras, stored_matrix(run, transform), path=path, fps=fps)}
-    if path is not None:
-        files["cameras.chan"] = chan_cameras(path)
+    moving = camera_path(cameras) if moves else None
+    files = {"cameras.usda": usd_cameras(cameras, stored_matrix(run, transform), path=moving, fps=fps)}
+    if moving is not None:
+        files["cameras.chan"] = chan_cameras(moving)
         # nerfstudio's dataparser_transforms.json starts from the photos' coordinates.
         to_photos = from_photos(run).inverse()
         files["camera_path.json"] = nerfstudio_path([to_photos.camera(camera) for _, camera in pinholes], fps)

@@ -156,9 +156,8 @@ def _warn_of_activated(path: Path, log_scales: np.ndarray, logits: np.ndarray) -
     if len(logits) < _FEWEST_JUDGED:
         return
     if logits.min() >= 0 and logits.max() <= 1:
-        log.warning(
-            "%s: all opacities lie between 0 and 1: if they are not logits, the scene is half transparent", path
-        )
+        text = "%s: all opacities lie between 0 and 1: if they are not logits, the scene is half transparent"
+        log.warning(text, path)
     if log_scales[:, :2].min() > 0:
         log.warning("%s: all sizes are above 1 unit: if they are not logarithms, its Gaussians are far too large", path)
 
