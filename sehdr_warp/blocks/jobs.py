@@ -73,7 +73,11 @@ def run_blocks(
     # Jobs that run beside each other on this machine share its processors.
     job = BlockJob(max(1, thread_count() // slots) if slurm is None and slots > 1 else None)
     running: dict[int, tuple[int, Any]] = {}
-    notes = None if slurm is None else _waiting_notes()
+    notes = None
+    if slurm is not None:
+        from .slurm_states import WaitingNotes  # Needs submitit.
+
+        notes = WaitingNotes()
     try:
         while queue.waiting or running:
             for slot in range(slots):
@@ -215,13 +219,6 @@ def _slurm_executor(out: Path, options: Mapping[str, str], *, gpu: bool) -> Any:
         ) from None
     submitit.SlurmJob.watcher = job_watcher()
     return executor
-
-
-def _waiting_notes() -> Any:
-    """Return what reports why jobs wait; its module needs submitit."""
-    from .slurm_states import WaitingNotes
-
-    return WaitingNotes()
 
 
 def _submitit() -> Any:

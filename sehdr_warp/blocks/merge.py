@@ -3,7 +3,7 @@
 Inside a block's core, its Gaussians are those of the merged run; those beyond, which its photos show too, are dropped,
 because another block has them. Of those inside, the ones that reach far into other blocks are dropped, too: photos
 there were not trained on, and a few Gaussians as large as a block can hide all of it. Rows are in an order in which
-neighbours in space are neighbours in memory, so that a part of the scene is a few ranges of rows.
+neighbors in space are neighbors in memory, so that a part of the scene is a few ranges of rows.
 """
 
 import logging

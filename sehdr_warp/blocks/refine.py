@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 BAND = 1.0  # Distance from a border, in margins of a block, within which its Gaussians are trained
 PART = 0.3  # Part of a block's training that is repeated
 LEAST_SHARE = 0.02  # Part of the near Gaussians that a photo must show to be trained on
-BOX = 256  # Consecutive rows, which are neighbours in space, that are rendered or left out together
+BOX = 256  # Consecutive rows, which are neighbors in space, that are rendered or left out together
 DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its box, standard deviations
 
 

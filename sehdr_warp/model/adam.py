@@ -22,8 +22,9 @@ class Adam:
     `param_groups` and `state` are laid out as in torch.optim.Adam.
 
     Attributes:
-        param_groups: Dictionaries with "params", "lr", "betas" and "eps".
+        param_groups: Dictionaries with "name", "params" and "lr".
         state: For each parameter "step", "exp_avg" and "exp_avg_sq".
+        betas: Decays of the first and the second moments.
         sh_update_interval: The harmonics above degree 0 are divided into this many parts, of which each step updates
             one, if their gradients come in factored form.
         trained_rows: Number of Gaussians that are trained, the first ones; the others stay, and have no moments. None
@@ -34,8 +35,8 @@ class Adam:
 
     def __init__(self, groups: list[dict], betas: tuple[float, float] = BETAS, sh_update_interval: int = 1):
         """Create an optimizer without state."""
+        self.param_groups, self.betas = groups, betas
         self.sh_update_interval, self.trained_rows = sh_update_interval, None
-        self.param_groups = [{"betas": betas, "eps": EPSILON} | group for group in groups]
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
 
     def zero_grad(self) -> None:
@@ -75,10 +76,10 @@ class Adam:
         # A list on both sides: torch reads a single tensor on the host, which CUDA graph capture does not allow.
         steps = [self.state[p]["step"] for p in parameters]
         torch._foreach_add_(steps, [applied] * len(steps))  # pyright: ignore[reportPrivateImportUsage]
-        steps_with_gradient, options = [], {}  # All groups have the same options.
+        steps_with_gradient = []
+        options: dict = {"betas": self.betas, "epsilon": EPSILON, "active_count": active_count}
         for group, parameter in grouped:
             first, second, step = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
-            options = {"betas": group["betas"], "epsilon": group["eps"]}
             values = _first_rows(parameter.detach(), first)
             if parameter.grad is not None:
                 width = values.numel() // len(values) if group.get("name") in PARAMETER_NAMES else 0
@@ -86,20 +87,10 @@ class Adam:
                 steps_with_gradient.append(AdamStep(values, gradient, first, second, step, group["lr"], width))
             elif harmonics is not None:
                 start = FIRST_HARMONIC[group["name"]]
-                harmonics_adam_step(
-                    values,
-                    start,
-                    harmonics,
-                    first,
-                    second,
-                    step,
-                    skipped,
-                    rate=group["lr"],
-                    active_count=active_count,
-                    turns=self.sh_update_interval if start else 1,
-                    **options,
-                )
-        adam_steps(steps_with_gradient, skipped, **options, active_count=active_count)
+                turns = self.sh_update_interval if start else 1
+                arguments = values, start, harmonics, first, second, step, skipped
+                harmonics_adam_step(*arguments, rate=group["lr"], turns=turns, **options)
+        adam_steps(steps_with_gradient, skipped, **options)
 
     def _with_gradient(self, *, factored: bool) -> list[tuple[dict, Tensor]]:
         """Return group and parameter of all that have a gradient; those of factored harmonics come first.

@@ -67,19 +67,19 @@ class Gaussians(nn.Module):
     def from_points(
         cls, points: Tensor, dc: Tensor, degree: int, *, opacity: float = 0.1, scale: float = 1.0
     ) -> "Gaussians":
-        """Create isotropic Gaussians at points, sized by the distance to their neighbours (3DGS, section 5.1).
+        """Create isotropic Gaussians at points, sized by the distance to their neighbors (3DGS, section 5.1).
 
         Args:
             points: [N, 3] float32, N >= 1.
             dc: [N, 3] constant part of the color (harmonic times coefficient).
             degree: Highest SH degree; harmonics above 0 start at 0.
             opacity: Start value in (0, 1).
-            scale: Factor on the root mean square distance to three neighbours.
+            scale: Factor on the root mean square distance to three neighbors.
         """
         count = points.shape[0]
         extent = max(float((points - points.mean(0)).norm(dim=1).max()), 1e-6)
         if count > 3:
-            distance = neighbour_distances(points).square().mean(1).sqrt().to(points)
+            distance = neighbor_distances(points).square().mean(1).sqrt().to(points)
         else:
             distance = points.new_full((count,), 0.1 * extent)
         # Bounds for coinciding points and for outliers.
@@ -259,7 +259,7 @@ class Gaussians(nn.Module):
             self._reserved.active_count.fill_(self.count)
 
 
-def neighbour_distances(points: Tensor) -> Tensor:
+def neighbor_distances(points: Tensor) -> Tensor:
     """Return exact distances [N, 3] float64 from each point to its three nearest others.
 
     Raises:

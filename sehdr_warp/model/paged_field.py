@@ -1,9 +1,9 @@
 """A radiance field whose Gaussians do not fit into the memory of a GPU: those that a camera may see are copied to it.
 
-The rows are cut into cells. Rows of a merged run are in an order in which neighbours in space are neighbours in memory,
+The rows are cut into cells. Rows of a merged run are in an order in which neighbors in space are neighbors in memory,
 so cells are compact; in another order the result is the same, but fewer cells can be left out. Cells outside of the
 field of view are left out. If the others do not fit into the budget, the farthest are taken at a lower level of detail:
-LEVEL_STEP neighbouring Gaussians become one, with their mean and covariance.
+LEVEL_STEP neighboring Gaussians become one, with their mean and covariance.
 """
 
 from collections import OrderedDict
@@ -181,7 +181,7 @@ def coarser(page: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return Gaussians that each stand for LEVEL_STEP consecutive ones: their mean, covariance, color and coverage.
 
     Args:
-        page: Parameters of N Gaussians on the CPU, neighbours in space one after the other.
+        page: Parameters of N Gaussians on the CPU, neighbors in space one after the other.
 
     Returns:
         Parameters of N / LEVEL_STEP Gaussians, rounded up.

@@ -180,16 +180,13 @@ class RadianceField(nn.Module):
             depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         else:
             depth = (self.gaussians.means - tensors.position).norm(dim=1, keepdim=True)
-        encoded, values = self.color_model.encoded, self._evaluate_sh(tensors.position, degree)
-        colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
-        rendering = self._rasterize(tensors, torch.cat([colors, depth], dim=1))
+        rendering = self._rasterize(tensors, torch.cat([self._colors(tensors.position, degree), depth], dim=1))
         depth = _unpremultiply(rendering.image[..., 3], rendering.alpha).mul_(self.normalization.unit)
         # In bands, because decoding takes many times the memory of what it decodes.
         image, rows = rendering.image, max(1, _DECODED_AT_ONCE // camera.width)
         hdr = image.new_empty(*image.shape[:2], 3)
         for colors, band in zip(image[..., :3].split(rows), hdr.split(rows)):
-            decoded = self.response.decode(colors.clamp(0, 1)) if encoded else colors
-            torch.div(decoded, self.base_time, out=band)
+            torch.div(self._decoded(colors), self.base_time, out=band)
         return RenderedView(hdr, rendering.alpha, depth)
 
     @torch.no_grad()
@@ -220,8 +217,7 @@ class RadianceField(nn.Module):
         gaussians = self.gaussians
         origin = self.normalization.points(position)
         origin = torch.tensor(origin, dtype=torch.float32, device=gaussians.means.device)
-        encoded, values = self.color_model.encoded, self._evaluate_sh(origin, degree)
-        colors = self.color_model.colors(values) if encoded else self._exposures(values)[1]
+        colors = self._colors(origin, degree)
         for index in without:
             colors = colors.index_fill(0, index, 0.0)
         features = [colors, (gaussians.means - origin).norm(dim=1, keepdim=True)]
@@ -244,12 +240,12 @@ class RadianceField(nn.Module):
         )
         clipped = None if shares is None else image[..., -1] / image[..., :3].mean(2).clamp_min(1e-30)
         image = image if shares is None else image[..., :-1]
-        alpha, colors = 1 - transmittance, image[..., :3]
-        colors = self.response.decode(colors.clamp(0, 1)) if encoded else colors
+        alpha = 1 - transmittance
         distance, *confidence = (_unpremultiply(image[..., i], alpha) for i in range(3, image.shape[2]))
         confidence = confidence[0].clamp(0, 1) if confidence else None
         distance = distance * self.normalization.unit
-        return DirectionalRender(colors / self.base_time, alpha, distance, confidence, clipped)
+        hdr = self._decoded(image[..., :3]) / self.base_time
+        return DirectionalRender(hdr, alpha, distance, confidence, clipped)
 
     @torch.no_grad()
     @without_replays()
@@ -278,10 +274,7 @@ class RadianceField(nn.Module):
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
         """Return the radiance [N, 3] of each Gaussian towards a point [3] in scene coordinates."""
         place = torch.tensor(self.normalization.points(position), dtype=torch.float32)
-        values = self._evaluate_sh(place.to(self.gaussians.means.device), degree)
-        if self.color_model.encoded:
-            return self.response.decode(self.color_model.colors(values).clamp(0, 1)) / self.base_time
-        return self._exposures(values)[1] / self.base_time
+        return self._decoded(self._colors(place.to(self.gaussians.means.device), degree)) / self.base_time
 
     @without_replays()
     def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:
@@ -302,6 +295,15 @@ class RadianceField(nn.Module):
         constant, rest = gaussians.harmonics_dc, gaussians.harmonics_rest
         coefficients = (constant.detach(), rest.detach()) if detach_harmonics else (constant, rest)
         return spherical_harmonics(sh_degree, coefficients, gaussians.means, position)
+
+    def _colors(self, position: Tensor, degree: int | None) -> Tensor:
+        """Return the colors [N, 3] of the HDR image towards a position [3]; see _decoded()."""
+        values = self._evaluate_sh(position, degree)
+        return self.color_model.colors(values) if self.color_model.encoded else self._exposures(values)[1]
+
+    def _decoded(self, colors: Tensor) -> Tensor:
+        """Return the exposures at the base time of colors [..., 3], which may be encoded."""
+        return self.response.decode(colors.clamp(0, 1)) if self.color_model.encoded else colors
 
     def _exposures(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return exposures [N, 3] at the base time of each Gaussian's base color and of its HDR color."""

@@ -32,8 +32,8 @@ class Region:
 
     Attributes:
         photo: Name of the view.
-        column: Horizontal centre.
-        row: Vertical centre.
+        column: Horizontal center.
+        row: Vertical center.
         pixels: Area.
         stops: Mean brightness of the photo above that of the scene; a bound if either is clipped or black.
         box: Left, top, width and height of the bounding box.

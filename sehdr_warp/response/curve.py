@@ -24,7 +24,7 @@ Numbers: TypeAlias = np.ndarray | float | Sequence[Any]
 class Response(ABC):
     """A camera response function f: exposure x = E dt >= 0 to encoded value in [0, 1], increasing and immutable.
 
-    Sources: SeHDR, Eq. 1 (Z = f(E dt)); Grossberg and Nayar 2004 for the normalisation of tabulated curves.
+    Sources: SeHDR, Eq. 1 (Z = f(E dt)); Grossberg and Nayar 2004 for the normalization of tabulated curves.
 
     encode, encode_extended and decode take a torch tensor (float32 or float64, any shape, any device; differentiable
     once) and return one like it, or a NumPy array or number and return a NumPy array. NaN stays NaN.

@@ -73,7 +73,7 @@ class TabulatedResponse(Response, kind="table"):
         if self._even:
             position = inside * (len(slope) / clip)
         else:
-            # Cell 0 is the toe; a position rounded across a node evaluates the neighbour's line, equal there.
+            # Cell 0 is the toe; a position rounded across a node evaluates the neighbor's line, equal there.
             position = (inside / clip).log2() * CELLS_PER_OCTAVE + (last + 1)
         cell = position.nan_to_num(0.0).clamp(0, last).long()
         slope = slope[cell]
@@ -194,7 +194,7 @@ def _check(exposures: np.ndarray, values: np.ndarray, source: str):
 def _tilt_flat_parts(exposures: np.ndarray, values: np.ndarray):
     """Return samples up to the clip point with strictly increasing values.
 
-    A flat part (steps under LEAST_STEP) becomes a line of FLAT_TILT, less if neighbours are near.
+    A flat part (steps under LEAST_STEP) becomes a line of FLAT_TILT, less if neighbors are near.
     """
     edges = np.flatnonzero(np.diff(values) >= LEAST_STEP) + 1
     starts, ends = np.r_[0, edges], np.r_[edges, len(values)] - 1

@@ -169,16 +169,16 @@ def _train(args: Train, ranks=None) -> None:
     data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
     config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(args.machine.device) if ranks is None else ranks.device
-    options = config.response
-    selection = {"method": options.method, "candidates": options.candidates, "photo_storage": _photo_storage(config)}
+    loading = {"response": config.response.name, "method": config.response.method}
+    loading |= {"candidates": config.response.candidates, "photo_storage": _photo_storage(config)}
     if not plan_only:
         check_dataset_truth(data, config)
     with nullcontext() if plan_only or device.type != "cpu" else _precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
             from .following import PhotoRequest
 
-            ranks.request_photos(PhotoRequest(data, {"response": options.name, **selection}))
-        scene = load_saved_scene(data, response=options.name, **selection)
+            ranks.request_photos(PhotoRequest(data, loading))
+        scene = load_saved_scene(data, **loading)
         if plan_only:
             _print_plan(args, scene, config, device)
             return
@@ -204,8 +204,8 @@ def _train(args: Train, ranks=None) -> None:
         with serve_training(trainer, str(output.out)) if output.view else nullcontext(trainer) as steps:
             run_with_progress(steps, trainer.total)  # Iterating the trainer trains.
     photos = len(trainer.scene.train_views)
-    options = {name: data.get(name) for name in LOAD_OPTIONS} | configs.named_fields(args.fields)
-    words = option_words(options | {"response": args.scene.response, "preset": args.training.preset})
+    typed = {name: data.get(name) for name in LOAD_OPTIONS} | configs.named_fields(args.fields)
+    words = option_words(typed | {"response": args.scene.response, "preset": args.training.preset})
     hints = partial(advice, train_photos=photos, scene=data.get("path") or "SCENE", options=words)
     _print_result(args, trainer.run, hints)
 

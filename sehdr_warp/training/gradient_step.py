@@ -19,7 +19,7 @@ from ..rasterizer.training_step import differentiate
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..scene import Scene
-from .losses import compares_exposures, data_loss, extra_images, opacity_loss
+from .losses import compared_image, compares_exposures, data_loss, extra_images, opacity_loss
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
 from .scene_facts import largest_hdr_truth, share_in_view
@@ -120,14 +120,7 @@ class GradientStep:
     ):
         """Prepare steps of a training.
 
-        Args:
-            scene: The scene; its HDR truth scales the HDR loss.
-            config: Options of the training.
-            field: As in the attributes, like the next two.
-            optimizer: Adam.
-            strategy: Densification strategy.
-            step_counters: Counters that steps add to, see GraphCapacity.
-            ranks: Processes that train together.
+        The HDR truth of the scene scales the HDR loss. Steps add to step_counters, see GraphCapacity.
         """
         self.field, self.optimizer, self.strategy, self.ranks = field, optimizer, strategy, ranks
         self._loss, self._step_counters = config.loss, step_counters
@@ -203,8 +196,7 @@ class GradientStep:
         else:
             dropped |= {"means2d", "extents"}
         rendering = replace(render.rendering, **dict.fromkeys(dropped))
-        image = render.encoded if self.needs_encoded else render.photo_exposure
-        assert image is not None
+        image = compared_image(render, target)
         del render, target, view
         differentiate(loss)
         harmonics = None

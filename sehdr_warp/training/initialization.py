@@ -295,7 +295,7 @@ def sizes_of(scene: Scene, gaussians: int | None = None) -> tuple[int, int, int]
 
 
 @torch.no_grad()
-def brighten_clipped(field: RadianceField, views: Sequence[View], estimates: Sequence[Tensor]) -> int:
+def brighten_clipped(field: RadianceField, views: Sequence[View], estimates: Sequence[Tensor]) -> None:
     """Brighten the Gaussians of a field at iteration 0 that are white, to the light that photos expect there.
 
     An optimizer moves the logarithm of a color by its learning rate. In short trainings, or for lamps that few photos
@@ -307,9 +307,6 @@ def brighten_clipped(field: RadianceField, views: Sequence[View], estimates: Seq
         field: Its constant colors are those of photos.
         views: Training views, in the field's normalized coordinates.
         estimates: ClippedLight.log_light [h, w, 6] of each view.
-
-    Returns:
-        The number of Gaussians that are brighter now.
     """
     gaussians, model = field.gaussians, field.color_model
     values = gaussians.harmonics_dc[:, 0] * HARMONIC_0
@@ -328,7 +325,6 @@ def brighten_clipped(field: RadianceField, views: Sequence[View], estimates: Seq
             weights += weight
     excess = torch.where(is_white[index], (sums / weights).clamp_min(0), 0)
     gaussians.harmonics_dc[index, 0] = model.brighten(values[index], excess) / HARMONIC_0
-    return int((excess > 0).any(1).sum())
 
 
 def _image_positions(camera: Camera, points: Tensor) -> Tensor:

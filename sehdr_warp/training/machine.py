@@ -4,7 +4,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -29,22 +28,6 @@ def machine_figures(device: torch.device) -> dict:
     if cuda:
         figures["peak_gpu_memory_bytes"] = torch.cuda.max_memory_allocated(device)
     return figures
-
-
-class Stopwatch:
-    """Sums the durations of `with` blocks, in seconds."""
-
-    def __init__(self) -> None:
-        """Start at 0."""
-        self.seconds = 0.0
-
-    def __enter__(self) -> None:
-        """Start a block."""
-        self._started = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        """End a block."""
-        self.seconds += time.perf_counter() - self._started
 
 
 @contextmanager

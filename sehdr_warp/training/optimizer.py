@@ -6,7 +6,7 @@ the same variance, as B steps of one photo (the rule of Grendel-GS, ICLR 2025, f
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -22,9 +22,9 @@ from ..runs.config import Config
 # Higher harmonics are 3/4 of all parameters and the Adam step is bandwidth-bound, so on a GPU each step updates
 # half of them: every second block of coefficients, in turn.
 SH_UPDATE_INTERVAL = 2
+SH_INTERVAL_FROM = 4000  # Steps of the shortest training to which SH_UPDATE_INTERVAL applies; shorter ones lose quality
 SAMPLES_PER_WINDOW = 10  # Of the moving average; consecutive iterations differ too little to be worth the time
 WINDOWS = 5  # Windows before the end at which the average begins; older samples would weigh less than 1 %
-SH_INTERVAL_FROM = 4000  # Steps of the shortest training to which SH_UPDATE_INTERVAL applies; shorter ones lose quality
 
 
 def make_optimizer(field: RadianceField, config: Config, batch: int = 1) -> Adam:
@@ -123,7 +123,7 @@ class FlatGradients:
         self.buffer = torch.zeros(sum(sizes) + 2, device=self._means.device)
         *parts, self.numbers = self.buffer.split([*sizes, 2])
         self._views = [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
-        self._with_gradient: Sequence[int] = ()
+        self._with_gradient: list[int] = []
         self._degree: int | None = None
 
     def fits(self, optimizer: Adam) -> bool:
@@ -133,7 +133,10 @@ class FlatGradients:
     @torch.no_grad()
     def collect(self, loss: Tensor, overflow: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
         """Move the parameters' gradients to the buffer, with the numbers of the step."""
-        self._with_gradient = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        with_gradient = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        # Else the mean would hold gradients of an earlier step.
+        assert self._with_gradient in ([], with_gradient), "all steps have gradients of the same parameters"
+        self._with_gradient = with_gradient
         gradients = [self.parameters[k].grad for k in self._with_gradient]
         torch._foreach_copy_([self._views[k] for k in self._with_gradient], gradients)
         self._degree = None
@@ -238,11 +241,3 @@ class MovingAverage:
             for name, values in gaussians.tensors().items():
                 values.copy_(self.means[name])
             self.means = {}
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the averages for a checkpoint."""
-        return self.means
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the averages of state_dict()."""
-        self.means = state

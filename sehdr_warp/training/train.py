@@ -1,6 +1,7 @@
 """Create trainers: from a scene, or from a run to resume; and train in one call."""
 
 import logging
+import time
 from collections.abc import Iterator, Mapping
 from operator import attrgetter
 from pathlib import Path
@@ -21,7 +22,7 @@ from ..scene.normalization import normalization_of
 from .compensation import SharedDecisions, prepare_photos
 from .following import send_training, several_ranks_notes
 from .initialization import brighten_clipped, make_field, response_for_training, sizes_of
-from .machine import Stopwatch, summary_writer
+from .machine import summary_writer
 from .plan import apply_plan
 from .ranks import Ranks
 from .run_output import RunOutput
@@ -127,22 +128,22 @@ def _new_trainer(
     overwrite: bool,
 ) -> Trainer:
     """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder."""
-    watch = Stopwatch()
     normalization = normalization_of(scene)
     config, plan = apply_plan(normalization.scene(scene), config, device)
     check_scene_truth(scene, config.loss)
     response = response_for_training(scene, config)
-    with watch:
-        prepared = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
-        base_time = None if shared is None else shared.base_time
-        field = make_field(prepared.scene, config, response, device, prepared.get_matcher, base_time)
+    started = time.perf_counter()
+    prepared = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
+    base_time = None if shared is None else shared.base_time
+    field = make_field(prepared.scene, config, response, device, prepared.get_matcher, base_time)
+    seconds = time.perf_counter() - started
     output = RunOutput(folder, config, tensorboard=tensorboard, is_block=shared is not None)
     trainer = Trainer(prepared.scene, config, field, get_matcher=prepared.get_matcher, ranks=ranks, output=output)
-    with watch:
-        estimates = trainer.views.loss_estimates
-        if estimates is not None and not config.model.init_file:
-            brighten_clipped(field, normalization.scene(prepared.scene).train_views, estimates)
-    trainer.seconds = watch.seconds
+    started = time.perf_counter()
+    estimates = trainer.views.loss_estimates
+    if estimates is not None and not config.model.init_file:
+        brighten_clipped(field, normalization.scene(prepared.scene).train_views, estimates)
+    trainer.seconds = seconds + time.perf_counter() - started
     if plan is not None and prepared.decision is not None:
         plan = plan.with_decision(prepared.decision)
     # The folder is begun last, when the scene is known to be usable.

@@ -38,7 +38,7 @@ def state_of(trainer: Trainer) -> TrainingState:
         "response": field.response.state_dict() if isinstance(field.response, torch.nn.Module) else {},
         "optimizer": optimizer_tensors(trainer.optimizer, trainer.batch),
         "densification": trainer.strategy.state_dict(field.gaussians.count),
-        "average": trainer.average.state_dict(),
+        "average": trainer.average.means,
     }
     order, remaining = trainer.order.state()
     parts["generators"] = {"order": order, "device": trainer.generator.get_state()}
@@ -53,7 +53,7 @@ def load_state(trainer: Trainer, state: TrainingState) -> None:
     load_optimizer_tensors(trainer.optimizer, under(tensors, "optimizer."), trainer.batch)
     statistics = {name: value.to(device) for name, value in under(tensors, "densification.").items()}
     trainer.strategy.load_state_dict(statistics)
-    trainer.average.load_state_dict({name: value.to(device) for name, value in under(tensors, "average.").items()})
+    trainer.average.means = {name: value.to(device) for name, value in under(tensors, "average.").items()}
     if trainer.ranks is not None and not trainer.ranks.leads:  # The sum over the ranks counts them once.
         for total in statistics.values():
             total.zero_()

@@ -133,7 +133,7 @@ class PhotoStream:
         stack = ViewStack.of(cameras)
         assert stack is not None
         self._cameras = stack
-        self._place = torch.zeros(1, dtype=torch.int64, device=self._device)
+        self._slot_index = torch.zeros(1, dtype=torch.int64, device=self._device)
         self._slot_views: list[int | None] = [None] * SLOTS
         self._filling: list[Future | None] = [None] * SLOTS
         self._current = 0
@@ -163,8 +163,8 @@ class PhotoStream:
     def at(self, index: Tensor) -> TrainingView:
         """Return the view whose number is in index [1], as in ViewStack; bring() must have been called for it."""
         view = self._cameras.at(index)
-        parts = {name: select_view(slots, self._place) for name, slots in self._slots.items() if name != "codes"}
-        return replace(view, target=replace(view.target, codes=self._slots["codes"], index=self._place, **parts))
+        parts = {name: select_view(slots, self._slot_index) for name, slots in self._slots.items() if name != "codes"}
+        return replace(view, target=replace(view.target, codes=self._slots["codes"], index=self._slot_index, **parts))
 
     def bring(self, index: int) -> None:
         """Make a view available to the kernels that are launched next."""
@@ -175,7 +175,7 @@ class PhotoStream:
         filling.result()
         if self._cuda:
             torch.cuda.current_stream(self._device).wait_event(self._filled[slot])
-        self._place.fill_(slot)
+        self._slot_index.fill_(slot)
 
     def release(self, following: int | None) -> None:
         """Mark the view of bring() as read by launched kernels, and start to fetch the one that follows."""

@@ -176,7 +176,7 @@ def test_what_is_white_starts_at_its_expected_light_and_the_rest_as_it_is(device
     encoded = [[1, 1, 1], [0.3, 0.4, 0.5], [1, 0.5, 0.2], [1, 1, 1]]
     field, views = field_of_points(scene, places, encoded, device, radiance)
     before = exposures(field)
-    assert brighten_clipped(field, views, estimates(views, math.log(50))) == 2
+    brighten_clipped(field, views, estimates(views, math.log(50)))
     factors = torch.ones(4, 3)
     factors[0], factors[2, 0] = 50, 50  # The last lies behind all cameras.
     torch.testing.assert_close(exposures(field) / before, factors, rtol=2e-3, atol=0)

@@ -62,9 +62,9 @@ def test_the_mean_is_as_old_as_its_span(average):
         moving_average.update(iteration, 1, gaussians)
         if iteration < iterations:
             assert (gaussians.value == iteration).all()
-            assert bool(moving_average.state_dict()) == (average > 0 and iteration >= begin)
+            assert bool(moving_average.means) == (average > 0 and iteration >= begin)
     age = iterations - float(gaussians.value[0])
-    assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not moving_average.state_dict()
+    assert age == (0 if not average else pytest.approx(0.9 * average, rel=0.1)) and not moving_average.means
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_fewer_samples_than_the_window_weigh_alike(iterations, last_change, batc
     config = load_config("default", {"schedule.iterations": iterations, "schedule.ema_window": 500})
     moving_average, gaussians = MovingAverage(config, last_change), Moving()
     # As from a training that was stopped and goes on with more iterations.
-    moving_average.load_state_dict({"means": torch.full((3,), 1e6)})
+    moving_average.means = {"means": torch.full((3,), 1e6)}
     for iteration in range(batch, iterations + 1, batch):
         gaussians.value.fill_(iteration)
         moving_average.update(iteration, batch, gaussians)

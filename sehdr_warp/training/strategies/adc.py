@@ -27,7 +27,7 @@ class AdcStrategy(Strategy):
     Attributes:
         options: Thresholds; those of size are in normalized units.
         reset_every: Iterations between resets.
-        gradient_sum: Sum of the gradients of the projected means, [rows], in normalised screen units.
+        gradient_sum: Sum of the gradients of the projected means, [rows], in normalized screen units.
         photo_count: Number of photos in that sum, [rows].
     """
 

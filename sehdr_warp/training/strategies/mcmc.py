@@ -97,7 +97,7 @@ class McmcStrategy(Strategy):
         gaussians.resize(count + added, optimizer)
         slots = RelocationSlots(slot_of_row, torch.zeros_like(slot_of_row, dtype=torch.bool))
         seeded = self.fill_proposals(gaussians, slots, dead_count, added, count, propose)
-        self.relocate(gaussians, slots, opacities.masked_fill(dead, 0), seeded, dead_count, generator)
+        self.relocate(gaussians, slots, opacities.masked_fill(dead, 0), seeded, dead_count, count, generator)
         if added > 0:
             self.sample_add(gaussians, slots, torch.maximum(dead_count, seeded), dead_count + added, added, generator)
         reset_moments(gaussians, optimizer, slots.changed)
@@ -144,35 +144,10 @@ class McmcStrategy(Strategy):
         weights: Tensor,
         first: Tensor,
         last: Tensor,
-        generator: torch.Generator,
-    ) -> None:
-        """Fill the slots [first, last) of dead Gaussians with living ones, sampled by weights [N]."""
-        self._fill(gaussians, slots, weights, first, last, len(weights), generator)
-
-    def sample_add(
-        self,
-        gaussians: Gaussians,
-        slots: RelocationSlots,
-        first: Tensor,
-        last: Tensor,
         bound: int,
         generator: torch.Generator,
     ) -> None:
-        """Fill the slots [first, last) of new Gaussians, at most `bound`, with others sampled by opacity."""
-        weights = gaussians.opacities().masked_fill_(slots.of_row >= first, 0)
-        self._fill(gaussians, slots, weights, first, last, bound, generator)
-
-    def _fill(
-        self,
-        gaussians: Gaussians,
-        slots: RelocationSlots,
-        weights: Tensor,
-        first: Tensor,
-        last: Tensor,
-        bound: int,
-        generator: torch.Generator,
-    ) -> None:
-        """Copy Gaussians sampled by weights to the slots [first, last), at most `bound`.
+        """Fill the slots [first, last), at most `bound`, none if first > last, with Gaussians sampled by weights [N].
 
         The copies and their source share opacity and size so that the image stays (3DGS-MCMC, equation 9).
         """
@@ -186,6 +161,19 @@ class McmcStrategy(Strategy):
         values = list(gaussians.tensors().values())
         # As in the authors' code, relocated Gaussians keep their Adam state, and only their sources lose it.
         copy_rows(values, values, slots.of_row, first, last, samples=sampled)
+
+    def sample_add(
+        self,
+        gaussians: Gaussians,
+        slots: RelocationSlots,
+        first: Tensor,
+        last: Tensor,
+        bound: int,
+        generator: torch.Generator,
+    ) -> None:
+        """Fill the slots [first, last) of new Gaussians, at most `bound`, as relocate(), sampled by opacity."""
+        weights = gaussians.opacities().masked_fill_(slots.of_row >= first, 0)
+        self.relocate(gaussians, slots, weights, first, last, bound, generator)
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
