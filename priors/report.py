@@ -31,18 +31,19 @@ _AREAS = {"30": "up to 30", "300": "31 to 300", "3000": "301 to 3000", "27648": 
 _TEXT = """# The prior for light above white
 
 How well the network that comes with the package estimates clipped light ([Light above white](light.md)), on photos of
-ten panoramas that it was not trained on (`priors/sources.toml`). Each row estimates the log2 excess over white of
-clipped values: by nothing (*white*), by the mean of the training (*constant*), by a ridge regression on ten figures of
-the photo's histogram, and by a network that was trained on the other panoramas like the one in the package, up to its
-third stage. RMS counts all clipped values alike. The card beside the weights, `sehdr_warp/prior/clipped_light.md`, says
-how it was trained, and what the further stages gave.
+seven panoramas that no training used (`checked` in `priors/sources.toml`), at most 384 for each table. Each row
+estimates the log2 excess over white of clipped values: by nothing (*white*), by the mean of the training (*constant*),
+by a ridge regression on ten figures of the photo's histogram, and by the network. Constant and ridge are fitted on the
+panoramas of the training. RMS counts all clipped values alike. The card beside the weights,
+`sehdr_warp/prior/clipped_light.md`, says how they were trained.
 
 {tables}
 
 ![Estimates against the truth, and how often the truth lies within a deviation](images/{page}.png)
 
-The truth lies within one deviation for {within:.0%} of the clipped values; one factor for all deviations was fitted on
-five of the ten panoramas. By quarters of the deviation:
+The truth lies within one deviation of the network for {within:.0%} of the clipped values (`camera`). One factor for
+all deviations was fitted on panoramas of its training. Regions err as a whole, so trainings widen deviations over one
+stop ([how well they hold](light.md#the-cheapest-cures)). By quarters of the deviation, as the network states it:
 
 | mean deviation, stops | RMS, stops | within one deviation |
 | -: | -: | -: |
