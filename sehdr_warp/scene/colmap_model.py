@@ -65,11 +65,11 @@ def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:
     """Return the folder that holds a model's cameras, or None.
 
     Looks for sparse/0, sparse, or a text export (sparse/txt, sparse_txt, sparse_txt/0) in the folder itself, then in
-    its colmap/, dense/ and distorted/; `anywhere` also in the folder without sparse/ and in folders that are not sets.
-    Of several models sparse/0, sparse/1 ... it is the one with the most images.
+    its colmap/, dense/, dense/0/ and distorted/; `anywhere` also in the folder without sparse/ and in folders that are
+    not sets. Of several models sparse/0, sparse/1 ... it is the one with the most images.
     """
     names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
-    places = (folder / above / name for above in (".", "colmap", "dense", DISTORTED) for name in names)
+    places = (folder / above / name for above in (".", "colmap", "dense", "dense/0", DISTORTED) for name in names)
     first = next(filter(_is_model, places), None) or (_model_elsewhere(folder) if anywhere else None)
     if first is None or first.name != "0":
         return first

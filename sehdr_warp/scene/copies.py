@@ -1,5 +1,6 @@
-"""Photos that are stored a second time as another kind of file, such as a phone's HEIC beside its JPEG."""
+"""Photos that are stored twice: as another kind of file, such as a phone's HEIC beside its JPEG, or as a copy."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -7,26 +8,27 @@ import numpy as np
 
 from ..errors import InputError
 from .heif import HEIF_SUFFIXES
-from .images import LDR_SUFFIXES, PILLOW_ERRORS, open_image, orientation_of, turn_upright
+from .images import JPEG_SUFFIXES, LDR_SUFFIXES, PILLOW_ERRORS, open_image, orientation_of, turn_upright
 from .lens import area_average
+from .sfm import file_digest
 
 _ALIKE = 0.97  # Correlation of two thumbnails of one picture; photos from two places have less
 _SIDE = 32  # Of a thumbnail
-_KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", ".jpg", ".jpeg", ".bmp")
+_KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", *JPEG_SUFFIXES, ".bmp")
 """Kinds of files by preference: of two files of one picture the first kind counts, which may hold more bits."""
 
 
 def find_copies(photos: Sequence[Path]) -> dict[Path, Path]:
-    """Return the photos that are copies of another one as another kind of file, each with that other one.
+    """Return the photos that are copies of another one, each with that other one.
 
-    They have one name but for the suffix, and the same picture. A held-out photo would have its copy among the
-    training photos.
+    They have the same bytes, or one name but for the suffix and the same picture. A held-out photo would have its copy
+    among the training photos.
     """
+    copies, photos = _equal_files(photos)
     by_stem: dict[str, list[Path]] = {}
     for photo in photos:
         if photo.suffix.lower() in LDR_SUFFIXES:
             by_stem.setdefault(photo.stem.lower(), []).append(photo)
-    copies: dict[Path, Path] = {}
     for group in by_stem.values():
         best, *others = sorted(group, key=lambda photo: _KINDS.index(photo.suffix.lower()))
         pictures = [_thumbnail(photo) for photo in (best, *others)] if others else []
@@ -43,7 +45,16 @@ def copies_note(copies: Mapping[Path, Path]) -> list[str]:
     copy, photo = next(iter(copies.items()))
     count = f"{len(copies)} photos are copies" if len(copies) > 1 else "1 photo is a copy"
     more = " ..." if len(copies) > 1 else ""
-    return [f"{count} of others in another kind of file and left out: {copy.name} of {photo.name}{more}"]
+    return [f"{count} of others and left out: {copy.name} of {photo.name}{more}"]
+
+
+def _equal_files(photos: Sequence[Path]) -> tuple[dict[Path, Path], list[Path]]:
+    """Return the photos that have the bytes of one with a shorter name, each with that one, and all others."""
+    sizes, firsts, copies = Counter(photo.stat().st_size for photo in photos), {}, {}
+    for photo in sorted(photos, key=lambda photo: len(photo.name)):
+        if sizes[photo.stat().st_size] > 1 and photo != (first := firsts.setdefault(file_digest(photo), photo)):
+            copies[photo] = first
+    return copies, [photo for photo in photos if photo not in copies]
 
 
 def _thumbnail(photo: Path) -> np.ndarray | None:

@@ -156,23 +156,22 @@ def pose_from_camera_to_world(matrix, source: Path, name: str) -> np.ndarray:
     The matrix is 3 x 4 or 4 x 4; errors name the file `source` and the image `name`.
 
     Raises:
-        InputError: for another shape, values that are not finite, a position in the last row, scale (beyond 1e-3),
-            shear or reflection.
+        InputError: for another shape, values that are not finite, a position in the last row, or axes of other
+            lengths (beyond 1e-3), shear or reflection. One scale of all axes, as of a camera in Blender, is left out.
     """
-    remedy = "export the poses again without scale"
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise InputError(source, f"pose of {name!r:.90} is not a finite 4 x 4 matrix", remedy)
+        raise InputError(source, f"pose of {name!r:.90} is not a finite 4 x 4 matrix", "export the poses again")
     if len(matrix) == 4 and np.abs(matrix[3, :3]).max() > 1e-3:
         problem = f"pose of {name!r:.90} has the last row {matrix[3].tolist()}, not 0 0 0 1"
         raise InputError(source, problem, "transpose the matrix if it states the position there")
     u, stretch, vt = np.linalg.svd(matrix[:3, :3])
     rotation = u @ vt
-    if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(rotation) < 0:
+    if np.linalg.det(rotation) < 0:
+        remedy = "export the poses again with right-handed axes"
+        raise InputError(source, f"pose of {name!r:.90} mirrors the scene", remedy)
+    if not stretch[2] > 1e-6 or stretch[0] > 1.002 * stretch[2]:
         problem = f"pose of {name!r:.90} is not a rotation (stretch {np.round(stretch, 4).tolist()})"
-        if np.linalg.det(rotation) < 0:
-            problem = f"pose of {name!r:.90} mirrors the scene"
-            remedy = "export the poses again with right-handed axes"
-        raise InputError(source, problem, remedy)
+        raise InputError(source, problem, "export the poses again without scale")
     if not np.abs(matrix[:3, 3]).max() < 1e12:
         raise InputError(source, f"position of {name!r:.90} is {matrix[:3, 3].tolist()}", "check the units")
     pose = np.eye(4)

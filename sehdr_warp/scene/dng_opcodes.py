@@ -316,17 +316,7 @@ def _warp(image: np.ndarray, polar: _Polar, terms: np.ndarray, moved: Callable) 
 
 
 _FUNCTIONS: dict[int, Callable[[_Reader, np.ndarray, int], np.ndarray]] = {
-    1: _warp_rectilinear,
-    2: _warp_fisheye,
-    3: _fix_vignette_radial,
-    4: _fix_bad_pixels_constant,
-    5: _fix_bad_pixels_list,
-    7: _map_table,
-    8: _map_polynomial,
-    9: _gain_map,
-    10: _along(0, np.add),
-    11: _along(1, np.add),
-    12: _along(0, np.multiply),
-    13: _along(1, np.multiply),
-    14: _warp_rectilinear_2,
-}
+    1: _warp_rectilinear, 2: _warp_fisheye, 3: _fix_vignette_radial, 4: _fix_bad_pixels_constant,
+    5: _fix_bad_pixels_list, 7: _map_table, 8: _map_polynomial, 9: _gain_map, 10: _along(0, np.add),
+    11: _along(1, np.add), 12: _along(0, np.multiply), 13: _along(1, np.multiply), 14: _warp_rectilinear_2,
+}  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from PIL import Image
 
 from ..errors import InputError
-from .images import HDR_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
+from .images import HDR_SUFFIXES, JPEG_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
 from .xmp import xmp_of, xmp_values
 
 SHORTEST, LONGEST = 1e-12, 1e12
@@ -24,6 +24,9 @@ _ISO_TAGS = (34855, 34866, 34867, 34865)
 StandardOutputSensitivity (EXIF 2.3)."""
 _FLASH = 37385  # Its lowest bit: the flash fired
 _LARGEST_SHORT = 65535
+_UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6}
+_LETTERS = " " + "".join(_UNITS)
+"""Seconds of a unit behind a number, and what may stand there."""
 _IN_XMP = {
     _EXPOSURE_TIME: "exif:ExposureTime", _SHUTTER_APEX: "exif:ShutterSpeedValue", _F_NUMBER: "exif:FNumber",
     _APERTURE_APEX: "exif:ApertureValue", 34855: "exif:ISOSpeedRatings", 34867: "exifEX:PhotographicSensitivity",
@@ -102,7 +105,7 @@ def exif_lens(path: Path | None) -> tuple[str, ...]:
 
 def are_camera_jpegs(sources: Sequence[Path | None]) -> bool:
     """Return whether most of the files are JPEGs of a camera: their EXIF states an exposure time or f-number."""
-    photos = (path for path in sources if path and path.suffix.lower() in (".jpg", ".jpeg") and path.is_file())
+    photos = (path for path in sources if path and path.suffix.lower() in JPEG_SUFFIXES and path.is_file())
     exposures = [exif_exposure(photo) for photo in photos]
     return 2 * sum(bool(exposure.time or exposure.f_number) for exposure in exposures) > len(sources)
 
@@ -139,11 +142,16 @@ def _number(value: Any) -> float | None:
 
 
 def parse_number(text: str) -> float | None:
-    """Return the number that a text states as photographers write it (`1/125`, `0,008`), None if it is not a number."""
-    whole, _, parts = text.strip(" \0s").replace(",", ".").partition("/")
+    """Return the number that a text states as photographers write it, None if it is not a number.
+
+    `1/125`, `0,008` and `8 ms` are seconds.
+    """
+    number = text.strip(" \0").rstrip(_LETTERS)
+    unit = text.strip(" \0").removeprefix(number).strip()
+    whole, _, parts = number.replace(",", ".").partition("/")
     try:
-        return float(whole) / float(parts or 1)
-    except (ValueError, ZeroDivisionError, OverflowError):
+        return float(whole) / float(parts or 1) * _UNITS[unit]
+    except (KeyError, ValueError, ZeroDivisionError, OverflowError):
         return None
 
 

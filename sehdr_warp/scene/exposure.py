@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from statistics import median
 
 from ..errors import InputError
 from ..files import has_file, read_bytes
@@ -13,11 +14,12 @@ from ..subsets import first_names
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, exif_exposure, parse_number
 from .images import PHOTO_SUFFIXES
-from .names import bases_of, fold_name, lies_at
+from .names import bases_of, fold_name, lies_at, plain_path
 
 EXPOSURES = "exposures.json"
 _LISTS = ("exposures", "exposure_times", "exposure")  # Names under which people list times in other files
 _LIST_SUFFIXES = (".csv", ".txt", ".tsv")
+_CONTRADICTION = 0.3  # Stops by which rounded times in EXIF may differ from those that a set states
 
 
 def choose_exposure(
@@ -59,9 +61,9 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
 
     The set's own seconds come first, then exposures.json in the data folder or beside the images, then EXIF. An EXIF
     time counts as t (ISO / ISO_0) (N_0 / N)^2 with the first photo's ISO_0 and f-number N_0, so that photos that differ
-    in sensitivity or aperture keep their ratio of recorded light. If most photos have a time, the others get the
-    geometric mean and `time_known` False: their light is compared with the others' later. If most have none, each is
-    1 second.
+    in sensitivity or aperture keep their ratio of recorded light; t is 1 s if no photo states a time. If most photos
+    have a time, the others get the geometric mean and `time_known` False: their light is compared with the others'
+    later. If most have none, each is 1 second.
 
     Args:
         records: the photos.
@@ -74,11 +76,10 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
         InputError: if exposures.json is damaged or states an impossible time.
     """
     times, notes = stated_times(records, source)
-    if None in times:
-        unlisted = [record for record, time in zip(records, times, strict=True) if time is None]
-        by_exif, more = _exif_times(unlisted)
-        exif_times = iter(by_exif)
-        times, notes = [next(exif_times) if time is None else time for time in times], [*notes, *more]
+    by_exif, exif_notes = _exif_times(records, timeless=not any(times))
+    times, contradictions = _compared_with_exif(times, by_exif)
+    notes = [*notes, *contradictions, *(exif_notes if None in times else ())]
+    times = [other if time is None else time for time, other in zip(times, by_exif, strict=True)]
     known_times = [time for time in times if time is not None]
     for record, time in zip(records, times, strict=True):
         if time is not None and not SHORTEST <= time <= LONGEST:
@@ -116,9 +117,8 @@ def stated_times(records: Sequence[ImageRecord], source: Path) -> tuple[list[flo
     if None not in times:
         return times, []
     table, notes = _listed_times(records, source)
-    return [
-        table.get(record.image) if time is None else time for time, record in zip(times, records, strict=True)
-    ], notes
+    pairs = zip(times, records, strict=True)
+    return [table.get(record.image) if time is None else time for time, record in pairs], notes
 
 
 def shutter(time: float) -> str:
@@ -127,13 +127,13 @@ def shutter(time: float) -> str:
     return f"1/{parts} s" if time < 0.3 and abs(parts * time - 1) < 0.02 else f"{time:.3g} s"
 
 
-def parse_seconds(value, source: Path, field: str) -> float:
-    """Return the seconds that JSON states as a number or as photographers write them.
+def parse_seconds(value, source: Path, field: str, unit: str = "") -> float:
+    """Return the seconds that JSON states as a number or as photographers write them; `unit` is "ms", "us" or "".
 
     Raises:
         InputError: if they are not positive and finite.
     """
-    seconds = parse_number(str(value))
+    seconds = parse_number(f"{value}{unit}")
     if isinstance(value, bool) or seconds is None or not SHORTEST <= seconds <= LONGEST:
         remedy = 'state seconds above zero, such as 0.008 or "1/125"'
         raise InputError(source, f"exposure time of {field!r:.90} is {value!r:.40}", remedy)
@@ -164,10 +164,9 @@ def _listed_times(records: Sequence[ImageRecord], source: Path) -> tuple[dict[Pa
             if len(matches) == 1:
                 times[matches[0]] = seconds
             elif matches:
-                ambiguous.append(
-                    f"{name:.90} ({', '.join(image.relative_to(bases[-1]).as_posix() for image in matches[:2])})"
-                )
-            elif not any(lies_at(f"{base}/{_plain(name)}") for base in {place, *bases, *parents}):
+                two = ", ".join(image.relative_to(bases[-1]).as_posix() for image in matches[:2])
+                ambiguous.append(f"{name:.90} ({two})")
+            elif not any(lies_at(f"{base}/{plain_path(name)}") for base in {place, *bases, *parents}):
                 strange.append(name)
         if strange:
             text = first_names([f"{name:.90}" for name in strange])
@@ -213,7 +212,7 @@ def _names_of(images: Sequence[Path], bases: Sequence[Path]) -> dict[str, list[P
 
 def _spellings(name: str) -> list[str]:
     """Return the ways to look up a name of exposures.json: as it is, without suffix, and if absolute its last parts."""
-    plain = fold_name(_plain(name))
+    plain = fold_name(plain_path(name))
     path = PurePosixPath(plain)
     ends = [plain]
     if path.is_absolute() or re.match("[a-z]:/", plain):
@@ -222,21 +221,19 @@ def _spellings(name: str) -> list[str]:
     return [*ends, *stems]
 
 
-def _plain(name: str) -> str:
-    """Return a name with forward slashes and without a leading `./`."""
-    name = name.replace("\\", "/")
-    while name.startswith("./"):
-        name = name[2:]
-    return name
+def _exif_times(records: list[ImageRecord], *, timeless: bool) -> tuple[list[float | None], list[str]]:
+    """Return the times of photos by EXIF, and notes.
 
-
-def _exif_times(records: list[ImageRecord]) -> tuple[list[float | None], list[str]]:
+    `timeless` takes 1 s where no photo states a time: ISO and f-number still tell how their exposures differ.
+    """
     exposures = [exif_exposure(record.image) for record in records]
     timed = [exposure for exposure in exposures if exposure.time is not None]
+    timeless = timeless and not timed
     notes, factors = [], [1.0] * len(records)
     for name, field, power in (("ISO", "iso", 1.0), ("f-number", "f_number", -2.0)):
-        values = [value for exposure in timed if (value := getattr(exposure, field)) is not None]
-        if 0 < len(values) < len(timed):
+        stating = exposures if timeless else timed
+        values = [value for exposure in stating if (value := getattr(exposure, field)) is not None]
+        if 0 < len(values) < len(stating):
             notes.append(f"{name} is not stated for all photos and was not counted")
         elif len(set(values)) > 1:
             factors = [
@@ -248,4 +245,23 @@ def _exif_times(records: list[ImageRecord]) -> tuple[list[float | None], list[st
     if flashed := [record.image.name for record, e in zip(records, exposures, strict=True) if e.flash]:
         count = f"{len(flashed)} of {len(records)} photos"
         notes.append(f"the flash fired in {count}, so their light is not the scene's: {first_names(flashed)}")
+    if timeless and max(factors) > min(factors):
+        return list(factors), [*notes, "photos state no exposure time, and count as 1 s at the first one's settings"]
     return [e.time and e.time * f for e, f in zip(exposures, factors, strict=True)], notes
+
+
+def _compared_with_exif(
+    times: Sequence[float | None], by_exif: Sequence[float | None]
+) -> tuple[list[float | None], list[str]]:
+    """Return stated times, in seconds if EXIF shows that they have another unit, and a note if EXIF contradicts."""
+    pairs = [(time, other) for time, other in zip(times, by_exif, strict=True) if time and other]
+    stops = [math.log2(time / other) for time, other in pairs if SHORTEST <= time <= LONGEST]
+    middle = median(stops) if stops else 0.0
+    if (most := max((abs(each - middle) for each in stops), default=0.0)) > _CONTRADICTION:
+        note = f"stated exposure times differ by up to {most:.1f} stops from EXIF, which counts ISO and f-number"
+        return list(times), [f"{note}; the stated ones count"]
+    for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6)):
+        if abs(middle - math.log2(factor)) < _CONTRADICTION:
+            note = f"stated exposure times are {factor:g} times those of EXIF, and count as {unit}"
+            return [time and time / factor for time in times], [note]
+    return list(times), []

@@ -156,11 +156,6 @@ def read_gain_map(path: Path, *, oriented: bool = False, problems: dict[Path, st
         return None
 
 
-def has_gain_map(path: Path) -> bool:
-    """Return whether a photo has a gain map that read_gain_map() decodes."""
-    return read_gain_map(path, problems={}) is not None
-
-
 def gain_map_notes(problems: dict[Path, str]) -> list[str]:
     """Return a note on photos whose gain maps are damaged."""
     if not problems:

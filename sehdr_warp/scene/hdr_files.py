@@ -65,11 +65,13 @@ def hdr_size(path: Path) -> tuple[int, int]:
 
 def exr_exposure_time(path: Path) -> float | None:
     """Return the seconds that an OpenEXR file states as `expTime`, None if it states none."""
-    if path.suffix.lower() != ".exr":
-        return None
-    with _exr_file(path, header_only=True) as file:
-        time = file.header(_colored_part(file)).get("expTime")
+    time = _exr_header(path).get("expTime") if path.suffix.lower() == ".exr" else None
     return float(time) if isinstance(time, int | float) and np.isfinite(time) and time > 0 else None
+
+
+def pixel_aspect(path: Path) -> float:
+    """Return the width of a pixel over its height that an OpenEXR file states, 1 for other files."""
+    return float(_exr_header(path)["pixelAspectRatio"]) if path.suffix.lower() == ".exr" else 1.0
 
 
 def is_without_colors(path: Path) -> bool:
@@ -277,6 +279,12 @@ def _exr_file(path: Path, **options) -> Iterator:
         raise InputError(path, f"cannot be read as OpenEXR ({error})", DAMAGED) from None
 
 
+def _exr_header(path: Path) -> dict[str, Any]:
+    """Return the attributes of an OpenEXR file's part that is the picture."""
+    with _exr_file(path, header_only=True) as file:
+        return dict(file.header(_colored_part(file)))
+
+
 def _require_magic(path: Path, magic: bytes, kind: str) -> None:
     """Raise InputError with what a file is if it does not begin as its name says; unknown content is left to others."""
     with path.open("rb") as file:
@@ -288,9 +296,8 @@ def _require_magic(path: Path, magic: bytes, kind: str) -> None:
 
 def _exr_window(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the display window's origin and its (width, height)."""
-    with _exr_file(path, header_only=True) as file:
-        header = file.header(_colored_part(file))
-        windows = [[(int(x), int(y)) for x, y in header[key]] for key in ("displayWindow", "dataWindow")]
+    header = _exr_header(path)
+    windows = [[(int(x), int(y)) for x, y in header[key]] for key in ("displayWindow", "dataWindow")]
     sizes = [(high[0] - low[0] + 1, high[1] - low[1] + 1) for low, high in windows]
     file_size = path.stat().st_size
     for size in sizes:

@@ -21,13 +21,9 @@ _EPSILON, _KAPPA = 216 / 24389, 24389 / 27
 _ReadCurve = Callable[[bytes], np.ndarray]
 _MOST_BYTES = 16 << 20  # Above any profile in use; printer tables have a few megabytes
 # Linear Rec.709 (sRGB, IEC 61966-2-1) from XYZ relative to D50, the connection space of ICC profiles.
-_REC709_FROM_D50 = np.array(
-    [
-        [3.1338561, -1.6168667, -0.4906146],
-        [-0.9787684, 1.9161415, 0.0334540],
-        [0.0719453, -0.2289914, 1.4052427],
-    ]
-)
+_REC709_FROM_D50 = np.array([
+    [3.1338561, -1.6168667, -0.4906146], [-0.9787684, 1.9161415, 0.0334540], [0.0719453, -0.2289914, 1.4052427],
+])  # fmt: skip
 _MOST_OF_NAME = 80  # Characters that lines show
 _SAMPLES = 65_536  # Of a curve that a formula describes: exact at all codes of 8 and 16 bits
 

@@ -23,7 +23,10 @@ from .tiff import BIG_ENDIAN, describe_tiff, has_planes_of_16_bits, has_thumbnai
 MAX_PIXELS = 160_000_000
 """Above the frame of any camera (the largest backs have 151 megapixels), far below what would exhaust memory."""
 MAX_SIDE = 65_536  # No photo has a longer side; a damaged one with few pixels in all would take long to decode
-LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".avif", *HEIF_SUFFIXES * heif_installed())
+JPEG_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe", ".mpo")
+LDR_SUFFIXES = (
+    ".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".webp", ".bmp", ".avif", *HEIF_SUFFIXES * heif_installed(),
+)  # fmt: skip
 """HEIF's among them if the package that decodes it is installed."""
 HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (
@@ -36,11 +39,9 @@ _opening = threading.Lock()  # Pillow's pixel limit, which is lifted while openi
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "AVIF")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _OTHER_MODES = {
-    "1": "one bit a pixel, black or white",
-    "CMYK": "inks (CMYK), not light",
-    "LAB": "CIELAB, not RGB",
+    "1": "one bit a pixel, black or white", "CMYK": "inks (CMYK), not light", "LAB": "CIELAB, not RGB",
     "F": "floating-point values, not encoded ones",
-}
+}  # fmt: skip
 DAMAGED = "copy or export the image again"
 _EXPORT = "export it as RGB or grey, in PNG or JPEG"
 _SIGNATURES = {

@@ -1,12 +1,12 @@
 """Load a scene: parse a data folder of any layout, choose the response, preprocess the photos."""
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from ..errors import InputError, did_you_mean, missing
 from ..files import has_file
@@ -18,22 +18,15 @@ from .exposure import choose_exposure, exposures_note, stated_times, with_exposu
 from .hdr_files import exr_exposure_time
 from .linear_photos import follow_times, log_averages, middle_grey_time
 from .masks import assign_masks
-from .names import unique_names
+from .names import image_folder, unique_names
 from .photos import usable_photos
 from .preprocess import preprocess
-from .read_folders import (
-    find_photos,
-    image_folder,
-    is_hdr_gs,
-    model_fits,
-    place_photos,
-    read_colmap,
-    read_hdr_gs,
-    read_hdr_nerf_real,
-    read_llff,
-)
+from .read_colmap import model_fits, read_colmap
+from .read_hdr_sets import is_hdr_gs, read_hdr_gs, read_hdr_nerf, read_hdr_nerf_real
+from .read_llff import read_llff
 from .read_opensfm import find_reconstruction, read_opensfm
-from .read_transforms import read_hdr_nerf, read_transforms
+from .read_photos import find_photos, place_photos
+from .read_transforms import is_transforms, read_transforms
 from .response_choice import check_response, choose_response
 from .truth_files import assign_truth
 from .types import Scene
@@ -181,50 +174,39 @@ def parse_dataset(
 
 
 def _with_times(records: list[ImageRecord], kind: str, folder: Path) -> tuple[list[ImageRecord], bool, list[str]]:
-    """Return the photos with an exposure time each, whether times are known, and notes."""
+    """Return the photos with an exposure time each, whether times are known, and notes.
+
+    Float images get the time at which they are middle grey. Their values are divided by the times of the set or
+    exposures.json, else by expTime of the headers. Times that the user states count if the images' brightness follows
+    them: a set of light may list those of photos.
+    """
     if kind != "float":
         return with_exposure_times(records, folder)
     averages = log_averages([record.image for record in records])
-    time, exposures = middle_grey_time(averages.values()), _float_exposures(records, averages, folder)
-    timed = []
-    for index, record in enumerate(records):
-        factor = exposures.times[index] / exposures.times[0] if exposures.times else 1.0
-        truth = record.hdr or record.image
-        timed.append(replace(record, exposure_time=time * factor, hdr=truth, light_scale=1 / factor))
-    return timed, True, exposures.notes
-
-
-class _FloatExposures(NamedTuple):
-    """Exposure times by which the values of float images are divided; none if the values are light."""
-
-    times: list[float]
-    notes: list[str]
-
-
-def _float_exposures(records: list[ImageRecord], averages: Mapping[int, float], folder: Path) -> _FloatExposures:
-    """Return the times of float images: those of the set or exposures.json, else expTime of the headers.
-
-    Times that the user states count if the images' brightness follows them: a set of light may list those of photos.
-    """
     stated, notes = stated_times(records, folder)
     times = [exr_exposure_time(record.image) if time is None else time for record, time in zip(records, stated)]
     known = [time for time in times if time is not None]
-    if len(known) < len(times) or max(known) < min(known) * 1.001:
-        return _FloatExposures([], [*notes, "float images: their values are taken as light, at no exposure"])
-    span = f"{min(known):g} to {max(known):g} s"
-    if None in stated:
-        return _FloatExposures(known, [*notes, f"float images: their values are light times expTime, {span}"])
-    if follow_times(averages, known):
-        return _FloatExposures(known, [*notes, f"float images: their values are light times the stated times, {span}"])
-    note = f"float images: their values are taken as light, because they do not follow the stated times, {span}"
-    return _FloatExposures([], [*notes, note])
+    factors, meaning = [1.0] * len(records), "taken as light, at no exposure"
+    if len(known) == len(times) and max(known) >= min(known) * 1.001:
+        span = f"{min(known):g} to {max(known):g} s"
+        if None in stated or follow_times(averages, known):
+            factors = [time / known[0] for time in known]
+            meaning = f"light times {'expTime' if None in stated else 'the stated times'}, {span}"
+        else:
+            meaning = f"taken as light, because they do not follow the stated times, {span}"
+    grey = middle_grey_time(averages.values())
+    timed = [
+        replace(record, exposure_time=grey * factor, hdr=record.hdr or record.image, light_scale=1 / factor)
+        for record, factor in zip(records, factors, strict=True)
+    ]
+    return timed, True, [*notes, f"float images: their values are {meaning}"]
 
 
 def _folder(path: Path | str) -> Path:
     if is_embedded(path):
         return embedded_folder(str(path))
     folder = Path(path)
-    if is_video(folder):
+    if is_video(folder) or is_transforms(folder):
         return folder
     try:
         empty = not any(folder.iterdir())
@@ -245,7 +227,9 @@ def _folder(path: Path | str) -> Path:
 
 
 def _read(folder: Path) -> DataparserOutputs:
-    """Parse by the first layout that fits, the most specific one first."""
+    """Parse by the first layout that fits, the most specific one first; a file as transforms.json."""
+    if folder.is_file():
+        return replace(read_transforms(folder.parent, folder), folder=folder.parent)
 
     def has(*names: str) -> bool:
         return all(has_file(folder / name) for name in names)

@@ -12,14 +12,13 @@ import numpy as np
 from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import UNPLACED, ImageRecord
-from .images import LDR_SUFFIXES, open_image, read_ldr
+from .images import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
 from .names import INVERTED_MASK, bases_of, fold_name, folders_named, lies_at, natural_key, without_mask_mark
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
 _COMMON = ("mask", "camera_mask")  # Stems of a mask of all photos
 _MOST_LABELS = 31  # Larger values are weights relative to white
-_LOSSY = (".jpg", ".jpeg")  # Their dark pixels may be noise
 _MATERIAL = 0.5  # Range of alpha that is a mask beside color that varies, too
 _REMEDY = "name each like its photo, such as masks/IMG_1.png or masks/IMG_1.jpg.png"
 
@@ -118,7 +117,9 @@ def read_mask(path: Path, *, oriented: bool = False, labeled: set[Path] | None =
     largest, two = float(values.max()), (values == 0) | (values == values.max())
     if largest <= 1 or (float(values.min()) == 0 and two.all()):
         return (values > 0).astype(np.float32)
-    if largest <= _MOST_LABELS and float(values.min()) < largest and path.suffix.lower() not in _LOSSY:
+    if (
+        largest <= _MOST_LABELS and float(values.min()) < largest and path.suffix.lower() not in JPEG_SUFFIXES
+    ):  # Their dark pixels may be noise
         if labeled is not None:
             labeled.add(path)
         return (values > 0).astype(np.float32)

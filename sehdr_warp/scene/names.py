@@ -9,12 +9,19 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
+from urllib.parse import unquote
 
 from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import ImageRecord
 from .images import PHOTO_SUFFIXES
 
+OTHER_FOLDERS = ("masks", "mask", "hdr", "exr")
+"""Folders of pictures that are not photos."""
+_IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
+"""Folders of photos, from the full size to reduced copies."""
+LOOKED_FOR = 20
+"""Images of a set by whose names their folder is found."""
 INVERTED_MASK = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which 0 keeps a pixel and every other value leaves it out."""
 
@@ -39,6 +46,11 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
         return None
 
 
+def image_folder(folder: Path) -> Path | None:
+    """Return the folder of images, at full size if possible, or None."""
+    return next((folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()), None)
+
+
 def folders_named(folder: Path, names: Sequence[str]) -> list[Path]:
     """List the folders in a folder that have some names, in any case, in the order of the names; none without it."""
     if not folder.is_dir():
@@ -57,17 +69,17 @@ def lies_at(path: str) -> bool:
 
 
 def without_mask_mark(stem: str) -> str:
-    """Return a stem, or a path without suffix, without what marks masks: `dynamic_mask_` before, or `_mask` behind."""
-    return re.sub(rf"(^|(?<=/)){INVERTED_MASK}(?=.)|(?<=.)[_.-]masks?$", "", stem, flags=re.IGNORECASE)
+    """Return a stem, or a path without suffix, without the mark of masks: `mask_`, `dynamic_mask_` or `_mask`."""
+    return re.sub(r"(^|(?<=/))(dynamic_)?mask[_-](?=.)|(?<=.)[_.-]masks?$", "", stem, flags=re.IGNORECASE)
 
 
 def find_image(folder: Path, name: str, source: Path) -> Path | None:
     """Return the image of a name that a data file states, None if it is not there.
 
-    Names written on Windows have backslashes, and names that are not UTF-8 are tried as Latin-1 too. A photo with
-    another suffix, as after a conversion, is found by its stem. An absolute name, or one that begins with `..`, as of a
-    set that was copied, stands for the file in the folder that its last parts name. Upper and lower case, and the
-    forms in which Unicode writes an accent, count as equal if no file has the exact name.
+    Names written on Windows have backslashes, those of web addresses %20 for spaces, and names that are not UTF-8 are
+    tried as Latin-1 too. A photo with another suffix, as after a conversion, is found by its stem. An absolute name, or
+    one that begins with `..`, as of a set that was copied, stands for the file in the folder that its last parts name.
+    Upper and lower case, and the forms in which Unicode writes an accent, count as equal if no file has the exact name.
 
     Args:
         folder: of the images.
@@ -83,6 +95,7 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         names |= dict.fromkeys((latin, latin.replace("\\", "/")))
     with suppress(UnicodeError):
         names |= {os.fsdecode(name.encode("latin-1")): None}
+    names |= {unquote(name): None}
     if inner := _inside(folder, name, source):
         names = {inner: None}
     elif PureWindowsPath(name).anchor and "\0" not in name:
@@ -91,6 +104,22 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
     image = next((place for place in places if os.path.isfile(place)), None)
     image = image or next((photo for place in places if (photo := sibling(place, PHOTO_SUFFIXES))), None)
     return image or next((photo for each in names if (photo := _alike(folder, each, source))), None)
+
+
+def find_images(folder: Path, names: Sequence[str], source: Path) -> dict[str, Path | None]:
+    """Return the image of each name as find_image(); if none is there, those of their file names in an inner folder.
+
+    Tools sort photos into folders by camera, or out of them, and 3DGS looks for file names alone.
+    """
+    images = {name: find_image(folder, name, source) for name in names}
+    files = {name: PureWindowsPath(name).name for name in names}
+    if any(images.values()) or len(set(files.values())) < len(files):
+        return images
+    first = list(files.values())[:LOOKED_FOR]
+    for place in (folder, *sorted(place for place in folder.rglob("*") if place.is_dir())):
+        if place.name not in OTHER_FOLDERS and any(find_image(place, file, source) for file in first):
+            return {name: find_image(place, file, source) for name, file in files.items()}
+    return images
 
 
 def _inside(folder: Path, name: str, source: Path) -> str | None:
@@ -132,6 +161,11 @@ def _alike(folder: Path, name: str, source: Path) -> Path | None:
     match = next((names[ending] for ending in endings if ending in names), None)
     photo = None if match is None else resolve_inside(folder, (place / match).relative_to(folder).as_posix(), source)
     return photo if photo is not None and os.path.isfile(photo) else None
+
+
+def plain_path(name: str) -> str:
+    """Return a path without a leading `./` and with forward slashes."""
+    return re.sub(r"^(\./)+", "", name.replace("\\", "/"))
 
 
 def fold_name(name: str) -> str:

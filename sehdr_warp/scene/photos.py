@@ -4,15 +4,16 @@ What cannot be used is left out and named before anything is decoded.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
 from ..subsets import first_names
 from .color_encoding import encoding_of, note_of
 from .dataparser import UNPLACED, ImageRecord
-from .hdr_files import hdr_size
+from .hdr_files import hdr_size, pixel_aspect
 from .heif import avif_bits
 from .images import EncodedImage, image_sizes, open_image, read_ldr, require_file
 from .lens import Lens
@@ -21,6 +22,8 @@ from .masks import MASK_FOLDERS
 
 FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_NAMED = 3
+_SMALLEST, _LARGEST = 1 / 32, 8  # Size of a photo in parts of its camera's
+_LEAST_SQUARE = 0.01  # Part by which the sides of a pixel may differ and count as equal
 _KINDS = {"encoded": "photos of codes", "raw": "RAW photos", "float": "float images"}
 _ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
 
@@ -70,20 +73,24 @@ def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
     """Return the lens at the photo's size, and whether the pixels are to be turned as EXIF says.
 
     COLMAP ignores the EXIF orientation, other tools follow it: the size that agrees with the camera's decides, and the
-    stored orientation wins if both agree. Photos may be smaller than the camera's size by a whole factor (images_2).
+    stored orientation wins if both agree. Photos may be smaller or larger than the camera's size, as of images_2 or
+    enlarged by a network, if their sides have its ratio to a pixel.
 
     Raises:
-        InputError: if no orientation and factor fits.
+        InputError: if the photo has another shape in both orientations.
     """
     lens = record.lens
     size, turned = photo_sizes(record.image)
     choices = [(size, False), (turned, True)] if record.oriented is None else [(turned, True)]
-    for factor in range(1, 17):
-        for (width, height), oriented in choices:
-            if factor == 1 and (width, height) == (lens.width, lens.height):
-                return lens, oriented
-            if factor > 1 and abs(lens.width / factor - width) < 1 and abs(lens.height / factor - height) < 1:
-                return lens.resized(width, height), oriented
+    for (width, height), oriented in choices:
+        if (width, height) == (lens.width, lens.height):
+            return lens, oriented
+    for (width, height), oriented in choices:
+        factor = max(width, height) / max(lens.width, lens.height)
+        if _SMALLEST <= factor <= _LARGEST and max(
+            abs(lens.width * factor - width), abs(lens.height * factor - height)
+        ) < max(1, factor):
+            return lens.resized(width, height), oriented
     problem = f"image is {size[0]} x {size[1]}, its camera {lens.width} x {lens.height}"
     raise InputError(record.image, problem, "use the images that the cameras were solved for")
 
@@ -113,14 +120,12 @@ def _left_out_note(problems: Sequence[InputError], count: int, files: str) -> li
         return []
     if 2 * len(problems) > count:
         raise problems[0]
-    reasons = "; ".join(f"{_short_name(Path(error.path))}: {error.problem}" for error in problems[:_MOST_NAMED])
+    # A mask may have the name of its photo, so its folder is named too.
+    paths = [Path(error.path) for error in problems[:_MOST_NAMED]]
+    names = [f"{p.parent.name}/" * (p.parent.name.lower() in MASK_FOLDERS) + p.name for p in paths]
+    reasons = "; ".join(f"{name}: {error.problem}" for name, error in zip(names, problems))
     more = " ..." if len(problems) > _MOST_NAMED else ""
     return [f"{len(problems)} of {count} {files} cannot be used and were left out ({reasons}{more})"]
-
-
-def _short_name(path: Path) -> str:
-    """Return a file's name, with its folder for a mask, which may have the name of its photo."""
-    return path.name if path.parent.name.lower() not in MASK_FOLDERS else f"{path.parent.name}/{path.name}"
 
 
 def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRecord], list[str]]:
@@ -137,14 +142,26 @@ def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRe
 
 def _check_size(record: ImageRecord) -> ImageRecord:
     """Return the photo with what its file states of its colors. Raises InputError if it cannot be used."""
+    width, height = pixel_aspect(record.image), 1.0
     if kind_of(record.image) == "encoded":
         with open_image(record.image) as image:
             record = replace(record, encoding=encoding_of(image))
+            width, height = _pixel_aspect(image.info)
     if record.lens is UNPLACED:
         photo_sizes(record.image)
+        if abs(width - height) > _LEAST_SQUARE * height:
+            problem = f"states pixels that are not square ({width:g} : {height:g})"
+            raise InputError(record.image, problem, "resample it to square pixels, such as with FFmpeg's scale")
     else:
         fitted_lens(record)
     return record
+
+
+def _pixel_aspect(info: Mapping[Any, Any]) -> tuple[float, float]:
+    """Return the shape of a pixel, horizontal : vertical, that JFIF, PNG and TIFF state as a density without a unit."""
+    density = info.get("jfif_density") if info.get("jfif_unit") == 0 else info.get("aspect", info.get("resolution"))
+    width, height = map(float, density or (1, 1))
+    return (width, height) if width > 0 and height > 0 else (1.0, 1.0)
 
 
 def _names_text(names: Sequence[str]) -> str:

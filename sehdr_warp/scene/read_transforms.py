@@ -1,6 +1,7 @@
-"""Readers of transforms.json and related layouts (nerfstudio, instant-ngp, Blender, HDR-NeRF's synthetic sets)."""
+"""Reader of transforms.json as nerfstudio, instant-ngp and Blender write it."""
 
-import re
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
@@ -11,26 +12,46 @@ from ..errors import InputError
 from ..files import read_json, resolve_inside
 from ..subsets import first_names
 from .colmap_model import find_model, read_ply_points, read_points
-from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
+from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
 from .frame_lens import frame_lens
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
-from .names import distinct, find_image, renamed_note, sibling
+from .names import distinct, find_image, find_images, image_folder, plain_path, renamed_note, sibling
 from .photos import unusable_notes
 
 _REMEDY = "correct the file or export it again"
-_INCOMPLETE = "copy the whole set"
+INCOMPLETE = "copy the whole set"
 _UNREAD = (
     "rolling_shutter", "transform_matrix_end", "fisheye_crop_radius", "depth_file_path", "depth_path", "mask_color",
     "white_transparent", "black_transparent",
 )  # fmt: skip
 """Fields of nerfstudio and instant-ngp that change what a photo shows or what is known of it."""
+_TIMES = {"exposure_time": "", "exposure_time_ms": "ms", "exposure_time_us": "us"}
+_VARYING = {
+    "what moves is not modeled": ("time",),
+    "exposure_time has to contain it": (
+        "iso", "ISO", "gain", "aperture", "f_number", "exposure", "ev", "shutter_speed",
+    ),
+}  # fmt: skip
+"""Fields that are not read, and what follows if their values differ between frames."""
 
 
-def read_transforms(folder: Path) -> DataparserOutputs:
-    """Parse transforms.json, or transforms_{train,test}.json (val if there is no test): one record for each frame."""
-    if (folder / "transforms.json").is_file():
-        files = [(folder / "transforms.json", None)]
+def is_transforms(path: Path) -> bool:
+    """Return whether a file states frames as nerfstudio's transforms.json does, whatever its name."""
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    return b'"frames"' in head and b'"transform_matrix"' in head
+
+
+def read_transforms(folder: Path, file: Path | None = None) -> DataparserOutputs:
+    """Parse transforms.json, or transforms_{train,test}.json (val if there is no test): one record for each frame.
+
+    `file` is read in place of them.
+    """
+    if file is not None or (folder / "transforms.json").is_file():
+        files = [(file or folder / "transforms.json", None)]
     else:
         other = "test" if (folder / "transforms_test.json").is_file() else "val"
         files = [(folder / "transforms_train.json", "train"), (folder / f"transforms_{other}.json", "test")]
@@ -67,7 +88,7 @@ class _Frames:
         unusable: errors of poses, whose frames are left out.
         untimed: errors of exposure times, which are left out.
         unread: fields of _UNREAD that the files state.
-        moments: values of the frames' `time`, by which the scene moves.
+        varying: values of the fields of _VARYING.
     """
 
     records: list[ImageRecord] = field(default_factory=list)
@@ -76,17 +97,19 @@ class _Frames:
     unusable: list[InputError] = field(default_factory=list)
     untimed: list[InputError] = field(default_factory=list)
     unread: set[str] = field(default_factory=set)
-    moments: set[str] = field(default_factory=set)
+    varying: dict[str, set[str]] = field(default_factory=dict)
 
     def add_file(self, folder: Path, path: Path, values: dict, split: str | None) -> None:
         """Add the frames of a file; `split` is that of all of them, None if the file states it by frame."""
         frames = frames_of(values, path)
         splits = _named_splits(values, frames)
+        images = _frame_images(folder, [name for name, _ in frames], path)
         for name, frame in frames:
             fields = values | frame
             self.unread |= {key for key in _UNREAD if np.any(fields.get(key))}
-            self.moments.add(repr(fields.get("time")))
-            image = _frame_image(folder, name, path)
+            for name_of_field in itertools.chain(*_VARYING.values()):
+                self.varying.setdefault(name_of_field, set()).add(repr(fields.get(name_of_field)))
+            image = images[name]
             try:
                 pose = frame_pose(frame, path, name, mitsuba=fields.get("from_mitsuba") is True)
             except InputError as error:
@@ -96,10 +119,11 @@ class _Frames:
                 self.absent.append(name)
                 continue
             self.photos.append((name, image))
-            record = _frame_record(folder, path, values, frame, image, split or splits.get(_plain(name)))
-            time = frame.get("exposure_time", values.get("exposure_time"))
+            record = _frame_record(folder, path, values, frame, image, split or splits.get(plain_path(name)))
+            stated = ((fields[key], unit) for key, unit in _TIMES.items() if fields.get(key) is not None)
+            time, unit = next(stated, (None, ""))
             try:
-                seconds = None if time is None else parse_seconds(time, path, name)
+                seconds = None if time is None else parse_seconds(time, path, name, unit)
             except InputError as error:
                 self.untimed.append(error)
                 seconds = None
@@ -108,8 +132,10 @@ class _Frames:
     def unread_note(self) -> list[str]:
         """Return a note on fields that are not read, and on scenes that move."""
         notes = [f"fields of the frames that are not read: {', '.join(sorted(self.unread))}"] if self.unread else []
-        if len(self.moments) > 1:
-            notes.append(f"frames state {len(self.moments)} moments (time): what moves is not modeled")
+        for consequence, names in _VARYING.items():
+            for name in names:
+                if (count := len(self.varying[name])) > 1:
+                    notes.append(f"frames differ in {name} ({count} values), which is not read: {consequence}")
         return notes
 
     def notes(self, folder: Path) -> list[str]:
@@ -118,58 +144,14 @@ class _Frames:
         notes = unusable_notes(self.unusable, count + len(self.absent) + len(self.unusable))
         if not count:
             problem = f"image file not found, nor any of {len(self.absent)} frames"
-            raise InputError(folder / _plain(self.absent[0]), problem, _INCOMPLETE)
-        notes += [*_absent_note(self.absent, count), *renamed_note(self.photos)]
+            raise InputError(folder / plain_path(self.absent[0]), problem, INCOMPLETE)
+        notes += [*absent_note(self.absent, count), *renamed_note(self.photos)]
         if 2 * len(self.untimed) > count:
             raise self.untimed[0]
         if self.untimed:
             problem = self.untimed[0].problem
             notes.append(f"{len(self.untimed)} of {count} frames state no usable exposure time: {problem}")
         return notes
-
-
-def read_hdr_nerf(folder: Path) -> DataparserOutputs:
-    """Parse HDR-NeRF's synthetic layout (xhuangcv/hdr-nerf, load_syn_llff.py).
-
-    `transforms_<split>.json` with frames whose file_path lacks the `_<k>.png` of the exposure; `exposure_<split>.json`
-    maps `<file_path>_<k>.png` to seconds; truth is in `<split>_hdr/hdr_%03d.exr` by the frame's index. With
-    `"photo_response": "reinhard-gamma"` (this package's field) photos are computed from the truth by that curve.
-    """
-    records, absent = [], []
-    for split in ("train", "test"):
-        path, times_path = folder / f"transforms_{split}.json", folder / f"exposure_{split}.json"
-        if split == "test" and not path.is_file():
-            continue
-        values, times = read_json(path), _exposures_of(read_json(times_path), times_path)
-        photo_response = values.get("photo_response")
-        if photo_response not in (None, DERIVED_PHOTOS):
-            raise InputError(
-                path, f"photo_response is {photo_response!r:.40}", f"only {DERIVED_PHOTOS!r} can be derived"
-            )
-        for place, (name, frame) in enumerate(frames_of(values, path)):
-            exposures = times.get(_plain(name))
-            if not exposures:
-                problem = f"has no exposure time for {name!r:.90}"
-                raise InputError(times_path, problem, "list <file_path>_<k>.png: seconds")
-            truth = folder / f"{split}_hdr" / f"hdr_{place:03d}.exr"
-            hdr, pose = sibling(truth, HDR_SUFFIXES), frame_pose(frame, path, name)
-            if photo_response and hdr is None:
-                raise InputError(truth, "HDR truth not found", _INCOMPLETE)
-            present = []
-            for key, (file, time) in sorted(exposures.items()):
-                image = hdr if photo_response and hdr else resolve_inside(folder, file, times_path)
-                if image.is_file():
-                    lens, view = frame_lens(values, frame, image, path), Path(_plain(name)).name
-                    present.append(
-                        ImageRecord(view, image, lens, pose, key, time, split, hdr=hdr, derived=bool(photo_response))
-                    )
-            if not present:
-                absent.append(f"{_plain(name)}_{min(exposures)}.png")
-            records += present
-    if not records:
-        raise InputError(folder / absent[0], "image file not found", _INCOMPLETE)
-    notes = _absent_note(absent, len({(record.split, record.view) for record in records}))
-    return DataparserOutputs("hdr-nerf", tuple(records), "background", cloud=_sparse_points(folder), notes=notes)
 
 
 def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
@@ -188,18 +170,18 @@ def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
 
 
 def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str]:
-    """Return splits by _plain() file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
+    """Return splits by plain_path() file_path: nerfstudio's <split>_filenames, or a frame's own "split"."""
     split_names = ("train", "test", "val")
-    by_name = {_plain(name): frame["split"] for name, frame in frames if frame.get("split") in split_names}
+    by_name = {plain_path(name): frame["split"] for name, frame in frames if frame.get("split") in split_names}
     for split in ("train", "val", "test"):
         filenames = values.get(f"{split}_filenames")
         if isinstance(filenames, list):
-            by_name.update({_plain(name): split for name in filenames if isinstance(name, str)})
+            by_name.update({plain_path(name): split for name in filenames if isinstance(name, str)})
     splits = {"train": "train", "test" if "test" in by_name.values() else "val": "test"}
     return {name: splits[split] for name, split in by_name.items() if split in splits}
 
 
-def _absent_note(absent: list[str], count: int) -> tuple[str, ...]:
+def absent_note(absent: list[str], count: int) -> tuple[str, ...]:
     """Return a note on frames, `absent` by name, whose photos are missing beside `count` frames that have one."""
     if not absent:
         return ()
@@ -215,6 +197,16 @@ def _without_missing_masks(records: list[ImageRecord]) -> tuple[list[ImageRecord
     names = first_names([mask.name for mask in absent])
     note = f"{len(absent)} masks that frames state are not here, and their photos count whole: {names}"
     return [replace(record, mask=None) if record.mask in absent else record for record in records], (note,)
+
+
+def _frame_images(folder: Path, names: Sequence[str], path: Path) -> dict[str, Path | None]:
+    """Return the photo of each frame, None if there is no such file.
+
+    If none is where the file says, they are looked for in the folder of images: of some sets images_4 alone is public.
+    """
+    images = {name: _frame_image(folder, name, path) for name in names}
+    inner = image_folder(folder)
+    return images if inner is None or any(images.values()) else find_images(inner, names, path)
 
 
 def _frame_image(folder: Path, name: str, path: Path) -> Path | None:
@@ -288,7 +280,7 @@ def _points(folder: Path, path: Path, values: dict) -> PointCloud:
     name = values.get("ply_file_path")
     if isinstance(name, str) and (ply := _points_file(folder, name, path)) is not None:
         return read_ply_points(ply)
-    points, colors = _sparse_points(folder)
+    points, colors = sparse_points(folder)
     if len(points) and values.get("applied_transform") is not None:
         matrix = _matrix(values["applied_transform"])
         if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
@@ -300,23 +292,8 @@ def _points(folder: Path, path: Path, values: dict) -> PointCloud:
     return PointCloud(points, colors)
 
 
-def _sparse_points(folder: Path) -> PointCloud:
+def sparse_points(folder: Path) -> PointCloud:
+    """Return the points of the COLMAP model of a set, or of points3D files in it; none without them."""
     places = (find_model(folder), folder / "sparse" / "0", folder / "sparse", folder)
     clouds = (read_points(place) for place in places if place is not None)
     return next((cloud for cloud in clouds if len(cloud[0])), NO_POINTS)
-
-
-def _plain(name: str) -> str:
-    """Return a path without a leading `./` and with forward slashes."""
-    return re.sub(r"^(\./)+", "", name.replace("\\", "/"))
-
-
-def _exposures_of(values: dict, path: Path) -> dict[str, dict[int, tuple[str, float]]]:
-    """Return frame -> exposure number -> (file name, seconds)."""
-    by_view: dict[str, dict[int, tuple[str, float]]] = {}
-    for key, value in values.items():
-        match = re.fullmatch(r"(.+)_(\d{1,3})(\.[A-Za-z]+)?", _plain(key))
-        if match:
-            name = _plain(key) if match[3] else f"{_plain(key)}.png"
-            by_view.setdefault(match[1], {})[int(match[2])] = (name, parse_seconds(value, path, key))
-    return by_view

@@ -38,13 +38,15 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
     files_in_use = {file for record in records for file in (record.image, record.mask, record.hdr)}
     files = list(_files_beside(images, folder))
     names = {name for file in files for name in (file.name, file.stem)}
-    photos, others = [], []
+    photos, others, broken = [], [], []
     for file in files:
         key = without_mask_mark(file.stem)
         if file in files_in_use or file.name in mentioned or (key != file.stem and key in names):
             continue
         suffix = file.suffix.lower()
-        if suffix in PHOTO_SUFFIXES:
+        if not file.exists():
+            broken.append(file)
+        elif suffix in PHOTO_SUFFIXES:
             photos.append(file)
         elif suffix not in _QUIET:
             others.append(file)
@@ -55,6 +57,9 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         where = Path(place).relative_to(folder).as_posix() if Path(place) != folder else "the folder"
         names_text, are = first_names([file.name for file in photos]), "are" if len(photos) > 1 else "is"
         notes.append(f"{count_text} of {where} {are} in no view: {names_text}")
+    if broken:
+        links = "links lead" if len(broken) > 1 else "link leads"
+        notes.append(f"{len(broken)} {links} to no file: {first_names([file.name for file in broken])}")
     if others:
         notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
     return notes
@@ -93,5 +98,5 @@ def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
                 if count > _MOST_FILES:
                     return
                 file = Path(root) / name
-                if not name.startswith(".") and file.is_file():
+                if not name.startswith(".") and (file.is_file() or (file.is_symlink() and not file.exists())):
                     yield file

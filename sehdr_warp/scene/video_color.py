@@ -17,25 +17,13 @@ _HLG, _PQ, _LOG100, _LOG316 = 18, 16, 9, 10
 _UNSPECIFIED = 2
 _STATED_CURVES = {_HLG: "colour:ITU-R BT.2100 HLG", _PQ: "colour:ST 2084"}
 _CURVE_NAMES = {
-    1: "Rec.709",
-    4: "gamma 2.2",
-    6: "Rec.601",
-    8: "linear",
-    13: "sRGB",
-    14: "Rec.2020",
-    15: "Rec.2020",
-    16: "PQ",
+    1: "Rec.709", 4: "gamma 2.2", 6: "Rec.601", 8: "linear", 13: "sRGB", 14: "Rec.2020", 15: "Rec.2020", 16: "PQ",
     18: "HLG",
-}
+}  # fmt: skip
 _PRIMARIES = {5: "ITU-R BT.470 - 625", 6: "SMPTE C", 9: "ITU-R BT.2020", 11: "DCI-P3", 12: "Display P3"}
 _LUMA = {
-    1: (0.2126, 0.0722),
-    4: (0.30, 0.11),
-    5: (0.299, 0.114),
-    6: (0.299, 0.114),
-    7: (0.212, 0.087),
-    9: (0.2627, 0.0593),
-}
+    1: (0.2126, 0.0722), 4: (0.30, 0.11), 5: (0.299, 0.114), 6: (0.299, 0.114), 7: (0.212, 0.087), 9: (0.2627, 0.0593),
+}  # fmt: skip
 # Matrix coefficients that are not luma and color differences of encoded values; FFmpeg does not convert them either.
 _OTHER_MATRICES = {8: "YCgCo", 10: "constant-luminance BT.2020", 11: "Y'D'zD'x", 12: "YCbCr of its own primaries",
                    13: "constant-luminance YCbCr of its own primaries", 14: "ICtCp", 15: "IPT-C2", 16: "YCgCo-Re",
@@ -48,23 +36,14 @@ _OUTSIDE = 0.02  # Negative channel of a color outside Rec.709, as a part of its
 _NEAR_WHITE = 0.9  # In light
 # What makers call their log curves in a clip's metadata: colour-science's curve, and the primaries that belong to it.
 _LOGS = {
-    "applelog": ("Apple Log Profile", "ITU-R BT.2020"),
-    "slog3": ("S-Log3", "S-Gamut3.Cine"),
-    "slog2": ("S-Log2", "S-Gamut"),
-    "vlog": ("V-Log", "V-Gamut"),
-    "canonlog3": ("Canon Log 3", "Cinema Gamut"),
-    "canonlog2": ("Canon Log 2", "Cinema Gamut"),
-    "clog3": ("Canon Log 3", "Cinema Gamut"),
-    "clog2": ("Canon Log 2", "Cinema Gamut"),
-    "dlog": ("D-Log", "DJI D-Gamut"),
-    "nlog": ("N-Log", "N-Gamut"),
-    "flog2": ("F-Log2", "F-Gamut"),
-    "flog": ("F-Log", "F-Gamut"),
-    "llog": ("L-Log", "ITU-R BT.2020"),
-    "logc4": ("ARRI LogC4", "ARRI Wide Gamut 4"),
-    "logc3": ("ARRI LogC3", "ARRI Wide Gamut 3"),
-    "log3g10": ("Log3G10", "REDWideGamutRGB"),
-}
+    "applelog": ("Apple Log Profile", "ITU-R BT.2020"), "llog": ("L-Log", "ITU-R BT.2020"),
+    "slog3": ("S-Log3", "S-Gamut3.Cine"), "slog2": ("S-Log2", "S-Gamut"), "vlog": ("V-Log", "V-Gamut"),
+    "canonlog3": ("Canon Log 3", "Cinema Gamut"), "canonlog2": ("Canon Log 2", "Cinema Gamut"),
+    "clog3": ("Canon Log 3", "Cinema Gamut"), "clog2": ("Canon Log 2", "Cinema Gamut"),
+    "dlog": ("D-Log", "DJI D-Gamut"), "nlog": ("N-Log", "N-Gamut"), "flog2": ("F-Log2", "F-Gamut"),
+    "flog": ("F-Log", "F-Gamut"), "logc4": ("ARRI LogC4", "ARRI Wide Gamut 4"),
+    "logc3": ("ARRI LogC3", "ARRI Wide Gamut 3"), "log3g10": ("Log3G10", "REDWideGamutRGB"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from .cached_folder import cached_folder
 from .dataparser import DataparserOutputs
 from .images import png16
 from .names import list_images
-from .read_folders import find_photos
+from .read_photos import find_photos
 from .sfm import file_digest
 from .video import Clip, codes, decode, grey, in_square_pixels, open_clip
 from .video_color import outside_rec709

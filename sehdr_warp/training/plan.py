@@ -15,7 +15,7 @@ from ..runs.config import Config, OptimizerConfig
 from ..runs.config_files import override_config
 from ..runs.device import pick_device
 from ..scene import Scene
-from ..scene.read_folders import FEWEST_PHOTOS
+from ..scene.photos import FEWEST_PHOTOS
 from .cost import CPU_GAUSSIAN, CPU_PIXEL, START_SECONDS, exchange_seconds, step_seconds
 from .initialization import base_time, start_count
 from .scene_facts import SceneFacts, largest_hdr_truth, measure_scene

@@ -10,7 +10,7 @@ from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
 from sehdr_warp.scene import Camera, Scene, View, look_at
 from sehdr_warp.scene.color_encoding import encoding_of
 from sehdr_warp.scene.exif import exif_exposure
-from sehdr_warp.scene.gain_map import has_gain_map, light_of, read_gain_map
+from sehdr_warp.scene.gain_map import light_of, read_gain_map
 from sehdr_warp.scene.gravity import find_up
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
 from sehdr_warp.scene.images import open_image
@@ -124,7 +124,7 @@ def make_gain_maps(folder: Path) -> None:
 
 def read_light(path: Path):
     pair = read_gain_map(path, oriented=True)
-    return has_gain_map(path), light_of(read_photo(path), pair) if pair is not None else None
+    return None if pair is None else light_of(read_photo(path), pair)
 
 
 def make_heic(folder: Path) -> None:

@@ -183,9 +183,9 @@ def test_photos_of_another_kind_than_most_are_left_out(tmp_path):
 
 def test_raw_photos_of_two_cameras_are_refused_before_they_are_matched(tmp_path, monkeypatch):
     pytest.importorskip("rawpy")
-    monkeypatch.setattr("sehdr_warp.scene.read_folders.reconstruct", lambda *_: pytest.fail("matched"))
+    monkeypatch.setattr("sehdr_warp.scene.read_photos.reconstruct", lambda *_: pytest.fail("matched"))
     for i, matrix in enumerate((TO_CAMERA, TO_CAMERA, TO_CAMERA[::-1])):
-        write_dng(tmp_path / f"{i}.dng", np.ones((64, 64, 3)), to_camera=matrix)
+        write_dng(tmp_path / f"{i}.dng", np.full((64, 64, 3), 0.5 + 0.1 * i), to_camera=matrix)
     with pytest.raises(InputError, match=r"2.dng: is of another camera than 0.dng"):
         load_scene(tmp_path)
 

@@ -8,7 +8,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.masks import read_mask
 from sehdr_warp.scene.names import list_images
-from sehdr_warp.scene.read_folders import find_photos
+from sehdr_warp.scene.read_photos import find_photos
 from tests.make_scenes import (
     RadianceView,
     arc_poses,
@@ -47,6 +47,7 @@ def masks_said(scene):
         "masks/{}.PNG",
         "masks/{}_mask.png",
         "masks/{}.mask.png",
+        "masks/mask_{}.png",
         "mask/{}.png",
         "masks/images/{}.png",
         "images/{}_mask.png",

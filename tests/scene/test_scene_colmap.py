@@ -10,7 +10,8 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene.colmap_model import find_model
 from sehdr_warp.scene.dataparser import reinhard_gamma
 from sehdr_warp.scene.lens import CAMERA_MODELS
-from sehdr_warp.scene.read_folders import find_photos, model_fits
+from sehdr_warp.scene.read_colmap import model_fits, read_colmap
+from sehdr_warp.scene.read_photos import find_photos
 from tests.make_scenes import arc_poses, load, pattern, write_colmap
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -204,6 +205,33 @@ def test_reduced_images_scale_the_camera_and_others_are_refused(tmp_path):
     Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / "000.png")
     with pytest.raises(InputError, match=r"000.png: image is 60 x 48, its camera 64 x 48"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize("size", [(26, 19), (200, 150)])
+def test_images_of_any_size_with_the_shape_of_the_camera(tmp_path, size):
+    write_colmap(tmp_path)
+    for i in range(6):
+        Image.fromarray(pattern(*size, i)).save(tmp_path / "images" / f"{i:03d}.png")
+    camera = load(tmp_path).views[0].camera
+    assert (camera.width, camera.height) == size
+    assert camera.fx == pytest.approx(50 * size[0] / 64) and camera.cy == pytest.approx(25 * size[1] / 48)
+
+
+@pytest.mark.parametrize("names, place", [("cam1/{:03d}.png", "."), ("{:03d}.png", "cam1")])
+def test_photos_that_were_sorted_into_a_folder_or_out_of_it(tmp_path, names, place):
+    """3DGS looks for file names alone, so its users' sets are without the folders of the model's names."""
+    write_colmap(tmp_path, name=names)
+    images = tmp_path / "images"
+    (images / place).mkdir(exist_ok=True)
+    (images / "masks").mkdir()
+    for photo in sorted(images.rglob("*.png")):
+        photo.rename(images / place / photo.name)
+    dataset = read_colmap(tmp_path)
+    assert [record.image for record in dataset.records] == [images / place / f"{i:03d}.png" for i in range(6)]
+    model = tmp_path / "sparse" / "0" / "images.txt"
+    model.write_text(model.read_text().replace("001.png", "other/000.png"))
+    with pytest.raises(InputError, match="none of the model's 6 images is here"):
+        read_colmap(tmp_path)  # Which of two photos of one name is there, nobody knows.
 
 
 def test_files_of_a_model_of_two_kinds(tmp_path):

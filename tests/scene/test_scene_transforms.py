@@ -143,13 +143,32 @@ def test_poses_of_mitsuba_have_x_to_the_left_and_z_ahead(tmp_path):
         np.testing.assert_allclose(record.world_to_camera, pose, atol=1e-12)
 
 
+def test_sets_of_which_reduced_images_alone_are_public(tmp_path):
+    write_blender(tmp_path, 3, w=160, h=120, fl_x=160)
+    (tmp_path / "images").rename(tmp_path / "images_4")
+    assert [record.image.parent.name for record in read_transforms(tmp_path).records] == ["images_4"] * 3
+    assert [view.camera.fx for view in load(tmp_path, holdout=0).views] == [40.0] * 3
+
+
+def test_names_of_web_addresses(tmp_path):
+    write_blender(tmp_path, 3)
+    (tmp_path / "images" / "r_0.png").rename(tmp_path / "images" / "r 0.png")
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    _edit(tmp_path, frames=[frames[0] | {"file_path": "images/r%200.png"}, *frames[1:]])
+    assert read_transforms(tmp_path).records[0].image.name == "r 0.png"
+
+
 def test_fields_that_are_not_read_are_named(tmp_path):
     write_blender(tmp_path, 3, fisheye_crop_radius=12, rolling_shutter=[0, 0, 0, 0])
     frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     _edit(tmp_path, frames=[frame | {"time": i / 2, "depth_file_path": "d.png"} for i, frame in enumerate(frames)])
     notes = read_transforms(tmp_path).notes
     assert "fields of the frames that are not read: depth_file_path, fisheye_crop_radius" in notes
-    assert "frames state 3 moments (time): what moves is not modeled" in notes
+    assert "frames differ in time (3 values), which is not read: what moves is not modeled" in notes
+    assert not any("frames differ in iso" in note for note in notes)
+    _edit(tmp_path, frames=[frame | {"iso": 100 * (i + 1)} for i, frame in enumerate(frames)])
+    note = "frames differ in iso (3 values), which is not read: exposure_time has to contain it"
+    assert note in read_transforms(tmp_path).notes
 
 
 @pytest.mark.parametrize(

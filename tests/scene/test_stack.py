@@ -21,7 +21,7 @@ def unmatched(monkeypatch):
     def reconstruct(*_):
         raise Matched
 
-    monkeypatch.setattr("sehdr_warp.scene.read_folders.reconstruct", reconstruct)
+    monkeypatch.setattr("sehdr_warp.scene.read_photos.reconstruct", reconstruct)
 
 
 def write_photos(folder, times, shift=0):
@@ -34,6 +34,7 @@ def write_photos(folder, times, shift=0):
     light = 2.0 ** (2 * stops / stops.std())
     for index, time in enumerate(times):
         codes = 255 * np.clip(0.1 * np.roll(light, shift * index, 1) * (time or 1.0), 0, 1) ** (1 / 2.2)
+        codes[0, 0] = index  # No two photos have the same bytes.
         Image.fromarray(codes.round().astype(np.uint8)).convert("RGB").save(folder / f"{index}.png")
     times_by_name = {f"{index}.png": time for index, time in enumerate(times) if time}
     (folder / "exposures.json").write_text(json.dumps(times_by_name))

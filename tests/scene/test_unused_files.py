@@ -177,7 +177,7 @@ def test_a_frame_without_a_usable_pose_is_left_out_and_named(tmp_path, pose):
         load(tmp_path)
 
 
-@pytest.mark.parametrize("sides, problem", [((1, 1, -1), "mirrors the scene"), ((2, 2, 2), r"stretch \[2.0, 2.0, 2.0")])
+@pytest.mark.parametrize("sides, problem", [((1, 1, -1), "mirrors the scene"), ((2, 2, 1), r"stretch \[2.0, 2.0, 1.0")])
 def test_poses_that_are_no_rotations_are_refused(tmp_path, sides, problem):
     write_blender(tmp_path)
     with edited_json(tmp_path / "transforms.json") as values:
@@ -185,6 +185,24 @@ def test_poses_that_are_no_rotations_are_refused(tmp_path, sides, problem):
             frame["transform_matrix"] = np.diag([*sides, 1.0]).tolist()
     with pytest.raises(InputError, match=problem):
         load(tmp_path)
+
+
+def test_the_scale_of_a_camera_is_left_out(tmp_path):
+    """Blender scales cameras as it shows them, and matrix_world has that scale."""
+    write_blender(tmp_path)
+    plain = load(tmp_path)
+    with edited_json(tmp_path / "transforms.json") as values:
+        for frame in values["frames"]:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([0.4, 0.4, 0.4, 1])).tolist()
+    for view, scaled in zip(plain.views, load(tmp_path).views, strict=True):
+        np.testing.assert_allclose(scaled.camera.world_to_camera, view.camera.world_to_camera, atol=1e-9)
+
+
+def test_links_to_files_that_are_gone_are_named(tmp_path):
+    write_colmap(tmp_path)
+    for name in ("x.png", "y.png"):
+        (tmp_path / "images" / name).symlink_to("gone.png")
+    assert said(load(tmp_path), "links lead") == ["2 links lead to no file: x.png, y.png"]
 
 
 def test_transposed_poses_are_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Folders as phones, cameras and other programs leave them: what is read, and what is named instead."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.load import parse_dataset
-from sehdr_warp.scene.read_folders import find_photos
+from sehdr_warp.scene.read_photos import find_photos
 from sehdr_warp.scene.unused_files import unused_notes
 from tests.make_scenes import edited_json, load, pattern, write_blender, write_colmap, write_ply
 
@@ -54,8 +55,8 @@ def test_photos_deep_in_an_export_are_found_for_the_user(tmp_path):
     Image.fromarray(pattern(16, 12)).save(tmp_path / "poly" / "thumbnail.jpg")
     with pytest.raises(InputError, match="is the only photo there; give .* with photos: keyframes/corrected_images"):
         parse_dataset(tmp_path / "poly")
-    write_colmap(tmp_path / "work" / "dense" / "0")
-    with pytest.raises(InputError, match="give one of its folders with photos: dense/0$"):
+    write_colmap(tmp_path / "work" / "dense" / "1")
+    with pytest.raises(InputError, match="give one of its folders with photos: dense/1$"):
         parse_dataset(tmp_path / "work")
 
 
@@ -71,7 +72,7 @@ def test_photos_as_3dgs_convert_expects_them(tmp_path):
 def test_poses_of_other_programs_are_named(tmp_path, file, tool):
     photos(tmp_path)
     files(tmp_path, file)
-    assert any(f"poses of {tool} ({file.lower()}) are not read" in note for note in find_photos(tmp_path).notes)
+    assert any(f"poses of {tool} ({file}) are not read" in note for note in find_photos(tmp_path).notes)
 
 
 def test_poses_of_other_programs_are_the_remedy_if_cameras_are_not_found(tmp_path):
@@ -188,4 +189,52 @@ def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):
     assert sorted(names) == ["IMG_0.png", "IMG_1.png", "IMG_2.png", "IMG_3.jpg", "IMG_3.png", "IMG_4.jpg", "IMG_4.png"]
     assert not any("no view" in note for note in unused_notes(tmp_path, dataset.records, dataset.mentioned))
     (note,) = dataset.notes
-    assert note.startswith("3 photos are copies of others in another kind of file and left out: img_0.JPG of IMG_0.png")
+    assert note.startswith("3 photos are copies of others and left out: img_0.JPG of IMG_0.png")
+
+
+def test_copies_of_the_same_bytes_are_left_out_and_named(tmp_path):
+    for i in range(4):
+        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
+    shutil.copy(tmp_path / "IMG_2.jpg", tmp_path / "IMG_2 (1).jpg")
+    dataset = find_photos(tmp_path)
+    assert [record.image.name for record in dataset.records] == [f"IMG_{i}.jpg" for i in range(4)]
+    assert dataset.notes == ("1 photo is a copy of others and left out: IMG_2 (1).jpg of IMG_2.jpg",)
+
+
+@pytest.mark.parametrize("suffix", [".jfif", ".jpe", ".mpo"])
+def test_jpegs_under_their_other_suffixes(tmp_path, suffix):
+    for i in range(3):
+        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"{i}{suffix}", "JPEG")
+    assert len(find_photos(tmp_path).records) == 3
+
+
+@pytest.mark.parametrize(
+    "file, content, tool",
+    [
+        ("project.xml", "<document><chunk></chunk></document>", "Metashape"),
+        ("castle.csv", "#name,x,y,alt,heading,pitch,roll,f\n", "RealityScan"),
+        ("IMG_0.xmp", '<rdf:Description xcr:Version="3"/>', "RealityScan"),
+    ],
+)
+def test_poses_of_other_programs_are_known_by_content(tmp_path, file, content, tool):
+    photos(tmp_path)
+    (tmp_path / file).write_text("<x/>")
+    assert not find_photos(tmp_path).notes
+    (tmp_path / file).write_text(content)
+    assert find_photos(tmp_path).notes[0].startswith(f"poses of {tool} ({file}) are not read")
+
+
+def test_the_folder_of_photos_in_place_of_its_set(tmp_path):
+    write_colmap(tmp_path)
+    (note,) = find_photos(tmp_path / "images").notes
+    assert note.endswith(f"sparse/0 are not used, cameras are found anew: give {tmp_path} for them")
+    with pytest.raises(InputError, match=f"known layout; give {tmp_path}"):
+        find_photos(tmp_path / "sparse")
+
+
+def test_transforms_of_any_name_are_named_in_a_folder_and_read_as_a_file(tmp_path):
+    write_blender(tmp_path)
+    file = (tmp_path / "transforms.json").rename(tmp_path / "undistorted.json")
+    assert find_photos(tmp_path).notes == ("undistorted.json states cameras: to use them, give the file itself",)
+    dataset = parse_dataset(file)
+    assert (dataset.format, dataset.folder, len(dataset.records)) == ("transforms", tmp_path, 6)

@@ -1,0 +1,50 @@
+"""Photos whose pixels are not square are refused by name where structure from motion would find wrong lenses."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene.photos import usable_photos
+from sehdr_warp.scene.read_photos import find_photos
+from tests.make_scenes import pattern
+
+
+def write(path: Path, aspect: tuple[int, int], seed: int) -> None:
+    """Write a photo with a pixel aspect ratio, as FFmpeg writes frames of anamorphic video."""
+    pixels = pattern(32, 24, seed)
+    if path.suffix == ".exr":
+        header = {"pixelAspectRatio": aspect[0] / aspect[1], "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {"RGB": pixels.astype(np.float32)}).write(str(path))
+    elif path.suffix == ".png":
+        Image.fromarray(pixels).save(path)
+        chunk = b"pHYs" + struct.pack(">IIB", *aspect, 0)
+        data = path.read_bytes()
+        path.write_bytes(data[:33] + struct.pack(">I", 9) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:])
+    else:
+        Image.fromarray(pixels).save(path, dpi=aspect)
+        data = bytearray(path.read_bytes())
+        data[13] = 0  # JFIF: no unit, so the densities state an aspect alone
+        path.write_bytes(data)
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".png", ".jpg"])
+def test_pixels_that_are_not_square(tmp_path, suffix):
+    for i in range(4):
+        write(tmp_path / f"{i}{suffix}", (1, 1), i)
+    write(tmp_path / f"odd{suffix}", (4, 3), 5)
+    records, _, notes = usable_photos(find_photos(tmp_path).records)
+    assert (
+        len(records) == 4 and f"1 of 5 photos cannot be used and were left out (odd{suffix}: states pixels" in notes[0]
+    )
+    for i in range(4):
+        write(tmp_path / f"{i}{suffix}", (4, 3), i)
+    with pytest.raises(
+        InputError, match=r"0\..*: states pixels that are not square \(.*\); resample it to square pixels"
+    ):
+        usable_photos(find_photos(tmp_path).records)
