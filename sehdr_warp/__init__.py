@@ -33,7 +33,7 @@ _HOMES = {
     "output.world_transform": ("write_orientation",),
     "response": ("Response", "response_by_name", "response_names"),
     "scene": ("Camera", "Scene", "View", "embedded_scenes", "load_cameras", "load_scene"),
-    "scene.stack": ("calibrate",),
+    "scene.exposure_stack": ("calibrate",),
     "rasterizer": ("Rendering", "differentiable", "rasterize", "rasterize_directions", "spherical_harmonics", "ssim"),
     "runs.config": ("Config",),
     "runs.config_files": ("load_config", "preset_names"),

@@ -22,7 +22,7 @@ from .runs.config import Config
 from .runs.config_files import load_config, preset_names
 from .runs.run import Run, Splats, load_run, load_splats
 from .scene import Camera, Scene, View, embedded_scenes, load_cameras, load_scene
-from .scene.stack import calibrate
+from .scene.exposure_stack import calibrate
 from .training.initialization import match_points
 from .training.plan import Plan, make_plan
 from .training.train import create_trainer, train

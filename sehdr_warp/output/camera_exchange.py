@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..scene import Camera
-from ..scene.exchange_cameras import CHAN_ROTATION, USD_SIZE, USD_WORLD_MATRIX
+from ..scene.camera_exchange import CHAN_ROTATION, USD_SIZE, USD_WORLD_MATRIX
 
 _APERTURE = 36.0  # Of a full-frame camera, mm: USD's lens lengths are relative to it
 _STAGE = """#usda 1.0

@@ -15,7 +15,7 @@ from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
 from ..progress import track_progress
 from ..scene import Camera, load_cameras
-from ..scene.exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
+from ..scene.camera_exchange import EXCHANGE_SUFFIXES, read_exchange_cameras
 from ..scene.images import MAX_PIXELS
 from ..splats import cameras_beside
 from ..subsets import first_names

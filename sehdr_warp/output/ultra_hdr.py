@@ -10,7 +10,7 @@ import struct
 import numpy as np
 from PIL import Image
 
-from ..scene.primaries import srgb_to_linear
+from ..scene.color_primaries import srgb_to_linear
 from .images import quantize
 
 MOST_STOPS = 5.5

@@ -12,13 +12,13 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_json, read_text
 from .camera import Camera, whole_number
+from .camera_exchange import EXCHANGE_SUFFIXES, read_exchange_cameras
 from .colmap_model import find_model, read_model
 from .dataparser import pose_from_camera_to_world
-from .exchange_cameras import EXCHANGE_SUFFIXES, read_exchange_cameras
-from .frame_lens import frame_lens
+from .file_names import natural_key
 from .images import MAX_PIXELS
-from .names import natural_key
 from .read_transforms import frame_pose, frames_of, pose_from_opengl
+from .transforms_lens import frame_lens
 
 log = logging.getLogger(__name__)
 _DATAPARSER = "dataparser_transforms.json"

@@ -17,8 +17,8 @@ from ..errors import InputError
 from ..files import read_bytes, read_lines
 from ..parallel import preserve_signals
 from .dataparser import NO_POINTS, PointCloud, pose_from_quaternion
+from .file_names import is_system_file
 from .lens import CAMERA_MODELS, Lens
-from .names import is_system_file
 
 _log = logging.getLogger("sehdr_warp.scene")
 # pycolmap is not used here: it hangs on a damaged count and accepts a truncated file as a whole one.

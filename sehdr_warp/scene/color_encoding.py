@@ -18,11 +18,11 @@ import numpy as np
 from PIL import Image
 
 from ..errors import InputError
+from .color_icc import IccTable, KnownColors, read_profile, xyz_to_rec709
+from .color_primaries import REC709, matrix_to_rec709, srgb_to_linear
+from .color_srgb_codes import encoded_in_bands
 from .heif import read_items
-from .icc import IccTable, KnownColors, read_profile, xyz_to_rec709
 from .images import PILLOW_ERRORS, EncodedImage, exif_of
-from .primaries import REC709, matrix_to_rec709, srgb_to_linear
-from .srgb_codes import encoded_in_bands
 
 _ADOBE_RGB = (0.640, 0.330, 0.210, 0.710, 0.150, 0.060, 0.3127, 0.3290)
 _ADOBE_GAMMA = 563 / 256

@@ -10,6 +10,7 @@ from PIL import Image
 
 from ..errors import InputError
 from .images import HDR_SUFFIXES, JPEG_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
+from .raw import raw_exposure
 from .xmp import xmp_of, xmp_values
 
 SHORTEST, LONGEST = 1e-12, 1e12
@@ -63,8 +64,6 @@ def exif_exposure(path: Path) -> ExifExposure:
         return ExifExposure()
     try:
         if path.suffix.lower() in RAW_SUFFIXES:
-            from .linear_photos import raw_exposure
-
             return ExifExposure(*raw_exposure(path))
         with open_image(path) as image:
             first = exif_of(image)

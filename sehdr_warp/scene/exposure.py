@@ -13,8 +13,8 @@ from ..files import has_file, read_bytes
 from ..subsets import first_names
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, exif_exposure, parse_number
+from .file_names import bases_of, fold_name, lies_at, plain_path
 from .images import PHOTO_SUFFIXES
-from .names import bases_of, fold_name, lies_at, plain_path
 
 EXPOSURES = "exposures.json"
 _LISTS = ("exposures", "exposure_times", "exposure")  # Names under which people list times in other files

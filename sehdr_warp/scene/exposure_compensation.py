@@ -10,7 +10,7 @@ import numpy as np
 from ..parallel import prefetch_map
 from ..response import Response
 from .exif import exif_lens
-from .photo_file import PhotoKeeper
+from .photo_storage import PhotoKeeper
 from .types import Scene, View, codes_of, encoded_values
 
 FAINT, BRIGHT = 10 / 255, 245 / 255  # Encoded values below are noise, above they may be clipped; neither is used

@@ -19,6 +19,8 @@ from PIL import Image
 from ..errors import InputError
 from ..subsets import first_names
 from .color_encoding import ColorEncoding, encoding_of, encoding_of_boxes, encoding_of_profile
+from .color_primaries import srgb_to_linear
+from .gain_map_enlargement import enlarge_guided
 from .gain_map_parameters import (
     MOST_STOPS,
     GainMapParameters,
@@ -26,11 +28,9 @@ from .gain_map_parameters import (
     parameters_of_iso,
     parameters_of_xmp,
 )
-from .guided_enlargement import enlarge_guided
 from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, with_primary
 from .images import PILLOW_ERRORS, EncodedImage, exif_of, open_image, orientation_of, turn_upright
-from .linear_photos import linear_codes
-from .primaries import srgb_to_linear
+from .raw import linear_codes
 from .xmp import xmp_of, xmp_text
 
 _log = logging.getLogger("sehdr_warp.scene")

@@ -14,8 +14,8 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_bytes
 from ..quiet import silent_output
+from .color_primaries import REC709, encoding_of_interop_id, matrix_to_rec709
 from .images import DAMAGED, check_size, kind_by_content, remedy_for_kind, require_file
-from .primaries import REC709, encoding_of_interop_id, matrix_to_rec709
 
 # OpenEXR allocates all pixels before it reads one. Its ZIP of a single color holds 500 pixels in a byte.
 _MOST_PIXELS_PER_BYTE = 4096

@@ -86,6 +86,12 @@ class EncodedImage:
         return int(np.iinfo(self.pixels.dtype).max)
 
 
+def kind_of(path: Path) -> str:
+    """Return raw, float or encoded, by the suffix."""
+    suffix = path.suffix.lower()
+    return "raw" if suffix in RAW_SUFFIXES else "float" if suffix in HDR_SUFFIXES else "encoded"
+
+
 def image_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the photo's size as stored and after its EXIF orientation, each (width, height); raises as open_image."""
     with open_image(path) as image:

@@ -15,10 +15,10 @@ from .camera_checks import check_cameras
 from .colmap_model import find_model
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
 from .exposure import choose_exposure, exposures_note, stated_times, with_exposure_times
+from .file_names import image_folder, unique_names
+from .float_images import follow_times, log_averages, middle_grey_time
 from .hdr_files import exr_exposure_time
-from .linear_photos import follow_times, log_averages, middle_grey_time
 from .masks import assign_masks
-from .names import image_folder, unique_names
 from .photos import usable_photos
 from .preprocess import preprocess
 from .read_colmap import model_fits, read_colmap

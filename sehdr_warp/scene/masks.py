@@ -12,8 +12,8 @@ import numpy as np
 from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import UNPLACED, ImageRecord
+from .file_names import INVERTED_MASK, bases_of, fold_name, folders_named, lies_at, natural_key, without_mask_mark
 from .images import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
-from .names import INVERTED_MASK, bases_of, fold_name, folders_named, lies_at, natural_key, without_mask_mark
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")

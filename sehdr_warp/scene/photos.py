@@ -13,12 +13,13 @@ from ..errors import InputError
 from ..subsets import first_names
 from .color_encoding import encoding_of, note_of
 from .dataparser import UNPLACED, ImageRecord
+from .float_images import tone_mapped
 from .hdr_files import hdr_size, pixel_aspect
 from .heif import avif_bits
-from .images import EncodedImage, image_sizes, open_image, read_ldr, require_file
+from .images import EncodedImage, image_sizes, kind_of, open_image, read_ldr, require_file
 from .lens import Lens
-from .linear_photos import kind_of, raw_sizes, read_raw, tone_mapped
 from .masks import MASK_FOLDERS
+from .raw import raw_sizes, read_raw
 
 FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_NAMED = 3

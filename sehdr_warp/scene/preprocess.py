@@ -15,19 +15,20 @@ from ..parallel import prefetch_map
 from ..progress import track_progress
 from .camera import Camera
 from .color_encoding import DEVIATION, ColorEncoding
+from .color_primaries import linear_to_srgb
+from .color_srgb_codes import FloatTable, bands_of
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
+from .file_names import unique_names
+from .float_images import float_codes
 from .gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
 from .hdr_files import hdr_size, read_hdr, read_light
-from .images import EncodedImage
+from .images import EncodedImage, kind_of
 from .lens import Lens, Undistortion, area_average
-from .linear_photos import float_codes, kind_of, linear_codes
 from .masks import mask_note, read_mask
-from .names import unique_names
 from .photo_content import ContentCheck, unused_bits_note
-from .photo_file import PhotoKeeper
+from .photo_storage import PhotoKeeper
 from .photos import fitted_lens, read_photo, truth_notes, unusable_notes
-from .primaries import linear_to_srgb
-from .srgb_codes import FloatTable, bands_of
+from .raw import linear_codes
 from .types import Scene, View, codes_of
 from .video_color import codes_in_rec709
 from .wide_camera import solid_angles

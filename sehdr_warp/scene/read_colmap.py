@@ -7,8 +7,7 @@ from ..errors import InputError
 from ..files import has_file, read_lines
 from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model
 from .dataparser import DataparserOutputs, ImageRecord
-from .images import HDR_SUFFIXES, LDR_SUFFIXES
-from .names import (
+from .file_names import (
     LOOKED_FOR,
     OTHER_FOLDERS,
     distinct,
@@ -19,6 +18,7 @@ from .names import (
     renamed_note,
     sibling,
 )
+from .images import HDR_SUFFIXES, LDR_SUFFIXES
 from .photos import unusable_notes
 from .unused_files import unread_kinds
 

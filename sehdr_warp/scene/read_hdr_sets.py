@@ -8,12 +8,12 @@ from ..files import read_json, resolve_inside
 from .colmap_model import find_model
 from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecord, PointCloud
 from .exposure import parse_seconds
-from .frame_lens import frame_lens
+from .file_names import natural_key, plain_path, sibling, view_and_exposure
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
-from .names import natural_key, plain_path, sibling, view_and_exposure
 from .read_colmap import IMAGES_REMEDY, model_of
 from .read_llff import camera_of_row, images_of_rows, pose_rows
 from .read_transforms import INCOMPLETE, absent_note, frame_pose, frames_of, sparse_points
+from .transforms_lens import frame_lens
 
 # HDR-NeRF's synthetic exposures, which HDR-GS's folders do not state (its train_synthetic.py holds them as constants).
 _HDR_GS_SECONDS = (0.125, 0.5, 2.0, 8.0, 32.0)

@@ -7,9 +7,9 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_bytes
 from .dataparser import DataparserOutputs, ImageRecord, pose_from_camera_to_world
+from .file_names import image_folder, list_images
 from .images import LDR_SUFFIXES
 from .lens import Lens
-from .names import image_folder, list_images
 
 _POSES_REMEDY = "export the poses again with LLFF's imgs2poses"
 

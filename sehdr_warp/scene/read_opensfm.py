@@ -9,8 +9,8 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_text
 from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud
+from .file_names import find_image, natural_key
 from .lens import Lens
-from .names import find_image, natural_key
 from .photos import unusable_notes
 
 FILE = "reconstruction.json"

@@ -11,18 +11,18 @@ import numpy as np
 from ..errors import InputError
 from ..subsets import first_names
 from .colmap_model import find_model
-from .copies import copies_note, find_copies
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
+from .exposure_stack import refuse_stack
+from .file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
 from .heif import HEIF_SUFFIXES, register_heif
 from .images import PHOTO_SUFFIXES
-from .linear_photos import color_matrix
-from .names import OTHER_FOLDERS, image_folder, is_system_file, list_images
+from .photo_copies import copies_note, find_copies
 from .photos import FEWEST_PHOTOS
+from .raw import color_matrix
 from .read_colmap import INPUT
 from .read_transforms import is_transforms
 from .sfm import reconstruct
 from .sfm_panorama import are_panoramas, reconstruct_panoramas
-from .stack import refuse_stack
 from .unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from .video import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
 

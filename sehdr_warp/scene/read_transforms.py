@@ -14,10 +14,10 @@ from ..subsets import first_names
 from .colmap_model import find_model, read_ply_points, read_points
 from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
-from .frame_lens import frame_lens
+from .file_names import distinct, find_image, find_images, image_folder, plain_path, renamed_note, sibling
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
-from .names import distinct, find_image, find_images, image_folder, plain_path, renamed_note, sibling
 from .photos import unusable_notes
+from .transforms_lens import frame_lens
 
 _REMEDY = "correct the file or export it again"
 INCOMPLETE = "copy the whole set"

@@ -14,9 +14,9 @@ from .dataparser import DataparserOutputs
 from .exif import are_camera_jpegs
 from .gain_map import MOST_STOPS_IN_CODES, read_gain_map
 from .images import has_16_bits
-from .linear_photos import CURVES, color_matrix
 from .photo_content import ContentCheck
 from .preprocess import read_codes
+from .raw import color_matrix
 from .types import View
 
 if TYPE_CHECKING:
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from ..response.selection import ResponseSelection
 
 _log = logging.getLogger("sehdr_warp.scene")
+_CURVES = {"raw": "srgb", "linear": "srgb", "gain-map": "gain-map", "float": "hdr-nerf"}
+"""Response of the codes of photos whose light is known, by kind. Float pictures have no white level, nor has Reinhard's
+curve."""
 _MOST_SAMPLED = 24  # Photos that a response is chosen from: they have more edges than are used
 _BELOW_WHITE = 0.97  # Code of the largest light of a gain map, in light: from 0.99 on codes count as clipped
 
@@ -64,7 +67,7 @@ def choose_response(
         dataset = as_linear(dataset)
         curve = "auto" if dataset.kind == "linear" else response_by_name("linear")
     # A run states the curve of its codes, by which its photos are loaded again.
-    if dataset.kind == "encoded" and (str(curve) == "auto" or name == CURVES["gain-map"]):
+    if dataset.kind == "encoded" and (str(curve) == "auto" or name == _CURVES["gain-map"]):
         dataset = as_gain_mapped(dataset)
     matrix = dataset.color_matrix
     if matrix is not None and dataset.stated_response is not None:
@@ -73,7 +76,7 @@ def choose_response(
     if dataset.kind != "encoded":
         if dataset.kind == "raw":
             matrix = color_matrix([record.image for record in dataset.records])
-        return ResponseChoice(dataset, response_by_name(CURVES[dataset.kind]), matrix)
+        return ResponseChoice(dataset, response_by_name(_CURVES[dataset.kind]), matrix)
     if str(curve) == "auto":
         selection = _select_for_dataset(dataset, method, candidates)
         if selection.note:
@@ -108,7 +111,7 @@ def check_response(dataset: DataparserOutputs, *, response: "str | Path | Respon
     """Raise InputError if a named response is not that of photos whose light is known."""
     if dataset.kind == "encoded" or not isinstance(response, str | Path):
         return
-    allowed = {"auto", CURVES[dataset.kind]} | ({"linear"} if dataset.kind == "linear" else set())
+    allowed = {"auto", _CURVES[dataset.kind]} | ({"linear"} if dataset.kind == "linear" else set())
     if str(response) not in allowed:
         problem = f"its photos are {dataset.kind}: their light is known, and response {response} does not apply"
         raise InputError(path, problem, "leave the response out")

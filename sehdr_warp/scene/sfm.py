@@ -28,8 +28,8 @@ from ..subsets import first_names
 from .cached_folder import cached_folder
 from .colmap_model import SparseModel, counted_rows, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
-from .photo_pairs import likely_pairs, pairs_with
 from .photos import read_photo, unusable_notes
+from .sfm_pairs import likely_pairs, pairs_with
 
 _log = logging.getLogger("sehdr_warp.scene")
 

@@ -16,9 +16,8 @@ from ..parallel import run_interruptibly
 from ..progress import stage, track_progress
 from .colmap_model import ModelImage, SparseModel, counted_rows, read_points
 from .dataparser import PointCloud
-from .images import open_image
+from .images import kind_of, open_image
 from .lens import Lens
-from .linear_photos import kind_of
 from .photos import photo_sizes, read_photo
 from .sfm import (
     EXHAUSTIVE_LIMIT,

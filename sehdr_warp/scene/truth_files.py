@@ -10,9 +10,9 @@ from pathlib import Path
 from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import ImageRecord
+from .file_names import bases_of, fold_name, folders_named
 from .hdr_files import is_without_colors
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
-from .names import bases_of, fold_name, folders_named
 
 TRUTH_FOLDERS = ("hdr", "exr")
 _MOST_FILES = 1 << 20  # Files among which photos of one name are looked for

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from ..subsets import first_names
 from .dataparser import ImageRecord
+from .file_names import bases_of, is_system_file, natural_key, without_mask_mark
 from .heif import HEIF_SUFFIXES, heif_installed
 from .images import PHOTO_SUFFIXES
-from .names import bases_of, is_system_file, natural_key, without_mask_mark
 
 # What tools write beside photos, and nobody takes for one.
 _QUIET = {

@@ -16,8 +16,8 @@ from PIL import Image
 
 from ..errors import InputError, require_extra
 from ..sandbox import read_sandboxed
-from .chroma import upsample_chroma
 from .images import MAX_PIXELS, check_size
+from .video_chroma import upsample_chroma
 from .video_color import VideoColor, read_color
 
 _log = logging.getLogger("sehdr_warp.scene")

@@ -15,8 +15,8 @@ from ..errors import InputError
 from ..progress import stage
 from .cached_folder import cached_folder
 from .dataparser import DataparserOutputs
+from .file_names import list_images
 from .images import png16
-from .names import list_images
 from .read_photos import find_photos
 from .sfm import file_digest
 from .video import Clip, codes, decode, grey, in_square_pixels, open_clip

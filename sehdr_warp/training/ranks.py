@@ -25,7 +25,7 @@ from ..errors import SehdrError, as_user_error
 from ..model.adam import Adam
 from ..model.gaussians import Gaussians
 from ..parallel import WAITING_NOTICE, run_interruptibly, thread_count
-from ..scene.photo_file import PhotoFile, can_share, open_shared
+from ..scene.photo_storage import PhotoFile, can_share, open_shared
 from .launch import RankInfo, installed_versions, open_store
 from .strategies import Strategy
 

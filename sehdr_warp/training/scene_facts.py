@@ -11,7 +11,7 @@ from ..runs.config import Config, LossConfig
 from ..runs.values import LoadArguments
 from ..scene import Scene, View, encoded_values
 from ..scene.exif import are_camera_jpegs
-from ..scene.linear_photos import kind_of
+from ..scene.images import kind_of
 from ..scene.wide_camera import perspective_views
 from ..subsets import every_nth
 from .initialization import focus_distance, points_on_rays
@@ -211,8 +211,8 @@ def check_dataset_truth(data: LoadArguments, config: Config) -> None:
 
     `data` names the photos, `config` is the config before the plan.
     """
+    from ..scene.file_names import unique_names
     from ..scene.load import parse_dataset
-    from ..scene.names import unique_names
 
     # A plan removes the loss between brackets and truth that is missing.
     removed = config.plan.enabled and not config.loss.hdr_weight

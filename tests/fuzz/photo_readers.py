@@ -14,9 +14,9 @@ from sehdr_warp.scene.gain_map import light_of, read_gain_map
 from sehdr_warp.scene.gravity import find_up
 from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
 from sehdr_warp.scene.images import open_image
-from sehdr_warp.scene.linear_photos import color_matrix, raw_exposure
 from sehdr_warp.scene.masks import read_mask
 from sehdr_warp.scene.photos import photo_sizes, read_photo
+from sehdr_warp.scene.raw import color_matrix, raw_exposure
 from sehdr_warp.scene.video import codes, decode, open_clip
 from sehdr_warp.scene.video_frames import choose_frames
 from tests.make_scenes import pattern

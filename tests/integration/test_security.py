@@ -190,7 +190,7 @@ def test_the_tests_of_a_sentence_are_there(sentence):
 
 
 MODULES = {"pickle", "marshal", "shelve", "dill", "joblib"}
-UNPICKLES = {"training/ranks.py", "scene/photo_file.py"}
+UNPICKLES = {"training/ranks.py", "scene/photo_storage.py"}
 """What the processes of one training hand each other."""
 
 

@@ -12,9 +12,9 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color_encoding import encoding_of, encoding_of_profile
-from sehdr_warp.scene.icc import xyz_to_rec709
+from sehdr_warp.scene.color_icc import xyz_to_rec709
+from sehdr_warp.scene.color_primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
 from sehdr_warp.scene.images import EncodedImage, open_image, read_ldr
-from sehdr_warp.scene.primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
 from tests.make_scenes import load, pattern, write_colmap
 
 SPACES = {"sRGB": ("sRGB", None), "Display P3": ("Display P3", None), "Adobe RGB": ("Adobe RGB (1998)", 563 / 256),

@@ -9,7 +9,7 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.linear_photos import color_matrix, raw_sizes, read_raw
+from sehdr_warp.scene.raw import color_matrix, raw_sizes, read_raw
 
 from .dng_files import area, gain_map, jpeg_tiles, longs, mosaic, opcodes, rationals, shorts, write_tagged_dng
 

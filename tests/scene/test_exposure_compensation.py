@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene import Camera, Scene, View, codes_of, photo_file
+from sehdr_warp.scene import Camera, Scene, View, codes_of, photo_storage
 from sehdr_warp.scene.camera import look_at
 from sehdr_warp.scene.exposure_compensation import (
     BAND_ROWS,
@@ -194,11 +194,11 @@ def test_photos_are_evened_row_by_row_as_by_their_light(gains, vignetting):
 def test_photos_that_do_not_fit_into_memory_are_evened_into_a_file(gains, monkeypatch, caplog):
     scene = photographed(gains, everywhere(VIGNETTING))
     in_memory = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
-    monkeypatch.setattr(photo_file, "available_memory", lambda: 0)
+    monkeypatch.setattr(photo_storage, "available_memory", lambda: 0)
     with caplog.at_level("INFO"):
         on_disk = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
     assert "they are read from a nameless file" in caplog.text
-    files = {photo_file._file_of(view.codes) for view in on_disk.views}
+    files = {photo_storage._file_of(view.codes) for view in on_disk.views}
     assert len(files) == 1 and None not in files
     assert all(np.array_equal(a.codes, b.codes) for a, b in zip(on_disk.views, in_memory.views, strict=True))
     # Photos that are left as they are stay in the file where they were.

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.color_primaries import matrix_to_rec709
 from sehdr_warp.scene.gain_map import GainMap, light_of, read_gain_map
 from sehdr_warp.scene.images import read_ldr
-from sehdr_warp.scene.primaries import matrix_to_rec709
 
 from .gain_map_files import iso_metadata, jpeg_bytes, write_heif_pair, write_jpeg_pair, xmp_segment
 from .test_color_encoding import icc_profile

@@ -16,7 +16,7 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.dng import read_dng
-from sehdr_warp.scene.linear_photos import color_matrix, linear_codes, raw_exposure, read_raw
+from sehdr_warp.scene.raw import color_matrix, linear_codes, raw_exposure, read_raw
 from sehdr_warp.scene.sfm import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
 from sehdr_warp.training.plan import make_plan

@@ -6,8 +6,8 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.file_names import list_images
 from sehdr_warp.scene.masks import read_mask
-from sehdr_warp.scene.names import list_images
 from sehdr_warp.scene.read_photos import find_photos
 from tests.make_scenes import (
     RadianceView,

@@ -20,9 +20,9 @@ from sehdr_warp.scene import load_scene, sfm
 from sehdr_warp.scene.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.dataparser import ImageRecord, PointCloud
 from sehdr_warp.scene.exposure import shutter
+from sehdr_warp.scene.file_names import natural_key, unique_names
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
-from sehdr_warp.scene.names import natural_key, unique_names
 from sehdr_warp.scene.sfm import MOST_ERROR, Reconstruction, image_name, reconstruct
 from tests.make_scenes import edited_json, load, write_blender, write_colmap, write_ply
 

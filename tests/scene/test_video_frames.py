@@ -8,9 +8,9 @@ import pytest
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.file_names import list_images
 from sehdr_warp.scene.images import read_ldr
 from sehdr_warp.scene.lens import Lens
-from sehdr_warp.scene.names import list_images
 from sehdr_warp.scene.video import open_clip
 from sehdr_warp.scene.video_color import codes_in_rec709
 from sehdr_warp.scene.video_frames import choose_frames, frames_folder

@@ -14,7 +14,7 @@ from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Scene, View, codes_of
 from sehdr_warp.scene.lens import Lens
-from sehdr_warp.scene.photo_file import PhotoKeeper
+from sehdr_warp.scene.photo_storage import PhotoKeeper
 from sehdr_warp.scene.wide_camera import pixel_directions, solid_angles
 from sehdr_warp.training.initialization import make_field
 from sehdr_warp.training.targets import PhotoSource

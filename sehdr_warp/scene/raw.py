@@ -1,12 +1,11 @@
-"""Photos that hold light itself: a camera's RAW files, linear 16-bit photos, and OpenEXR and Radiance pictures.
+"""A camera's RAW files: LibRaw's photos, in 16-bit codes of sRGB's curve, so that there is no response to guess.
 
-They become 16-bit codes of a curve of this package's own choice, so there is no response to guess. RAW stays in the
-sensor's own colors, without white balance: there each channel clips at its own white level, which is code 65535. One
-matrix (Scene.color_matrix) leads from there to Rec.709, with the white balance of the set's first photo.
+Light stays in the sensor's own colors, without white balance: there each channel clips at its own white level, code
+65535. One matrix (Scene.color_matrix) leads from there to Rec.709, with the white balance of the set's first photo.
 """
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,72 +13,17 @@ import numpy as np
 
 from ..errors import InputError, require_extra
 from ..quiet import silent_stderr
-from ..subsets import every_nth
-from .dataparser import reinhard_gamma
+from .color_primaries import linear_to_srgb
 from .dng import read_dng
 from .dng_develop import CLIPPED, clipping_level, develop_dng
-from .hdr_files import read_hdr
-from .images import HDR_SUFFIXES, RAW_SUFFIXES, EncodedImage, check_size, require_file
-from .primaries import linear_to_srgb
+from .images import EncodedImage, check_size, require_file
 from .types import codes_of
 
-CURVES = {"raw": "srgb", "linear": "srgb", "gain-map": "gain-map", "float": "hdr-nerf"}
-"""The response of each kind's codes. Float pictures have no white level, nor has Reinhard's curve."""
 _XYZ_FROM_REC709 = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
 _NOISE = 0.02  # Standard deviation of the logarithm of light near white, from a sensor's noise and demosaicing
-_MIDDLE_GREY = 0.18
-_MOST_JUDGED = 24
 _REMEDY = "develop the photos as JPEG, PNG or TIFF, or convert them to DNG"
-
-
-def kind_of(path: Path) -> str:
-    """Return raw, float or encoded, by the suffix."""
-    suffix = path.suffix.lower()
-    return "raw" if suffix in RAW_SUFFIXES else "float" if suffix in HDR_SUFFIXES else "encoded"
-
-
-def float_codes(radiance: np.ndarray, time: float) -> np.ndarray:
-    """Return [H, W, 3] uint16 codes of linear values at an exposure time."""
-    return codes_of(reinhard_gamma(radiance * time), 16)
-
-
-def log_averages(photos: Sequence[Path]) -> dict[int, float]:
-    """Return the logarithm of the log-average of each float image of an even sample, by its index.
-
-    Raises:
-        InputError: if none of those that are sampled can be read; others are left out.
-    """
-    averages, problems = {}, []
-    for index in every_nth(range(len(photos)), _MOST_JUDGED):
-        try:
-            averages[index] = float(np.log(_log_average(read_hdr(photos[index]))))
-        except InputError as error:
-            problems.append(error)
-    if not averages:
-        raise problems[0]
-    return averages
-
-
-def middle_grey_time(averages: Collection[float]) -> float:
-    """Return the exposure time at which images of these log_averages() are middle grey."""
-    return _MIDDLE_GREY / float(np.exp(np.mean(list(averages))))
-
-
-def follow_times(averages: Mapping[int, float], times: Sequence[float]) -> bool:
-    """Return whether images become more alike if their values are divided by their exposure times.
-
-    `averages` are log_averages(), `times` those of all images.
-    """
-    values = np.array(list(averages.values()))
-    return bool(np.std(values - np.log([times[index] for index in averages])) <= np.std(values))
-
-
-def tone_mapped(path: Path) -> np.ndarray:
-    """Return [H, W, 3] uint8 of a float image at its own exposure, for structure from motion."""
-    radiance = read_hdr(path)
-    return codes_of(reinhard_gamma(radiance * _MIDDLE_GREY / _log_average(radiance)), 8)
 
 
 def raw_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -140,16 +84,17 @@ def linear_codes(linear: np.ndarray) -> np.ndarray:
 
 
 def raw_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
-    """Exposure time in seconds, ISO speed and f-number that a RAW file states, None where it does not."""
+    """Return exposure time in seconds, ISO speed and f-number that a RAW file states, None for what it does not."""
     with _open(path) as raw:
         metadata = raw.other
         return tuple(v if v > 0 else None for v in (metadata.shutter_speed, metadata.iso_speed, metadata.aperture))  # type: ignore[return-value]
 
 
 def color_matrix(photos: Sequence[Path]) -> np.ndarray:
-    """[3, 3] from the sensor's colors to linear Rec.709, with the white balance of the first photo.
+    """Return [3, 3] from the sensor's colors to linear Rec.709, with the white balance of the first photo.
 
-    InputError where a file states no colors, or the photos are of different cameras.
+    Raises:
+        InputError: if a file states no colors, or the photos are of different cameras.
     """
     first = None
     for photo in photos:
@@ -185,11 +130,3 @@ def _open(path: Path) -> Iterator[Any]:
         read_dng(path)  # Its own words come first, for example of a compression that LibRaw does not know.
         reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
         raise InputError(path, f"cannot be read as RAW ({reason})", "copy the file again") from None
-
-
-def _log_average(radiance: np.ndarray) -> float:
-    mean = radiance.mean(axis=2)
-    bright = float(np.percentile(mean, 99))
-    if not bright > 0:
-        return 1.0
-    return float(np.exp(np.log(np.maximum(mean, bright * 1e-6)).mean()))

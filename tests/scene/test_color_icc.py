@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.scene.color_encoding import encoding_of_profile
-from sehdr_warp.scene.icc import read_profile, xyz_to_rec709
+from sehdr_warp.scene.color_icc import read_profile, xyz_to_rec709
 from sehdr_warp.scene.images import read_ldr
 from tests.make_scenes import load
 

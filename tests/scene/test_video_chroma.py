@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
-from sehdr_warp.scene.chroma import upsample_chroma
+from sehdr_warp.scene.video_chroma import upsample_chroma
 
 CENTER = (0.5, 0.5)
 

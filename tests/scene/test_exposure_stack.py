@@ -9,7 +9,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.stack import calibrate
+from sehdr_warp.scene.exposure_stack import calibrate
 
 
 class Matched(Exception):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sehdr_warp.scene.srgb_codes import FloatTable
+from sehdr_warp.scene.color_srgb_codes import FloatTable
 
 
 def test_values_are_those_of_the_function_at_nearly_the_same_place():

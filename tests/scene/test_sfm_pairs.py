@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.scene import photo_pairs, sfm
-from sehdr_warp.scene.photo_pairs import _match_count, likely_pairs, pairs_with
+from sehdr_warp.scene.sfm_pairs import _match_count, likely_pairs, pairs_with
 
 
 def descriptors(count, seed, like=None, noise=0.0):

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from .primaries import linear_to_srgb
+from .color_primaries import linear_to_srgb
 
 _DROPPED = 10  # Bits of the fraction that are dropped: 13 stay, which are within 6e-5 of a value
 _LEAST, _MOST = 2.0**-24, 2.0**17  # The darkest value that photos of 16 bits hold, and the brightest float16

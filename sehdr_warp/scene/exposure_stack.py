@@ -14,8 +14,8 @@ from PIL import Image
 from ..errors import InputError
 from .dataparser import UNPLACED, ImageRecord
 from .exposure import shutter, with_exposure_times
+from .file_names import list_images
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
-from .names import list_images
 
 if TYPE_CHECKING:
     from ..response import Response

@@ -10,7 +10,7 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.photo_file import PhotoFile, open_shared
+from sehdr_warp.scene.photo_storage import PhotoFile, open_shared
 from tests.make_scenes import write_blender, write_ply
 
 
@@ -42,9 +42,9 @@ def test_too_large_for_the_disk_is_one_line(tmp_path, monkeypatch):
     assert load_scene(tmp_path, response="srgb").notes is not None
     with pytest.raises(InputError, match="the photos take .* of this disk; use smaller photos"):
         load_scene(tmp_path, response="srgb", photo_storage="disk")
-    monkeypatch.setattr("sehdr_warp.scene.photo_file.available_memory", lambda: 0)
+    monkeypatch.setattr("sehdr_warp.scene.photo_storage.available_memory", lambda: 0)
     with pytest.raises(InputError, match="of this disk"):
         load_scene(tmp_path, response="srgb")
     monkeypatch.undo()
-    monkeypatch.setattr("sehdr_warp.scene.photo_file.available_memory", lambda: 0)
+    monkeypatch.setattr("sehdr_warp.scene.photo_storage.available_memory", lambda: 0)
     assert any("nameless file" in note for note in load_scene(tmp_path, response="srgb").notes)
