@@ -1,4 +1,15 @@
-"""Cameras, views, scenes, and the readers that load them from photos. Imports neither torch nor warp."""
+"""Cameras, views, scenes, and the readers that load them from photos. Imports neither torch nor warp.
+
+load.py leads from a data folder to a Scene (types.py). Files in the order of its work:
+
+- read_*.py: dataparsers, one for each layout, whose result (dataparser.py) is photos, cameras and points.
+- masks.py, truth_files.py, unused_files.py, file_names.py: which file belongs to which photo.
+- exposure*.py, exif.py: exposure times, and what a camera changed without stating it.
+- sfm*.py: cameras of bare photos by structure from motion. camera*.py, lens.py: cameras and their lenses.
+- images.py, heif.py, tiff.py, hdr_files.py, raw.py, dng*.py, gain_map*.py, video*.py: decoders.
+- color_*.py, response_choice.py: colors that files state, and the camera's response.
+- preprocess.py, photo_storage.py: views, undistorted and resized in linear light, in memory or on the disk.
+"""
 
 from .camera import Camera, look_at
 from .camera_files import load_cameras

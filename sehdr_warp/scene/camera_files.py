@@ -5,7 +5,6 @@ import logging
 import math
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -67,8 +66,12 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
 
 
 def _of_json(path: Path) -> list[tuple[str, Camera]]:
-    if read_text(path).lstrip().startswith("["):
-        return _cameras(path, _list(path), lambda entry, _: (str(entry["img_name"]), _inria(entry, path)))
+    if (text := read_text(path)).lstrip().startswith("["):
+        try:
+            entries = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(path, f"is not valid JSON ({error})", "export the file again") from None
+        return _cameras(path, entries, lambda entry, _: (str(entry["img_name"]), _inria(entry, path)))
     values = read_json(path)
     if isinstance(values.get("cameras"), list):
         return _cameras(path, values["cameras"], lambda e, i: (str(e.get("name", f"{i:04d}")), Camera.from_dict(e)))
@@ -94,13 +97,6 @@ def _cameras(path: Path, entries: list, read) -> list[tuple[str, Camera]]:
         except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
             raise InputError(path, f"camera {i} cannot be used ({error!s:.120})", "correct the camera") from None
     return cameras
-
-
-def _list(path: Path) -> list[Any]:
-    try:
-        return json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, f"is not valid JSON ({error})", "export the file again") from None
 
 
 def _inria(entry: dict, path: Path) -> Camera:

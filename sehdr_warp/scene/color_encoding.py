@@ -266,7 +266,12 @@ def _from_cicp(values: tuple[int, int, int], source: str) -> ColorEncoding:
     primaries, transfer, full = values
     name = f"{source} {primaries}/{transfer}"
     try:
-        matrix = None if primaries in _UNSTATED else _h273_matrix(primaries)
+        matrix = None
+        if primaries not in _UNSTATED:
+            from colour.models.rgb import itut_h_273 as h273
+
+            places, white = h273.COLOUR_PRIMARIES_ITUTH273[primaries], h273.CCS_WHITEPOINTS_ITUTH273[primaries]
+            matrix = matrix_to_rec709((*map(float, np.ravel(places)), *map(float, white)))
         curve = _h273_curve(13 if transfer in _UNSTATED else transfer)
     except (KeyError, ValueError):
         return ColorEncoding(name, problem=f"its {name} is not known")
@@ -276,13 +281,6 @@ def _from_cicp(values: tuple[int, int, int], source: str) -> ColorEncoding:
     if transfer in _LIGHT:
         return ColorEncoding(name, matrix, (curve,) * 3, _LIGHT[transfer])
     return _simplify(name, matrix, (curve,) * 3)
-
-
-def _h273_matrix(primaries: int) -> np.ndarray:
-    from colour.models.rgb import itut_h_273 as h273
-
-    places, white = h273.COLOUR_PRIMARIES_ITUTH273[primaries], h273.CCS_WHITEPOINTS_ITUTH273[primaries]
-    return matrix_to_rec709((*map(float, np.ravel(places)), *map(float, white)))
 
 
 def _h273_curve(transfer: int) -> np.ndarray:

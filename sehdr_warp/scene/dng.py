@@ -112,7 +112,12 @@ def read_dng(path: Path) -> DngRaw | None:
         return None
     if big:
         raise InputError(path, "is a DNG in the form of a BigTIFF, which LibRaw does not read", _CONVERT)
-    raw = [table for table in tables if table.get(_PHOTOMETRIC) in (_CFA, _LINEAR_RAW) and not _reduce(table)]
+    # Directories of another subfile type hold a preview, a mask or a depth map.
+    raw = [
+        table
+        for table in tables
+        if table.get(_PHOTOMETRIC) in (_CFA, _LINEAR_RAW) and not table.get(_NEW_SUBFILE_TYPE, 0)
+    ]
     if not raw:
         return None
     try:
@@ -141,12 +146,6 @@ def _tables(file: Any) -> Iterator[Any]:
         inner = table.get(_SUB_IFDS, ())
         places += [*(inner if isinstance(inner, tuple) else (inner,)), table.next]
         yield table
-
-
-def _reduce(table: Any) -> bool:
-    """Return whether a directory holds a preview, a mask or a depth map rather than the photo."""
-    kind = table.get(_NEW_SUBFILE_TYPE, 0)
-    return bool(kind if isinstance(kind, int) else 0)
 
 
 def _check_decodable(path: Path, table: Any) -> None:

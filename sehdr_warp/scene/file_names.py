@@ -14,7 +14,7 @@ from urllib.parse import unquote
 from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import ImageRecord
-from .images import PHOTO_SUFFIXES
+from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 
 OTHER_FOLDERS = ("masks", "mask", "hdr", "exr")
 """Folders of pictures that are not photos."""
@@ -44,6 +44,12 @@ def sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
         return next((candidate for candidate in candidates if candidate.is_file()), None)
     except (OSError, ValueError):  # A name from a data file that is not possible as a file name.
         return None
+
+
+def photo_and_truth(image: Path) -> tuple[Path, Path | None]:
+    """Return the photo beside a float picture, and the picture as its truth; any other image without truth."""
+    photo = sibling(image, LDR_SUFFIXES) if image.suffix.lower() in HDR_SUFFIXES else None
+    return (image, None) if photo is None else (photo, image)
 
 
 def image_folder(folder: Path) -> Path | None:
@@ -204,20 +210,18 @@ def distinct(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[st
     return unique, [f"{count} listed more than once, and counted once: {text}"]
 
 
-def renamed_note(renamed: Sequence[tuple[str, Path]]) -> list[str]:
-    """Return a note on photos that were found under another suffix.
-
-    Args:
-        renamed: the name that a data file states and the photo, of all photos.
-    """
-    suffixes = [PureWindowsPath(name).suffix.lower() for name, _ in renamed]
-    pairs = zip(suffixes, renamed, strict=True)
-    others = [pair for suffix, pair in pairs if suffix in PHOTO_SUFFIXES and suffix != pair[1].suffix.lower()]
+def renamed_note(images: Mapping[str, Path | None]) -> list[str]:
+    """Return a note on photos under another suffix than their names, which are the keys, have."""
+    suffixes = {name: PureWindowsPath(name).suffix.lower() for name in images}
+    others = [
+        (PureWindowsPath(name).name, photo.name)
+        for name, photo in images.items()
+        if photo is not None and suffixes[name] in PHOTO_SUFFIXES and suffixes[name] != photo.suffix.lower()
+    ]
     if not others:
         return []
-    name, photo = others[0]
     count = f"{len(others)} photos have" if len(others) > 1 else "1 photo has"
-    return [f"{count} another suffix than the set states: {PureWindowsPath(name).name} is {photo.name}"]
+    return [f"{count} another suffix than the set states: {others[0][0]} is {others[0][1]}"]
 
 
 def bases_of(images: Sequence[Path], folder: Path) -> list[Path]:

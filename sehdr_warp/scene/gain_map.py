@@ -238,15 +238,11 @@ def _of_items(path: Path) -> GainMap | None:
     for number, item in items.items.items():
         kinds = [data[4:].split(b"\0")[0].decode("latin-1") for name, data in item.properties if name == "auxC"]
         if _APPLE_AUX in kinds:
-            xmp = "".join(xmp_text(item_bytes(path, items.items[n])) for n in _described_by(items, number))
+            sources = (source for kind, source, to in items.references if kind == "cdsc" and number in to)
+            described = (items.items[n] for n in sources if n in items.items and items.items[n].kind == "mime")
+            xmp = "".join(xmp_text(item_bytes(path, each)) for each in described)
             return _gain_map_of(parameters_of_apple(xmp, exif), _item_pixels(path, items, number, photo))
     return None
-
-
-def _described_by(items: HeifItems, number: int) -> list[int]:
-    """Return the XMP items that describe an item."""
-    sources = [source for kind, source, to in items.references if kind == "cdsc" and number in to]
-    return [source for source in sources if source in items.items and items.items[source].kind == "mime"]
 
 
 def _item_pixels(path: Path, items: HeifItems, number: int, photo: tuple[int, int]) -> np.ndarray:

@@ -117,9 +117,8 @@ def read_mask(path: Path, *, oriented: bool = False, labeled: set[Path] | None =
     largest, two = float(values.max()), (values == 0) | (values == values.max())
     if largest <= 1 or (float(values.min()) == 0 and two.all()):
         return (values > 0).astype(np.float32)
-    if (
-        largest <= _MOST_LABELS and float(values.min()) < largest and path.suffix.lower() not in JPEG_SUFFIXES
-    ):  # Their dark pixels may be noise
+    lossy = path.suffix.lower() in JPEG_SUFFIXES  # Its dark pixels may be noise.
+    if largest <= _MOST_LABELS and float(values.min()) < largest and not lossy:
         if labeled is not None:
             labeled.add(path)
         return (values > 0).astype(np.float32)

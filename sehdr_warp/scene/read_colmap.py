@@ -15,10 +15,9 @@ from .file_names import (
     find_images,
     image_folder,
     natural_key,
+    photo_and_truth,
     renamed_note,
-    sibling,
 )
-from .images import HDR_SUFFIXES, LDR_SUFFIXES
 from .photos import unusable_notes
 from .unused_files import unread_kinds
 
@@ -56,21 +55,16 @@ def read_colmap(folder: Path) -> DataparserOutputs:
         raise InputError(folder, "is a COLMAP model without photos", "give the folder that holds it and images/")
     if images is None:
         raise InputError(folder / "images", "folder not found", "put the photos that COLMAP used there")
-    records, absent, photo_names = [], [], []
-    held_out = _held_out_names(source)
     photos = find_images(images, [image.name for image in model.images], source)
+    absent = sorted((name for name, photo in photos.items() if photo is None), key=natural_key)
+    listed = source / "test.txt"  # Held-out images, as 3DGS lists them
+    held_out = {line.strip() for line in read_lines(listed, "surrogateescape")} if has_file(listed) else set()
+    records = []
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
-        image = photos[entry.name]
-        photo_names += [] if image is None else [(entry.name, image)]
-        if image is not None and image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
-            hdr, image = image, photo
-        elif image is None:
-            absent.append(entry.name)
-            continue
-        else:
-            hdr = None
-        split = "test" if entry.name in held_out else "train" if held_out else None
-        records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, split=split, hdr=hdr))
+        if (found := photos[entry.name]) is not None:
+            image, hdr = photo_and_truth(found)
+            split = "test" if entry.name in held_out else "train" if held_out else None
+            records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, split=split, hdr=hdr))
     if not records:
         problem = f"none of the model's {len(absent)} images is here (the first is {absent[0]!r:.90})"
         others = unread_kinds(images)
@@ -78,16 +72,10 @@ def read_colmap(folder: Path) -> DataparserOutputs:
         raise InputError(images, problem, IMAGES_REMEDY)
     records, repeated = distinct(records)
     unusable = unusable_notes(model.unusable, len(model.images) + len(model.unusable))
-    notes = [*other_models(source), *unusable, *renamed_note(photo_names), *repeated]
+    notes = [*other_models(source), *unusable, *renamed_note(photos), *repeated]
     if absent:
         notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
     return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))
-
-
-def _held_out_names(source: Path) -> set[str]:
-    """Return the images that a list beside a model holds out, as 3DGS reads it; none without the list."""
-    listed = source / "test.txt"
-    return {line.strip() for line in read_lines(listed, "surrogateescape")} - {""} if has_file(listed) else set()
 
 
 def _images_of_model(source: Path, names: Sequence[str], folder: Path) -> Path | None:

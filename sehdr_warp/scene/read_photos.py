@@ -129,8 +129,9 @@ def _require_photos(count: int, first: Path, folder: Path) -> None:
 def _remedy_without_photos(folder: Path) -> str:
     """Return what to give in place of a folder that holds no photos."""
     with suppress(OSError):
-        if find_model(folder.parent) and image_folder(folder.parent):
-            return f"give {folder.parent}"
+        above = folder.resolve().parent
+        if find_model(above) and image_folder(above):
+            return f"give {above}"
         if inner := _folders_with_photos(folder):
             poses = "".join(f"; {note}" for note in _foreign_poses(folder))
             return f"give one of its folders with photos: {first_names(inner, 5)}{poses}"
@@ -165,7 +166,7 @@ def _folders_with_photos(folder: Path) -> list[str]:
 
 def _cameras_above(folder: Path) -> list[str]:
     """Return a note if the folder above holds cameras of a set to which the photos may belong."""
-    above = folder.parent
+    above = folder.resolve().parent
     files = [above / name for name in _CAMERA_FILES if (above / name).is_file()]
     cameras = find_model(above) or next(iter(files), None)
     return (

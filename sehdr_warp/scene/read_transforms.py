@@ -14,8 +14,8 @@ from ..subsets import first_names
 from .colmap_model import find_model, read_ply_points, read_points
 from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
-from .file_names import distinct, find_image, find_images, image_folder, plain_path, renamed_note, sibling
-from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
+from .file_names import distinct, find_image, find_images, image_folder, photo_and_truth, plain_path, renamed_note
+from .images import PHOTO_SUFFIXES
 from .photos import unusable_notes
 from .transforms_lens import frame_lens
 
@@ -69,7 +69,7 @@ def read_transforms(folder: Path, file: Path | None = None) -> DataparserOutputs
     notes = read.notes(folder)
     records, repeated = distinct(read.records)
     records, unmasked = _without_missing_masks(records)
-    notes += [*repeated, *missing, *unmasked, *read.unread_note()]
+    notes += [*repeated, *missing, *unmasked]
     in_splits = [record for record in records if record.split]
     if 0 < len(in_splits) < len(records):
         count = len(records) - len(in_splits)
@@ -84,7 +84,7 @@ class _Frames:
     Attributes:
         records: of the frames that can be used.
         absent: names of frames without a photo.
-        photos: names and photos of the frames that have one.
+        photos: by the names of the frames, None for one without.
         unusable: errors of poses, whose frames are left out.
         untimed: errors of exposure times, which are left out.
         unread: fields of _UNREAD that the files state.
@@ -93,7 +93,7 @@ class _Frames:
 
     records: list[ImageRecord] = field(default_factory=list)
     absent: list[str] = field(default_factory=list)
-    photos: list[tuple[str, Path]] = field(default_factory=list)
+    photos: dict[str, Path | None] = field(default_factory=dict)
     unusable: list[InputError] = field(default_factory=list)
     untimed: list[InputError] = field(default_factory=list)
     unread: set[str] = field(default_factory=set)
@@ -104,6 +104,7 @@ class _Frames:
         frames = frames_of(values, path)
         splits = _named_splits(values, frames)
         images = _frame_images(folder, [name for name, _ in frames], path)
+        self.photos |= images
         for name, frame in frames:
             fields = values | frame
             self.unread |= {key for key in _UNREAD if np.any(fields.get(key))}
@@ -118,8 +119,9 @@ class _Frames:
             if image is None:
                 self.absent.append(name)
                 continue
-            self.photos.append((name, image))
-            record = _frame_record(folder, path, values, frame, image, split or splits.get(plain_path(name)))
+            image, hdr = photo_and_truth(image)
+            lens = frame_lens(values, frame, image, path)
+            mask = _mask_file(folder, frame["mask_path"], path) if frame.get("mask_path") else None
             stated = ((fields[key], unit) for key, unit in _TIMES.items() if fields.get(key) is not None)
             time, unit = next(stated, (None, ""))
             try:
@@ -127,19 +129,12 @@ class _Frames:
             except InputError as error:
                 self.untimed.append(error)
                 seconds = None
-            self.records.append(replace(record, world_to_camera=pose, exposure_time=seconds))
-
-    def unread_note(self) -> list[str]:
-        """Return a note on fields that are not read, and on scenes that move."""
-        notes = [f"fields of the frames that are not read: {', '.join(sorted(self.unread))}"] if self.unread else []
-        for consequence, names in _VARYING.items():
-            for name in names:
-                if (count := len(self.varying[name])) > 1:
-                    notes.append(f"frames differ in {name} ({count} values), which is not read: {consequence}")
-        return notes
+            own_split = split or splits.get(plain_path(name))
+            record = ImageRecord(image.stem, image, lens, pose, None, seconds, own_split, mask, hdr)
+            self.records.append(record)
 
     def notes(self, folder: Path) -> list[str]:
-        """Return notes on the frames that cannot be used; raise InputError if too few can."""
+        """Return notes on frames and fields that cannot be used; raise InputError if too few frames can."""
         count = len(self.records)
         notes = unusable_notes(self.unusable, count + len(self.absent) + len(self.unusable))
         if not count:
@@ -151,6 +146,12 @@ class _Frames:
         if self.untimed:
             problem = self.untimed[0].problem
             notes.append(f"{len(self.untimed)} of {count} frames state no usable exposure time: {problem}")
+        if self.unread:
+            notes.append(f"fields of the frames that are not read: {', '.join(sorted(self.unread))}")
+        for consequence, names in _VARYING.items():
+            for name in (name for name in names if len(self.varying[name]) > 1):
+                values = f"{len(self.varying[name])} values"
+                notes.append(f"frames differ in {name} ({values}), which is not read: {consequence}")
         return notes
 
 
@@ -221,17 +222,6 @@ def _frame_image(folder: Path, name: str, path: Path) -> Path | None:
         # Of a kind that is not read, such as .jxl: what it is will be named.
         image = other if other.name == PureWindowsPath(name).name else None
     return image
-
-
-def _frame_record(folder: Path, path: Path, values: dict, frame: dict, image: Path, split: str | None) -> ImageRecord:
-    """Return the photo of a frame without its pose and exposure time."""
-    hdr = None
-    if image.suffix.lower() in HDR_SUFFIXES and (photo := sibling(image, LDR_SUFFIXES)):
-        hdr, image = image, photo
-    lens = frame_lens(values, frame, image, path)
-    mask = frame.get("mask_path")
-    mask = _mask_file(folder, mask, path) if mask else None
-    return ImageRecord(image.stem, image, lens, np.eye(4), split=split, mask=mask, hdr=hdr)
 
 
 def _mask_file(folder: Path, name: Any, path: Path) -> Path:

@@ -41,7 +41,10 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         return list(records), []
     bases = bases_of([record.image for record in photos], folder)
     places = folders_named(folder, TRUTH_FOLDERS)
-    files = {place: {_key(file.relative_to(place)): file for file in _float_files(place)} for place in places}
+    files = {
+        place: {_key(file.relative_to(place)): file for file in sorted(place.rglob("*")) if _is_float(file)}
+        for place in places
+    }
     stems = _stems_below(bases[0]) if places else Counter()
     beside = {parent: _beside(parent) for parent in {record.image.parent for record in photos}}
     result = []
@@ -52,7 +55,8 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
             keys += [fold_name(image.stem)] * (stems[fold_name(image.stem)] <= 1)
             candidates = ((place, files[place].get(key)) for key in keys for place in places)
             near = image.parent, beside[image.parent].get(fold_name(image.stem))
-            hdr = next((_inside(place, file, folder) for place, file in (*candidates, near) if file), None)
+            found = ((place, file.relative_to(place).as_posix()) for place, file in (*candidates, near) if file)
+            hdr = next((resolve_inside(place, name, folder) for place, name in found), None)
             hdr = None if hdr is not None and is_without_colors(hdr) else hdr
         result.append(replace(record, hdr=hdr))
     in_use, notes = {record.hdr for record in result}, []
@@ -70,21 +74,15 @@ def _may_have_truth(record: ImageRecord) -> bool:
     return record.hdr is None and not record.derived and record.image.suffix.lower() in LDR_SUFFIXES
 
 
-def _inside(place: Path, file: Path, folder: Path) -> Path:
-    """Return a file in a folder, or raise InputError if it is a link that leads out of it."""
-    return resolve_inside(place, file.relative_to(place).as_posix(), folder)
-
-
-def _float_files(place: Path) -> list[Path]:
-    return sorted(file for file in place.rglob("*") if file.suffix.lower() in HDR_SUFFIXES and file.is_file())
-
-
 def _beside(parent: Path) -> dict[str, Path]:
     """Map fold_name() stems to the float pictures of a folder."""
     if not parent.is_dir():
         return {}
-    files = (file for file in sorted(parent.iterdir(), reverse=True) if file.suffix.lower() in HDR_SUFFIXES)
-    return {fold_name(file.stem): file for file in files if file.is_file()}
+    return {fold_name(file.stem): file for file in sorted(parent.iterdir(), reverse=True) if _is_float(file)}
+
+
+def _is_float(file: Path) -> bool:
+    return file.suffix.lower() in HDR_SUFFIXES and file.is_file()
 
 
 def _stems_below(folder: Path) -> Counter:
