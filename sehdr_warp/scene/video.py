@@ -23,7 +23,7 @@ from .video_color import VideoColor, read_color
 _log = logging.getLogger("sehdr_warp.scene")
 
 VIDEO_SUFFIXES = (
-    ".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf",
+    ".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".mxf",
 )  # fmt: skip
 _IN_ONE_FRAME = b"\1", b"\2", b"\4", b"\5", b"\6", b"\7"  # FFmpeg's AVStereo3DType of two pictures in a frame
 UNSTITCHED_SUFFIXES = (".insv", ".insp", ".360", ".lrv")
@@ -83,7 +83,8 @@ def open_clip(path: Path) -> Clip:
             _log.warning("%s: its transparency is not read, so what it hides counts as seen", path)
         width, height = frame.width, frame.height
         aspect = float(stream.sample_aspect_ratio or 1)
-        aspect = aspect if 0.25 <= aspect <= 4 else 1.0
+        if not 0.25 <= aspect <= 4:
+            raise InputError(path, f"states pixels {aspect:g} times as wide as high", "correct its sample aspect ratio")
         width, height = round(width * max(aspect, 1)), round(height / min(aspect, 1))  # So that no pixel is lost
         check_size(path, width, height)
         if min(width, height) < _SMALLEST:

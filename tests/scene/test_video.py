@@ -147,6 +147,8 @@ def test_clips_that_cannot_be_used(tmp_path):
     refused("its camera hardly moves .* that shows no depth; walk with the camera")
     write_clip(tmp_path / "a.mp4", pan(2), codec="libx264", pixels="yuv420p")
     refused("holds 2 frames")
+    write_clip(tmp_path / "a.mp4", pan(4), codec="libx264", pixels="yuv420p", aspect=Fraction(9))
+    refused("states pixels 9 times as wide as high; correct its sample aspect ratio")
 
 
 @pytest.mark.parametrize("text", ["ffconcat version 1.0\nfile other.mp4\n", "#EXTM3U\n#EXTINF:10,\nother.mp4\n"])
