@@ -175,20 +175,20 @@ def rough_gains(
     weight.
     """
     light, radius = point_light(views, points, visible, response)
-    valid, of = np.isfinite(light), lens_groups(views)
+    valid, lenses = np.isfinite(light), lens_groups(views)
     light, square = np.where(valid, light, 0.0), radius[..., None] ** 2
-    gains, slopes = np.zeros((len(views), 1, 3)), np.zeros(of.max() + 2)  # The last is for photos of no group
-    mine = [(of == lens)[:, None, None] * square for lens in range(of.max() + 1)]
-    beside = [(own - _mean(own * valid, valid, 0)) * valid for own in mine]
+    gains, slopes = np.zeros((len(views), 1, 3)), np.zeros(lenses.max() + 2)  # The last is for photos of no group
+    squares = [(lenses == lens)[:, None, None] * square for lens in range(lenses.max() + 1)]
+    centered_squares = [(each - _mean(each * valid, valid, 0)) * valid for each in squares]
     for _ in range(ROUNDS):
-        for lens, own in enumerate(beside):
-            rest = light - gains + slopes[of][:, None, None] * square
+        for lens, centered in enumerate(centered_squares):
+            rest = light - gains + slopes[lenses][:, None, None] * square
             rest -= _mean(rest * valid, valid, 0)
-            slopes[lens] -= float((rest * own).sum() / max((own**2).sum(), 1e-9))
-        rest = light + slopes[of][:, None, None] * square
+            slopes[lens] -= float((rest * centered).sum() / max((centered**2).sum(), 1e-9))
+        rest = light + slopes[lenses][:, None, None] * square
         gains = _mean((rest - _mean((rest - gains) * valid, valid, 0)) * valid, valid, 1)
     names = [view.name for view in views]
-    vignetting = {name: (max(float(slopes[lens]), 0.0), 0.0) for name, lens in zip(names, of, strict=True)}
+    vignetting = {name: (max(float(slopes[lens]), 0.0), 0.0) for name, lens in zip(names, lenses, strict=True)}
     return _from_logarithms(names, gains[:, 0], vignetting)
 
 
@@ -294,33 +294,31 @@ def fit_gains(
 
     names = [view.name for view in (*views, *others)]
     light, radius = point_light((*views, *others), points, visible, response)
-    trained, count, most, of = light[: len(views)], len(points), len(views), lens_groups((*views, *others))
-    view, point, channel = np.nonzero(np.isfinite(trained))
-    values, lens = trained[view, point, channel], of[view]
+    lenses, view_count, point_count = lens_groups((*views, *others)), len(views), len(points)
+    view, point, channel = np.nonzero(np.isfinite(light[:view_count]))
+    values, lens = light[view, point, channel], lenses[view]
     r = np.where(lens >= 0, radius[view, point], 0.0)
-    one = np.ones(len(values))
-    rows = np.arange(len(values))
-    first = 3 * (count + most)
-    columns = 3 * point + channel, 3 * (count + view) + channel, first + 2 * lens.clip(0)
+    one, rows = np.ones(len(values)), np.arange(len(values))
+    # Unknowns: the light of each point and the gain of each photo, by channel, then a and b of each lens.
+    first_lens = 3 * (point_count + view_count)
+    a = first_lens + 2 * lens.clip(0)
+    columns = np.concatenate([3 * point + channel, 3 * (point_count + view) + channel, a, a + 1])
     system = sparse.csr_matrix(
-        (
-            np.concatenate([one, one, -(r**2), -(r**4)]),
-            (np.tile(rows, 4), np.concatenate([*columns, columns[2] + 1])),
-        ),
-        shape=(len(rows), first + 2 * (of.max() + 2)),
+        (np.concatenate([one, one, -(r**2), -(r**4)]), (np.tile(rows, 4), columns)),
+        shape=(len(rows), first_lens + 2 * (lenses.max() + 2)),
     )
-    solution: np.ndarray = np.zeros(first + 2 * (of.max() + 2))
+    solution: np.ndarray = np.zeros(system.shape[1])
     for width in TIGHT:
         residual = (values - system @ solution) / width if solution.any() else np.zeros_like(values)
         weight = 1 / (1 + residual**2)
         solution = lsmr(sparse.diags(weight) @ system, weight * values, damp=1e-3, x0=solution, maxiter=80)[0]
-    pairs = [*map(_possible, solution[first:].reshape(-1, 2)[: of.max() + 1]), NO_VIGNETTING]
-    vignetting = {name: pairs[lens] for name, lens in zip(names, of, strict=True)}
+    pairs = [*map(_possible, solution[first_lens:].reshape(-1, 2)[: lenses.max() + 1]), NO_VIGNETTING]
+    vignetting = {name: pairs[lens] for name, lens in zip(names, lenses, strict=True)}
     powers = _powers(ExposureCompensation({}, vignetting), (*views, *others), radius)
-    surfaces = solution[: 3 * count].reshape(count, 3)
-    gains = list(solution[3 * count : first].reshape(most, 3))
+    surfaces = solution[: 3 * point_count].reshape(point_count, 3)
+    gains = list(solution[3 * point_count : first_lens].reshape(view_count, 3))
     mean = np.mean(gains, 0)
-    for index in range(most, len(names)):
+    for index in range(view_count, len(names)):
         differences = light[index] - surfaces + powers[index][:, None]
         has_values = np.isfinite(differences).sum(0).min() > 0
         gains.append(np.nanmedian(differences, 0) if has_values else mean)

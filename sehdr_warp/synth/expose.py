@@ -22,10 +22,11 @@ _MOST_SAMPLES, _STEPS_PER_STOP = 200_000, 16
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """ImageRecord noise and read noise of a linear sensor, in electrons.
+    """Shot noise and read noise of a linear sensor, in electrons.
 
-    full_well: at the response's clip_exposure; for a curve that only approaches its peak, at Response.white.
-    read_noise: standard deviation.
+    Attributes:
+        full_well: at the response's clip_exposure; for a curve that only approaches its peak, at Response.white.
+        read_noise: standard deviation.
     """
 
     full_well: float = 20_000.0
@@ -41,7 +42,14 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class RadianceView:
-    """name: the view's stem (`r_0`); radiance: [H, W, 3] scene-linear, >= 0; split: "train" or "test"."""
+    """A view of HDR truth.
+
+    Attributes:
+        name: the view's stem (`r_0`).
+        camera: its camera.
+        radiance: [H, W, 3] scene-linear, at least 0.
+        split: "train" or "test".
+    """
 
     name: str
     camera: Camera
@@ -99,11 +107,13 @@ def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0)
 
 
 def ladder_of(name: str, images: Sequence[np.ndarray], encode: Callable, count: int = 5, factor: float = 4.0):
-    """`count` exposure times, each `factor` times the last, around a well exposed one of radiance images.
+    """Return `count` exposure times, each `factor` times the last, around a well exposed one of radiance images.
 
     Their geometric middle maximizes the mean well-exposedness exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z
-    (Mertens et al. 2007, "Exposure Fusion"), to a sixteenth of a stop. Raises InputError, with the name, where all is
-    black.
+    (Mertens et al. 2007, "Exposure Fusion"), to a sixteenth of a stop.
+
+    Raises:
+        InputError: with the name, if all is black.
     """
     radiance = np.concatenate([image.ravel() for image in images])
     radiance = radiance[:: -(-len(radiance) // _MOST_SAMPLES)].astype(np.float64)
@@ -182,15 +192,21 @@ def write_hdr_nerf_scene(
 ) -> None:
     """Write a set that load_scene reads, with HDR-NeRF's file names.
 
-    exposure_times: seconds. photos: at each time one of each view, [H, W, 3] encoded in [0, 1], stored in 8 bits.
-    points: ([P, 3] places, [P, 3] colors in [0, 1]). Raises InputError for a camera that the layout cannot hold.
+    Args:
+        folder: of the set, which exists.
+        views: with their truth.
+        exposure_times: seconds.
+        photos: at each time one of each view, [H, W, 3] encoded in [0, 1], stored in 8 bits.
+        points: [P, 3] positions and [P, 3] colors in [0, 1].
+
+    Raises:
+        InputError: for a camera that the layout cannot hold.
     """
     places = {"train": count(), "test": count()}
     for index, view in enumerate(views):
         (folder / view.split).mkdir(parents=True, exist_ok=True)
         for k, photo in enumerate(photos):
-            code = (np.clip(photo[index], 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
-            Image.fromarray(code).save(folder / view.split / f"{view.name}_{k}.png")
+            Image.fromarray(codes_of(photo[index], 8)).save(folder / view.split / f"{view.name}_{k}.png")
         write_radiance(truth_path(folder, view.split, next(places[view.split])), view.radiance)
     write_tables(folder, views, exposure_times, points)
 
@@ -206,7 +222,7 @@ def write_radiance(path: Path, radiance: np.ndarray, **options) -> None:
 
 
 def write_tables(folder: Path, views: Sequence[RadianceView], times: Sequence[float], points, **metadata) -> None:
-    """Write a set's poses, times and points, without its pictures; `stated` are more fields of transforms_<split>.json.
+    """Write a set's poses, times and points, without its pictures; `metadata` are more fields of its JSON.
 
     Raises:
         InputError: for cameras that differ, or have no square pixels or centered principal point.
