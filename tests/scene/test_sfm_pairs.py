@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sehdr_warp.scene import photo_pairs, sfm
+from sehdr_warp.scene import sfm, sfm_pairs
 from sehdr_warp.scene.sfm_pairs import _match_count, likely_pairs, pairs_with
 
 
@@ -50,11 +50,11 @@ def database(tmp_path):
 
 
 def test_each_photo_is_paired_with_those_that_match_it_best(database, monkeypatch):
-    monkeypatch.setattr(photo_pairs, "_FEATURES", 60)
+    monkeypatch.setattr(sfm_pairs, "_FEATURES", 60)
     pairs = {tuple(int(Path(name).stem) for name in pair) for pair in likely_pairs(database)}
     assert pairs >= {(i, i + 1) for i in range(6)} | {(0, 6)}
     assert not any(second - first in (2, 3, 4) for first, second in pairs if second < 7)
-    monkeypatch.setattr(photo_pairs, "_PARTNERS", 1)
+    monkeypatch.setattr(sfm_pairs, "_PARTNERS", 1)
     assert len(likely_pairs(database)) < len(pairs)
 
 
