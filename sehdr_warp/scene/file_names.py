@@ -101,7 +101,6 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         names |= dict.fromkeys((latin, latin.replace("\\", "/")))
     with suppress(UnicodeError):
         names |= {os.fsdecode(name.encode("latin-1")): None}
-    names |= {unquote(name): None}
     if inner := _inside(folder, name, source):
         names = {inner: None}
     elif PureWindowsPath(name).anchor and "\0" not in name:
@@ -109,7 +108,9 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
     places = [resolve_inside(folder, each, source) for each in names]
     image = next((place for place in places if os.path.isfile(place)), None)
     image = image or next((photo for place in places if (photo := sibling(place, PHOTO_SUFFIXES))), None)
-    return image or next((photo for each in names if (photo := _alike(folder, each, source))), None)
+    image = image or next((photo for each in names if (photo := _alike(folder, each, source))), None)
+    plain = unquote(name)
+    return image if image or plain == name else find_image(folder, plain, source)
 
 
 def find_images(folder: Path, names: Sequence[str], source: Path) -> dict[str, Path | None]:

@@ -88,9 +88,8 @@ def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
             return lens, oriented
     for (width, height), oriented in choices:
         factor = max(width, height) / max(lens.width, lens.height)
-        if _SMALLEST <= factor <= _LARGEST and max(
-            abs(lens.width * factor - width), abs(lens.height * factor - height)
-        ) < max(1, factor):
+        off = max(abs(lens.width * factor - width), abs(lens.height * factor - height))
+        if _SMALLEST <= factor <= _LARGEST and off < max(1, factor):
             return lens.resized(width, height), oriented
     problem = f"image is {size[0]} x {size[1]}, its camera {lens.width} x {lens.height}"
     raise InputError(record.image, problem, "use the images that the cameras were solved for")

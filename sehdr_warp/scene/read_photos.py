@@ -65,7 +65,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
         )
     copies = find_copies(photos)
     photos = [photo for photo in photos if photo not in copies]
-    _require_photos(len(photos), photos[0], folder)
+    _require_photos(photos, folder, len(copies))
     notes = [*copies_note(copies), *_foreign_poses(folder), *_cameras_above(folder)]
     if model := find_model(folder, anywhere=True):
         place = model.relative_to(folder).as_posix()
@@ -94,7 +94,7 @@ def place_photos(
         InputError: if the photos are an exposure stack, or of several cameras' sensors, or cannot be placed.
     """
     photos = [record.image for record in records]
-    _require_photos(len(photos), photos[0], folder)
+    _require_photos(photos, folder)
     if kind == "raw":
         color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
@@ -118,11 +118,13 @@ def place_photos(
     )
 
 
-def _require_photos(count: int, first: Path, folder: Path) -> None:
-    if count < 2:
-        raise InputError(first, "is the only photo; one view does not show depth", "add photos from other places")
-    if count < FEWEST_PHOTOS:
-        problem = f"holds {count} photos: depth and light cannot be told apart from so few"
+def _require_photos(photos: Sequence[Path], folder: Path, copies: int = 0) -> None:
+    beside = f" beside {copies} copies" if copies else ""
+    if len(photos) < 2:
+        problem = f"is the only photo{beside}; one view does not show depth"
+        raise InputError(photos[0], problem, "add photos from other places")
+    if len(photos) < FEWEST_PHOTOS:
+        problem = f"holds {len(photos)} photos{beside}: depth and light cannot be told apart from so few"
         raise InputError(folder, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
 
 
