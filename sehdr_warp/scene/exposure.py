@@ -231,9 +231,9 @@ def _exif_times(records: list[ImageRecord], *, timeless: bool) -> tuple[list[flo
     timeless = timeless and not timed
     notes, factors = [], [1.0] * len(records)
     for name, field, power in (("ISO", "iso", 1.0), ("f-number", "f_number", -2.0)):
-        stating = exposures if timeless else timed
-        values = [value for exposure in stating if (value := getattr(exposure, field)) is not None]
-        if 0 < len(values) < len(stating):
+        used = exposures if timeless else timed
+        values = [value for exposure in used if (value := getattr(exposure, field)) is not None]
+        if 0 < len(values) < len(used):
             notes.append(f"{name} is not stated for all photos and was not counted")
         elif len(set(values)) > 1:
             factors = [

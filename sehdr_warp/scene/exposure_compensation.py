@@ -307,7 +307,7 @@ def fit_gains(
         (np.concatenate([one, one, -(r**2), -(r**4)]), (np.tile(rows, 4), columns)),
         shape=(len(rows), first_lens + 2 * (lenses.max() + 2)),
     )
-    solution: np.ndarray = np.zeros(system.shape[1])
+    solution: np.ndarray = np.zeros(first_lens + 2 * (lenses.max() + 2))
     for width in TIGHT:
         residual = (values - system @ solution) / width if solution.any() else np.zeros_like(values)
         weight = 1 / (1 + residual**2)

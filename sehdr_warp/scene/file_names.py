@@ -70,8 +70,8 @@ def lies_at(path: str) -> bool:
     """Return whether a path, or one with a suffix of photos behind it, is a file; case and accents do not matter."""
     folder, name = os.path.split(path)
     names, folded = _entries(Path(folder)), fold_name(name)
-    found = (names.get(folded + suffix) for suffix in ("", *PHOTO_SUFFIXES))
-    return any(os.path.isfile(os.path.join(folder, each)) for each in found if each is not None)
+    spellings = (names.get(folded + suffix) for suffix in ("", *PHOTO_SUFFIXES))
+    return any(os.path.isfile(os.path.join(folder, each)) for each in spellings if each is not None)
 
 
 def without_mask_mark(stem: str) -> str:

@@ -61,8 +61,8 @@ def read_colmap(folder: Path) -> DataparserOutputs:
     held_out = {line.strip() for line in read_lines(listed, "surrogateescape")} if has_file(listed) else set()
     records = []
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
-        if (found := photos[entry.name]) is not None:
-            image, hdr = photo_and_truth(found)
+        if (photo := photos[entry.name]) is not None:
+            image, hdr = photo_and_truth(photo)
             split = "test" if entry.name in held_out else "train" if held_out else None
             records.append(ImageRecord(image.stem, image, entry.lens, entry.world_to_camera, split=split, hdr=hdr))
     if not records:

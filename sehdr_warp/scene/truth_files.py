@@ -55,8 +55,8 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
             keys += [fold_name(image.stem)] * (stems[fold_name(image.stem)] <= 1)
             candidates = ((place, files[place].get(key)) for key in keys for place in places)
             near = image.parent, beside[image.parent].get(fold_name(image.stem))
-            found = ((place, file.relative_to(place).as_posix()) for place, file in (*candidates, near) if file)
-            hdr = next((resolve_inside(place, name, folder) for place, name in found), None)
+            names = ((place, file.relative_to(place).as_posix()) for place, file in (*candidates, near) if file)
+            hdr = next((resolve_inside(place, name, folder) for place, name in names), None)
             hdr = None if hdr is not None and is_without_colors(hdr) else hdr
         result.append(replace(record, hdr=hdr))
     in_use, notes = {record.hdr for record in result}, []
