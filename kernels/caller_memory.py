@@ -7,10 +7,10 @@ import warp as wp
 
 from .constants import NO_AUTODIFF
 
-INPUTS, OUTPUTS = 7, 5
-"""Largest numbers of tensors that a graph reads and writes."""
-TABLE_SIZE = INPUTS + OUTPUTS + 1
-"""Length of the table: the addresses of inputs, then of outputs, then of memory to fill with zeros."""
+MAX_TENSORS = 7
+"""Largest number of tensors that a graph reads, and that it writes."""
+TABLE_SIZE = 2 * MAX_TENSORS + 1
+"""Length of the table: addresses of inputs, from MAX_TENSORS on of outputs, and last of memory to fill with zeros."""
 
 STRIDE = 256  # Distance between the numbers of a thread, so that neighbouring threads copy neighbouring numbers
 PER_THREAD = 4
@@ -25,36 +25,24 @@ _threads_for = wp.func(threads_for)
 
 
 @wp.func
-def first_number(i: int):
-    """Return the index of the first number that thread i of a tensor copies."""
-    return i // STRIDE * (STRIDE * PER_THREAD) + i % STRIDE
+def copy(address: wp.uint64, numbers: wp.array(dtype=wp.float32), count: int, reads: bool, i: int):
+    """Copy `count` numbers from or to an address if thread i is one of theirs; return i as the next tensor counts it.
 
-
-@wp.func
-def read(addresses: wp.array(dtype=wp.uint64), entry: int, numbers: wp.array(dtype=wp.float32), i: int):
-    """Copy the caller's tensor to `numbers` if thread i belongs to it; return i as counted from the next tensor."""
-    count = numbers.shape[0]
+    Where `numbers` end, zeros are written.
+    """
     threads = _threads_for(count)
-    if i >= 0 and i < threads and addresses[entry] != wp.uint64(0):
-        source = wp.array(ptr=addresses[entry], shape=(count,), dtype=wp.float32)
+    if i >= 0 and i < threads and address != wp.uint64(0):
+        caller = wp.array(ptr=address, shape=(count,), dtype=wp.float32)
+        first = i // STRIDE * (STRIDE * PER_THREAD) + i % STRIDE
         for k in range(PER_THREAD):
-            j = first_number(i) + k * STRIDE
+            j = first + k * STRIDE
             if j < count:
-                numbers[j] = source[j]
-    return i - threads
-
-
-@wp.func
-def write(addresses: wp.array(dtype=wp.uint64), entry: int, numbers: wp.array(dtype=wp.float32), i: int):
-    """Copy `numbers` to the caller's tensor if thread i belongs to it; return i as counted from the next tensor."""
-    count = numbers.shape[0]
-    threads = _threads_for(count)
-    if i >= 0 and i < threads and addresses[entry] != wp.uint64(0):
-        target = wp.array(ptr=addresses[entry], shape=(count,), dtype=wp.float32)
-        for k in range(PER_THREAD):
-            j = first_number(i) + k * STRIDE
-            if j < count:
-                target[j] = numbers[j]
+                if reads:
+                    numbers[j] = caller[j]
+                elif j < numbers.shape[0]:
+                    caller[j] = numbers[j]
+                else:
+                    caller[j] = 0.0
     return i - threads
 
 
@@ -72,8 +60,10 @@ def write_last(numbers: wp.array(dtype=wp.int64), result: wp.array(dtype=wp.int6
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-def read_inputs(
+def copy_tensors(
     addresses: wp.array(dtype=wp.uint64),
+    entry: int,
+    zeros: int,
     a: wp.array(dtype=wp.float32),
     b: wp.array(dtype=wp.float32),
     c: wp.array(dtype=wp.float32),
@@ -82,38 +72,18 @@ def read_inputs(
     f: wp.array(dtype=wp.float32),
     g: wp.array(dtype=wp.float32),
 ):
-    """Copy the caller's inputs to a, b, ..., g; launch the sum of their threads_for()."""
-    i = wp.tid()
-    i = read(addresses, 0, a, i)
-    i = read(addresses, 1, b, i)
-    i = read(addresses, 2, c, i)
-    i = read(addresses, 3, d, i)
-    i = read(addresses, 4, e, i)
-    i = read(addresses, 5, f, i)
-    i = read(addresses, 6, g, i)
+    """Copy the caller's inputs to a, ..., g (entry 0), or these to its outputs (entry MAX_TENSORS); write `zeros` zeros.
 
-
-@wp.kernel(module="unique", module_options=NO_AUTODIFF)
-def write_outputs(
-    addresses: wp.array(dtype=wp.uint64),
-    a: wp.array(dtype=wp.float32),
-    b: wp.array(dtype=wp.float32),
-    c: wp.array(dtype=wp.float32),
-    d: wp.array(dtype=wp.float32),
-    e: wp.array(dtype=wp.float32),
-    zeros: int,
-):
-    """Copy a, b, ..., e to the caller's outputs, fill `zeros` numbers with 0; launch the sum of their threads_for()."""
+    Launch the sum of threads_for() of the lengths and of `zeros`.
+    """
     i = wp.tid()
-    i = write(addresses, wp.static(INPUTS), a, i)
-    i = write(addresses, wp.static(INPUTS + 1), b, i)
-    i = write(addresses, wp.static(INPUTS + 2), c, i)
-    i = write(addresses, wp.static(INPUTS + 3), d, i)
-    i = write(addresses, wp.static(INPUTS + 4), e, i)
-    address = addresses[wp.static(INPUTS + OUTPUTS)]
-    if i >= 0 and address != wp.uint64(0):
-        target = wp.array(ptr=address, shape=(zeros,), dtype=wp.float32)
-        for k in range(PER_THREAD):
-            j = first_number(i) + k * STRIDE
-            if j < zeros:
-                target[j] = 0.0
+    reads = entry == 0
+    i = copy(addresses[entry], a, a.shape[0], reads, i)
+    i = copy(addresses[entry + 1], b, b.shape[0], reads, i)
+    i = copy(addresses[entry + 2], c, c.shape[0], reads, i)
+    i = copy(addresses[entry + 3], d, d.shape[0], reads, i)
+    i = copy(addresses[entry + 4], e, e.shape[0], reads, i)
+    i = copy(addresses[entry + 5], f, f.shape[0], reads, i)
+    i = copy(addresses[entry + 6], g, g.shape[0], reads, i)
+    nothing = wp.array(ptr=wp.uint64(0), shape=(0,), dtype=wp.float32)
+    copy(addresses[TABLE_SIZE - 1], nothing, zeros, False, i)

@@ -23,17 +23,15 @@ class CallerMemory:
 
     def __init__(self, device: torch.device) -> None:
         """Make a table of zeros: a graph copies nothing where an address is 0."""
-        table = torch.empty(kernels.TABLE_SIZE, dtype=torch.int64, device="cpu", pin_memory=True)
-        self._table, self._addresses = table, (ctypes.c_int64 * kernels.TABLE_SIZE).from_address(table.data_ptr())
-        self._addresses[:] = [0] * kernels.TABLE_SIZE
+        self._table = torch.zeros(kernels.TABLE_SIZE, dtype=torch.int64, pin_memory=device.type == "cuda")
+        self._addresses = (ctypes.c_int64 * kernels.TABLE_SIZE).from_address(self._table.data_ptr())
         self._on_device = torch.zeros(kernels.TABLE_SIZE, dtype=torch.int64, device=device)
         self._inputs: Sequence[Tensor] = ()
 
     def set(self, inputs: Sequence[Tensor], outputs: Sequence[Tensor], zeros: Tensor | None) -> None:
         """Set the tensors of the next replay. All are contiguous float32; the graph fills `zeros` with 0."""
-        addresses = self._addresses
+        addresses, begin = self._addresses, kernels.MAX_TENSORS
         addresses[: len(inputs)] = [tensor.data_ptr() for tensor in inputs]
-        begin = kernels.INPUTS
         addresses[begin : begin + len(outputs)] = [tensor.data_ptr() for tensor in outputs]
         addresses[-1] = 0 if zeros is None else zeros.data_ptr()
 
@@ -42,18 +40,16 @@ class CallerMemory:
         # By a kernel: on an H100 the next one waits 12 us for a copy.
         launch(kernels.read_addresses, kernels.TABLE_SIZE, self._on_device, self._table)
         self._inputs = inputs
-        arguments = [self._on_device, *inputs, *[None] * (kernels.INPUTS - len(inputs))]
-        launch(kernels.read_inputs, _threads([tensor.numel() for tensor in inputs]), *arguments)
+        self._copy(0, inputs, 0)
 
     def write(self, outputs: Sequence[Tensor], zeros: int) -> None:
         """Copy float32 tensors to the caller's outputs; fill `zeros` numbers of the caller's memory with 0."""
-        arguments = [self._on_device, *outputs, *[None] * (kernels.OUTPUTS - len(outputs)), zeros]
-        counts = [tensor.numel() for tensor in outputs]
-        launch(kernels.write_outputs, _threads([*counts, zeros]), *arguments)
+        self._copy(kernels.MAX_TENSORS, outputs, zeros)
 
-
-def _threads(counts: Sequence[int]) -> int:
-    """Return the threads that copy tensors of these lengths; raise RuntimeError if one launch cannot copy them."""
-    if sum(counts) >= 1 << 30:
-        raise RuntimeError(f"{sum(counts)} numbers are too many for one launch of copies")
-    return sum(map(kernels.threads_for, counts))
+    def _copy(self, entry: int, tensors: Sequence[Tensor], zeros: int) -> None:
+        counts = [*(tensor.numel() for tensor in tensors), zeros]
+        if sum(counts) >= 1 << 30:
+            raise RuntimeError(f"{sum(counts)} numbers are too many for one launch of copies")
+        absent = [None] * (kernels.MAX_TENSORS - len(tensors))
+        threads = sum(map(kernels.threads_for, counts))
+        launch(kernels.copy_tensors, threads, self._on_device, entry, zeros, *tensors, *absent)

@@ -36,49 +36,52 @@ class GradientMemory:
         of_splats: by means2d and features, and if the CUDA graph begins with 2D Gaussians, by conics and opacities;
             emptied when they are returned, because torch takes a leaf's gradient without a copy only if nothing else
             refers to it.
-        of_gaussians: by the projection's inputs; None if they are not needed.
-        addresses: of the gradients by conics, opacities and each input of the projection, 0 if not needed.
-        features: address of a copy of the features' gradient that is contiguous, 0 if there is none.
+        of_gaussians: by the projection's inputs, None where not needed.
+        features: address of a copy of the features' gradient that is contiguous; None if there is none.
+        of_projection: addresses of the gradients by conics, opacities and the inputs of the projection that need one.
     """
 
     zeros: Tensor
     of_splats: Sequence[Tensor]
-    of_gaussians: list[Tensor | None]
-    addresses: list[int]
-    features: int
+    of_gaussians: Sequence[Tensor | None]
+    features: int | None
+    of_projection: Sequence[int]
 
 
 class GradientLayout:
     """Views of the gradients of blend and projection in one tensor.
 
     It begins with a row for each Gaussian, which the blend adds to: features, conic, x, y, opacity, and columns that
-    pad the row. A copy of the features' gradient follows, and if the CUDA graph projects, the gradients by the
-    projection's inputs.
+    pad the row. Then come a copy of the features' gradient and the gradients by the projection's inputs.
 
     Args:
         blend: of the render.
-        gaussians: inputs of the projection; none if the CUDA graph begins with 2D Gaussians.
+        gaussians: inputs of the projection, None where no gradient is needed; none if the CUDA graph begins with 2D
+            Gaussians.
+        copies_features: add a contiguous gradient by features, which torch can use as a leaf's without a copy.
 
     Attributes:
-        size: numbers in the tensor.
-        like: a tensor of this shape that takes no memory, for torch.empty_like().
+        like: a tensor of the shape of all of it that takes no memory, for torch.empty_like().
     """
 
-    def __init__(self, blend: BlockBackward, gaussians: Sequence[Tensor]) -> None:
+    def __init__(self, blend: BlockBackward, gaussians: Sequence[Tensor | None], *, copies_features: bool) -> None:
         """Add up the offsets."""
         count, columns, channels = len(blend.features), blend.columns, blend.channels
-        self.means2d = _View((count, 2), (columns, 1), channels + 3)
-        self.features = _View((count, channels), (columns, 1), 0)
+        self._size = count * columns
         self.conics = _View((count, 3), (columns, 1), channels)
+        self.means2d = _View((count, 2), (columns, 1), channels + 3)
         self.opacities = _View((count,), (columns,), channels + 5)
-        self.features_copy = _View((count, channels), (channels, 1), _aligned(count * columns))
-        self.size = self.features_copy.begin + count * channels
-        self.gaussians: list[_View] = []
-        for tensor in gaussians:
-            view = _View(tensor.shape, tensor.stride(), _aligned(self.size))
-            self.gaussians.append(view)
-            self.size = view.begin + tensor.numel()
-        self.like = blend.transmittance.new_empty(1).expand(self.size)
+        self.features = _View((count, channels), (columns, 1), 0)
+        self.copies_features = copies_features
+        if copies_features:
+            self.features = self._append(self.features.shape, (channels, 1))
+        self.gaussians = [None if like is None else self._append(like.shape, like.stride()) for like in gaussians]
+        self.like = blend.transmittance.new_empty(1).expand(self._size)
+
+    def _append(self, shape: Sequence[int], strides: Sequence[int]) -> _View:
+        begin = -(-self._size // 64) * 64  # A multiple of 64 numbers, where memory of its own could begin.
+        self._size = begin + torch.Size(shape).numel()
+        return _View(shape, strides, begin)
 
 
 class CapturedBackward:
@@ -107,37 +110,34 @@ class CapturedBackward:
         """Pack the launches."""
         self._layout, self.conics_opacities = layout, layout.like if gaussians else None
         self._blend, rows = blend.on_fixed_memory()
-        self._device = rows.device
-        copy = rows.new_empty(layout.features_copy.shape)
-        kernel = copy_features_kernel(warp_scalar(rows.dtype))
-        self._copy_features = fixed_launch(kernel, copy.shape, rows, copy, whole=(rows, copy))
+        self._device, self._number_size = rows.device, rows.element_size()
+        self._of_splats = [layout.means2d, layout.features]
+        if layout.copies_features:
+            copy = rows.new_empty(layout.features.shape)
+            kernel = copy_features_kernel(warp_scalar(rows.dtype))
+            self._copy_features = fixed_launch(kernel, copy.shape, rows, copy, whole=(rows, copy))
         if gaussians:
-            like = rows.as_strided(*layout.conics), rows.as_strided(*layout.opacities)
-            self._project = _fixed_projection_backward(gaussians, options, projected, *like)
+            self._of_projection = [layout.conics, layout.opacities, *filter(None, layout.gaussians)]
+            self._project = _fixed_projection_backward(gaussians, layout, options, projected, rows)
+        else:
+            self._of_splats += layout.conics, layout.opacities
+            self._of_projection = []
 
-    def allocate(self, needed: Sequence[bool], *, copies_features: bool, zeros: Tensor | None = None) -> GradientMemory:
+    def allocate(self, zeros: Tensor | None = None) -> GradientMemory:
         """Return memory for one backward pass.
 
-        needed: which gradients by the projection's inputs are needed; empty if the CUDA graph does not project.
-        copies_features: return a contiguous gradient by features, which torch can use as a leaf's without a copy.
-        zeros: [GradientLayout.size] zeros that the render's replay wrote; by default new ones.
+        zeros: like GradientLayout.like, which the render's replay wrote; by default new ones.
         """
-        layout = self._layout
+        layout, size = self._layout, self._number_size
         if zeros is None:
             zeros = torch.zeros_like(layout.like)
-        first, size = zeros.data_ptr(), zeros.element_size()
-        features = layout.features_copy if copies_features else layout.features
-        of_splats = [zeros.as_strided(*layout.means2d), zeros.as_strided(*features)]
-        if self.conics_opacities is None:
-            of_splats += zeros.as_strided(*layout.conics), zeros.as_strided(*layout.opacities)
-        views = [view if need else None for view, need in zip(layout.gaussians, needed, strict=True)]
-        rows = layout.conics, layout.opacities
+        begin = zeros.data_ptr()
         return GradientMemory(
             zeros,
-            of_splats,
-            [None if view is None else zeros.as_strided(*view) for view in views],
-            [0 if view is None else first + size * view.begin for view in (*rows, *views)],
-            first + size * features.begin if copies_features else 0,
+            [zeros.as_strided(*view) for view in self._of_splats],
+            [None if view is None else zeros.as_strided(*view) for view in layout.gaussians],
+            begin + size * layout.features.begin if layout.copies_features else None,
+            [begin + size * view.begin for view in self._of_projection],
         )
 
     def blend(self, memory: GradientMemory, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
@@ -145,7 +145,7 @@ class CapturedBackward:
         stream, rows = warp_stream(self._device), memory.zeros.data_ptr()
         transmittance = 0 if grad_transmittance is None else grad_transmittance.data_ptr()
         self._blend.launch((), (grad_image.data_ptr(), transmittance, rows), stream)
-        if memory.features:
+        if memory.features is not None:
             self._copy_features.launch((), (rows, memory.features), stream)
         gradients, memory.of_splats = memory.of_splats, ()
         return gradients if self.conics_opacities is None else (*gradients, memory.zeros)
@@ -157,28 +157,25 @@ class CapturedBackward:
 
         memory: of the blend's backward pass, or if the image has no gradient, a new one.
         """
-        self._project.launch((grad_means2d, grad_depths), memory.addresses, warp_stream(self._device))
+        self._project.launch((grad_means2d, grad_depths), memory.of_projection, warp_stream(self._device))
         return memory.of_gaussians
-
-
-def _aligned(numbers: int) -> int:
-    """Return the next multiple of 64, where memory of its own could begin."""
-    return -(-numbers // 64) * 64
 
 
 def _fixed_projection_backward(
     gaussians: Sequence[Tensor],
+    layout: GradientLayout,
     options: RenderOptions,
     projected: ProjectedGaussians,
-    grad_conics: Tensor,
-    grad_opacities: Tensor,
+    rows: Tensor,
 ) -> FixedLaunch:
     """Return the launch of a projection's adjoint on the same inputs and extents, for any gradients.
 
-    grad_conics, grad_opacities: with the strides that they will have.
+    rows: like the gradients by Gaussian, which hold those by conics and opacities.
     """
     grad_means2d, grad_depths = torch.empty_like(projected.means2d), torch.empty_like(projected.depths)
-    results = [torch.empty_like(tensor) for tensor in gaussians]
+    grad_conics, grad_opacities = rows.as_strided(*layout.conics), rows.as_strided(*layout.opacities)
+    pairs = zip(gaussians, layout.gaussians, strict=True)
+    results = [None if view is None else torch.empty_like(tensor) for tensor, view in pairs]
     kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
     upstream = grad_means2d, grad_conics, grad_depths, grad_opacities, None
     parameters = projection_parameters(options)
@@ -189,5 +186,5 @@ def _fixed_projection_backward(
         *arguments,
         gradients=gradients,
         rows=(grad_means2d, grad_depths),
-        whole=(grad_conics, grad_opacities, *results),
+        whole=(grad_conics, grad_opacities, *(result for result in results if result is not None)),
     )

@@ -35,8 +35,10 @@ MAX_COPIED_GAUSSIANS = MAX_SINGLE_SORT
 SPINS = 200  # Looks at the number of intersections before other threads may run in between, and from query to query.
 HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
 MIN_INTERSECTIONS = 1 << 12
+RASTERIZE_TENSORS = 7
+"""Number of tensors of a call of rasterize(). A render of 2D Gaussians has six, see flatten()."""
 FEATURES = 4
-"""Index of features among a call's seven tensors, those that rasterize() takes first."""
+"""Index of features among the tensors of rasterize(); those of flatten() end with them."""
 _let_others_run: Callable[[], object] = getattr(os, "sched_yield", partial(time.sleep, 0))
 """Lets other threads run. On Linux time.sleep(0) takes 50 us, to which timers are rounded up."""
 
@@ -48,7 +50,7 @@ class ReplayResult(NamedTuple):
         image: [H, W, C].
         transmittance: [H, W].
         others: means2d, depths and extents; extents alone if the graph begins with 2D Gaussians.
-        gradients: zeros for the gradients of a backward pass, see GradientLayout; None if that pass allocates them.
+        gradients: zeros like GradientLayout.like; None if the backward pass allocates them.
     """
 
     image: Tensor
@@ -65,100 +67,121 @@ class CapturedRender:
     before and after the graph.
 
     Args:
-        tensors: the seven tensors of a call, or flatten() of RasterInputs.
+        tensors: the seven tensors of a call of rasterize(), or flatten() of RasterInputs.
         options: of the image.
         intersections: the least number to allocate memory for.
-        differentiable: whether its backward passes may be called.
+        differentiable: whether gradients by the tensors that require them are needed.
 
     Attributes:
         max_intersections: that there is memory for.
-        backward: the backward passes, if differentiable.
+        backward: the backward passes; None unless differentiable.
     """
-
-    backward: CapturedBackward
 
     def __init__(
         self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
     ) -> None:
         """Launch the render once, then capture it."""
-        width, height, threshold = options.width, options.height, options.alpha_threshold
-        projects = len(tensors) == FEATURES + 3
+        self._options, self._projects = options, len(tensors) == RASTERIZE_TENSORS
         many = len(tensors[0]) > MAX_COPIED_GAUSSIANS
-        self._copies = differentiable or options.depth or not projects or not many
-        inputs = [tensor.detach().contiguous() for tensor in tensors]
+        self._copies = differentiable or options.depth or not self._projects or not many
+        self._inputs = [tensor.detach().contiguous() for tensor in tensors]
         if self._copies:
-            inputs = [tensor.clone() for tensor in inputs]
-        device = inputs[0].device
-        channels = inputs[FEATURES].shape[1] + options.depth if projects else inputs[-1].shape[1]
-        image, transmittance = inputs[0].new_empty(height, width, channels), inputs[0].new_empty(height, width)
-        counter = torch.empty(1, dtype=torch.int64, device="cpu", pin_memory=True)
-        self._counter, self._count = counter, ctypes.c_int64.from_address(counter.data_ptr())
-        self._stream = torch.cuda.current_stream(device)
-        self._runner, self._callers = CudaGraphRunner(device), CallerMemory(device)
+            self._inputs = [tensor.clone() for tensor in self._inputs]
+        first, features = self._inputs[0], self._inputs[FEATURES if self._projects else -1]
+        channels = features.shape[1] + (options.depth and self._projects)
+        self._image = first.new_empty(options.height, options.width, channels)
+        self._transmittance = first.new_empty(options.height, options.width)
+        self._counter = torch.empty(1, dtype=torch.int64, device="cpu", pin_memory=True)
+        self._count = ctypes.c_int64.from_address(self._counter.data_ptr())
+        self._stream = torch.cuda.current_stream(first.device)
+        self._runner, self._callers = CudaGraphRunner(first.device), CallerMemory(first.device)
+        self.backward: CapturedBackward | None = None
 
-        def begin() -> tuple[RasterInputs, PackedSplats]:
-            splats = _project(inputs, options) if projects else unflatten(inputs)
-            pads = not self._copies or channels % 4 > 0
-            return splats, pack_splats(splats, threshold, width, height, pads=pads)
-
-        def count(splats: RasterInputs, packed: PackedSplats) -> IntersectionOffsets:
-            depths, extents = splats.projected.depths, splats.projected.extents
-            offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
-            launch(write_last, 1, offsets.cumulative_counts, counter)  # What follows waits longer for a copy.
-            return offsets
-
-        def list_tiles(splats: RasterInputs, packed: PackedSplats, offsets: IntersectionOffsets) -> TileLists:
-            depths, extents, limit = splats.projected.depths, splats.projected.extents, self.max_intersections
-            return build_tile_lists(packed, offsets, depths, extents, width, height, limit, keep_emit_order=False)
-
-        def blend(splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> BlockBackward:
-            features = splats.features
-            return blend_on_cuda(features, lists, packed, image, transmittance, threshold, False, keeps_padded=True)
-
-        def middle(splats: RasterInputs, packed: PackedSplats) -> TileLists:
-            return list_tiles(splats, packed, count(splats, packed))
-
-        def outputs_of(splats: RasterInputs) -> list[Tensor]:
-            means2d, _, depths, _, extents = splats.projected
-            return [means2d, depths, extents] if projects else [extents]
-
-        def whole() -> tuple[RasterInputs, BlockBackward]:
-            self._callers.read(inputs)
-            splats, packed = begin()
-            backward = blend(splats, packed, middle(splats, packed))
-            self._callers.write([image, transmittance, *outputs_of(splats)], zeros)
-            return splats, backward
-
-        gaussians = _without_features(inputs) if projects else ()
-        splats, packed = begin()
+        splats, packed = self._project_and_pack()
         # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
         with self._runner.on_capture_stream():
-            offsets = count(splats, packed)
+            offsets = self._order_and_count(splats, packed)
             limit = int(HEADROOM * max(intersections, int(offsets.cumulative_counts[-1])))
             self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
-            layout = GradientLayout(blend(splats, packed, list_tiles(splats, packed, offsets)), gaussians)
+            layout = self._layout_for(tensors, self._blend(splats, packed, self._list(splats, packed, offsets)))
             # With more Gaussians memory is worth more than the host's time.
-            zeros = layout.size if differentiable and not many else 0
+            self._gradients = layout.like if differentiable and not many else None
             if self._copies:
-                self._callers.read(inputs)
-                self._callers.write([image, transmittance, *outputs_of(splats)], zeros)
+                self._callers.read(self._inputs)
+                self._write(splats)
             del offsets
-        self._gradients_like = layout.like if zeros else None
         if self._copies:
             del splats, packed
-            splats, backward = self._runner.capture(None, whole)
+            splats, blend = self._runner.capture(None, self._render)
             if differentiable:
-                self.backward = CapturedBackward(layout, backward, gaussians, options, splats.projected)
+                gaussians = without_features(self._inputs) if self._projects else []
+                self.backward = CapturedBackward(layout, blend, gaussians, options, splats.projected)
         else:
-            lists = self._runner.capture(None, lambda: middle(splats, packed))
-            assert packed.padded is not None
-            self._project = _fixed_projection(inputs, options, splats.projected)
-            self._pack = fixed_pack_splats(splats, packed, threshold, width, height)
-            self._blend = fixed_blend_blocks(packed.padded, lists, packed, image, transmittance, threshold)
-        self._outputs = [*([image, transmittance] if self._copies else ()), *outputs_of(splats)]
-        self._image_shape = image.shape
+            lists = self._runner.capture(
+                None, lambda: self._list(splats, packed, self._order_and_count(splats, packed))
+            )
+            self._fix_launches(splats, packed, lists)
+        self._results = [*([self._image, self._transmittance] if self._copies else ()), *self._projection_of(splats)]
 
-    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> ReplayResult:
+    def _render(self) -> tuple[RasterInputs, BlockBackward]:
+        """Run all stages, which the methods below are, in their order."""
+        self._callers.read(self._inputs)
+        splats, packed = self._project_and_pack()
+        lists = self._list(splats, packed, self._order_and_count(splats, packed))
+        backward = self._blend(splats, packed, lists)
+        self._write(splats)
+        return splats, backward
+
+    def _project_and_pack(self) -> tuple[RasterInputs, PackedSplats]:
+        options = self._options
+        splats = _project(self._inputs, options) if self._projects else unflatten(self._inputs)
+        pads = not self._copies or self._image.shape[2] % 4 > 0
+        return splats, pack_splats(splats, options.alpha_threshold, options.width, options.height, pads=pads)
+
+    def _order_and_count(self, splats: RasterInputs, packed: PackedSplats) -> IntersectionOffsets:
+        _, _, depths, _, extents = splats.projected
+        offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
+        launch(write_last, 1, offsets.cumulative_counts, self._counter)  # What follows waits longer for a copy.
+        return offsets
+
+    def _list(self, splats: RasterInputs, packed: PackedSplats, offsets: IntersectionOffsets) -> TileLists:
+        (_, _, depths, _, extents), options = splats.projected, self._options
+        size = options.width, options.height
+        return build_tile_lists(packed, offsets, depths, extents, *size, self.max_intersections, keep_emit_order=False)
+
+    def _blend(self, splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> BlockBackward:
+        outputs, threshold = (self._image, self._transmittance), self._options.alpha_threshold
+        return blend_on_cuda(splats.features, lists, packed, *outputs, threshold, False, keeps_padded=True)
+
+    def _write(self, splats: RasterInputs) -> None:
+        zeros = 0 if self._gradients is None else self._gradients.numel()
+        self._callers.write([self._image, self._transmittance, *self._projection_of(splats)], zeros)
+
+    def _projection_of(self, splats: RasterInputs) -> list[Tensor]:
+        """Return what a render returns beside image and transmittance."""
+        means2d, _, depths, _, extents = splats.projected
+        return [means2d, depths, extents] if self._projects else [extents]
+
+    def _layout_for(self, tensors: Sequence[Tensor], blend: BlockBackward) -> GradientLayout:
+        """Return the layout of the gradients that these tensors of a call require."""
+        if not self._projects:
+            return GradientLayout(blend, [], copies_features=_is_trained(tensors[-1]))
+        inputs = zip(without_features(tensors), without_features(self._inputs), strict=True)
+        gaussians = [like if tensor.requires_grad else None for tensor, like in inputs]
+        # Features with depths get their gradient through torch.cat().
+        copies_features = _is_trained(tensors[FEATURES]) and not self._options.depth
+        return GradientLayout(blend, gaussians, copies_features=copies_features)
+
+    def _fix_launches(self, splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> None:
+        """Prepare the launches of _launch()."""
+        assert packed.padded is not None
+        options, outputs = self._options, (self._image, self._transmittance)
+        size = options.width, options.height
+        self._project = _fixed_projection(self._inputs, options, splats.projected)
+        self._pack = fixed_pack_splats(splats, packed, options.alpha_threshold, *size)
+        self._fixed_blend = fixed_blend_blocks(packed.padded, lists, packed, *outputs, options.alpha_threshold)
+
+    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor] = ()) -> ReplayResult:
         """Render. Call count_intersections() before the next replay: the GPU has then read the table of addresses.
 
         outputs: contiguous, to write what follows image and transmittance to. By default they are new tensors.
@@ -168,14 +191,13 @@ class CapturedRender:
         self._count.value = -1
         if not self._copies:
             return self._launch(tensors)
-        known = len(self._outputs) - len(outputs)
-        results = [*map(torch.empty_like, self._outputs[:known]), *outputs]
-        gradients = None if self._gradients_like is None else torch.empty_like(self._gradients_like)
+        new = self._results[: len(self._results) - len(outputs)]
+        results = [*map(torch.empty_like, new), *outputs]
+        gradients = None if self._gradients is None else torch.empty_like(self._gradients)
         inputs = [tensor.contiguous() for tensor in tensors]  # Copies must live until the graph is launched.
         self._callers.set(inputs, results, gradients)
         self._runner.replay()
-        image, transmittance, *others = results
-        return ReplayResult(image, transmittance, others, gradients)
+        return ReplayResult(results[0], results[1], results[2:], gradients)
 
     def _launch(self, tensors: Sequence[Tensor]) -> ReplayResult:
         """Do what replay() does without copies of the features and of the image."""
@@ -185,10 +207,10 @@ class CapturedRender:
         self._project.launch((), [tensor.data_ptr() for tensor in inputs], stream)
         self._pack.launch((), (features.data_ptr(),), stream)
         self._runner.replay()
-        image, transmittance = features.new_empty(self._image_shape), features.new_empty(self._image_shape[:2])
-        self._blend.launch((), (image.data_ptr(), transmittance.data_ptr()), stream)
-        others = [torch.empty_like(output) for output in self._outputs]
-        torch._foreach_copy_(others, self._outputs)  # pyright: ignore[reportPrivateImportUsage]
+        image, transmittance = torch.empty_like(self._image), torch.empty_like(self._transmittance)
+        self._fixed_blend.launch((), (image.data_ptr(), transmittance.data_ptr()), stream)
+        others = [torch.empty_like(result) for result in self._results]
+        torch._foreach_copy_(others, self._results)  # pyright: ignore[reportPrivateImportUsage]
         return ReplayResult(image, transmittance, others, None)
 
     def count_intersections(self) -> int:
@@ -201,6 +223,11 @@ class CapturedRender:
             if looks % SPINS == 0 and self._stream.query() and count.value < 0:
                 raise RuntimeError("the GPU has not counted the intersections of a render")
         return count.value
+
+
+def _is_trained(tensor: Tensor) -> bool:
+    """Return whether torch keeps the tensor's gradient, and so would copy one that is not contiguous."""
+    return tensor.is_leaf and tensor.requires_grad
 
 
 def _project(inputs: Sequence[Tensor], options: RenderOptions) -> RasterInputs:
@@ -223,12 +250,12 @@ def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
 
 def _fixed_projection(inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
     """Return the launch of _project() for any inputs, to the same outputs."""
-    gaussians = _without_features(inputs)
+    gaussians = without_features(inputs)
     kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
     arguments = *gaussians, *projection_parameters(options), None, *projected
     return fixed_launch(kernel, len(projected.depths), *arguments, whole=gaussians)
 
 
-def _without_features(inputs: Sequence[Tensor]) -> list[Tensor]:
-    """Return the inputs of the projection among a call's seven tensors."""
-    return [tensor for place, tensor in enumerate(inputs) if place != FEATURES]
+def without_features(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Return the inputs of the projection among the tensors of rasterize()."""
+    return [*tensors[:FEATURES], *tensors[FEATURES + 1 :]]

@@ -46,7 +46,8 @@ def kernel_layout(gradient: Tensor | None) -> Tensor | None:
     """Return a gradient as kernels read it: contiguous, or with any stride from row to row; no negated view."""
     if gradient is None:
         return None
-    gradient = gradient.resolve_neg()  # The imaginary part of a conjugate, as in losses of Fourier transforms.
+    if gradient.is_neg():
+        gradient = gradient.resolve_neg()  # The imaginary part of a conjugate, as in losses of Fourier transforms.
     if gradient.ndim < 2 or gradient.is_contiguous():
         return gradient
     rows_are_contiguous = gradient.stride(1) == 1 if gradient.ndim == 2 else gradient[0].is_contiguous()

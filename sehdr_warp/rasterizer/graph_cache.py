@@ -1,19 +1,24 @@
 """Replay renders that repeat as CUDA graphs: at the GPU's pace instead of Python's.
 
 Rendering 2D Gaussians takes some ten launches; called from Python one by one, they take longer than a small image does.
-After a few calls with the same sizes the next one is captured as CUDA graphs on memory of its own: inputs are copied
-in, outputs are copied out.
+After a few calls with the same sizes the next one is captured as CUDA graphs on memory of its own, which copy inputs in
+and results out.
 
 This applies to calls of rasterize() and, with packed=False, of gsplat's rasterization(). A training captures its whole
 step as one CUDA graph (training/step_graphs.py); within it, and with max_intersections, calls are launched.
+
+A call, from top to bottom: find_pool() or get_or_create_pool() returns the GraphPool of calls like it; begin_render()
+takes one of its graphs (captured_render.py), and that GraphInUse renders. torch's backward pass then calls its
+blend_backward() and project_backward() (captured_backward.py).
 """
 
 import atexit
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import count
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import torch
@@ -21,7 +26,7 @@ from torch import Tensor
 
 from .blending import BlendResult
 from .captured_backward import GradientMemory
-from .captured_render import CapturedRender
+from .captured_render import CapturedRender, without_features
 from .cuda_graphs import is_capturing, replays_are_off
 from .projection import with_projection_gradient
 from .render_options import RenderOptions
@@ -37,16 +42,8 @@ MAX_LARGE_GRAPHS = 1  # The same with more than MAX_SINGLE_SORT Gaussians, whose
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
 MAX_GAUSSIANS = 1 << 21
 
-
-class _Signature(NamedTuple):
-    """Properties that the calls of one CUDA graph share."""
-
-    options: RenderOptions
-    stream: int
-    differentiable: bool
-    dtype: torch.dtype
-    device: int
-    shapes: tuple[torch.Size, ...]
+_properties = attrgetter("shape", "dtype", "device")
+_properties_with_gradients = attrgetter("shape", "dtype", "device", "requires_grad", "is_leaf")
 
 
 def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
@@ -71,7 +68,7 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     """Return the CUDA graphs of calls like this one, an empty pool at first; None if the call cannot be captured.
 
     Args:
-        tensors: as GraphPool.begin_render() takes them, of one device.
+        tensors: as GraphPool.begin_render() takes them, of one device and dtype.
         options: of the image.
     """
     first = tensors[0]
@@ -79,110 +76,122 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
         return None
     if options.max_intersections is not None or options.deterministic or replays_are_off():
         return None
-    signature = _signature(tensors, options)
     fits = 0 < len(first) <= MAX_GAUSSIANS and options.width * options.height <= MAX_PIXELS
     if not fits or is_capturing(first.device):
         return None
-    return _pool_of(signature, MAX_GRAPHS if len(first) <= MAX_SINGLE_SORT else MAX_LARGE_GRAPHS)
+    differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    max_graphs = MAX_GRAPHS if len(first) <= MAX_SINGLE_SORT else MAX_LARGE_GRAPHS
+    with _lock:
+        pool = _pools.setdefault(_signature(tensors, options), GraphPool(differentiable, max_graphs))
+        pool.last_use = next(_uses)
+        while len(_pools) > MAX_SIZES:
+            del _pools[min(_pools, key=lambda key: _pools[key].last_use)]
+    return pool
 
 
 def on_gpu(tensor: Tensor) -> bool:
-    """Return whether CUDA graphs can render it."""
+    """Return whether CUDA graphs can render it; tests without a GPU replace this function."""
     return tensor.is_cuda
 
 
-def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> _Signature:
-    """Return a call's signature; raise TypeError if dtypes or devices differ."""
-    first = tensors[0]
-    dtype, device = first.dtype, first.get_device()
-    shapes, requires_grad = [], False
-    for tensor in tensors:
-        if tensor.dtype is not dtype or tensor.get_device() != device:
-            raise TypeError("tensors differ in dtype or device")
-        shapes.append(tensor.shape)
-        requires_grad = requires_grad or tensor.requires_grad
-    differentiable = requires_grad and torch.is_grad_enabled()
-    return _Signature(options, stream_handle(first.device), differentiable, dtype, device, tuple(shapes))
+def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> tuple[Any, ...]:
+    """Return the properties that the calls of one pool share."""
+    properties = _properties_with_gradients if torch.is_grad_enabled() else _properties
+    return options, stream_handle(tensors[0].device), properties, *map(properties, tensors)
 
 
-class ReplayedRender:
-    """A render by a CUDA graph, which no other call uses for as long as the backward passes of this render exist.
-
-    They hold the graph until the autograd graph of the render is freed; a render without gradients holds it as long as
-    this object lives.
+class ReplayedRender(NamedTuple):
+    """A render by a CUDA graph, of which all but `blended` are differentiable functions of the call's tensors.
 
     Attributes:
-        result: of the blend.
-        intersections: of the render; 0 before fits().
-        means2d: [N, 2]; this and the next three if the CUDA graph began with 3D Gaussians.
+        graph: of the render.
+        blended: image and transmittance.
+        means2d: [N, 2].
         depths: [N].
         extents: [N, 2].
         conics_opacities: stands for both in the autograd graph, see CapturedBackward; None without gradients.
     """
 
-    result: BlendResult
+    graph: "GraphInUse"
+    blended: BlendResult
     means2d: Tensor
     depths: Tensor
     extents: Tensor
     conics_opacities: Tensor | None
 
-    def __init__(self, pool: "GraphPool", graph: "CapturedRender") -> None:
+
+class GraphInUse:
+    """A CUDA graph that renders one call, and that no other call gets until this object is deleted.
+
+    Autograd's nodes refer to this object, so it lives until the autograd graph of the render is freed. It does not
+    refer to the tensors that the nodes return, which would keep it alive for ever.
+    """
+
+    def __init__(self, pool: "GraphPool", graph: CapturedRender) -> None:
         """Keep the CUDA graph from other calls."""
-        self._pool, self._in_use = pool, _GraphInUse(pool.idle, graph)
-        self.intersections = 0
+        self._pool, self._idle, self._graph = pool, pool.idle, graph
+        self._next: GradientMemory | None = None  # Of the next backward pass of the blend.
+        self._between: GradientMemory | None = None  # Of the last one, until that of the projection.
 
-    def render(self, tensors: Sequence[Tensor]) -> None:
-        """Render from the seven tensors of a call, of which the attributes are differentiable functions."""
-        if not self._pool.differentiable:
-            self.means2d, self.depths, self.extents = self._replay(tensors, (), ())
-            self.conics_opacities = None
-            return
-        means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
-        gaussians = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
-        needed = [tensor.requires_grad for tensor in gaussians]
-        conics_opacities = self._in_use.graph.backward.conics_opacities
+    def __del__(self) -> None:
+        self._idle.append(self._graph)
+
+    def render(self, tensors: Sequence[Tensor]) -> ReplayedRender:
+        """Render from the seven tensors of rasterize()."""
+        blended, (means2d, depths, extents) = self._replay(tensors, ())
+        if self._graph.backward is None:
+            return ReplayedRender(self, blended, means2d, depths, extents, None)
+        conics_opacities = self._graph.backward.conics_opacities
         assert conics_opacities is not None, "the CUDA graph begins with 2D Gaussians"
-        means2d, depths, extents = self._replay(tensors, (), needed, copies_features=_is_trained(features))
-        outputs = means2d, conics_opacities.detach(), depths, extents
-        outputs = with_projection_gradient(outputs, gaussians, self._in_use.project_backward)
-        self.means2d, self.conics_opacities, self.depths, self.extents = outputs
+        outputs, gaussians = (means2d, conics_opacities.detach(), depths, extents), without_features(tensors)
+        outputs = with_projection_gradient(outputs, gaussians, self.project_backward)
+        means2d, conics_opacities, depths, extents = outputs
+        return ReplayedRender(self, blended, means2d, depths, extents, conics_opacities)
 
-    def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> None:
+    def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> BlendResult:
         """Render from flatten() of RasterInputs; write the extents that are left, see pack_splats()."""
-        with torch.no_grad():
-            self._replay(tensors, (extents,), (), copies_features=_is_trained(tensors[-1]))
+        return self._replay(tensors, (extents,))[0]
 
-    def _replay(
-        self,
-        tensors: Sequence[Tensor],
-        outputs: Sequence[Tensor],
-        needed: Sequence[bool],
-        *,
-        copies_features: bool = False,
-    ) -> Sequence[Tensor]:
-        """Replay the CUDA graph and prepare a backward pass, with options of CapturedBackward.allocate()."""
-        image, transmittance, others, gradients = self._in_use.graph.replay(tensors, outputs)
-        self.result = BlendResult(image, transmittance, self._in_use.blend_backward)
-        if self._pool.differentiable:
-            self._in_use.prepare(needed, gradients, copies_features=copies_features)
-        return others
+    def _replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> tuple[BlendResult, Sequence[Tensor]]:
+        image, transmittance, others, gradients = self._graph.replay(tensors, outputs)
+        if gradients is not None and self._graph.backward is not None:  # Views are made while the GPU renders.
+            self._next = self._graph.backward.allocate(gradients)
+        return BlendResult(image, transmittance, self.blend_backward), others
 
-    def fits(self) -> bool:
-        """Wait until the GPU has counted the intersections; return whether the graph has memory for them.
+    def count_intersections(self) -> int | None:
+        """Wait until the GPU has counted the intersections; return how many there are.
 
-        If not, the render is not to be used.
+        None if the graph has too little memory for them: the render is not to be used.
         """
-        graph = self._in_use.graph
-        self.intersections = graph.count_intersections()
-        if self.intersections <= graph.max_intersections:
-            return True
-        self._pool.grow(self.intersections)
-        return False
+        intersections = self._graph.count_intersections()
+        if intersections <= self._graph.max_intersections:
+            return intersections
+        self._pool.grow(intersections)
+        return None
 
+    def blend_backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
+        """Return the gradients by means2d, features, and GradientMemory.zeros, or those by conics and opacities."""
+        backward = self._graph.backward
+        assert backward is not None
+        memory, self._next = self._next or backward.allocate(), None
+        self._between = memory
+        return backward.blend(memory, grad_image, grad_transmittance)
 
-def _is_trained(tensor: Tensor) -> bool:
-    """Return whether torch keeps the tensor's gradient, and so would copy one that is not contiguous."""
-    return tensor.is_leaf and tensor.requires_grad
+    def project_backward(
+        self, inputs: Sequence[Tensor], visibility: Tensor, upstream: Sequence[Tensor | None], needed: Sequence[bool]
+    ) -> Sequence[Tensor | None]:
+        """Return the gradients by the projection's inputs, see ProjectionBackward.
+
+        upstream: of what render() gave to the projection; for conics_opacities GradientMemory.zeros, as blend_backward()
+            has returned it.
+        """
+        grad_means2d, zeros, grad_depths, _ = upstream
+        backward = self._graph.backward
+        assert backward is not None
+        memory, self._between = self._between, None
+        if memory is None or memory.zeros is not zeros:  # Passes overlap, or nothing reached the image.
+            memory = backward.allocate(zeros)
+        return backward.project(memory, grad_means2d, grad_depths)
 
 
 @dataclass
@@ -207,82 +216,39 @@ class GraphPool:
     idle: list[CapturedRender] = field(default_factory=list)
     last_use: int = 0
 
-    def take(self, capture: Callable[[int], CapturedRender]) -> CapturedRender | None:
-        """Return a CUDA graph that is the caller's until it is idle again; None for a call that is to be launched."""
+    def begin_render(self, tensors: Sequence[Tensor], options: RenderOptions) -> GraphInUse | None:
+        """Return a CUDA graph for one render, or None if the call is to be launched instead.
+
+        Args:
+            tensors: the seven tensors of rasterize(), or flatten() of RasterInputs.
+            options: of the image.
+        """
         try:
-            return self.idle.pop()
+            graph = self.idle.pop()
         except IndexError:
-            pass
+            graph = self._capture(tensors, options)
+        return None if graph is None else GraphInUse(self, graph)
+
+    def _capture(self, tensors: Sequence[Tensor], options: RenderOptions) -> CapturedRender | None:
         self.launched += 1
         if self.launched <= WARMUP_CALLS or self.captured >= self.max_graphs:
             return None
         self.captured += 1
         try:
-            return capture(self.intersections)
+            with torch.inference_mode(False), torch.no_grad():
+                return CapturedRender(tensors, options, self.intersections, self.differentiable)
         except RuntimeError:
             LOG.debug("a render could not be captured and is launched", exc_info=True)
             self.captured = self.max_graphs
             return None
-
-    def begin_render(self, tensors: Sequence[Tensor], options: RenderOptions) -> ReplayedRender | None:
-        """Return a render by a CUDA graph that is to be made, or None if the call is to be launched instead.
-
-        Args:
-            tensors: the seven tensors of a call, or flatten() of RasterInputs.
-            options: of the image.
-        """
-
-        def capture(intersections: int) -> CapturedRender:
-            with torch.inference_mode(False), torch.no_grad():
-                return CapturedRender(tensors, options, intersections, self.differentiable)
-
-        graph = self.take(capture)
-        return None if graph is None else ReplayedRender(self, graph)
 
     def grow(self, intersections: int) -> None:
         """Let new CUDA graphs be captured, because one had too little memory for this many intersections."""
         self.intersections, self.captured, self.idle = max(intersections, self.intersections), 0, []
 
 
-class _GraphInUse:
-    """Keeps a CUDA graph from other calls, and returns it to the idle ones when it is deleted."""
-
-    def __init__(self, idle: list[CapturedRender], graph: CapturedRender) -> None:
-        self._idle, self.graph = idle, graph
-        self._needed: Sequence[bool] = ()
-        self._copies_features = False
-        self._next: GradientMemory | None = None  # Of the next backward pass of the blend.
-        self._between: GradientMemory | None = None  # Of the last one, until that of the projection.
-
-    def prepare(self, needed: Sequence[bool], gradients: Tensor | None, *, copies_features: bool) -> None:
-        """Prepare a backward pass; see CapturedBackward.allocate() and ReplayResult.gradients."""
-        self._needed, self._copies_features = needed, copies_features
-        if gradients is not None:
-            self._next = self._allocate(gradients)
-
-    def _allocate(self, zeros: Tensor | None = None) -> GradientMemory:
-        return self.graph.backward.allocate(self._needed, copies_features=self._copies_features, zeros=zeros)
-
-    def blend_backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        memory, self._next = self._next or self._allocate(), None
-        self._between = memory if any(self._needed) else None
-        return self.graph.backward.blend(memory, grad_image, grad_transmittance)
-
-    def project_backward(
-        self, inputs: Sequence[Tensor], visibility: Tensor, upstream: Sequence[Tensor | None], needed: Sequence[bool]
-    ) -> Sequence[Tensor | None]:
-        grad_means2d, zeros, grad_depths, _ = upstream
-        memory, self._between = self._between, None
-        if memory is None or memory.zeros is not zeros:  # Passes overlap, or nothing reached the image.
-            memory = self._allocate(zeros)
-        return self.graph.backward.project(memory, grad_means2d, grad_depths)
-
-    def __del__(self) -> None:
-        self._idle.append(self.graph)
-
-
 _lock = threading.Lock()
-_pools: dict[_Signature, GraphPool] = {}
+_pools: dict[tuple[Any, ...], GraphPool] = {}
 _uses = count(1)
 
 
@@ -292,12 +258,3 @@ def clear_graphs() -> None:
 
 
 atexit.register(clear_graphs)  # CUDA graphs must be freed before CUDA is.
-
-
-def _pool_of(signature: _Signature, max_graphs: int) -> GraphPool:
-    with _lock:
-        pool = _pools.setdefault(signature, GraphPool(signature.differentiable, max_graphs))
-        pool.last_use = next(_uses)
-        while len(_pools) > MAX_SIZES:
-            del _pools[min(_pools, key=lambda key: _pools[key].last_use)]
-    return pool

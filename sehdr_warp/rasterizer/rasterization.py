@@ -147,9 +147,9 @@ def rasterize(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
     tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
-    # A call like an earlier one has arguments that were checked then, but for the background.
-    pool = find_pool(tensors, options) if background is None else None
-    if pool is None:
+    # A call like an earlier one, which a CUDA graph can render, has arguments that were checked then.
+    pool = find_pool(tensors, options)
+    if pool is None or background is not None:
         check_shapes(*tensors, background)
         check_opacities(opacities)
         check_cameras(world_to_camera, intrinsics)
@@ -202,19 +202,16 @@ def check_shapes(
         raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
 
 
-def _begin(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool | None) -> "_Begun":
+_Begun = ProjectedGaussians | ReplayedRender
+
+
+def _begin(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool | None) -> _Begun:
     """Project to one camera. On a GPU, a repeated call replays a CUDA graph, which renders the image as well.
 
     pool: CUDA graphs of calls like this one (graph_cache.py); None if it is to be launched.
     """
-    replayed = None if pool is None else pool.begin_render(tensors, options)
-    if replayed is None:
-        return _launch_projection(tensors, options)
-    replayed.render(tensors)
-    return replayed
-
-
-_Begun = ProjectedGaussians | ReplayedRender
+    graph = None if pool is None else pool.begin_render(tensors, options)
+    return _launch_projection(tensors, options) if graph is None else graph.render(tensors)
 
 
 def _launch_projection(tensors: Sequence[Tensor], options: RenderOptions) -> ProjectedGaussians:
@@ -232,10 +229,10 @@ def _finish(begun: _Begun, means2d: Tensor, tensors: Sequence[Tensor], options: 
         blended = features
         if options.depth and torch.is_grad_enabled():  # The image is there: they lead its gradients to the depths.
             blended = torch.cat([features, begun.depths[:, None]], 1)
-        image, transmittance = with_gradient(begun.result, means2d, blended, begun.conics_opacities)
-        if begun.fits():  # Called last, because it waits for the GPU.
-            splats = means2d, begun.depths, begun.extents
-            return _rendering(image, transmittance, *splats, begun.intersections, None, None, options)
+        image, transmittance = with_gradient(begun.blended, means2d, blended, begun.conics_opacities)
+        count = begun.graph.count_intersections()  # Called last, because it waits for the GPU.
+        if count is not None:
+            return _rendering(options, image, transmittance, means2d, begun.depths, begun.extents, count)
         begun = _launch_projection(tensors, options)
     return render_projected(begun._replace(means2d=means2d), features, options, replays=False)
 
@@ -285,16 +282,16 @@ def render_projected(
     features = features.contiguous()
     # extents.data: pack_splats() writes to it in place, which torch's check of saved tensors must not see.
     inputs = RasterInputs(projected._replace(extents=extents.data), features)
-    replays = replays and store_absolute is None and extents.is_contiguous()
-    pool = get_or_create_pool(flatten(inputs), options) if replays else None
-    replayed = None if pool is None else pool.begin_render(flatten(inputs), options)
-    if replayed is not None:
-        replayed.render_projected(flatten(inputs), extents.data)
-        image, transmittance = with_gradient(replayed.result, means2d, features, conics, opacities)
-        if replayed.fits():
-            return _rendering(
-                image, transmittance, means2d, depths, extents, replayed.intersections, None, None, options
-            )
+    if replays and store_absolute is None and extents.is_contiguous():
+        tensors = flatten(inputs)
+        pool = get_or_create_pool(tensors, options)
+        graph = None if pool is None else pool.begin_render(tensors, options)
+        if graph is not None:
+            blended = graph.render_projected(tensors, extents.data)
+            image, transmittance = with_gradient(blended, means2d, features, conics, opacities)
+            count = graph.count_intersections()
+            if count is not None:
+                return _rendering(options, image, transmittance, means2d, depths, extents, count)
     lists, packed = list_splats(inputs._replace(features=features.detach()), options)
     image, transmittance = blend(
         means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic
@@ -304,26 +301,15 @@ def render_projected(
             image, transmittance, features, lists, packed, options.alpha_threshold, store_absolute
         )
     needed = None if options.max_intersections is None else lists.total
-    return _rendering(
-        image, transmittance, means2d, depths, extents, lists.intersection_count, lists.overflow, needed, options
-    )
+    splats = means2d, depths, extents
+    return _rendering(options, image, transmittance, *splats, lists.intersection_count, lists.overflow, needed)
 
 
-def _rendering(
-    image: Tensor,
-    transmittance: Tensor,
-    means2d: Tensor,
-    depths: Tensor,
-    extents: Tensor,
-    count: int,
-    overflow: Tensor | None,
-    needed: Tensor | None,
-    options: RenderOptions,
-) -> Rendering:
-    depth = None
-    if options.depth:
-        image, depth = image[..., :-1], image[..., -1]
-    return Rendering(image, transmittance, means2d, depths, extents, count, overflow, needed, depth)
+def _rendering(options: RenderOptions, image: Tensor, *others: Any) -> Rendering:
+    """Return a Rendering of its first attributes; the last channel of the image is the depth if that was requested."""
+    if not options.depth:
+        return Rendering(image, *others)
+    return replace(Rendering(image[..., :-1], *others), depth=image[..., -1])
 
 
 def list_splats(

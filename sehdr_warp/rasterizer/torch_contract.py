@@ -25,9 +25,10 @@ _BATCHES: Any = torch._C._parse_dispatch_key("VmapMode")
 _includes_key = torch._C._dispatch_tls_is_dispatch_key_included
 _transforms_are_active = torch._C._are_functorch_transforms_active
 
+keeps_graph: Callable[[], bool] = torch._C._autograd._get_current_graph_task_keep_graph  # pyright: ignore[reportAttributeAccessIssue]
+"""Return whether the backward pass that is running was asked to retain the graph.
 
-_some_autocast = torch._C._is_any_autocast_enabled
-is_compiling = torch.compiler.is_compiling
+If not, what a node holds beside its saved tensors can be freed: a further backward pass is refused by torch."""
 
 _compiled: dict[str, Callable[..., Any]] = {}
 
@@ -52,13 +53,13 @@ def torch_operation(function: Callable[P, T], *, compiles: bool = False) -> Call
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        if compiles and is_compiling():
+        if compiles and torch.compiler.is_compiling():
             return _compiled[name](*args, **kwargs)  # Registered by custom_ops.py, which the package imports.
         if _transforms_are_active():
             raise NotImplementedError(f"{name}() does not support torch.func; use torch.autograd")
         if forward_ad._current_level >= 0 and any(map(_has_tangent, (*args, *kwargs.values()))):
             raise NotImplementedError(f"{name}() has no forward-mode derivative; use torch.autograd.grad()")
-        if _some_autocast():
+        if torch._C._is_any_autocast_enabled():
             return _without_autocast(function, args, kwargs)
         return function(*args, **kwargs)
 
@@ -95,14 +96,6 @@ def _without_autocast(function: Callable[..., T], args: tuple, kwargs: dict) -> 
         return function(*map(cast, args), **{name: cast(value) for name, value in kwargs.items()})
 
 
-def keeps_graph() -> bool:
-    """Return whether the backward pass that is running was asked to retain the graph.
-
-    If not, what a node holds beside its saved tensors can be freed: a further backward pass is refused by torch.
-    """
-    return torch._C._autograd._get_current_graph_task_keep_graph()  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
     """Let what differentiates a gradient raise RuntimeError, and a batch of gradients NotImplementedError.
 
@@ -122,11 +115,11 @@ def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
         parts: tuple[Any, ...] = gradients if isinstance(gradients, tuple) else (gradients,)
         sources = [tensor for tensor in (*ctx.saved_tensors, *upstream) if tensor is not None and tensor.requires_grad]
         if not sources:
-            sources = [
-                torch.zeros((), device=next(part.device for part in parts if part is not None), requires_grad=True)
-            ]
-        tensors = [*parts, *sources]
-        return _Once.apply(len(parts), *tensors)
+            devices = [part.device for part in parts if part is not None]
+            if not devices:
+                return gradients
+            sources = [torch.zeros((), device=devices[0], requires_grad=True)]
+        return _Once.apply(len(parts), *parts, *sources)
 
     return call
 
@@ -144,6 +137,11 @@ class _Once(torch.autograd.Function):
 
 
 def direct_apply(function: type[torch.autograd.Function]) -> Callable[..., Any]:
-    """Return the autograd.Function's apply() without what it does for torch.func, which operations refuse."""
+    """Return the apply() of an autograd.Function in C++, and let C++ call its backward().
+
+    Leaves out the Python functions of torch in between, whose work for torch.func and vjp() operations do not need.
+    """
+    node: Any = function._backward_cls  # pyright: ignore[reportAttributeAccessIssue]
+    node.apply = function.backward
     apply: Any = super(torch.autograd.Function, function)
     return apply.apply

@@ -234,32 +234,37 @@ def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
     assert recordings() and not drawing.visible[7] and drawing.visible.any() and bool(drawing.image.isfinite().all())
 
 
-def test_calls_are_recorded_after_some_and_hold_what_they_were_given():
-    kind, labels = graph_cache.GraphPool(), iter("abcdefgh")
-    assert [kind.take(lambda pairs: next(labels)) for _ in range(graph_cache.WARMUP_CALLS)] == [
-        None
-    ] * graph_cache.WARMUP_CALLS
-    in_use = [
-        graph_cache._GraphInUse(kind.idle, kind.take(lambda pairs: next(labels))) for _ in range(graph_cache.MAX_GRAPHS)
-    ]
-    assert kind.take(lambda pairs: next(labels)) is None, "all are held"
+def test_calls_are_recorded_after_some_and_hold_what_they_were_given(monkeypatch):
+    labels = iter("abcdefgh")
+    monkeypatch.setattr(graph_cache, "CapturedRender", lambda tensors, options, pairs, differentiable: next(labels))
+    pool = graph_cache.GraphPool()
+
+    def take():
+        return pool.begin_render((), RenderOptions(8, 8))
+
+    assert not any(take() for _ in range(graph_cache.WARMUP_CALLS))
+    in_use = [take() for _ in range(graph_cache.MAX_GRAPHS)]
+    assert take() is None, "all are held"
     del in_use[1]
-    assert kind.take(lambda pairs: next(labels)) == "b"
-    kind.grow(70)
-    kind.grow(50)
+    assert take()._graph == "b"
+    pool.grow(70)
+    pool.grow(50)
     del in_use
-    assert kind.idle == [], "too small, they are let go"
-    assert kind.take(lambda pairs: pairs) == 70
+    assert pool.idle == [], "too small, they are let go"
+    monkeypatch.setattr(graph_cache, "CapturedRender", lambda tensors, options, pairs, differentiable: pairs)
+    assert take()._graph == 70
 
 
-def test_what_cannot_be_recorded_is_launched():
+def test_what_cannot_be_recorded_is_launched(monkeypatch):
     pool, requests = graph_cache.GraphPool(), []
 
-    def record(intersections):
+    def record(tensors, options, intersections, differentiable):
         requests.append(intersections)
         raise torch.OutOfMemoryError("no memory")
 
-    assert not any(pool.take(record) for _ in range(graph_cache.WARMUP_CALLS + 5)) and len(requests) == 1
+    monkeypatch.setattr(graph_cache, "CapturedRender", record)
+    calls = graph_cache.WARMUP_CALLS + 5
+    assert not any(pool.begin_render((), RenderOptions(8, 8)) for _ in range(calls)) and len(requests) == 1
 
 
 def test_packed_calls_of_gsplats_push_out_no_graphs():

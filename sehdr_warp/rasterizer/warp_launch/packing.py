@@ -150,25 +150,29 @@ class FixedLaunch:
         """Pack the values."""
         packed.prepare(dim, values)
 
-        def slots(tensors: Sequence[Tensor]) -> list[_Slot]:
-            indices = (next(k for k, value in enumerate(values) if value is tensor) for tensor in tensors)
-            return [_Slot(packed.arrays[index], tensor) for index, tensor in zip(indices, tensors, strict=True)]
-
-        self._rows, self._whole = slots(rows), slots(whole)
-        self._packed = packed
+        self._slots = []
+        for tensor in (*rows, *whole):
+            index = next(k for k, value in enumerate(values) if value is tensor)
+            self._slots.append(_Slot(packed.arrays[index], tensor))
+        self._packed, self._row_slots = packed, self._slots[: len(rows)]
         self._on_stream = _on_stream(packed.command) if packed.command.device.is_cuda else None
         self._values = [value for value in values if not any(value is tensor for tensor in (*rows, *whole))]
         self._lock = threading.Lock()  # A retained graph may be differentiated by several threads.
 
     def launch(self, rows: Sequence[Tensor | None], addresses: Sequence[int], stream: wp.Stream | None) -> None:
         """Launch on tensors with the layouts of the first ones; None and address 0 are an empty array."""
+        if rows:
+            addresses = [0 if tensor is None else tensor.data_ptr() for tensor in rows] + list(addresses)
         with self._lock:
-            for slot, tensor in zip(self._rows, rows, strict=True):
-                slot.put(0 if tensor is None else tensor.data_ptr())
+            for slot, tensor in zip(self._row_slots, rows, strict=True):
                 if tensor is not None and (step := tensor.stride(0)) != slot.step:
                     slot.step, slot.strides[0] = step, step * slot.size
-            for slot, address in zip(self._whole, addresses, strict=True):
-                slot.put(address)
+            # A loop without calls: torch runs backward passes on a thread whose caches hold none of this.
+            for slot, address in zip(self._slots, addresses, strict=True):
+                slot.array.data = address
+                if slot.is_empty is not (address == 0):
+                    slot.is_empty = address == 0
+                    slot.shape[0] = 0 if slot.is_empty else slot.length
             # Of a launch that failed, Warp's own launch raises the error.
             if self._on_stream is None or stream is None or self._on_stream(stream.cuda_stream, None):
                 self._packed.run(stream)
@@ -195,24 +199,21 @@ class _Slot:
     """A packed array that tensors of one layout take in turn.
 
     Attributes:
-        strides: of the array, bytes; a view of its descriptor.
+        array: its descriptor.
+        shape: of the array; a view of the descriptor.
+        strides: of the array, bytes; a view of the descriptor.
+        length: shape[0] unless the array is empty.
+        is_empty: whether it is.
         step: numbers from row to row, as the strides have it; -1 if unknown.
         size: bytes of a number.
     """
 
-    __slots__ = ("_array", "_empty", "_length", "_shape", "size", "step", "strides")
+    __slots__ = ("array", "is_empty", "length", "shape", "size", "step", "strides")
 
     def __init__(self, array: Any, tensor: Tensor) -> None:
-        self._array, self._shape, self.strides = array, array.shape, array.strides
-        self._length, self._empty = array.shape[0], False
+        self.array, self.shape, self.strides = array, array.shape, array.strides
+        self.length, self.is_empty = array.shape[0], False
         self.size, self.step = tensor.element_size(), -1
-
-    def put(self, address: int) -> None:
-        """Let the array be the memory at an address, or empty if that is 0."""
-        self._array.data = address
-        if self._empty != (address == 0):
-            self._empty = address == 0
-            self._shape[0] = 0 if self._empty else self._length
 
 
 def write_layout(array: Any, tensor: Tensor, kind: wp.array, label: str = "the kernel") -> None:
