@@ -42,10 +42,8 @@ def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:
     return [zeros.as_strided(t.shape, t.stride(), start) for t, start in zip(tensors, starts, strict=False)]
 
 
-def kernel_layout(gradient: Tensor | None) -> Tensor | None:
+def kernel_layout(gradient: Tensor) -> Tensor:
     """Return a gradient as kernels read it: contiguous, or with any stride from row to row; no negated view."""
-    if gradient is None:
-        return None
     if gradient.is_neg():
         gradient = gradient.resolve_neg()  # The imaginary part of a conjugate, as in losses of Fourier transforms.
     if gradient.ndim < 2 or gradient.is_contiguous():

@@ -131,18 +131,20 @@ def adjoint_arguments(
 def with_projection_gradient(
     outputs: Sequence[Tensor], inputs: Sequence[Tensor], backward: ProjectionBackward
 ) -> Sequence[Tensor]:
-    """Return the outputs of a projection as differentiable functions of its inputs."""
-    return _apply_projection(outputs, backward, *inputs) if torch.is_grad_enabled() else outputs
+    """Return the outputs of a projection, all but the last one as differentiable functions of its inputs."""
+    if not torch.is_grad_enabled():
+        return outputs
+    return *_apply_projection(outputs, backward, *inputs), outputs[-1]
 
 
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(ctx, outputs: Sequence[Tensor], backward: ProjectionBackward, *inputs: Tensor):
+        *differentiable, visibility = outputs
         ctx.gradients_of = backward
-        ctx.save_for_backward(*inputs, outputs[-1])
-        ctx.mark_non_differentiable(outputs[-1])
+        ctx.save_for_backward(*inputs, visibility)
         ctx.set_materialize_grads(False)
-        return tuple(outputs)
+        return tuple(differentiable)
 
     @staticmethod
     @once_differentiable
@@ -151,8 +153,8 @@ class _Projection(torch.autograd.Function):
         gradients_of = ctx.gradients_of
         if not keeps_graph():
             ctx.gradients_of = None
-        upstream = [kernel_layout(gradient) for gradient in upstream]
-        return None, None, *gradients_of(inputs, visibility, upstream, ctx.needs_input_grad[2:])
+        upstream = [None if gradient is None else kernel_layout(gradient) for gradient in upstream]
+        return None, None, *gradients_of(inputs, visibility, [*upstream, None], ctx.needs_input_grad[2:])
 
 
 _apply_projection = direct_apply(_Projection)

@@ -27,7 +27,7 @@ from .tile_lists import (
 from .torch_contract import torch_operation
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(eq=False, repr=False)  # Not frozen, which would take as long as a launch.
 class Rendering:
     """One rendered view of N Gaussians; for B cameras in one call, tensors begin with an axis of B unless noted.
 
