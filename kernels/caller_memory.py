@@ -72,7 +72,7 @@ def copy_tensors(
     f: wp.array(dtype=wp.float32),
     g: wp.array(dtype=wp.float32),
 ):
-    """Copy the caller's inputs to a, ..., g (entry 0), or these to its outputs (entry MAX_TENSORS); write `zeros` zeros.
+    """Copy inputs to a, ..., g if entry is 0, or these to outputs if it is MAX_TENSORS; write `zeros` zeros.
 
     Launch the sum of threads_for() of the lengths and of `zeros`.
     """

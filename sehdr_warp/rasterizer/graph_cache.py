@@ -134,6 +134,7 @@ class GraphInUse:
         self._between: GradientMemory | None = None  # Of the last one, until that of the projection.
 
     def __del__(self) -> None:
+        """Return the CUDA graph to the pool."""
         self._idle.append(self._graph)
 
     def render(self, tensors: Sequence[Tensor]) -> ReplayedRender:
@@ -182,8 +183,7 @@ class GraphInUse:
     ) -> Sequence[Tensor | None]:
         """Return the gradients by the projection's inputs, see ProjectionBackward.
 
-        upstream: of what render() gave to the projection; for conics_opacities GradientMemory.zeros, as blend_backward()
-            has returned it.
+        upstream: gradients by means2d, conics_opacities (GradientMemory.zeros, from blend_backward()), and depths.
         """
         grad_means2d, zeros, grad_depths, _ = upstream
         backward = self._graph.backward
