@@ -121,6 +121,7 @@ class CapturedRender:
                 None, lambda: self._list(splats, packed, self._order_and_count(splats, packed))
             )
             self._fix_launches(splats, packed, lists)
+            self._inputs = []  # The caller's.
         self._results = [*([self._image, self._transmittance] if self._copies else ()), *self._projection_of(splats)]
 
     def _render(self) -> tuple[RasterInputs, BlockBackward]:

@@ -52,7 +52,7 @@ def _one_thread():
 
 def is_capturing(device: torch.device) -> bool:
     """Return whether launches on a device are being captured in a CUDA graph instead of run."""
-    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+    return device.type == "cuda" and torch._C._cuda_isCurrentStreamCapturing()  # torch.cuda has it one frame deeper.
 
 
 _replays_are_off: ContextVar[bool] = ContextVar("replays_are_off", default=False)

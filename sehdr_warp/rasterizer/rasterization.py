@@ -1,7 +1,7 @@
 """Differentiable rasterization of 3D Gaussians: project, order, list by tile, blend."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -160,10 +160,10 @@ def rasterize(
             rendering = _finish(begun, begun.means2d, tensors, options)
         else:
             rendering = _render_cameras(tensors, options)
-        if background is None:
-            return rendering
-        behind = background[:, None, None] if background.ndim == 2 else background
-        return replace(rendering, image=rendering.image + rendering.transmittance[..., None] * behind)
+        if background is not None:
+            behind = background[:, None, None] if background.ndim == 2 else background
+            rendering.image = rendering.image + rendering.transmittance[..., None] * behind
+        return rendering
 
 
 def check_shapes(
@@ -226,15 +226,14 @@ def _finish(begun: _Begun, means2d: Tensor, tensors: Sequence[Tensor], options: 
     """
     features = tensors[FEATURES]
     if isinstance(begun, ReplayedRender):
-        blended = features
-        if options.depth and torch.is_grad_enabled():  # The image is there: they lead its gradients to the depths.
-            blended = torch.cat([features, begun.depths[:, None]], 1)
-        image, transmittance = with_gradient(begun.blended, means2d, blended, begun.conics_opacities)
+        if options.depth and torch.is_grad_enabled():  # The image is there: this leads its gradients to the depths.
+            features = torch.cat([features, begun.depths[:, None]], 1)
+        image, transmittance = with_gradient(begun.blended, means2d, features, begun.conics_opacities)
         count = begun.graph.count_intersections()  # Called last, because it waits for the GPU.
         if count is not None:
             return _rendering(options, image, transmittance, means2d, begun.depths, begun.extents, count)
         begun = _launch_projection(tensors, options)
-    return render_projected(begun._replace(means2d=means2d), features, options, replays=False)
+    return render_projected(begun._replace(means2d=means2d), tensors[FEATURES], options, replays=False)
 
 
 def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
@@ -307,9 +306,10 @@ def render_projected(
 
 def _rendering(options: RenderOptions, image: Tensor, *others: Any) -> Rendering:
     """Return a Rendering of its first attributes; the last channel of the image is the depth if that was requested."""
-    if not options.depth:
-        return Rendering(image, *others)
-    return replace(Rendering(image[..., :-1], *others), depth=image[..., -1])
+    rendering = Rendering(image, *others)
+    if options.depth:
+        rendering.image, rendering.depth = image[..., :-1], image[..., -1]
+    return rendering
 
 
 def list_splats(
