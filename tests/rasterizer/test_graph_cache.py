@@ -155,6 +155,17 @@ def test_gradients_of_leaves_are_contiguous_and_not_copied(monkeypatch):
     assert {gradient.untyped_storage().data_ptr() for gradient in gradients} == {addresses[-1]}
 
 
+def test_calls_that_require_other_gradients_have_graphs_of_their_own():
+    scene = scene_of()
+    for required in ((0, 5), (4,), tuple(range(7))):
+        for place, tensor in enumerate(scene.tensors):
+            tensor.requires_grad_(place in required)
+        images = [[rasterize(*scene.arguments) for _ in range(CALLS)][-1].image, launched(*scene.arguments).image]
+        leaves, cotangent = [scene.tensors[place] for place in required], random_like(images[0], 1)
+        assert_alike(*[torch.autograd.grad(image, leaves, cotangent) for image in images])
+    assert len(graph_cache._pools) == 3 and all(pool.captured for pool in graph_cache._pools.values())
+
+
 @pytest.mark.parametrize("place", [0, 1, 4])
 def test_a_change_in_place_before_the_backward_pass_of_a_replay_is_refused(place):
     scene = scene_of()

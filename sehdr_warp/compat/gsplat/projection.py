@@ -119,41 +119,41 @@ def _project_covariances(
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     finite = means.isfinite().all(1) & covars.isfinite().all(2).all(1) & opacities.isfinite()
     opacities = torch.where(finite, opacities, 0.0)
-    centres = torch.where(finite[:, None], means, 0.0) @ rotation.T + translation
-    inside = finite & (centres[:, 2] > near_plane) & viewmat.isfinite().all() & K.isfinite().all()
+    centers = torch.where(finite[:, None], means, 0.0) @ rotation.T + translation
+    inside = finite & (centers[:, 2] > near_plane) & viewmat.isfinite().all() & K.isfinite().all()
     # What is culled takes part as a point in front of the camera, so that its derivatives are finite.
-    centres = torch.where(inside[:, None], centres, centres.new_tensor([0.0, 0.0, 1.0]))
+    centers = torch.where(inside[:, None], centers, centers.new_tensor([0.0, 0.0, 1.0]))
     covars = torch.where(inside[:, None, None], covars, torch.eye(3, dtype=covars.dtype, device=covars.device))
-    centre2d, jacobian = _linearise(centres, K, width, height, camera_model)
-    spread = jacobian @ rotation
-    covars2d = spread @ covars @ spread.transpose(1, 2)
+    means2d, jacobian = _linearize(centers, K, width, height, camera_model)
+    to_image = jacobian @ rotation
+    covars2d = to_image @ covars @ to_image.transpose(1, 2)
     xx, xy, yy = covars2d[:, 0, 0], covars2d[:, 0, 1], covars2d[:, 1, 1]
-    sharp, xx, yy = xx * yy - xy * xy, xx + eps2d, yy + eps2d
+    unblurred, xx, yy = xx * yy - xy * xy, xx + eps2d, yy + eps2d
     determinant = xx * yy - xy * xy
     inside = inside & (determinant > 0) & determinant.isfinite()
     determinant = torch.where(inside, determinant, 1.0)
     if antialiased:
-        opacities = opacities * (sharp / determinant).clamp_min(1e-12).sqrt()
+        opacities = opacities * (unblurred / determinant).clamp_min(1e-12).sqrt()
     with torch.no_grad():
-        level = 2 * torch.log((opacities / ALPHA_THRESHOLD).clamp_min(1.0))
-        extents = (level[:, None] * torch.stack([xx, yy], 1)).clamp_min(0.0).sqrt()
+        cutoffs = 2 * torch.log((opacities / ALPHA_THRESHOLD).clamp_min(1.0))
+        extents = (cutoffs[:, None] * torch.stack([xx, yy], 1)).clamp_min(0.0).sqrt()
         inside = inside & (opacities > ALPHA_THRESHOLD)
-        size = centre2d.new_tensor([width, height])
-        inside = inside & ((centre2d + extents > 0) & (centre2d - extents < size)).all(1)
+        size = means2d.new_tensor([width, height])
+        inside = inside & ((means2d + extents > 0) & (means2d - extents < size)).all(1)
         extents = torch.where(inside[:, None], extents, 0.0)
     conics = torch.stack([yy, -xy, xx], 1) / determinant[:, None]
     return ProjectedGaussians(
-        torch.where(inside[:, None], centre2d, 0.0),
+        torch.where(inside[:, None], means2d, 0.0),
         torch.where(inside[:, None], conics, conics.new_tensor([1.0, 0.0, 1.0])),
-        torch.where(inside, centres[:, 2], 0.0),
+        torch.where(inside, centers[:, 2], 0.0),
         torch.where(inside, opacities, 0.0),
         extents,
     )
 
 
-def _linearise(centres: Tensor, K: Tensor, width: int, height: int, camera_model: CameraModel) -> tuple[Tensor, Tensor]:
+def _linearize(centers: Tensor, K: Tensor, width: int, height: int, camera_model: CameraModel) -> tuple[Tensor, Tensor]:
     """Return the pixels [N, 2] of places in front of the camera [N, 3] and the Jacobian there [N, 2, 3]."""
-    x, y, z = centres.unbind(1)
+    x, y, z = centers.unbind(1)
     focal, principal = torch.stack([K[0, 0], K[1, 1]]), torch.stack([K[0, 2], K[1, 2]])
     zero, one = torch.zeros_like(x), torch.ones_like(x)
     if camera_model == "ortho":
@@ -366,10 +366,10 @@ def isect_tiles(
     if image_ids is None:
         images = math.prod(shape[:-1])
         image_ids = torch.arange(images, device=depths.device).repeat_interleave(shape[-1]).reshape(-1)
-    centres, reach, depths = means2d.detach().reshape(-1, 2), radii.reshape(-1, 2), depths.detach().reshape(-1)
-    limits = torch.tensor([tile_width, tile_height], device=centres.device)
-    low = ((centres - reach) / tile_size).floor().clamp_min(0).minimum(limits).long()
-    high = ((centres + reach) / tile_size).ceil().clamp_min(0).minimum(limits).long()
+    centers, reach, depths = means2d.detach().reshape(-1, 2), radii.reshape(-1, 2), depths.detach().reshape(-1)
+    limits = torch.tensor([tile_width, tile_height], device=centers.device)
+    low = ((centers - reach) / tile_size).floor().clamp_min(0).minimum(limits).long()
+    high = ((centers + reach) / tile_size).ceil().clamp_min(0).minimum(limits).long()
     spans = torch.where((reach > 0).all(1, keepdim=True), (high - low).clamp_min(0), 0)
     counts = spans.prod(1)
     flatten_ids = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)

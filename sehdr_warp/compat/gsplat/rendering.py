@@ -162,8 +162,8 @@ def rasterization(
             )
             for view in views
         ]
-        batch, cameras = tuple(means.shape[:-2]), viewmats.shape[-3]
-        splats = JoinedSplats.of(projected, packed, (*batch, cameras))
+        shape = *means.shape[:-2], viewmats.shape[-3]
+        splats = JoinedSplats.of(projected, packed, shape)
         means2d = splats.all.means2d
         if absgrad and means2d.requires_grad:
             means2d.absgrad = torch.zeros_like(means2d)  # pyright: ignore[reportAttributeAccessIssue]
@@ -176,9 +176,8 @@ def rasterization(
             features = torch.cat(features, 1) if len(features) > 1 else features[0]
             store = _store(splats, mine.rows) if absgrad and means2d.requires_grad else None
             # The number of packed Gaussians differs from view to view, so no CUDA graph fits two of them.
-            rendering = render_projected(
-                mine.projected, features, RenderOptions(*size), replays=not packed, store_absolute=store
-            )
+            options = RenderOptions(*size)  # The others were read by the projection.
+            rendering = render_projected(mine.projected, features, options, replays=not packed, store_absolute=store)
             image, transmittance = rendering.image, rendering.transmittance
             if view.background is not None:
                 behind = view.background
@@ -195,7 +194,6 @@ def rasterization(
                 extras.append(extra)
             images.append(image)
             alphas.append(alpha)
-    shape = *batch, cameras
     meta = make_meta(splats, shape, size, tile_size)
     if extras:
         meta["render_extra_signals"] = torch.stack(extras).unflatten(0, shape)

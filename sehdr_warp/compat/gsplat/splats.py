@@ -12,7 +12,13 @@ from .projection import isect_offset_encode, isect_tiles
 
 
 class ViewSplats(NamedTuple):
-    """The 2D Gaussians of one view, their rows in the joined tensors, and if packed which Gaussians they are."""
+    """The 2D Gaussians of one view.
+
+    Attributes:
+        projected: the Gaussians.
+        rows: index of the view in what JoinedSplats.by_view() returns, or if packed the slice of its Gaussians.
+        gaussian_ids: which Gaussians they are; None unless packed.
+    """
 
     projected: ProjectedGaussians
     rows: Any
