@@ -50,6 +50,5 @@ class CallerMemory:
         counts = [*(tensor.numel() for tensor in tensors), zeros]
         if sum(counts) >= 1 << 30:
             raise RuntimeError(f"{sum(counts)} numbers are too many for one launch of copies")
-        absent = [None] * (kernels.MAX_TENSORS - len(tensors))
-        threads = sum(map(kernels.threads_for, counts))
-        launch(kernels.copy_tensors, threads, self._on_device, entry, zeros, *tensors, *absent)
+        arrays = [*tensors, *[None] * (kernels.MAX_TENSORS - len(tensors))]
+        launch(kernels.copy_tensors, sum(map(kernels.threads_for, counts)), self._on_device, entry, zeros, *arrays)

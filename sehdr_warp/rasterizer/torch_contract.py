@@ -119,7 +119,8 @@ def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
             if not devices:
                 return gradients
             sources = [torch.zeros((), device=devices[0], requires_grad=True)]
-        return _Once.apply(len(parts), *parts, *sources)
+        tensors = [*parts, *sources]
+        return _Once.apply(len(parts), *tensors)
 
     return call
 

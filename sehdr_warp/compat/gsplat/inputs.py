@@ -110,7 +110,7 @@ class Inputs(NamedTuple):
             check_degree("sh_degree", integer("sh_degree", sh_degree, 0, 4))
             inner = ("N", "K", 3)
             if isinstance(colors, Tensor) and colors.ndim == 3:  # gsplat 1.6 shares coefficients among scenes.
-                colors = colors.expand(*batch, *colors.shape)
+                colors = colors.expand(batch + colors.shape)
 
         def by_camera(features: Any, inner: tuple) -> bool:
             return isinstance(features, Tensor) and features.ndim == len(batch) + len(inner) + 1
