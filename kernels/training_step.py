@@ -62,22 +62,6 @@ def bias_correction(decay_log: float, step: float) -> float:
     return correction
 
 
-@wp.func
-def step_by_adam(
-    i: int, gradient: float, step: float, rate: float,
-    first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
-    parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
-    second_moments: wp.array(dtype=wp.float32),
-):
-    """One step of number i, in place."""
-    mean = first_moments[i] + first_gain * (gradient - first_moments[i])
-    square = second_moments[i] + second_gain * (gradient * gradient - second_moments[i])
-    first_moments[i] = mean
-    second_moments[i] = square
-    deviation = wp.sqrt(square / bias_correction(second_decay_log, step)) + epsilon
-    parameters[i] = parameters[i] - rate / bias_correction(first_decay_log, step) * mean / deviation
-
-
 _floats = wp.array(dtype=wp.float32)
 
 
@@ -88,6 +72,24 @@ def active_values(parameters: _floats, active_count: wp.array(dtype=wp.int32), w
     if active_count.shape[0] > 0 and width > 0:
         count = wp.min(count, active_count[0] * width)
     return count
+
+
+@wp.func
+def step_by_adam(
+    i: int, active_count: wp.array(dtype=wp.int32), width: int,
+    first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
+    gradients: _floats, step: _floats, rate: _floats,
+    parameters: _floats, first_moments: _floats, second_moments: _floats,
+):
+    """One step of number i, in place, if it is among the active ones."""
+    if i < active_values(parameters, active_count, width):
+        gradient = gradients[i]
+        mean = first_moments[i] + first_gain * (gradient - first_moments[i])
+        square = second_moments[i] + second_gain * (gradient * gradient - second_moments[i])
+        first_moments[i] = mean
+        second_moments[i] = square
+        deviation = wp.sqrt(square / bias_correction(second_decay_log, step[0])) + epsilon
+        parameters[i] = parameters[i] - rate[0] / bias_correction(first_decay_log, step[0]) * mean / deviation
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
@@ -108,26 +110,22 @@ def update_by_adam(
     """
     i = range_start + wp.tid()
     if skipped[0] == 0.0:
-        if i < active_values(parameters_a, active_count, width_a):
-            step_by_adam(
-                i, grad_a[i], step_a[0], rate_a[0], first_gain, second_gain, first_decay_log, second_decay_log,
-                epsilon, parameters_a, exp_avg_a, exp_avg_sq_a,
-            )  # fmt: skip
-        if i < active_values(parameters_b, active_count, width_b):
-            step_by_adam(
-                i, grad_b[i], step_b[0], rate_b[0], first_gain, second_gain, first_decay_log, second_decay_log,
-                epsilon, parameters_b, exp_avg_b, exp_avg_sq_b,
-            )  # fmt: skip
-        if i < active_values(parameters_c, active_count, width_c):
-            step_by_adam(
-                i, grad_c[i], step_c[0], rate_c[0], first_gain, second_gain, first_decay_log, second_decay_log,
-                epsilon, parameters_c, exp_avg_c, exp_avg_sq_c,
-            )  # fmt: skip
-        if i < active_values(parameters_d, active_count, width_d):
-            step_by_adam(
-                i, grad_d[i], step_d[0], rate_d[0], first_gain, second_gain, first_decay_log, second_decay_log,
-                epsilon, parameters_d, exp_avg_d, exp_avg_sq_d,
-            )  # fmt: skip
+        step_by_adam(
+            i, active_count, width_a, first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
+            grad_a, step_a, rate_a, parameters_a, exp_avg_a, exp_avg_sq_a,
+        )  # fmt: skip
+        step_by_adam(
+            i, active_count, width_b, first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
+            grad_b, step_b, rate_b, parameters_b, exp_avg_b, exp_avg_sq_b,
+        )  # fmt: skip
+        step_by_adam(
+            i, active_count, width_c, first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
+            grad_c, step_c, rate_c, parameters_c, exp_avg_c, exp_avg_sq_c,
+        )  # fmt: skip
+        step_by_adam(
+            i, active_count, width_d, first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
+            grad_d, step_d, rate_d, parameters_d, exp_avg_d, exp_avg_sq_d,
+        )  # fmt: skip
 
 
 @wp.func

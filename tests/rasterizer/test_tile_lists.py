@@ -1,4 +1,4 @@
-"""The lists of the tiles: every entry that was counted is written, whatever the two kernels make of a border case."""
+"""The lists of the tiles: every counted intersection is written, whatever the two kernels make of a border case."""
 
 from dataclasses import fields
 
@@ -46,12 +46,12 @@ def emit(arguments, counts, monkeypatch):
     """Tiles and Gaussians of the intersections, in memory that holds what no tile and no Gaussian is."""
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
-    room = int(counts.sum())
+    capacity = int(counts.sum())
     order, splats, *others = arguments
     offsets = IntersectionOffsets(order, counts.cumsum(0))
-    tiles, gaussians = emit_intersections(splats, offsets, *others, GRID, room)
+    tiles, gaussians = emit_intersections(splats, offsets, *others, GRID, capacity)
     monkeypatch.undo()
-    return tiles[:room], gaussians[:room]
+    return tiles[:capacity], gaussians[:capacity]
 
 
 def test_each_counted_tile_is_emitted_once(device, monkeypatch):
@@ -64,7 +64,7 @@ def test_each_counted_tile_is_emitted_once(device, monkeypatch):
     assert len(pairs.unique()) == len(pairs)
 
 
-def test_an_entry_counted_too_much_is_no_tiles_and_one_too_few_costs_its_own_gaussian_only(device, monkeypatch):
+def test_an_intersection_counted_too_much_has_no_tile_and_one_too_few_costs_its_own_gaussian_only(device, monkeypatch):
     arguments, counts = counted(device, 500)
     true_tiles, _ = emit(arguments, counts, monkeypatch)
     first, second = counts.nonzero()[[3, 40], 0].tolist()
@@ -90,14 +90,14 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     # Many at one depth: ties keep the order of indices.
     depths = (depths * 4).round().clamp_min(1) / 4
     lists = built(splats, depths, extents)
-    room = lists.intersection_count + spare
+    capacity = lists.intersection_count + spare
     offsets = IntersectionOffsets(None, counts.cumsum(0))
-    keys, gaussians = emit_intersections(splats, offsets, depths, extents, GRID, room)
-    sort_pairs(keys, gaussians, room, DEPTH_BITS + GRID.tiles.bit_length())
-    keys, gaussians = keys[:room], gaussians[:room]
+    keys, gaussians = emit_intersections(splats, offsets, depths, extents, GRID, capacity)
+    sort_pairs(keys, gaussians, capacity, DEPTH_BITS + GRID.tiles.bit_length())
+    keys, gaussians = keys[:capacity], gaussians[:capacity]
     ranges, corners = find_tile_ranges(keys, gaussians, splats, GRID)
     if spare < 0:
-        assert int(ranges[-1, 1]) == room and int(keys.max() >> DEPTH_BITS) < GRID.tiles
+        assert int(ranges[-1, 1]) == capacity and int(keys.max() >> DEPTH_BITS) < GRID.tiles
         return
     assert torch.equal(gaussians[: lists.intersection_count], lists.gaussians)
     assert torch.equal(ranges, lists.tile_ranges)
@@ -127,13 +127,13 @@ def test_subtiles_are_those_that_an_ellipse_touches(device):
 
 @pytest.mark.parametrize("keep_emit_order", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 500])
-def test_overflow_is_more_entries_than_room(device, keep_emit_order, count):
+def test_overflow_is_more_intersections_than_capacity(device, keep_emit_order, count):
     size = {"width": 16 * GRID.columns, "height": 16 * GRID.rows}
     scene = packed(random_scene(count=count, **size, seed=3).to(torch.float32, device))
     intersections = built(*scene, keep_emit_order=keep_emit_order).intersection_count
-    for room in {max(1, intersections + spare) for spare in (-1, 0, 1)}:
-        lists = built(*scene, room, keep_emit_order=keep_emit_order)
-        assert bool(lists.overflow) == (intersections > room) and lists.total == intersections
+    for capacity in {max(1, intersections + spare) for spare in (-1, 0, 1)}:
+        lists = built(*scene, capacity, keep_emit_order=keep_emit_order)
+        assert bool(lists.overflow) == (intersections > capacity) and lists.total == intersections
 
 
 def kept_bytes(holder):
@@ -162,7 +162,7 @@ def test_lists_keep_no_more_memory_than_they_use(device, keep_emit_order, spare)
 
 @pytest.mark.parametrize("keep_emit_order", [True, False])
 @pytest.mark.parametrize("count, chunks", [(0, 1), (1, 3), (5000, 7)])
-def test_entries_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, keep_emit_order):
+def test_intersections_counted_by_chunks_are_those_sorted(monkeypatch, count, chunks, keep_emit_order):
     monkeypatch.setattr(tile_lists, "MIN_CHUNK", max(1, count // chunks))
     monkeypatch.setenv("SEHDR_THREADS", str(chunks))
     generator, grid = torch.Generator().manual_seed(count), TileGrid(40, 1)
