@@ -123,8 +123,12 @@ def find_images(folder: Path, names: Sequence[str], source: Path) -> dict[str, P
     if any(images.values()) or len(set(files.values())) < len(files):
         return images
     first = list(files.values())[:LOOKED_FOR]
-    for place in (folder, *sorted(place for place in folder.rglob("*") if place.is_dir())):
-        if place.name not in OTHER_FOLDERS and any(find_image(place, file, source) for file in first):
+    inner = (place for pattern in ("*/", "*/*/", "*/*/*/") for place in sorted(folder.glob(pattern)))
+    for place in (folder, *inner):
+        # A link must not lead out of the set.
+        if place.name in OTHER_FOLDERS or not place.resolve().is_relative_to(folder.resolve()):
+            continue
+        if any(find_image(place, file, source) for file in first):
             return {name: find_image(place, file, source) for name, file in files.items()}
     return images
 

@@ -184,7 +184,7 @@ def _foreign_poses(folder: Path) -> list[str]:
     for suffix, file in sorted(kinds.items()):
         mark, tool = _POSE_CONTENT[suffix]
         if file.is_file() and file.name.lower() not in _POSE_FILES:
-            with file.open("rb") as opened:
+            with suppress(OSError), file.open("rb") as opened:
                 tools += [f"{tool} ({file.name})"] if mark in opened.read(1 << 16) else []
     remedy = "are not read, cameras are found anew: export them for COLMAP or nerfstudio"
     notes = [f"poses of {', '.join(tools)} {remedy}"] if tools else []

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
@@ -40,7 +41,8 @@ def is_transforms(path: Path) -> bool:
     """Return whether a file states frames as nerfstudio's transforms.json does, whatever its name."""
     if path.suffix.lower() != ".json" or not path.is_file():
         return False
-    with path.open("rb") as file:
+    head = b""
+    with suppress(OSError), path.open("rb") as file:
         head = file.read(1 << 16)
     return b'"frames"' in head and b'"transform_matrix"' in head
 

@@ -207,6 +207,16 @@ def test_reduced_images_scale_the_camera_and_others_are_refused(tmp_path):
         load(tmp_path)
 
 
+def test_photos_are_not_looked_for_behind_links_out_of_the_set(tmp_path):
+    write_colmap(tmp_path / "set")
+    images = tmp_path / "set" / "images"
+    images.rename(tmp_path / "private")
+    images.mkdir()
+    (images / "a").symlink_to(tmp_path / "private")
+    with pytest.raises(InputError, match="none of the model's 6 images is here"):
+        read_colmap(tmp_path / "set")
+
+
 @pytest.mark.parametrize("size", [(26, 19), (200, 150)])
 def test_images_of_any_size_with_the_shape_of_the_camera(tmp_path, size):
     write_colmap(tmp_path)
