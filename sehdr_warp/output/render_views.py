@@ -110,9 +110,10 @@ def render_views(
         InputError: If a file would be replaced or a pixel is not finite.
     """
     out = Path(out)
-    header = PictureHeader(
-        run.base_time, colorspace, datetime.now().replace(microsecond=0), provenance(run), luminance_of_one(run)
-    )
+    transform = world_transform(run, axes, up=up, scale=scale)
+    facts = provenance(run) | {"worldMatrix": json.dumps(stored_matrix(run, transform).tolist())}
+    now = datetime.now().replace(microsecond=0)
+    header = PictureHeader(run.base_time, colorspace, now, facts, luminance_of_one(run))
     brackets = None
     if evs is not None or exposures is not None:
         brackets = Brackets(
@@ -132,14 +133,12 @@ def render_views(
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
     ocio_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
     aovs = read_aovs(aovs) if aovs else ()
-    transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
     if size is not None:
         width, height = read_size(size)
         views = [(name, reframe(camera, width, height)) for name, camera in views]
     are_photos = str(cameras) in SPLITS or (str(cameras) not in PATHS and Path(cameras).is_dir())
     camera_files = _camera_files(run, views, transform, fps, moves=not are_photos)
-    world_matrix = json.dumps(stored_matrix(run, transform).tolist())
     empty = []
     with ExitStack() as stack:
         for name, text in camera_files.items():
@@ -152,7 +151,7 @@ def render_views(
             images = render_images(run, view_camera, transform)
             if images.confidence is None and index == 0:
                 log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            attributes = header.of(name, exposure, images.camera_in_file, worldMatrix=world_matrix)
+            attributes = header.of(name, exposure, images.camera_in_file)
             parts = _hdr_parts(images, attributes, colorspace, exposure, aovs)
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)

@@ -172,8 +172,10 @@ def test_upright_files_have_their_up_where_readers_expect_it(tmp_path):
 
 def test_pictures_and_cameras_are_in_one_space(tmp_path):
     run = AnalyticRun()
-    render_views(run, tmp_path, aovs="position", scale=3.0)
+    render_views(run, tmp_path, aovs="position", scale=3.0, evs=(0,))
     header = read_exr(tmp_path / "hdr" / "t_0.exr")[2]
+    bracket = read_exr(next((tmp_path / "brackets" / "t_0").glob("*.exr")))[2]
+    assert all(bracket[name] == header[name] for name in ("sehdr:worldMatrix", "sehdr:camera"))
     transform = WorldTransform.from_matrix(json.loads(header["sehdr:worldMatrix"]))
     assert transform.scale == pytest.approx(3)
     stored = Camera.from_dict(json.loads(header["sehdr:camera"]))
