@@ -322,7 +322,7 @@ def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | N
         except ValueError as error:
             raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
         views = [(name, to_photos.camera(camera)) for name, camera in views]
-    elif (beside := cameras_beside(Path(run.path))) is not None and beside.samefile(path):
+    elif run.world_matrix is None or ((own := cameras_beside(Path(run.path))) is not None and own.samefile(path)):
         return views
     return [(name, photos_to_scene.camera(camera)) for name, camera in views]
 

@@ -229,13 +229,13 @@ class Orientation(NamedTuple):
 
 
 def read_orientation(run: "RenderableScene") -> Orientation:
-    """Return the up direction and the scale that are kept with a run.
+    """Return the up direction and the scale that are kept with a run; neither during a training.
 
     Raises:
         InputError: If the file is damaged.
     """
-    path = Path(run.path) / ORIENTATION_FILE
-    if not path.is_file():
+    folder = getattr(run, "path", None)
+    if folder is None or not (path := Path(folder) / ORIENTATION_FILE).is_file():
         return Orientation()
     values = read_json(path)
     try:

@@ -54,7 +54,7 @@ class LiveTraining(ViewerScene):
             "iterations": self.run.iteration,
             "cameras": self.run.scene.views,
         }
-        attributes |= {"color_matrix": self.run.scene.color_matrix, "world_matrix": None, "reference": None}
+        attributes |= {"color_matrix": self.run.scene.color_matrix, "world_matrix": None, "reference": None, "up": None}
         if name not in attributes:
             raise AttributeError(name)
         return attributes[name]

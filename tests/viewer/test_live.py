@@ -189,3 +189,21 @@ def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
         page.locator("#pause:disabled").wait_for()
         wait("the training has ended", "#told")
         assert page.is_disabled("#step")
+
+
+def test_a_picture_is_saved_while_a_scene_is_trained(tmp_path, logged):
+    scene = toy_scene()
+    training = create_trainer(scene, tmp_path / "run", CONFIG | {"schedule.iterations": 3}, device="cpu")
+    camera, answers = scene.views[0].camera.resized(24, 24).to_dict(), []
+    with serve_training(training, "toy") as steps:
+        address = re.search(r"http://([^/]*)/", logged[-1])[1]
+        body = {"cameras": [camera], "kind": "exr"}
+        saving = threading.Thread(target=lambda: answers.append(ask(address, "/save", body)))
+        ask(address, "/training", {"do": "pause"})
+        saving.start()
+        threading.Thread(target=lambda: (saving.join(), ask(address, "/training", {"do": "resume"}))).start()
+        for _ in steps:
+            pass
+        saving.join()
+    assert answers[0][0] == 200, answers[0][1]
+    assert answers[0][1][:4] == b"v/1\x01"
