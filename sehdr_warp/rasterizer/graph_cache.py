@@ -35,9 +35,9 @@ from .warp_launch.launching import stream_handle
 
 LOG = logging.getLogger(__name__)
 
-WARMUP_CALLS = 4  # Launched calls of a size before one is captured: a capture takes the time of some twenty of them.
-MAX_SIZES = 3  # Sizes of calls with CUDA graphs, the most recent ones.
-MAX_GRAPHS = 4  # CUDA graphs of a size: each holds a render until its backward pass.
+WARMUP_CALLS = 4  # Launched calls of a pool before one is captured: a capture takes the time of some twenty of them.
+MAX_POOLS = 3  # Pools of CUDA graphs, by sizes, options and required gradients of calls, the most recent ones.
+MAX_GRAPHS = 4  # CUDA graphs of a pool: each holds a render until its backward pass.
 MAX_LARGE_GRAPHS = 1  # The same with more than MAX_SINGLE_SORT Gaussians, whose memory is hundreds of megabytes.
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
 MAX_GAUSSIANS = 1 << 21
@@ -84,7 +84,7 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     with _lock:
         pool = _pools.setdefault(_signature(tensors, options), GraphPool(differentiable, max_graphs))
         pool.last_use = next(_uses)
-        while len(_pools) > MAX_SIZES:
+        while len(_pools) > MAX_POOLS:
             del _pools[min(_pools, key=lambda key: _pools[key].last_use)]
     return pool
 
@@ -130,8 +130,8 @@ class GraphInUse:
     def __init__(self, pool: "GraphPool", graph: CapturedRender) -> None:
         """Keep the CUDA graph from other calls."""
         self._pool, self._idle, self._graph = pool, pool.idle, graph
-        self._next: GradientMemory | None = None  # Of the next backward pass of the blend.
-        self._between: GradientMemory | None = None  # Of the last one, until that of the projection.
+        self._prepared: GradientMemory | None = None  # For the next backward pass of the blend.
+        self._blended: GradientMemory | None = None  # Of the last one, until that of the projection.
 
     def __del__(self) -> None:
         """Return the CUDA graph to the pool."""
@@ -156,7 +156,7 @@ class GraphInUse:
     def _replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> tuple[BlendResult, Sequence[Tensor]]:
         image, transmittance, others, gradients = self._graph.replay(tensors, outputs)
         if gradients is not None and self._graph.backward is not None:  # Views are made while the GPU renders.
-            self._next = self._graph.backward.allocate(gradients)
+            self._prepared = self._graph.backward.allocate(gradients)
         return BlendResult(image, transmittance, self.blend_backward), others
 
     def count_intersections(self) -> int | None:
@@ -174,8 +174,8 @@ class GraphInUse:
         """Return the gradients by means2d, features, and GradientMemory.zeros, or those by conics and opacities."""
         backward = self._graph.backward
         assert backward is not None
-        memory, self._next = self._next or backward.allocate(), None
-        self._between = memory
+        memory, self._prepared = self._prepared or backward.allocate(), None
+        self._blended = memory
         return backward.blend(memory, grad_image, grad_transmittance)
 
     def project_backward(
@@ -188,7 +188,7 @@ class GraphInUse:
         grad_means2d, zeros, grad_depths, _ = upstream
         backward = self._graph.backward
         assert backward is not None
-        memory, self._between = self._between, None
+        memory, self._blended = self._blended, None
         if memory is None or memory.zeros is not zeros:  # Passes overlap, or nothing reached the image.
             memory = backward.allocate(zeros)
         return backward.project(memory, grad_means2d, grad_depths)

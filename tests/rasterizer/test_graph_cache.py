@@ -312,7 +312,7 @@ def test_only_the_latest_kinds_are_remembered():
         return graph_cache.get_or_create_pool(tensors, RenderOptions(width, 8))
 
     assert graph_cache.find_pool(tensors, RenderOptions(1, 8)) is None
-    kinds = [graphs(1 + n) for n in range(graph_cache.MAX_SIZES)]
+    kinds = [graphs(1 + n) for n in range(graph_cache.MAX_POOLS)]
     assert graphs(1) is kinds[0] and graph_cache.find_pool(tensors, RenderOptions(1, 8)) is kinds[0]
     graphs(99)
     assert graphs(1) is kinds[0] and graphs(2) is not kinds[1]
