@@ -10,8 +10,8 @@ from sehdr_warp.kernels.blend_cuda import BLOCKS_PER_TILE
 from sehdr_warp.kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
 from sehdr_warp.rasterizer.block_blending import blend_blocks, pad_features
 from sehdr_warp.rasterizer.projection import RasterInputs, project_to_camera
-from sehdr_warp.rasterizer.rasterization import list_splats
 from sehdr_warp.rasterizer.render_options import RenderOptions
+from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_intersections, pack_splats
 
 
 class Workload(NamedTuple):
@@ -42,7 +42,10 @@ def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) ->
     )
     options = RenderOptions(width, height)
     projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
-    lists, packed = list_splats(RasterInputs(projected, features), options, blocks=True)
+    packed = pack_splats(RasterInputs(projected, features), ALPHA_THRESHOLD, width, height)
+    depths, extents = projected.depths, projected.extents
+    offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
+    lists = build_tile_lists(packed, offsets, depths, extents, width, height, keep_emit_order=False)
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     image, transmittance = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
     last_contributor = blend_blocks(pad_features(features), lists, packed, image, transmittance, ALPHA_THRESHOLD)

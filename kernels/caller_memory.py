@@ -12,7 +12,7 @@ MAX_TENSORS = 7
 TABLE_SIZE = 2 * MAX_TENSORS + 1
 """Length of the table: addresses of inputs, from MAX_TENSORS on of outputs, and last of memory to fill with zeros."""
 
-STRIDE = 256  # Distance between the numbers of a thread, so that neighbouring threads copy neighbouring numbers
+STRIDE = 256  # Distance between the numbers of a thread, so that neighboring threads copy neighboring numbers
 PER_THREAD = 4
 
 

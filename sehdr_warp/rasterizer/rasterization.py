@@ -34,7 +34,7 @@ class Rendering:
     Attributes:
         image: [H, W, C] blended features over the background, or over zero.
         transmittance: [H, W] in [0, 1], how much of each pixel's background is visible.
-        means2d: [N, 2] centres in pixels. They are part of the graph, so means2d.retain_grad() gives densification its
+        means2d: [N, 2] centers in pixels. They are part of the graph, so means2d.retain_grad() gives densification its
             signal.
         depths: [N] along the camera's axis, in scene units; 0 if culled.
         extents: [N, 2] half-width and half-height in pixels within which a Gaussian counts; 0 if culled.
@@ -122,7 +122,7 @@ def rasterize(
         intrinsics: [4] fx, fy, cx, cy in pixels.
         width: of the image, pixels.
         height: of the image, pixels.
-        near_plane: least depth of a Gaussian's centre, in scene units; > 0.
+        near_plane: least depth of a Gaussian's center, in scene units; > 0.
         eps2d: variance in square pixels added to each 2D Gaussian; >= 0.
         alpha_threshold: contributions with a smaller alpha are left out; in (0, 1).
         antialiased: lower opacities so that the variance of eps2d keeps a Gaussian's energy (Mip-Splatting).
@@ -312,28 +312,16 @@ def _rendering(options: RenderOptions, image: Tensor, *others: Any) -> Rendering
     return rendering
 
 
-def list_splats(
-    inputs: RasterInputs, options: RenderOptions, *, blocks: bool = False
-) -> tuple[TileLists, PackedSplats]:
-    """Return the tile lists of 2D Gaussians and their packed form, as blend() takes them.
-
-    blocks: leave out the order of emission, which atomic sums of gradients do not need. A GPU does unless
-    options.deterministic, whose block kernels sum in that order.
-    """
-    width, height, threshold = options.width, options.height, options.alpha_threshold
-    keep_emit_order = not blocks and (inputs.features.device.type == "cpu" or options.deterministic)
-    packed = pack_splats(inputs, threshold, width, height)
+def list_splats(inputs: RasterInputs, options: RenderOptions) -> tuple[TileLists, PackedSplats]:
+    """Return the tile lists of 2D Gaussians and their packed form, as blend() takes them."""
+    width, height = options.width, options.height
+    # Sums of gradients in a fixed order need it, atomics of a GPU do not.
+    keep_emit_order = inputs.features.device.type == "cpu" or options.deterministic
+    packed = pack_splats(inputs, options.alpha_threshold, width, height)
     depths, extents = inputs.projected.depths, inputs.projected.extents
     offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=keep_emit_order)
     lists = build_tile_lists(
-        packed,
-        offsets,
-        depths,
-        extents,
-        width,
-        height,
-        options.max_intersections,
-        keep_emit_order=keep_emit_order,
+        packed, offsets, depths, extents, width, height, options.max_intersections, keep_emit_order=keep_emit_order
     )
     return lists, packed
 
