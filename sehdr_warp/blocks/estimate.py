@@ -35,7 +35,7 @@ def estimate(plan: Plan, device: torch.device, gpus: int = 1) -> tuple[list[Choi
     )
     if device.type == "cuda":
         memory = float(torch.cuda.get_device_properties(device).total_memory)
-        return list(choices(whole, divided, blocks, memory, gpus)), recommend(whole, blocks, memory, gpus)
+        return choices(whole, divided, blocks, memory, gpus), recommend(whole, blocks, memory, gpus)
     threads = thread_count()
     here = Choice(f"CPU, {threads} threads", cpu_cost(whole, threads))
     others = [replace(each, name=f"{each.name} (H100)") for each in choices(whole, divided, blocks, None, gpus)]

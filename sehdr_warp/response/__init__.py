@@ -63,7 +63,7 @@ def response_by_name(text: str | Path) -> "Response":
 
 
 def responses_named(text: str | Path) -> "list[Response]":
-    """Every curve of a file that holds many, or the one that response_by_name gives."""
+    """Return every curve of a file that holds many, or the one that response_by_name returns."""
     from .files import responses_in_file
 
     if _is_file(str(text)):

@@ -118,7 +118,7 @@ class AnalyticResponse(Response, kind="analytic"):
 
 
 def _gamma(exponent: float) -> PowerLaw:
-    """Its toe is the chord from the origin to half an 8-bit code: codes above 0 are exact, and the slope finite."""
+    """Return a power law with a finite slope: its toe is the chord from 0 to half an 8-bit code."""
     toe_end = HALF_CODE**exponent
     return PowerLaw(exponent, 0.0, HALF_CODE / toe_end, toe_end)
 

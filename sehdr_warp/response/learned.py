@@ -93,7 +93,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
 
     @torch.no_grad()
     def decode(self, value: Any) -> Any:
-        """Exposures [..., 3] whose encoded values these are, within TABLE_RANGE."""
+        """Return the exposures [..., 3] whose encoded values these are, within TABLE_RANGE."""
         if not isinstance(value, torch.Tensor):
             return self._with_arrays(self.decode, value)
         low, high = (math.log(exposure) for exposure in TABLE_RANGE)
@@ -107,7 +107,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
         return exposures.T.reshape(value.shape).to(value)
 
     def slope(self, exposure: Any) -> Any:
-        """df/dx of encode, shaped like the exposures [..., 3]. Not differentiable itself."""
+        """Return df/dx of encode, shaped like the exposures [..., 3]; it is not differentiable."""
         if not isinstance(exposure, torch.Tensor):
             return self._with_arrays(self.slope, exposure)
         with torch.enable_grad():

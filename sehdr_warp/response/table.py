@@ -45,7 +45,7 @@ class TabulatedResponse(Response, kind="table"):
         self._tensors: dict = {}
 
     def _log_grid(self):
-        """Nodes 0, then even in log exposure up to the clip point; values by monotone cubic interpolation."""
+        """Return nodes, 0 and then even in log exposure, and their values by monotone cubic interpolation."""
         from scipy.interpolate import PchipInterpolator
 
         top = self._knots[-1]
@@ -56,7 +56,7 @@ class TabulatedResponse(Response, kind="table"):
         return nodes, np.maximum.accumulate(values)
 
     def _table(self, like: torch.Tensor):
-        """Intercept and slope of each cell in `like`'s type and place, and float64 nodes for the inverse."""
+        """Return each cell's intercept and slope in the type of `like`, on its device, and float64 nodes to invert."""
         key = (like.device, like.dtype)
         if key not in self._tensors:
             slope = np.diff(self._node_values) / np.diff(self._nodes)
@@ -149,7 +149,7 @@ class ChannelResponse(TabulatedResponse, kind="channels"):
 
 
 def _monotone(exposures: np.ndarray, values: np.ndarray, source: str):
-    """Increasing samples from exposure 0 to the clip point, and what had to be repaired."""
+    """Return increasing samples from exposure 0 to the clip point, and notes on repairs."""
     _check(exposures, values, source)
     notes = []
     if (np.diff(exposures) <= 0).any():

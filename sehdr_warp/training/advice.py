@@ -10,9 +10,7 @@ from ..subsets import first_names
 STILL_RISING = 0.2  # dB that held-out photos gained in the last third of a training that was too short
 UNFINISHED = 0.5  # dB gained there from which blur, and not movement, explains what differs from the photos
 FALLING = 0.5  # dB that they lost since their best in a training that overfits; seeds differ by up to 0.3 dB
-EXPOSURE_JUMP = (
-    0.4  # Stops by which a whole photo is brighter or darker than the scene if its exposure is not as stated
-)
+EXPOSURE_JUMP = 0.4  # Stops between a whole photo and the scene from which its exposure is not as stated
 _FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred

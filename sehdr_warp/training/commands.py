@@ -92,7 +92,7 @@ class MachineOptions:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a scene from photos of one exposure. What it does not need is left out; options you set stay."""
+    """Train a scene from photos of one exposure. A plan leaves out what it does not need; options you set stay."""
 
     removed_flags: ClassVar[Mapping[str, str]] = {
         **{configs.flag_of(path): advice for path, advice in configs.GONE.items()},

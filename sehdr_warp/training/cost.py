@@ -6,7 +6,6 @@ nodes, or more Gaussians than were measured.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 
 STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 2.0e-4, 3.4e-10, 2.4e-9
@@ -165,8 +164,8 @@ class Choice:
         return {"name": self.name, "fits": self.fits, **asdict(self.cost)}
 
 
-def choices(whole: Workload, divided: Workload, blocks: int, memory: float | None, gpus: int = 1) -> Iterator[Choice]:
-    """Yield ways to train a set on GPUs: on one, on several, in blocks.
+def choices(whole: Workload, divided: Workload, blocks: int, memory: float | None, gpus: int = 1) -> list[Choice]:
+    """Return ways to train a set on GPUs: on one, on several, in blocks.
 
     Args:
         whole: Size of one training.
@@ -175,15 +174,11 @@ def choices(whole: Workload, divided: Workload, blocks: int, memory: float | Non
         memory: Bytes of a GPU's memory; None if there is none to compare with.
         gpus: GPUs that may be used on this machine.
     """
-    for count in sorted({1, 2, 4, 8, gpus}):
-        cost = training_cost(whole, count)
-        yield Choice("1 GPU" if count == 1 else f"{count} GPUs", cost, memory is None or cost.gpu_bytes <= memory)
-    cost = training_cost(whole, 64, 8)
-    yield Choice("8 nodes of 8 GPUs", cost, memory is None or cost.gpu_bytes <= memory)
+    costs = {f"{count} GPU" + "s" * (count > 1): training_cost(whole, count) for count in sorted({1, 2, 4, 8, gpus})}
+    costs["8 nodes of 8 GPUs"] = training_cost(whole, 64, 8)
     for count in sorted({1, gpus, min(blocks, 8)}) if blocks > 1 else ():
-        cost = block_cost(divided, blocks, count)
-        name = f"{blocks} blocks on {count} GPU" + "s" * (count > 1)
-        yield Choice(name, cost, memory is None or cost.gpu_bytes <= memory)
+        costs[f"{blocks} blocks on {count} GPU" + "s" * (count > 1)] = block_cost(divided, blocks, count)
+    return [Choice(name, cost, memory is None or cost.gpu_bytes <= memory) for name, cost in costs.items()]
 
 
 def recommend(whole: Workload, blocks: int, memory: float | None, gpus: int = 1) -> str:

@@ -135,8 +135,8 @@ def device_of_rank(rank: int, device: str | None) -> torch.device:
     return torch.device("cuda", rank)
 
 
-def open_store(info: RankInfo, patience: float) -> dist.Store:
-    """Return the store of the ranks: a file of --gpus, or torchrun's server, for which it waits `patience` seconds.
+def open_store(info: RankInfo, timeout: float) -> dist.Store:
+    """Return the store of the ranks: a file of --gpus, or torchrun's server, for which it waits `timeout` seconds.
 
     Raises:
         SehdrError: If there is no server, naming its address.
@@ -153,7 +153,7 @@ def open_store(info: RankInfo, patience: float) -> dist.Store:
     serves = info.rank == 0 and not of_agent
     try:
         # Not torch's rendezvous(), which does not say who is missing.
-        wait = timedelta(seconds=patience)
+        wait = timedelta(seconds=timeout)
         store = dist.TCPStore(host, int(port), info.count, serves, wait, wait_for_workers=False)
         # An agent's server outlives a restart of its processes.
         return dist.PrefixStore(f"attempt_{os.environ['TORCHELASTIC_RESTART_COUNT']}", store) if of_agent else store

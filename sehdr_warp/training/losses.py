@@ -68,11 +68,12 @@ def code_scale(
 ) -> CodeScale:
     """Return how photos are compared: in the mu-law of decoded exposures, or without a response as encoded values.
 
-    With `clipping`, white means at least white less half an 8-bit code, and 0 at most half a code; the half code, for
-    16 bits too, keeps a response that never quite reaches white from being pulled up. If exposures are compared, a code
-    stands for the middle of its interval, which near white may span stops of light: once the scale is widened, any
-    exposure within the interval is equally good, except for the finest 8-bit step at its ends, so that fine codes stay
-    values.
+    With `clipping`, white means at least white less half an 8-bit code, and 0 at most half a code. The half code, for
+    16 bits too, keeps a response that never quite reaches white from being pulled up.
+
+    If exposures are compared, a code stands for the middle of the interval of exposures that round to it. Near white
+    an interval may span stops. CodeScale.widen() makes all of it equally good, less the finest 8-bit step at its ends,
+    so that codes with finer intervals stay values.
 
     Args:
         largest: Largest code, 255 or 65535.

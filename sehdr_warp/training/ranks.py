@@ -32,13 +32,13 @@ from .strategies import Strategy
 log = logging.getLogger(__name__)
 
 TIMEOUT = "SEHDR_RANK_TIMEOUT"
-LONGEST_SILENCE = 600.0  # Seconds that a step of another rank may take; the environment variable above overrides it
-_SHORTEST_SILENCE = 0.1
+DEFAULT_TIMEOUT = 600.0  # Seconds that a step of another rank may take; the environment variable above overrides it
+_SHORTEST_TIMEOUT = 0.1
 GO, WAIT, END = 2, 1, 0
 _EVER = timedelta(days=30)  # Disables torch's own timeouts, which end a process with long stack traces
 _POLL = 0.1
 ENDING = "all ranks end; the last checkpoint is complete, --resume continues from it"
-_LONGEST_WORD = 5.0  # Seconds that the watch may take to end
+_WATCH_END = 5.0  # Seconds that the watch may take to end
 _GRACE = 1.0  # Seconds that a rank with a more specific error has to report it first
 
 
@@ -67,12 +67,12 @@ class Ranks:
         self._deadline: float | None = None
         self._over = threading.Event()
         self._photos: PhotoFile | None = None
-        self._patience = patience()
+        self._timeout = rank_timeout()
 
     def init(self) -> None:
         """Connect to the other ranks; raise SehdrError if some do not come, or run other versions."""
         self._await_all()
-        with self._together():
+        with self._collective():
             backend = "nccl" if self._cuda else "gloo"
             options: dict[str, Any] = {"device_id": self.device} if self._cuda else {}
             options |= {"store": self.store, "rank": self.rank, "world_size": self.count}
@@ -98,10 +98,10 @@ class Ranks:
             if waited > WAITING_NOTICE and not logged_once:
                 self._log_wait()
                 logged_once = True
-            if waited > self._patience:
+            if waited > self._timeout:
                 absent = [rank for rank, key in enumerate(keys) if not self.store.check([key])]
                 nodes = ", ".join(str(node) for node in sorted({self.info.node_of(rank) for rank in absent}))
-                problem = f"{self.info} waited {self._patience:.0f} s ({TIMEOUT}) for rank {absent[0]}"
+                problem = f"{self.info} waited {self._timeout:.0f} s ({TIMEOUT}) for rank {absent[0]}"
                 problem += f" and {len(absent) - 1} more" if len(absent) > 1 else ""
                 raise SehdrError(
                     f"{problem}: node {nodes} of {self.info.nodes} did not come; start it, or use fewer nodes"
@@ -115,23 +115,23 @@ class Ranks:
         """
         answer = torch.tensor([signal], dtype=torch.int32)
         # Rank 0 may evaluate or be paused, so only it expects answers in time.
-        self._deadline = time.monotonic() + self._patience if self.leads else None
-        with self._together():
+        self._deadline = time.monotonic() + self._timeout if self.leads else None
+        with self._collective():
             dist.all_reduce(answer, dist.ReduceOp.MIN, group=self._hosts)
         agreed = int(answer)
-        self._deadline = time.monotonic() + self._patience if agreed == GO else None
+        self._deadline = time.monotonic() + self._timeout if agreed == GO else None
         return agreed
 
     def shutdown(self) -> None:
         """End a training: wait until all ranks have called this, because leaving early breaks off pending transfers."""
         self.all_reduce_min(END)
-        came, until = self.store.add("parted", 1), time.monotonic() + self._patience
+        came, until = self.store.add("parted", 1), time.monotonic() + self._timeout
         while self.store.add("parted", 0) < -(-came // self.count) * self.count and time.monotonic() < until:
             time.sleep(_POLL / 10)
 
     def all_reduce_mean(self, buffer: Tensor) -> None:
         """Replace a buffer by its mean over the ranks, with the same bits on all of them."""
-        with self._together():
+        with self._collective():
             dist.all_reduce(buffer, dist.ReduceOp.AVG if self._cuda else dist.ReduceOp.SUM)
         if not self._cuda:  # gloo lacks ReduceOp.AVG.
             buffer.mul_(1 / self.count)
@@ -139,7 +139,7 @@ class Ranks:
     def reduce_to_leader(self, totals: list[Tensor]) -> None:
         """Sum tensors on rank 0 and zero them on the others, so that a second call changes nothing."""
         for total in totals:
-            with self._together():
+            with self._collective():
                 dist.reduce(total, 0)
             if not self.leads:
                 total.zero_()
@@ -148,9 +148,9 @@ class Ranks:
         """Replace tensors by those of rank 0; the others wait as long as rank 0 needs before it calls this."""
         self._deadline = None
         for tensor in tensors:
-            with self._together():
+            with self._collective():
                 dist.broadcast(tensor, 0)
-        self._deadline = time.monotonic() + self._patience
+        self._deadline = time.monotonic() + self._timeout
 
     def refine_on_leader(
         self, refine: Callable[[], bool], strategy: Strategy, gaussians: Gaussians, optimizer: Adam
@@ -177,7 +177,7 @@ class Ranks:
         sums = [t.detach().contiguous().view(torch.int32).sum(dtype=torch.int64) for t in tensors.values()]
         own = torch.stack(sums)
         least, most = own.clone(), own.clone()
-        with self._together():
+        with self._collective():
             dist.all_reduce(least, dist.ReduceOp.MIN)
             dist.all_reduce(most, dist.ReduceOp.MAX)
         different = [name for name, same in zip(tensors, (least == most).tolist(), strict=True) if not same]
@@ -190,14 +190,14 @@ class Ranks:
     def broadcast_object(self, value: Any = None) -> Any:
         """Return rank 0's value on all ranks; the others wait as long as rank 0 needs before it calls this."""
         values = [value]
-        with self._together():
+        with self._collective():
             run_interruptibly(partial(dist.broadcast_object_list, values, 0, group=self._hosts))
         return values[0]
 
     def broadcast_arrays(self, tensors: list[Tensor]) -> None:
         """Replace tensors on the CPU by those of rank 0."""
         for tensor in tensors:
-            with self._together():
+            with self._collective():
                 dist.broadcast(tensor, 0, group=self._hosts)
 
     def request_photos(self, request: Any) -> None:
@@ -236,7 +236,7 @@ class Ranks:
 
     def _await_keys(self, keys: list[str]) -> None:
         """Wait until the store has keys; exit if a rank has ended before."""
-        with self._together():
+        with self._collective():
             while not self.store.check(keys):
                 if self.store.check(["ended"]):
                     raise SystemExit(1)
@@ -260,7 +260,7 @@ class Ranks:
         """Disconnect at the end of a training that all ranks reached."""
         self._over.set()
         # A thread that still talks to other ranks while the interpreter ends would abort the process.
-        self._watcher.join(_LONGEST_WORD)
+        self._watcher.join(_WATCH_END)
         self._hosts = None
         dist.destroy_process_group()
 
@@ -269,7 +269,7 @@ class Ranks:
         self._over.set()
 
     @contextmanager
-    def _together(self) -> Iterator[None]:
+    def _collective(self) -> Iterator[None]:
         """Convert errors of a collective operation to RanksLost."""
         try:
             yield
@@ -282,7 +282,7 @@ class Ranks:
         """Raise SehdrError if a rank runs other versions of packages."""
         own = installed_versions()
         versions: list = [None] * self.count
-        with self._together():
+        with self._collective():
             dist.all_gather_object(versions, own, group=self._hosts)
         other = next((k for k, text in enumerate(versions) if text != versions[0]), None)
         if other is not None:
@@ -296,32 +296,32 @@ class Ranks:
         Rank 0 may be long between steps, but its own watch keeps reporting.
         """
         last_message, since, beat = "", time.monotonic(), 0.0
-        while not self._over.wait(min(1.0, self._patience / 4)):
+        while not self._over.wait(min(1.0, self._timeout / 4)):
             now, deadline = time.monotonic(), self._deadline
-            if now - beat > self._patience / 4:
+            if now - beat > self._timeout / 4:
                 beat = now
                 with suppress(RuntimeError):  # The store is gone: its rank will be missed otherwise.
                     if self.leads:
                         self.store.set("alive", str(now))
                     elif self.store.check(["alive"]) and (message := self.store.get("alive").decode()) != last_message:
                         last_message, since = message, now
-            if (deadline is not None and now > deadline) or (last_message and now - since > self._patience):
+            if (deadline is not None and now > deadline) or (last_message and now - since > self._timeout):
                 if self.ends_first():
                     message = "another rank did not answer %s for %.0f s (%s): %s"
-                    log.error(message, self.info, self._patience, TIMEOUT, ENDING)
+                    log.error(message, self.info, self._timeout, TIMEOUT, ENDING)
                 os._exit(1)
 
 
-def patience() -> float:
+def rank_timeout() -> float:
     """Return the seconds that another rank may be silent; raise SehdrError for a value that is not a number of them."""
     if not (timeout := os.environ.get(TIMEOUT, "")):
-        return LONGEST_SILENCE
+        return DEFAULT_TIMEOUT
     try:
         seconds = float(timeout)
     except ValueError:
         seconds = 0.0
-    if not _SHORTEST_SILENCE <= seconds <= _EVER.total_seconds():
-        least, most = _SHORTEST_SILENCE, _EVER.total_seconds()
+    if not _SHORTEST_TIMEOUT <= seconds <= _EVER.total_seconds():
+        least, most = _SHORTEST_TIMEOUT, _EVER.total_seconds()
         raise SehdrError(f"{TIMEOUT} = {timeout:.40} is not a number of seconds from {least:g} to {most:g}: correct it")
     return seconds
 
@@ -340,7 +340,7 @@ def join_ranks(info: RankInfo, device: torch.device) -> Iterator[Ranks]:
     if info.rank:
         logging.getLogger("sehdr_warp").setLevel(logging.ERROR)
     waits = partial(log.info, "%s waits for the others", info)
-    ranks = Ranks(run_interruptibly(partial(open_store, info, patience()), waits), info, device)
+    ranks = Ranks(run_interruptibly(partial(open_store, info, rank_timeout()), waits), info, device)
     try:
         ranks.init()
         yield ranks

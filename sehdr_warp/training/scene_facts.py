@@ -133,21 +133,25 @@ def _in_view(views: Sequence[View], points: np.ndarray) -> np.ndarray:
 def _codes(view: View) -> tuple[float, float, float, float, float]:
     """Return statistics of a photo: clipped and black fractions, mean, mean square, and the median's light in stops.
 
-    The mean is of encoded values, the light by a gamma of 2.2. A photo of more than MOST_PIXELS is sampled on a grid.
+    The mean is of encoded values, the light by a gamma of 2.2.
     """
-    step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
-    image = encoded_values(view.codes[::step, ::step])
+    image = _sampled(view)
     clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
     median = 2.2 * math.log2(max(float(np.median(image)), 0.5 / 255))
     return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean(), median
+
+
+def _sampled(view: View) -> np.ndarray:
+    """Return the encoded values [h, w, 3] of a photo, sampled on a grid if it has more than MOST_PIXELS."""
+    step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
+    return encoded_values(view.codes[::step, ::step])
 
 
 def _plateau(views: Sequence[View]) -> int:
     """Return the code of 255, below 255, that is the largest of many pixels of the photos; 0 if there is none."""
     counts = np.zeros(256)
     for view in views:
-        step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
-        brightest = encoded_values(view.codes[::step, ::step]).max(2)
+        brightest = _sampled(view).max(2)
         counts += np.bincount(np.rint(255 * brightest).astype(np.int64).ravel(), minlength=256)
     largest = int(np.flatnonzero(counts)[-1])
     at, below = (counts[max(0, top - PLATEAU_CODES) : top].sum() for top in (largest + 1, largest + 1 - PLATEAU_CODES))

@@ -75,7 +75,7 @@ def mixed(ranks, folder: Path) -> None:
 def fall_silent(ranks, folder: Path) -> None:
     """Rank 1 no longer answers, and rank 0 ends; what it says is kept."""
     if ranks.leads:
-        ranks._patience = 2.0
+        ranks._timeout = 2.0
         logging.getLogger("sehdr_warp").addHandler(logging.FileHandler(folder / "silent"))
         ranks.all_reduce_min(2)
     time.sleep(60)

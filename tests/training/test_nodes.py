@@ -18,7 +18,7 @@ from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder, describe_scene
 from sehdr_warp.training.following import _check_same_photos
 from sehdr_warp.training.launch import RankInfo, open_store, rank_from_environment
-from sehdr_warp.training.ranks import patience
+from sehdr_warp.training.ranks import rank_timeout
 
 from ..refusals import call
 from .toy import toy_scene
@@ -176,4 +176,4 @@ def test_ports_that_cannot_be_are_refused(monkeypatch, port):
 def test_times_that_cannot_be_are_refused(monkeypatch, seconds):
     monkeypatch.setenv("SEHDR_RANK_TIMEOUT", seconds)
     with pytest.raises(SehdrError, match=f"SEHDR_RANK_TIMEOUT = {seconds} is not a number of seconds"):
-        patience()
+        rank_timeout()
