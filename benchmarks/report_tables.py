@@ -117,6 +117,22 @@ def _bits_tables(result: dict) -> Iterable[str]:
     yield pivot(rows, places, "scene", "hdr", ".2f")
 
 
+def _phone_tables(result: dict) -> Iterable[str]:
+    titles = {
+        "three-channels": "gain map, three channels",
+        "one-channel": "one channel",
+        "libultrahdr": "libultrahdr",
+        "darker-jpeg": "two stops darker, JPEG",
+        "darker-png": "PNG",
+    }
+    table = []
+    for (size, scene), rows in groups(result["rows"], "size", "scene").items():
+        kinds = groups(rows, "photos").items()
+        means = {titles[photos]: fmean(row["hdr"] for row in mine) for (photos,), mine in kinds}
+        table.append({"pixels": size, "scene": scene} | means)
+    yield markdown_table(table, {"pixels": "d", "scene": ""} | dict.fromkeys(titles.values(), ".2f"))
+
+
 def _rows_table(name: str, result: dict) -> Iterable[str]:
     yield markdown_table(result["rows"], COLUMNS[name])
     if result.get("checks"):
@@ -197,6 +213,7 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "captures": _captures_tables,
     "units": partial(_rows_table, "units"),
     "bits": _bits_tables,
+    "phone": _phone_tables,
     "files": partial(_rows_table, "files"),
     "panorama": partial(_rows_table, "panorama"),
     "kernels": _kernel_tables,

@@ -43,10 +43,20 @@ def ultra_hdr(light: np.ndarray, base: np.ndarray) -> bytes:
     plain = srgb_to_linear(codes)
     light = np.clip(light, 0, 2**MOST_STOPS)
     gain = np.log2((light + _OFFSET) / (plain + _OFFSET))
+    return jpeg_with_gain_map(base, gain, float(np.log2(light.max(initial=0) + 1e-9)))
+
+
+def jpeg_with_gain_map(base: np.ndarray, gain: np.ndarray, headroom: float) -> bytes:
+    """Return a JPEG with a gain map.
+
+    Args:
+        base: [H, W, 3] sRGB-encoded, in [0, 1].
+        gain: [h, w] or [h, w, 3] log2 of light over that of `base`, both plus 1/64.
+        headroom: log2 of the brightest light over white, at which a display shows all of it.
+    """
     low, high = float(gain.min()), max(float(gain.max()), float(gain.min()) + 0.1)
-    brightest = max(float(np.log2(light.max(initial=0) + 1e-9)), 0.1)  # At which a display shows all of it
     facts = {"GainMapMin": low, "GainMapMax": high, "Gamma": 1, "OffsetSDR": _OFFSET, "OffsetHDR": _OFFSET}
-    facts |= {"HDRCapacityMin": 0, "HDRCapacityMax": brightest, "BaseRenditionIsHDR": False}
+    facts |= {"HDRCapacityMin": 0, "HDRCapacityMax": max(headroom, 0.1), "BaseRenditionIsHDR": False}
     attributes = " ".join(f'hdrgm:{name}="{value}"' for name, value in facts.items())
     second = _with(_jpeg((gain - low) / (high - low)), _segment(0xE1, _XMP + _PACKET.format(f"{attributes}>").encode()))
     first = _jpeg(base)
