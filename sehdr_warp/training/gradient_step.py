@@ -22,13 +22,9 @@ from ..scene import Scene
 from .losses import compared_image, compares_exposures, data_loss, extra_images, opacity_loss
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
-from .scene_facts import largest_hdr_truth, share_in_view
+from .scene_facts import largest_hdr_truth
 from .strategies import Strategy
 from .targets import TrainingView
-
-LARGE_SCENE = 0.1
-"""If a photo shows less than this fraction of the scene's points, Gaussians that no photo has shown yet are spared from
-the opacity penalty: they would fade before one does. Elsewhere the penalty removes copies that are not needed."""
 
 
 @dataclass(frozen=True)
@@ -117,17 +113,20 @@ class GradientStep:
         strategy: Strategy,
         step_counters: Tensor,
         ranks: Ranks | None,
+        large_scene: bool,
     ):
         """Prepare steps of a training.
 
-        The HDR truth of the scene scales the HDR loss. Steps add to step_counters, see GraphCapacity.
+        The HDR truth of the scene scales the HDR loss. Steps add to step_counters, see GraphCapacity. In a large scene
+        the opacity penalty spares Gaussians that no photo has shown yet.
         """
         self.field, self.optimizer, self.strategy, self.ranks = field, optimizer, strategy, ranks
         self._loss, self._step_counters = config.loss, step_counters
         self.needs_encoded = not compares_exposures(config.loss, field)
         self.defer_sh_gradients = field.gaussians.means.device.type == "cuda"
         self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
-        self._spares_unseen = share_in_view(scene) < LARGE_SCENE
+        # They would fade before a photo shows them. Elsewhere the penalty removes copies that are not needed.
+        self._spares_unseen = large_scene
         self._flat: FlatGradients | None = None
 
     def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:

@@ -21,6 +21,7 @@ _REMEDY = "take a scene with HDR truth, or a preset that needs none"
 PROBES = 2000  # Number of places at which overlap and visibility are measured
 FEWEST_POINTS = 100  # With fewer sparse points, places along the cameras' rays are the probes
 MOST_PIXELS = 250_000  # Largest number of pixels that are read from a photo
+LARGE_SCENE = 0.1  # A scene is large if its photos contain less than this part of its points, in the mean
 MOST_VIEWS = 64  # Largest number of photos whose codes are read; cameras are read of all
 LOWEST_PLATEAU, PLATEAU_CODES, PLATEAU_SHARE, PLATEAU_EXCESS = 200, 3, 1e-3, 3.0
 """Photos clip below white if the brightest code is at least the first; if so many codes, the brightest that occur, hold
@@ -104,6 +105,11 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         unclipped=scene.light_known and all(view.source and kind_of(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
     )
+
+
+def is_large(scene: Scene) -> bool:
+    """Return whether photos show so little of a scene that many steps pass before a Gaussian is seen again."""
+    return share_in_view(scene) < LARGE_SCENE
 
 
 def share_in_view(scene: Scene, seed: int = 0) -> float:

@@ -39,6 +39,7 @@ from .matching import Matcher, seed_gaussians
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
+from .scene_facts import is_large
 from .step_graphs import GraphCapacity, StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
 from .training_state import Pace, TrainingProgress
@@ -113,7 +114,8 @@ class Trainer:
         self.optimizer = make_optimizer(field, config, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in views)
         positions = torch.tensor([view.camera.position.tolist() for view in views], device=self.device)
-        self.strategy = make_strategy(config, pixels, positions)
+        large_scene = is_large(scene)
+        self.strategy = make_strategy(config, pixels, positions, large_scene=large_scene)
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.order = PhotoOrder(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
@@ -126,7 +128,7 @@ class Trainer:
         field.gaussians.release()  # Rows that another trainer of this field reserved hold its optimizer's moments.
         self.capacity = GraphCapacity(self.device)
         self.gradient_step = GradientStep(
-            scene, config, field, self.optimizer, self.strategy, self.capacity.step_counters, ranks
+            scene, config, field, self.optimizer, self.strategy, self.capacity.step_counters, ranks, large_scene
         )
         use_cuda_graph = config.schedule.use_cuda_graph
         self.graphs = StepGraphs(

@@ -248,6 +248,31 @@ def test_sources_of_copies_do_not_fade_before_a_photo_shows_them(cap):
     assert (faded[sources].abs() < 1e-3).all(), "about 0.01 in each step otherwise"
 
 
+@pytest.mark.parametrize("large, density", [(True, 400.0), (True, 200.0), (False, 400.0)])
+def test_copies_in_a_large_dense_scene_take_over_the_second_moments_of_their_source(large, density):
+    gaussians = cloud(40)
+    optimizer = adam(gaussians)
+    gaussians.overwrite({"opacity_logits": torch.tensor([-8.0] * 10 + [2.0] * 30)})
+    before = torch.arange(1.0, 41.0)
+    optimizer.state[gaussians.means]["exp_avg_sq"][:] = before[:, None]
+    options = {"densification.strategy": "mcmc", "mcmc.seed_fraction": 0.0, "mcmc.cap_density": density}
+    dense = large and density > 300
+    strategy = make_strategy(load_config("default", options), 10**6, large_scene=large)
+    strategy.cap_max = 44 if dense else 40
+    strategy.refine(600, gaussians, optimizer, torch.Generator().manual_seed(0))
+    assert (gaussians.count > 40) == dense
+    means, state = gaussians.means.detach(), optimizer.state[gaussians.means]
+    copies = [*range(10), *range(40, gaussians.count)]
+    sources = [10 + int((means[10:40] == means[copy]).all(1).nonzero()) for copy in copies]
+    assert not state["exp_avg"][sources].any()
+    assert (state["exp_avg_sq"][sources, 0] / before[sources] - (0.4 if dense else 0.1)).abs().max() < 1e-6
+    if dense:
+        assert not state["exp_avg"][copies].any()
+        assert torch.equal(state["exp_avg_sq"][copies], state["exp_avg_sq"][sources])
+    else:
+        assert torch.equal(state["exp_avg_sq"][:10, 0], before[:10])
+
+
 def proposer(colors):
     """A function that proposes Gaussians of these colors at the origin."""
 

@@ -23,11 +23,14 @@ __all__ = [
 ]
 
 
-def make_strategy(config: Config, pixels: int, camera_positions: Tensor | None = None) -> AdcStrategy | McmcStrategy:
+def make_strategy(
+    config: Config, pixels: int, camera_positions: Tensor | None = None, *, large_scene: bool = False
+) -> AdcStrategy | McmcStrategy:
     """Create the strategy that config.densification.strategy names.
 
-    The training photos have `pixels` in all and camera_positions [V, 3], in the Gaussians' coordinates.
+    The training photos have `pixels` in all and camera_positions [V, 3], in the Gaussians' coordinates. large_scene: as
+    of scene_facts.is_large().
     """
     if config.densification.strategy == "adc":
         return AdcStrategy.from_config(config)
-    return McmcStrategy.from_config(config, pixels, camera_positions)
+    return McmcStrategy.from_config(config, pixels, camera_positions, large_scene=large_scene)

@@ -26,6 +26,8 @@ MAX_NOISE_SIZES = 0.05
 MAX_DISTANCE = 100.0
 """Noise moves no Gaussian farther than this from the origin, in normalized units (1.1 camera radii)."""
 SECOND_MOMENT_LEFT = 0.1  # Of a source's second moments, see reset_moments()
+SECOND_MOMENT_LEFT_WHERE_DENSE = 0.4
+DENSE = 300.0  # Gaussians over the square root of the photos' pixels, from which on a large scene counts as dense
 
 
 @dataclass(frozen=True)
@@ -55,22 +57,28 @@ class McmcStrategy(Strategy):
         options: Options of the strategy.
         random_seed: Seed of the training.
         camera_positions: [V, 3] positions of the training cameras, for prune_near_angle.
+        dense: Whether copies take over the second moments of their source, see reset_moments().
     """
 
     options: McmcConfig = field(default_factory=McmcConfig)
     random_seed: int = 0
     camera_positions: Tensor | None = None
+    dense: bool = False
 
     @staticmethod
-    def from_config(config: Config, pixels: int, camera_positions: Tensor | None = None) -> "McmcStrategy":
+    def from_config(
+        config: Config, pixels: int, camera_positions: Tensor | None = None, *, large_scene: bool = False
+    ) -> "McmcStrategy":
         """Create the strategy of a config for training photos of so many pixels in total."""
+        cap_max = mcmc_cap(config, pixels)
         return McmcStrategy(
             schedule=Schedule.from_config(config),
-            cap_max=mcmc_cap(config, pixels),
+            cap_max=cap_max,
             prune_opacity=config.densification.prune_opacity,
             options=config.mcmc,
             random_seed=config.seed,
             camera_positions=camera_positions,
+            dense=large_scene and cap_max > DENSE * math.sqrt(pixels),
         )
 
     @torch.no_grad()
@@ -97,10 +105,13 @@ class McmcStrategy(Strategy):
         gaussians.resize(count + added, optimizer)
         slots = RelocationSlots(slot_of_row, torch.zeros_like(slot_of_row, dtype=torch.bool))
         seeded = self.fill_proposals(gaussians, slots, dead_count, added, count, propose)
-        self.relocate(gaussians, slots, opacities.masked_fill(dead, 0), seeded, dead_count, count, generator)
+        weights = opacities.masked_fill(dead, 0)
+        self.relocate(gaussians, optimizer, slots, weights, seeded, dead_count, count, generator)
         if added > 0:
-            self.sample_add(gaussians, slots, torch.maximum(dead_count, seeded), dead_count + added, added, generator)
-        reset_moments(gaussians, optimizer, slots.changed)
+            first, last = torch.maximum(dead_count, seeded), dead_count + added
+            self.sample_add(gaussians, optimizer, slots, first, last, added, generator)
+        left = SECOND_MOMENT_LEFT_WHERE_DENSE if self.dense else SECOND_MOMENT_LEFT
+        reset_moments(gaussians, optimizer, slots.changed, left)
         return added > 0
 
     def next_count(self, iteration: int, count: int) -> int:
@@ -140,6 +151,7 @@ class McmcStrategy(Strategy):
     def relocate(
         self,
         gaussians: Gaussians,
+        optimizer: Optimizer | None,
         slots: RelocationSlots,
         weights: Tensor,
         first: Tensor,
@@ -158,13 +170,18 @@ class McmcStrategy(Strategy):
         copies = count_copies(sampled, first, last, slots.changed)
         logits, log_scales = gaussians.opacity_logits.detach(), gaussians.log_scales.detach()
         share_opacities(logits, log_scales, copies, least=self.prune_opacity)
-        values = list(gaussians.tensors().values())
-        # As in the authors' code, relocated Gaussians keep their Adam state, and only their sources lose it.
-        copy_rows(values, values, slots.of_row, first, last, samples=sampled)
+        values, changed = list(gaussians.tensors().values()), None
+        if self.dense:
+            states = [moments_of(optimizer, parameter) for parameter in gaussians.parameters()]
+            values += [state["exp_avg_sq"] for state in states if state]
+            changed = slots.changed
+        # Elsewhere, as in the authors' code, copies keep the Adam state of their row, and only their sources lose it.
+        copy_rows(values, values, slots.of_row, first, last, samples=sampled, changed=changed)
 
     def sample_add(
         self,
         gaussians: Gaussians,
+        optimizer: Optimizer | None,
         slots: RelocationSlots,
         first: Tensor,
         last: Tensor,
@@ -173,7 +190,7 @@ class McmcStrategy(Strategy):
     ) -> None:
         """Fill the slots [first, last) of new Gaussians, at most `bound`, as relocate(), sampled by opacity."""
         weights = gaussians.opacities().masked_fill_(slots.of_row >= first, 0)
-        self.relocate(gaussians, slots, weights, first, last, bound, generator)
+        self.relocate(gaussians, optimizer, slots, weights, first, last, bound, generator)
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
@@ -203,15 +220,17 @@ class McmcStrategy(Strategy):
         return gaussians.log_scales.amax(1) > torch.log(self.options.prune_near_angle * nearest)
 
 
-def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tensor) -> None:
-    """Reset Adam's moments of the sources of copies, rows marked in `which` [N] bool.
+def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tensor, left: float) -> None:
+    """Clear Adam's first moments of the rows marked in `which` [N] bool; of their second moments `left` is kept.
 
-    The authors clear both moments. Adam then moves a source by 3 to 6 times its rate for about 50 steps, and where no
-    photo shows it, it fades as fast by the opacity penalty. In scenes with many refinements and Gaussians the rendering
-    collapses. If the second moments stay, sources and copies part too slowly. So a tenth stays.
+    These are the sources of copies, whose state the authors clear. Adam then moves a source, and a new copy, by 3 to 6
+    times its rate for about 50 steps. That parts the two, but where Gaussians are small beside such a step, the
+    rendering collapses. If all of the second moments stay, sources and copies part too slowly. So a tenth stays. In
+    large and dense scenes, where Gaussians are small and their next photo comes late, more stays, and copies take over
+    their source's second moments, too.
     """
     states = [moments_of(optimizer, parameter) for parameter in gaussians.parameters()]
-    for name, factor in (("exp_avg", 0.0), ("exp_avg_sq", SECOND_MOMENT_LEFT)):
+    for name, factor in (("exp_avg", 0.0), ("exp_avg_sq", left)):
         if moments := [state[name] for state in states if name in state]:
             scale_rows(moments, which, factor)
 
