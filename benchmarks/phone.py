@@ -126,10 +126,10 @@ def one_channel(light: np.ndarray) -> bytes:
 
 def libultrahdr(light: np.ndarray) -> bytes:
     """Return what libultrahdr, the encoder of Android, makes of light: it chooses the photo's tones itself."""
-    import imagecodecs  # Of the extra `test-interop`
+    import imagecodecs  # Of the extra `spz`
 
     pixels = np.concatenate([light, np.ones_like(light[..., :1])], axis=2).astype(np.float16)
-    return imagecodecs.ultrahdr_encode(pixels, level=QUALITY, gamut=imagecodecs.ULTRAHDR.CG.BT_709)
+    return bytes(imagecodecs.ultrahdr_encode(pixels, level=QUALITY, gamut=imagecodecs.ULTRAHDR.CG.BT_709))
 
 
 def _codes(light: np.ndarray) -> np.ndarray:
