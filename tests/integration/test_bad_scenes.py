@@ -51,8 +51,8 @@ def test_folders_without_a_scene(tmp_path, capfd):
     (tmp_path / "file").write_text("x")
     for name, photos in (("one", "a"), ("two", "ab")):
         (tmp_path / name).mkdir()
-        for photo in photos:
-            Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(tmp_path / name / f"{photo}.png")
+        for level, photo in enumerate(photos):  # Photos of the same bytes count as copies.
+            Image.fromarray(np.full((8, 8, 3), 90 + level, np.uint8)).save(tmp_path / name / f"{photo}.png")
     write_blender(tmp_path / "blender", count=1)
     for name, words in {
         "nowhere": "not found",
@@ -84,7 +84,7 @@ COLMAP_TEXT = {
     "huge camera": ("cameras.txt", lambda text: text.replace(" 64 48 ", " 999999999 48 "), "999999999"),
     "negative focal length": ("cameras.txt", lambda text: text.replace(" 50 ", " -50 "), "cameras.txt"),
     "infinite focal length": ("cameras.txt", lambda text: text.replace(" 50 ", " inf "), "cameras.txt"),
-    "other size": ("cameras.txt", lambda text: text.replace(" 64 48 ", " 63 48 "), "64 x 48"),
+    "other size": ("cameras.txt", lambda text: text.replace(" 64 48 ", " 48 64 "), "64 x 48"),
     "unknown model": ("cameras.txt", lambda text: text.replace("PINHOLE", "PERSPEX"), "PERSPEX"),
     "point in words": ("points3D.txt", lambda text: re.sub(r"(?m)^1 \S+", "1 far", text), "points3D.txt"),
 }
@@ -292,12 +292,12 @@ def test_transforms(frames, capfd, case):
     assert "transforms.json" in train_refused(capfd, frames)
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None, "scaled", "mirrored"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None, "stretched", "mirrored"])
 def test_a_frame_without_a_place_is_left_out(frames, value):
     with edited_json(frames / "transforms.json") as values:
         matrix = values["frames"][2]["transform_matrix"]
-        if value in ("scaled", "mirrored"):
-            factors = (2, 2, 2) if value == "scaled" else (-1, 1, 1)
+        if value in ("stretched", "mirrored"):
+            factors = (2, 1, 1) if value == "stretched" else (-1, 1, 1)
             values["frames"][2]["transform_matrix"] = [[*np.multiply(row[:3], factors), row[3]] for row in matrix]
         else:
             matrix[0][3] = value
