@@ -19,7 +19,7 @@ from ..progress import stage, track_progress
 from ..response import response_by_name
 from ..scene import Camera
 from ..scene.normalization import Normalization
-from ..splats.arrays import HARMONIC_0, GaussianArrays, colors_of_basis, harmonic_basis
+from ..splats.arrays import HARMONIC_0, GaussianArrays, colors_of_basis, harmonic_basis, rounded_means
 from .adam import Adam
 from .color_models import rec709_of
 from .gaussians import Gaussians
@@ -28,7 +28,6 @@ from .radiance_field import RadianceField
 log = logging.getLogger(__name__)
 # Smallest radiance whose logarithm is taken.
 DARKEST = 1e-12
-COARSE = 1e-3  # Of the median size of Gaussians: larger errors of float32 positions keep them in float64
 STEPS = 150
 RATES = {"harmonics_dc": 0.03, "harmonics_rest": 0.01, "opacity_logits": 0.3}
 # For a fit: more than three directions for each of the 16 coefficients of degree 3, and the sphere's whole weight
@@ -104,11 +103,8 @@ def _transform(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -
     Positions stay float64 if float32 would move them by more than a thousandth of the median size, as in UTM
     coordinates.
     """
-    sizes = gaussians.log_scales.astype(np.float64) + log_scale
-    rounded = means.astype(np.float32)
-    moved = np.abs(rounded - means).max(initial=0.0)
-    coarse = len(means) > 0 and moved > COARSE * float(np.exp(np.median(sizes)))
-    return replace(gaussians, means=means if coarse else rounded, log_scales=sizes.astype(np.float32))
+    sizes = (gaussians.log_scales.astype(np.float64) + log_scale).astype(np.float32)
+    return replace(gaussians, means=rounded_means(means, sizes), log_scales=sizes)
 
 
 def _in_colors(

@@ -176,7 +176,7 @@ class PictureHeader:
 
     def of(self, view: str, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
         """Return the EXR attributes of a picture."""
-        values = {**self.provenance, **provenance, "view": view, "baseExposureTime": repr(self.base_time)}
+        values = {**self.provenance, **provenance, "view": view, "baseExposureTime": repr(float(self.base_time))}
         luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
         return exr_header(self.colorspace, exposure_time, camera, self.captured, values, luminance)
 

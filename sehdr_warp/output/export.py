@@ -24,7 +24,7 @@ from ..splats import (
     read_gaussians,
     write_gaussians,
 )
-from ..subsets import every_nth
+from ..subsets import every_nth, first_names
 from .camera_paths import training_cameras
 from .splat_edits import SplatEdits, most_visible, without_strays
 from .tonemap import display_gain
@@ -265,8 +265,12 @@ def _display_renderer(run: "RenderableScene", time: float) -> Callable:
 
 
 def _write_cameras(path: Path, run: "RenderableScene", transform: WorldTransform, overwrite: bool) -> None:
-    described = []
+    described, wide = [], [entry.name for entry in run.cameras if not entry.camera.is_pinhole]
+    if wide:
+        log.info("%s: without %s, because it holds pinholes alone", path.name, first_names(wide, 5))
     for index, entry in enumerate(run.cameras):
+        if not entry.camera.is_pinhole:
+            continue
         camera = transform.camera(entry.camera)
         pose = camera.camera_to_world
         size = {"width": camera.width, "height": camera.height}

@@ -210,7 +210,7 @@ def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> Gaus
     factor = np.where(far, limit / np.maximum(distance, 1e-12), 1.0)
     moved = replace(
         gaussians,
-        means=(center + offsets * factor[:, None]).astype(np.float32),
+        means=(center + offsets * factor[:, None]).astype(gaussians.means.dtype),
         log_scales=(gaussians.log_scales + np.log(factor)[:, None]).astype(np.float32),
     )
     text = "strays: %d Gaussians beyond %.3g units: %d faint ones left out, %d moved there"

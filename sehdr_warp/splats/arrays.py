@@ -22,11 +22,12 @@ SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
 _MOST_LOGIT = 20.0
 # Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.
 _MOST_LOG_SCALE = 20.0
+COARSE = 1e-3  # Of the median size of Gaussians: larger errors of float32 positions keep them in float64
 
 
 @dataclass(frozen=True)
 class GaussianArrays:
-    """N Gaussians as NumPy arrays, float32.
+    """N Gaussians as NumPy arrays, float32; means in float64 where float32 would move them, as in UTM coordinates.
 
     Attributes:
         means: [N, 3] world coordinates.
@@ -96,10 +97,11 @@ class GaussianArrays:
         rotation = matrix[:3, :3] / scale
         turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.roll(self.unit_quaternions, -1, axis=1))
         before = np.eye(4) if self.world_matrix is None else self.world_matrix
+        log_scales = (self.log_scales + np.log(scale)).astype(np.float32)
         return replace(
             self,
-            means=(self.means.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32),
-            log_scales=(self.log_scales + np.log(scale)).astype(np.float32),
+            means=rounded_means(self.means.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3], log_scales),
+            log_scales=log_scales,
             quaternions=np.roll(turned.as_quat(), 1, axis=1).astype(np.float32),
             harmonics=rotate_harmonics(self.harmonics, rotation),
             world_matrix=matrix @ before,
@@ -160,6 +162,13 @@ def join_gaussians(parts: Sequence[GaussianArrays]) -> GaussianArrays:
     degree = max(part.degree for part in parts)
     padded = [part.padded(degree) for part in parts]
     return replace(padded[0], **{name: np.concatenate([getattr(part, name) for part in padded]) for name in _ARRAYS})
+
+
+def rounded_means(means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    """Return means [N, 3] float64 as float32, unless that moves one by more than COARSE of the median size."""
+    rounded = means.astype(np.float32)
+    moved = np.abs(rounded - means).max(initial=0.0)
+    return means if len(means) and moved > COARSE * float(np.exp(np.median(log_scales))) else rounded
 
 
 def degree_of(coefficients: float, path: Path) -> int:

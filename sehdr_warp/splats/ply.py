@@ -62,7 +62,7 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     table = np.empty(gaussians.count, [(name, "<f4") for name, _ in columns])
     for name, values in columns:
         table[name] = values
-    facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(gaussians.base_time)}
+    facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(float(gaussians.base_time))}
     if gaussians.world_matrix is not None:
         facts["world_matrix"] = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
     comments = [f"sehdr:{name} {value}" for name, value in facts.items()]

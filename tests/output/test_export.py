@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -99,6 +100,14 @@ def test_cameras_beside_are_read_again(tmp_path, run):
     with pytest.raises(InputError, match=r"cameras.json: exists already"):
         export(run, tmp_path / "b.ply", cameras=True)
     assert not (tmp_path / "b.ply").exists()
+
+
+def test_panoramas_are_not_among_the_pinholes_beside_a_file(tmp_path, run, logged):
+    panorama = replace(camera(64, 32), fx=1.0, fy=1.0, projection="equirectangular")
+    run = Splats(run.path, run.field, (*run.cameras, Entry("around", "train", panorama)))
+    export(run, tmp_path / "a.ply", cameras=True)
+    assert [name for name, _ in load_cameras(tmp_path / "a.cameras.json")] == ["0", "1", "2"]
+    assert any("a.cameras.json: without around" in line for line in logged)
 
 
 def test_unusable_requests(tmp_path, run):

@@ -15,6 +15,8 @@ from sehdr_warp.splats import GaussianArrays, read_gaussians, write_gaussians
 
 from .helpers import Entry, camera
 
+UTM = np.array([5e5, 5.4e6, 100.0])
+
 
 def splats(means, opacities, scale=0.1):
     """Grey Gaussians of display colors."""
@@ -170,5 +172,11 @@ def test_strays_come_near_or_go(tmp_path, logged):
     offset = result.means[1] - cameras[1].position
     assert np.exp(result.log_scales[1, 0]) / np.linalg.norm(offset) == pytest.approx(10 / 1e5, rel=1e-3)
     assert any("2 Gaussians beyond" in line and "1 faint ones left out, 1 moved" in line for line in logged)
+    # In UTM coordinates float32 would move every Gaussian by up to 0.25 m.
+    utm = replace(original, means=original.means + UTM)
+    there = [camera(position=UTM + np.array((i - 1, 0, -6)), target=UTM) for i in range(3)]
+    moved = without_strays(utm, there).means - UTM
+    np.testing.assert_allclose(moved[0], 0, atol=1e-9)
+    np.testing.assert_allclose(moved[1], result.means[1], rtol=1e-6)
     near = splats([(0, 0, 0), (5, 5, 5)], [0.9, 0.9])
     assert without_strays(near, cameras) is near and without_strays(original, []) is original

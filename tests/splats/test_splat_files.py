@@ -47,6 +47,20 @@ def test_round_trip(tmp_path, suffix, color_model, degree, tolerance):
     assert [path.name for path in tmp_path.glob("[!.]*")] == [file.name]
 
 
+def test_positions_stay_precise_in_map_coordinates():
+    near, moved = gaussians(), np.array([5e5, 5.4e6, 100.0])
+    matrix = np.eye(4)
+    matrix[:3, 3] = moved
+    far = near.transformed(matrix)
+    np.testing.assert_allclose(far.means - moved, near.means, atol=1e-8)
+    assert near.transformed(np.eye(4)).means.dtype == np.float32
+
+
+def test_a_base_time_of_numpy_is_read_again(tmp_path):
+    write_gaussians(tmp_path / "a.ply", replace(gaussians(), base_time=np.float64(0.01)))
+    assert read_gaussians(tmp_path / "a.ply").base_time == 0.01
+
+
 def test_ply_has_the_names_and_order_of_the_reference_release(tmp_path):
     written = gaussians()
     write_gaussians(tmp_path / "a.ply", written)
