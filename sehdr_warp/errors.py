@@ -147,7 +147,8 @@ def as_user_error(error: Exception) -> SehdrError | None:
     out_of_memory = isinstance(error, RuntimeError | ImportError | OSError) and _OUT_OF_MEMORY.search(text)
     if out_of_memory or isinstance(error, MemoryError):
         reason = (str(error).splitlines() or ["no more"])[0]
-        return SehdrError(f"out of memory ({reason}); use smaller photos (--max-size) or a larger machine")
+        remedy = "use smaller photos (--max-size), smaller pictures (--size) or a larger machine"
+        return SehdrError(f"out of memory ({reason}); {remedy}")
     if isinstance(error, OSError) and error.strerror:
         path = error.filename if isinstance(error.filename, str | bytes) else "a file"
         return InputError(os.fsdecode(path), f"cannot be used ({error.strerror})", "check the path and its permissions")

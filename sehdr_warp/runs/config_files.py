@@ -231,7 +231,7 @@ def flags_type() -> type:
         text = lambda words: words[0], lambda value: isinstance(value, str), lambda value: [value]
         spec = PrimitiveConstructorSpec(1, _metavar(item.annotation), *text)
         argument = tyro.conf.arg(
-            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {_flag_text(item.default)})"
+            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {flag_text(item.default)})"
         )
         tables.setdefault(path.rpartition(".")[0], {})[path] = Annotated[str, spec, argument]
     parts = {
@@ -250,7 +250,7 @@ def named_fields(values: dict) -> dict[str, str]:
     return fields
 
 
-def _flag_text(value) -> str:
+def flag_text(value) -> str:
     """Return a field's value as its flag takes it."""
     if isinstance(value, tuple):
         value = ",".join(map(str, value))

@@ -42,7 +42,7 @@ def open_run(path: Path, device: str | None) -> Run:
 
 def open_scene(path: Path, device: str | None) -> Run | Splats:
     """Load the run in a folder, or the Gaussians in a file of one of splats.SUFFIXES; arguments as of open_run."""
-    _require(path)
+    _require(path, "no such file or folder", "give the folder of a run, or a file of Gaussians")
     from ..splats import SUFFIXES
     from .run import load_splats
 
@@ -51,10 +51,12 @@ def open_scene(path: Path, device: str | None) -> Run | Splats:
     return open_run(path, device)
 
 
-def _require(path: Path) -> None:
+def _require(
+    path: Path, problem: str = "no such folder", remedy: str = "give the folder that a training wrote"
+) -> None:
     """Raise InputError for a path that is not there, before torch is imported, which takes seconds."""
     if not os.path.lexists(path):
-        raise missing(path, "no such folder", "give the folder that a training wrote")
+        raise missing(path, problem, remedy)
 
 
 def load_saved_scene(data: LoadArguments, **options: Any) -> Scene:

@@ -1,1 +1,1 @@
-"""From a scene to a trained run: configs, losses, densification, the loop, checkpoints and run folders."""
+"""From a scene to a trained run: the plan, losses, densification and the loop; configs and run folders are in runs/."""

@@ -2,9 +2,12 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..runs.config_files import config_fields, flag_text
+from ..runs.run import Run
 from ..subsets import first_names
 
 STILL_RISING = 0.2  # dB that held-out photos gained in the last third of a training that was too short
@@ -80,6 +83,17 @@ def option_words(options: Mapping[str, Any]) -> list[str]:
     """Return the words of a command line that state options, by their names, but for the number of steps."""
     values = {name: value for name, value in options.items() if value is not None and name != "schedule.iterations"}
     return [word for name, value in values.items() for word in ("--" + name.replace("_", "-"), str(value))]
+
+
+def options_of_run(run: Run) -> dict[str, str]:
+    """Return the fields that a run was started with: what differs from the default and was not planned."""
+    planned = {name for decision in run.decisions() for name in decision["fields"]} - set(run.config.plan.keep)
+    options = {}
+    for name, item in config_fields():
+        value = attrgetter(name)(run.config)
+        if value != item.default and name not in planned and name != "plan.keep":
+            options[name] = flag_text(value)
+    return options
 
 
 def _exposure_jump(offsets: Mapping[str, float], again: str) -> str | None:

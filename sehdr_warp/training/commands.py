@@ -184,7 +184,7 @@ def _train(args: Train, ranks=None) -> None:
             return
         from ..console import run_with_progress
         from ..viewer.live import serve_training
-        from .advice import advice, option_words
+        from .advice import advice, option_words, options_of_run
         from .train import create_trainer
 
         assert output.out is not None, "_run_to_resume() refuses a training without --out"
@@ -204,8 +204,9 @@ def _train(args: Train, ranks=None) -> None:
         with serve_training(trainer, str(output.out)) if output.view else nullcontext(trainer) as steps:
             run_with_progress(steps, trainer.total)  # Iterating the trainer trains.
     photos = len(trainer.scene.train_views)
-    typed = {name: data.get(name) for name in LOAD_OPTIONS} | configs.named_fields(args.fields)
-    words = option_words(typed | {"response": args.scene.response, "preset": args.training.preset})
+    typed = configs.named_fields(args.fields) | {"response": args.scene.response, "preset": args.training.preset}
+    options = options_of_run(trainer.run) if output.resume else typed | {"seed": args.training.seed}
+    words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
     hints = partial(advice, train_photos=photos, scene=data.get("path") or "SCENE", options=words)
     _print_result(args, trainer.run, hints)
 

@@ -127,7 +127,8 @@ class RunOutput:
         self.checkpoint(trainer, last=True)
         if trainer.ranks is not None:
             trainer.ranks.shutdown()
-        self._write_summary(trainer)
+        if trainer.iteration > trainer.first_iteration or not self.folder.summary_file.exists():
+            self._write_summary(trainer)
         if self._writer is not None:
             self._writer.close()
         if not complete:
@@ -196,6 +197,7 @@ def remove_unseen(trainer: Trainer) -> Evidence:
     if remaining == count or remaining == 0:
         return evidence
     trainer.field.gaussians.keep_only(contributes, trainer.optimizer)
+    trainer.strategy.load_state_dict({})  # Its statistics are of the rows before.
     log.info("removed %d of %d Gaussians, which no training photo shows", count - remaining, count)
     return evidence.rows(contributes)
 

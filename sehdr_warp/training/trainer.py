@@ -4,12 +4,12 @@ Read `Trainer.__iter__` for the loop and `Trainer.step` for a step: gradient ste
 gradient step (forward, loss, backward, optimizer) is in gradient_step.py; run_output.py evaluates, logs and saves, and
 training_state.py lists what a checkpoint holds. On several ranks, each runs this loop; only rank 0 has an output.
 
-The calls of a step: step() -> StepGraphs.run() -> GradientStep.compute_and_apply() -> compute_gradients() ->
-RadianceField.render_train_view() -> rasterize() (kernels project, tiles, blend_cuda or blend_cpu) -> data_loss() ->
-differentiate() -> apply_gradients() -> guarded_step() -> Adam.step() (kernels training_step). On a GPU,
-StepGraphs.run() captures compute_gradients() and apply_gradients() as CUDA graphs; a replay repeats their kernels, and
-neither runs. create_trainer() writes the checkpoint of iteration 0 before the first step, RunOutput.after_step() the
-later ones, and RunOutput.finish() the last one.
+The calls of a step: step() -> StepGraphs.run() -> GradientStep.compute_and_apply(), which calls compute_gradients(),
+then apply_gradients(). The first calls RadianceField.render_train_view() -> rasterize() (kernels project, tiles,
+blend_cuda or blend_cpu), then data_loss() and differentiate(); the second calls guarded_step() -> Adam.step() (on a
+GPU, kernels training_step). On a GPU, StepGraphs.run() captures both as CUDA graphs; a replay repeats their kernels,
+and neither function runs. create_trainer() writes the checkpoint of iteration 0 before the first step,
+RunOutput.after_step() the later ones, and RunOutput.finish() the last one.
 """
 
 import logging

@@ -43,7 +43,8 @@ def state_of(trainer: Trainer) -> TrainingState:
     order, remaining = trainer.order.state()
     parts["generators"] = {"order": order, "device": trainer.generator.get_state()}
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-    values = {"iteration": trainer.iteration, "order": remaining, "skipped_steps": trainer.skipped_steps}
+    counts = {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.capacity.overflows}
+    values = {"iteration": trainer.iteration, "order": remaining} | counts
     return TrainingState(tensors, values)
 
 
@@ -63,6 +64,7 @@ def load_state(trainer: Trainer, state: TrainingState) -> None:
         trainer.generator.set_state(generators["device"].cpu())
     trainer.iteration = trainer.first_iteration = values["iteration"]
     trainer.capacity.step_counters[0] = values["skipped_steps"]
+    trainer.capacity.step_counters[2] = values.get("overflowed_steps", 0)
 
 
 class TrainingProgress:

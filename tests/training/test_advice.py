@@ -1,7 +1,8 @@
 from pathlib import Path
 
+from sehdr_warp.runs.config_files import load_config, value_of
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.training.advice import advice, option_words
+from sehdr_warp.training.advice import advice, option_words, options_of_run
 from sehdr_warp.training.train import train
 
 from .toy import toy_scene
@@ -37,6 +38,17 @@ def test_commands_keep_the_options_of_the_training():
     [line] = advice(Path("r"), summary([20, 26, 25, 24]), 12, "park", options)
     assert line.endswith("sehdr-warp train park --out r --max-size 240 --preset fast --overwrite --iterations 44")
     assert option_words({"max_size": 240, "holdout": None, "schedule.iterations": 9, "preset": "fast"}) == options
+
+
+def test_a_resumed_training_is_repeated_with_the_fields_of_its_run(tmp_path):
+    fields = {"seed": 7, "schedule.iterations": 4, "loss.ssim_weight": 0.3, "plan.keep": ("loss.ssim_weight", "seed")}
+    train(toy_scene(), tmp_path / "run", load_config("3dgs", fields), device="cpu")
+    run = train(toy_scene(), tmp_path / "run", device="cpu", resume=True)
+    options = options_of_run(run)
+    assert "--plan.keep" not in option_words(options) and "--schedule.iterations" not in option_words(options)
+    again = load_config("default", {name: value_of(name, text) for name, text in options.items()})
+    assert (again.seed, again.loss.ssim_weight) == (7, 0.3)
+    assert again.densification.strategy == run.config.densification.strategy == "adc", "the preset's fields are stated"
 
 
 def test_a_training_that_is_too_short_blames_nothing_that_moved():

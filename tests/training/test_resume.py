@@ -14,6 +14,7 @@ from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
+from sehdr_warp.training.run_output import remove_unseen
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import TrainingState, load_state, state_of
@@ -37,9 +38,12 @@ def test_resume_is_exact(scene, trained, tmp_path, variant):
     for name in ("order", "skipped_steps"):
         assert whole.values[name] == resumed.values[name]
     assert [line["iteration"] for line in run.metrics()] == [10, run.iterations], "each evaluation once"
-    # Of a finished run nothing changes.
+    # Of a finished run nothing changes, its figures neither.
+    before = run.summary() | {"device": "another", "overflowed_steps": 7}
+    run.folder.summary_file.write_text(json.dumps(before))
     again = train(blind, tmp_path / "killed", VARIANTS[variant], device="cpu", resume=True)
     assert torch.equal(run.field.gaussians.means, again.field.gaussians.means) and run.metrics() == again.metrics()
+    assert again.summary() == before
 
 
 def test_a_run_begins_with_a_checkpoint_of_its_start(scene, trained, tmp_path):
@@ -80,10 +84,14 @@ def test_a_run_is_replaced_whole_or_not_at_all(scene, trained, tmp_path, monkeyp
     others = "notes.txt", "checkpoints/iteration_best"
     for name in others:
         (out / name).write_text("mine")
+    settings = [out / name for name in ("orientation.json", "light_unit.json")]
+    for path in settings:  # What other commands stated about the earlier scene.
+        path.write_text("{}")
     with monkeypatch.context() as patch:
         patch.setattr(os, "getpid", lambda: 1 << 30)  # By a process that is gone.
         copies = copy_at_each_change(patch, out, tmp_path)
         train(scene, out, quick(seed=5, **{"schedule.iterations": 8}), device="cpu", overwrite=True)
+    assert not any(path.exists() for path in settings)
     ends = []
     for place, copy in enumerate(copies):
         try:
@@ -115,6 +123,7 @@ def test_a_trainer_continues_from_its_state(scene, variant):
         info = {"response": whole.field.response.to_dict(), "base_time": whole.field.base_time}
         info["normalization"] = whole.field.normalization.to_dict()
         field = field_from_checkpoint(Checkpoint(Path("memory"), tensors, values), config, info)
+        values["overflowed_steps"] = 3
         resumed = Trainer(scene, config, field)
         load_state(resumed, TrainingState(tensors, values))
         for trainer in (whole, resumed):
@@ -124,6 +133,19 @@ def test_a_trainer_continues_from_its_state(scene, variant):
     again = state_of(resumed).tensors
     for name, value in state_of(whole).tensors.items():
         assert torch.equal(value, again[name]), name
+    assert resumed.capacity.overflows == 3, "overflows are summed over all sessions, as skipped steps are"
+
+
+def test_statistics_of_gaussians_do_not_outlive_the_removal_of_some(scene):
+    trainer = make_trainer(scene, VARIANTS["adc"])
+    _steps(trainer, 30)
+    count = trainer.field.gaussians.count
+    assert trainer.strategy.state_dict(count)
+    with torch.no_grad():
+        trainer.field.gaussians.opacity_logits[0] = -20.0
+    remove_unseen(trainer)
+    assert trainer.field.gaussians.count < count and not trainer.strategy.state_dict(count - 1)
+    _steps(trainer, 25)  # Over a refinement.
 
 
 def _steps(trainer, count):
