@@ -69,7 +69,7 @@ class Study:
     gaussians: int = 2_300_000
     """Most Gaussians of the whole, and of all blocks together."""
     steps: int = 8700
-    """Of the whole."""
+    """Steps of the whole training."""
     count: int = 4
     """Blocks."""
     copies: int = 20_000_000
@@ -83,7 +83,7 @@ class Study:
     began: tyro.conf.Suppress[float] = field(default_factory=time.monotonic)
     """Start of the study, monotonic seconds."""
     rows: tyro.conf.Suppress[list[dict[str, Any]]] = field(default_factory=list)
-    """What was found."""
+    """Results of the study."""
 
     @property
     def device(self) -> torch.device:

@@ -15,7 +15,7 @@ TRANSMITTANCE_MIN = 1.0e-4
 EPS2D = 0.3
 # Points nearer than this to the camera plane are culled, in scene units.
 NEAR_PLANE = 0.01
-# The linearized projection (J) uses view rays up to this fraction of the field of view beyond the image's border.
+# The linearized projection (J) uses view rays up to this fraction of half the image beyond the image's border.
 FRUSTUM_MARGIN = 0.3
 # exp(+-LOG_SCALE_MAX) bounds the scales so that squares of them stay finite in float32.
 LOG_SCALE_MAX = 20.0

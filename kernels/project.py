@@ -136,7 +136,7 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
             cutoff = real(2.0) * wp.log(opacity / alpha_threshold)
             extent_x = wp.sqrt(cutoff * variance_x)
             extent_y = wp.sqrt(cutoff * variance_y)
-        # Keep only what reaches the center of a pixel of this image.
+        # Keep only what reaches into this image.
         usable = (
             usable and pixel[0] + extent_x > real(0.0) and pixel[0] - extent_x < w
             and pixel[1] + extent_y > real(0.0) and pixel[1] - extent_y < h

@@ -1,1 +1,1 @@
-"""The model of the paper: Gaussians, camera responses, exposure brackets, their fusion, and the field they make."""
+"""The model of the paper: Gaussians, exposure brackets, their fusion, and the field they make."""

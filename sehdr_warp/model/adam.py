@@ -17,7 +17,7 @@ EPSILON = 1e-15  # As in 3DGS: the gradients of a single Gaussian are small comp
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015) with one launch for all parameters.
+    """Adam (Kingma and Ba 2015) with few launches, each for several parameters.
 
     `param_groups` and `state` are laid out as in torch.optim.Adam.
 

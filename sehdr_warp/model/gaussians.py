@@ -48,7 +48,10 @@ class Gaussians(nn.Module):
     harmonics_rest: Tensor
 
     def __init__(self, means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest):
-        """Wrap copies of the tensors as parameters; raises ValueError for shapes that do not fit each other."""
+        """Wrap the tensors as parameters; contiguous ones are not copied.
+
+        Raises ValueError for shapes that do not fit each other.
+        """
         super().__init__()
         tensors = (means, log_scales, quaternions, opacity_logits, harmonics_dc, harmonics_rest)
         count, harmonics = means.shape[0], 1 + harmonics_rest.shape[1]

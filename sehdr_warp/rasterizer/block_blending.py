@@ -30,10 +30,10 @@ def blend_on_cuda(
     padded = pad_features(features) if packed.padded is None else packed.padded
     last_contributor = blend_blocks(padded, lists, packed, image, transmittance, alpha_threshold)
     # Padded features take more memory. The backward pass pads those of many Gaussians again.
-    kept = padded if keeps_padded or len(features) <= MAX_SINGLE_SORT else features
+    features = padded if keeps_padded or len(features) <= MAX_SINGLE_SORT else features
     packed = packed._replace(padded=None)
     return BlockBackward(
-        kept, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
+        features, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
     )
 
 

@@ -22,7 +22,7 @@ Numbers: TypeAlias = np.ndarray | float | Sequence[Any]
 
 
 class Response(ABC):
-    """A camera response function f: exposure x = E dt >= 0 to encoded value in [0, 1], increasing and immutable.
+    """A camera response function f: exposure x = E dt >= 0 to encoded value in [0, 1], increasing unless it is learned.
 
     Sources: SeHDR, Eq. 1 (Z = f(E dt)); Grossberg and Nayar 2004 for the normalization of tabulated curves.
 

@@ -124,9 +124,9 @@ def test_an_earlier_render_leaves_nothing_beside_a_new_one(tmp_path, logged):
     (tmp_path / "brackets" / "note.txt").write_text("mine")
     (tmp_path / "camera_path.json").rename(tmp_path / "path.json")
     (tmp_path / "camera_path.json").symlink_to("path.json")
-    kept = [*(tmp_path / "brackets").rglob("*.*"), tmp_path / "path.json", tmp_path / "cameras.chan"]
+    user_files = [*(tmp_path / "brackets").rglob("*.*"), tmp_path / "path.json", tmp_path / "cameras.chan"]
     render_views(run, tmp_path, overwrite=True)
-    assert all(path.exists() for path in kept) and (tmp_path / "camera_path.json").is_symlink()
+    assert all(path.exists() for path in user_files) and (tmp_path / "camera_path.json").is_symlink()
     assert not (tmp_path / "brackets_ldr").exists() and not (tmp_path / "brackets.json").exists()
     for name in ("brackets", "cameras.chan", "camera_path.json"):
         assert any(line.startswith(f"{tmp_path / name}: stays, though") for line in logged)

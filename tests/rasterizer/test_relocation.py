@@ -1,4 +1,4 @@
-"""What moves Gaussians on the device: shares as equation 9 has them, and rows in their slots."""
+"""Relocation of Gaussians on the device: shares of opacity by equation 9, and rows in their slots."""
 
 import torch
 
