@@ -21,8 +21,8 @@ from ..kernels import (
     residual_sampling,
     shared_ranges,
     ssim,
+    step_updates,
     tiles,
-    training_step,
 )
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
@@ -51,7 +51,7 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
         *(tiles.count_tiles, tiles.place_intersections, distance.blur_columns),
         *(distance.blur_derivatives, distance.gradient),
         *(lists.gather_intersections, harmonics.harmonics_backward_kernel(real, 0, True)),
-        *(training_step.decide_step, training_step.add_position_noise),
+        *(step_updates.decide_step, step_updates.add_position_noise),
         *(relocation.number_slots, relocation.count_copies, relocation.share_opacities, relocation.copy_rows),
         *(relocation.scale_rows, residual_sampling.error_weights_kernel(wp.uint8), residual_sampling.sampled_pixels),
     ]

@@ -7,7 +7,7 @@ training_state.py lists what a checkpoint holds. On several ranks, each runs thi
 The calls of a step: step() -> StepGraphs.run() -> GradientStep.compute_and_apply(), which calls compute_gradients(),
 then apply_gradients(). The first calls RadianceField.render_train_view() -> rasterize() (kernels project, tiles,
 blend_cuda or blend_cpu), then data_loss() and differentiate(); the second calls guarded_step() -> Adam.step() (on a
-GPU, kernels training_step). On a GPU, StepGraphs.run() captures both as CUDA graphs; a replay repeats their kernels,
+GPU, kernels step_updates). On a GPU, StepGraphs.run() captures both as CUDA graphs; a replay repeats their kernels,
 and neither function runs. create_trainer() writes the checkpoint of iteration 0 before the first step,
 RunOutput.after_step() the later ones, and RunOutput.finish() the last one.
 """

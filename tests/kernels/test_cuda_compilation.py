@@ -27,8 +27,8 @@ from sehdr_warp.kernels import (
     response_curves,
     sphere,
     ssim_cuda,
+    step_updates,
     tiles,
-    training_step,
 )
 
 ARCHITECTURES = wp.get_cuda_supported_archs()
@@ -49,7 +49,7 @@ KERNELS: dict[str, Callable[[], Any]] = {
     "fusion": lambda: exposure_fusion.fusion_kernels(REAL),
     "harmonics": lambda: harmonics.harmonics_kernel(REAL, 3),
     "harmonics backward": lambda: harmonics.harmonics_backward_kernel(REAL, 3, True),
-    "harmonics, Adam": lambda: training_step.harmonics_adam_kernel(4),
+    "harmonics, Adam": lambda: step_updates.harmonics_adam_kernel(4),
     "interpolation": lambda: interpolation,
     "opacity penalty": lambda: activations.opacity_penalty_kernel(REAL),
     "opacity penalty, backward": lambda: activations.opacity_penalty_backward_kernel(REAL),
@@ -64,7 +64,7 @@ KERNELS: dict[str, Callable[[], Any]] = {
     "tile lists": lambda: tiles.tile_ranges_kernel(REAL, wp.int64, 32),
     "tiles": lambda: tiles.tile_kernels(REAL),
     "tiles, module": lambda: tiles,
-    "training step": lambda: training_step,
+    "training step": lambda: step_updates,
 }
 
 

@@ -6,7 +6,7 @@ import torch
 from scipy.special import sph_harm_y
 
 from sehdr_warp.rasterizer import HarmonicsGradients, harmonics, spherical_harmonics
-from sehdr_warp.rasterizer.training_step import AdamStep, adam_steps, harmonics_adam_step
+from sehdr_warp.rasterizer.step_updates import AdamStep, adam_steps, harmonics_adam_step
 
 from .scenes import finite_differences, relative_error
 

@@ -15,7 +15,7 @@ from ...rasterizer.relocation import (
     scale_rows,
     share_opacities,
 )
-from ...rasterizer.training_step import add_position_noise
+from ...rasterizer.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
 from .base import SEED_STRIDE, Propose, Schedule, Strategy
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..kernels import training_step as kernels
+from ..kernels import step_updates as kernels
 from .gradients import unit_gradient
 from .harmonics import HarmonicsGradients
 from .torch_contract import once_differentiable

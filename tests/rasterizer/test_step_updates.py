@@ -6,9 +6,9 @@ from itertools import product
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import HarmonicsGradients, training_step
+from sehdr_warp.rasterizer import HarmonicsGradients, step_updates
 from sehdr_warp.rasterizer.ssim import image_distance
-from sehdr_warp.rasterizer.training_step import (
+from sehdr_warp.rasterizer.step_updates import (
     AdamStep,
     adam_steps,
     add_gradient_statistics,
@@ -33,7 +33,7 @@ def run_adam(step_function, parameter, gradients, rate, skip=()):
     return first, second, step
 
 
-@pytest.mark.parametrize("function", [adam_steps, training_step._steps_by_kernel])
+@pytest.mark.parametrize("function", [adam_steps, step_updates._steps_by_kernel])
 @pytest.mark.parametrize("scale", [1.0, 1e-12, 1e12])
 def test_many_steps_are_torchs_in_float64(device, scale, function):
     generator = torch.Generator().manual_seed(0)
@@ -52,7 +52,7 @@ def test_many_steps_are_torchs_in_float64(device, scale, function):
         assert ((moment.cpu() - true_moment).norm() / true_moment.norm()) < 1e-6
 
 
-@pytest.mark.parametrize("function", [adam_steps, training_step._steps_by_kernel])
+@pytest.mark.parametrize("function", [adam_steps, step_updates._steps_by_kernel])
 def test_a_skipped_step_changes_nothing(device, function):
     gradients = [torch.full((5,), value, device=device) for value in (1.0, float("nan"), -0.5)]
     with_skip, without = torch.zeros(5, device=device), torch.zeros(5, device=device)
@@ -63,7 +63,7 @@ def test_a_skipped_step_changes_nothing(device, function):
     assert all(moment.isfinite().all() for moment in moments)
 
 
-@pytest.mark.parametrize("function", [adam_steps, training_step._steps_by_kernel])
+@pytest.mark.parametrize("function", [adam_steps, step_updates._steps_by_kernel])
 def test_many_parameters_step_as_each_by_itself(device, function):
     generator = torch.Generator().manual_seed(2)
     one = torch.ones((), device=device)
@@ -81,7 +81,7 @@ def test_many_parameters_step_as_each_by_itself(device, function):
         assert all(torch.equal(a, b) for a, b in zip(together[:4], alone[:4], strict=True))
 
 
-@pytest.mark.parametrize("function", [finiteness_of, training_step._nonfinite_by_kernel])
+@pytest.mark.parametrize("function", [finiteness_of, step_updates._nonfinite_by_kernel])
 @pytest.mark.parametrize("place", [None, 0, 9])
 def test_one_number_that_is_not_finite_shows_in_the_result(device, place, function):
     gradients = [torch.ones(7 * k + 1, 3, device=device) for k in range(10)]
@@ -110,7 +110,7 @@ def test_rows_that_do_not_count_are_left_alone(device):
         for tensor, width in ((values, 4), (other, 0))
     ]
     active_count = torch.tensor([5], dtype=torch.int32, device=device)
-    training_step._steps_by_kernel(steps, 0 * one, *OPTIONS.values(), active_count)
+    step_updates._steps_by_kernel(steps, 0 * one, *OPTIONS.values(), active_count)
     assert (values[:5] == values[0, 0]).all() and values[0, 0] < 0 and not values[5].any() and other.all()
     moments = (torch.zeros(6, 15, 3, device=device) for _ in range(3))
     ones = torch.ones(6, 3, device=device)
