@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, SehdrError, did_you_mean
 from ..files import read_json, write_json
+from ..runs.values import LIGHT_UNIT_FILE
 from .images import as_array
 from .tonemap import LUMINANCE
 
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
-UNIT_FILE = "light_unit.json"
-"""File in a run's folder that keeps the unit."""
 GREY_CARD = 0.18
 """Reflectance of a photographer's grey card."""
 EFFICACY = 179.0
@@ -51,7 +50,7 @@ def read_light_unit(run: "RenderableScene") -> LightUnit | None:
         InputError: If the file is damaged.
     """
     folder = getattr(run, "path", None)
-    if folder is None or not (path := Path(folder) / UNIT_FILE).is_file():
+    if folder is None or not (path := Path(folder) / LIGHT_UNIT_FILE).is_file():
         return None
     values = read_json(path)
     try:
@@ -120,7 +119,7 @@ def meter(
     if clipped is not None and float(clipped[rows, columns].mean()) > _CLIPPED:
         log.warning("photos clip at %g,%g of %s: its light is an estimate; read a darker place", x, y, view)
     unit = LightUnit(_check(light / rendered), view, (float(x), float(y)), reading)
-    write_json(Path(run.path) / UNIT_FILE, asdict(unit), internal=True)
+    write_json(Path(run.path) / LIGHT_UNIT_FILE, asdict(unit), internal=True)
     return unit
 
 

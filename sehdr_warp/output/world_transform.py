@@ -1,5 +1,8 @@
 """The similarity from a scene's coordinates to those of files: upright, and scaled to meters.
 
+    photos' coordinates  -- from_photos() -->  scene's coordinates  -- world_transform() -->  coordinates of files
+    photos' coordinates  ------------------------ stored_matrix() ---------------------->  coordinates of files
+
 A scene's coordinates are those of its cameras and renders: the photos' own for a run, the file's for a file of
 Gaussians. Pictures, Gaussians, maps, lights, meshes, cameras.usda and .chan share the transform, so that they line up
 in another program; PLY, SOG and SPZ are turned over, and JSON cameras stay in the photos' coordinates. It depends on
@@ -18,6 +21,7 @@ import numpy as np
 
 from ..errors import InputError, SehdrError
 from ..files import read_json, write_json
+from ..runs.values import ORIENTATION_FILE
 from ..scene import Camera
 from ..scene.gravity import is_pitch_known, typical_roll, up_direction
 from ..splats import STREAMED_SOG
@@ -29,8 +33,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 AXES = ("upright", "scene")
 Y_DOWN_SUFFIXES = (".ply", ".sog", ".spz")
-ORIENTATION_FILE = "orientation.json"
-"""File in a run's folder that keeps an up direction and a scale set for it; they then need no options."""
 _WORST_ROLL = math.radians(12)  # Median roll about the common up above which the cameras are said to have none
 _LARGEST_SCALE = 1e6
 

@@ -49,7 +49,7 @@ class RenderableScene:
         scene_name: Name of the scene.
         cameras: Views of the scene.
         iterations: Iterations of the training; None if it is not known.
-        field: The radiance field.
+        field: The radiance field; a PagedField if is_paged.
         response: Camera response.
         degree: SH degree to render with.
         base_time: Exposure time of the photos, seconds.
@@ -77,8 +77,13 @@ class RenderableScene:
 
     @property
     def model(self) -> RadianceField:
-        """The same as `field`."""
+        """Older name of `field`."""
         return self.field
+
+    @property
+    def is_paged(self) -> bool:
+        """True if the Gaussians do not fit into the GPU: those in view are copied to it for each picture."""
+        return isinstance(self.field, PagedField)
 
     @property
     def device(self) -> torch.device:
@@ -163,7 +168,7 @@ class Splats(RenderableScene):
         path: The file.
         field: The radiance field.
         base_time: Exposure time that the file states, seconds; else 1.
-        cameras: Views listed in a `<stem>.cameras.json` beside the file, as export writes it, or in a cameras.json, as
+        cameras: Views listed in `<name>.cameras.json` beside the file, as export writes it, or in a cameras.json, as
             the reference release of 3D Gaussian Splatting writes it; else none.
     """
 
@@ -193,15 +198,15 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
     """
     path = Path(path)
     gaussians = read_gaussians(path)
-    model = on_device(field_of(gaussians), pick_device(device))
+    field = on_device(field_of(gaussians), pick_device(device))
     beside, cameras = cameras_beside(path), ()
     if beside is not None:
         views = load_cameras(beside)
         if beside.name == "cameras.json":
             text = "%s: %d cameras from %s beside it, which does not say what it belongs to"
             log.info(text, path, len(views), beside)
-        cameras = tuple(CameraEntry(name, "train", camera, model.base_time) for name, camera in views)
-    return Splats(path, model, cameras, gaussians.world_matrix)
+        cameras = tuple(CameraEntry(name, "train", camera, field.base_time) for name, camera in views)
+    return Splats(path, field, cameras, gaussians.world_matrix)
 
 
 class Run(RenderableScene):
@@ -222,10 +227,18 @@ class Run(RenderableScene):
         data: Arguments with which the photos were loaded; may be empty.
     """
 
-    def __init__(self, folder: RunFolder, config: Config, field: RadianceField, info: dict, values: dict):
+    def __init__(
+        self,
+        folder: RunFolder,
+        config: Config,
+        field: RadianceField,
+        info: dict,
+        values: dict,
+        clipped: Tensor | None = None,
+    ):
         """Wrap the parts of a run; load_run() reads them."""
         self.folder, self.path = folder, folder.path
-        self.config, self.field = config, field
+        self.config, self.field, self._clipped = config, field, clipped
         self.response: Response = field.response
         self.base_time = field.base_time
         self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
@@ -248,10 +261,7 @@ class Run(RenderableScene):
 
     def clipped_share(self) -> Tensor | None:
         """Return the fraction [N] of clipped values that show each Gaussian; None if it was not measured."""
-        if self.field.confidence is None:
-            return None
-        clipped = self.folder.read_clipped()
-        return None if clipped is None else clipped.to(self.device)
+        return None if self._clipped is None else self._clipped.to(self.device)
 
     def metrics(self) -> list[dict]:
         """Return the evaluations during the training, as in metrics.jsonl."""
@@ -270,7 +280,7 @@ class Run(RenderableScene):
         return self.folder.read_decisions()
 
     def measure_confidence(self, scene: Scene) -> Evidence:
-        """Measure the confidence of the Gaussians' light on the training photos of a scene, and set it in the field.
+        """Measure the confidence of the Gaussians' light on the training photos of a scene, and keep it in this object.
 
         HDR truth of the photos counts only if the run was trained on it.
         """
@@ -281,7 +291,7 @@ class Run(RenderableScene):
             estimates = light_estimates(views, self.field.response, self.config.loss, self.device)
         certainties = None if estimates is None else [estimate.certainty for estimate in estimates]
         evidence = gather_evidence(self.field, views, degree=self.degree, truth=truth, certainties=certainties)
-        self.field.confidence = evidence.confidence()
+        self.field.confidence, self._clipped = evidence.confidence(), evidence.clipped
         return evidence
 
 
@@ -302,26 +312,26 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     checkpoint = folder.newest_checkpoint(PICTURE)
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
-    model = field_from_checkpoint(checkpoint, config, info)
-    model.confidence = folder.read_confidence(checkpoint)
-    return Run(folder, config, on_device(model.requires_grad_(False), pick_device(device)), info, checkpoint.values)
+    field = field_from_checkpoint(checkpoint, config, info).requires_grad_(False)
+    field.confidence, clipped = folder.read_confidence(checkpoint) or (None, None)
+    return Run(folder, config, on_device(field, pick_device(device)), info, checkpoint.values, clipped)
 
 
-def on_device(model: RadianceField, device: torch.device, budget: int | None = None) -> RadianceField:
+def on_device(field: RadianceField, device: torch.device, budget: int | None = None) -> RadianceField:
     """Return a field on a device; if its Gaussians are too many for a GPU, one that copies those that are in view.
 
     Args:
-        model: The field, on the CPU.
+        field: The field, on the CPU.
         device: The device.
         budget: Bytes of the device's memory that pictures may take; by default MEMORY_SHARE of what is free on a GPU.
     """
     if budget is None and device.type == "cuda":
         budget = int(MEMORY_SHARE * torch.cuda.mem_get_info(device)[0])
-    paged = None if budget is None else PagedField(model, device, budget)
-    if paged is None or paged.row_bytes * model.gaussians.count <= paged.budget:
-        return model.to(device)
+    paged = None if budget is None else PagedField(field, device, budget)
+    if paged is None or paged.row_bytes * field.gaussians.count <= paged.budget:
+        return field.to(device)
     text = "%d Gaussians do not fit into %.1f GB of %s: those in view are copied to it, far ones at less detail"
-    log.info(text, model.gaussians.count, paged.budget / 1e9, device)
+    log.info(text, field.gaussians.count, paged.budget / 1e9, device)
     return paged.requires_grad_(False)
 
 

@@ -8,6 +8,11 @@ metrics.jsonl               one line for each evaluation
 checkpoints/iteration_N/    tensors as safetensors, values as JSON with the hash of the tensors
 confidence.safetensors      how far photos support each Gaussian, and of which checkpoint
 summary.json                times, memory and counts, once the training has ended
+extension.json              more iterations than config.json has, of a training that was extended
+orientation.json            up direction and scale of the files, set after the training
+light_unit.json             cd/m^2 of a radiance of 1, set after the training (`sehdr-warp meter`)
+blocks.json                 the blocks of a survey that the run was merged from
+tensorboard/                curves of the training, if tensorboard is installed
 
 Nothing is pickled. A run may come from anybody: reading one changes nothing in it, follows no link in it (the folder
 itself may be one), and checks every value (see values.py). A checkpoint holds hashes of the other files that decide the
@@ -21,7 +26,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel
 from torch import Tensor
@@ -38,6 +43,8 @@ from .config_files import config_from_dict, override_config
 from .photo_signatures import changed_photos, photo_signature
 from .values import (
     FORMAT,
+    LIGHT_UNIT_FILE,
+    ORIENTATION_FILE,
     REMEDY,
     PlanValues,
     RunValues,
@@ -68,6 +75,18 @@ class CameraEntry:
     exposure_time: float
 
 
+class Confidence(NamedTuple):
+    """Measured on the training photos, for each of N Gaussians: see Evidence.
+
+    Attributes:
+        confidence: [N] in [0, 1], confidence in its light.
+        clipped: [N] in [0, 1], fraction of clipped values in the photos that show it.
+    """
+
+    confidence: Tensor
+    clipped: Tensor
+
+
 class RunFolder:
     """The files of a run, each read when it is asked for.
 
@@ -83,9 +102,8 @@ class RunFolder:
         self.config_file, self.scene_file, self.info_file, self.plan_file, self.summary_file = (
             self.path / f"{name}.json" for name in ("config", "scene", "run", "plan", "summary")
         )
-        # Set after the training began: more iterations, up and scale for its files, and the unit of light.
-        self.extension, self.orientation = self.path / "extension.json", self.path / "orientation.json"
-        self.light_unit = self.path / "light_unit.json"
+        self.extension, self.orientation = self.path / "extension.json", self.path / ORIENTATION_FILE
+        self.light_unit = self.path / LIGHT_UNIT_FILE
         self.blocks = self.path / "blocks.json"
         self.metrics = self.path / "metrics.jsonl"
         self.checkpoints = self.path / "checkpoints"
@@ -156,7 +174,7 @@ class RunFolder:
 
     def read_config(self) -> Config:
         """Return the config of the training, with the iterations that it was extended to."""
-        self.read_info()
+        self.read_info()  # It names a run of another version as such.
         config = config_from_dict(self._read(self.config_file, read_object), self.config_file)
         if not self.extension.is_file():
             return config
@@ -244,26 +262,19 @@ class RunFolder:
             raise newest
         return None
 
-    def read_confidence(self, checkpoint: Checkpoint) -> Tensor | None:
-        """Return the confidence of a checkpoint's Gaussians, [N] in [0, 1]; None if it was not measured for it."""
-        tensors = self._confidence_tensors(checkpoint.values["sha256"])
+    def read_confidence(self, checkpoint: Checkpoint) -> Confidence | None:
+        """Return what was measured of a checkpoint's Gaussians; None if it was not measured for this checkpoint."""
+        tensors = self._confidence_tensors(checkpoint, Confidence._fields)
         if tensors is None:
             return None
-        confidence, expected = tensors["confidence"], checkpoint.tensors["gaussians.means"].shape[:1]
-        if confidence.shape != expected:
-            problem = f"confidence has shape {tuple(confidence.shape)}, not {tuple(expected)}"
-            raise InputError(self.confidence, problem, _MAKE_AGAIN)
-        if not bool(((confidence >= 0) & (confidence <= 1)).all()):  # NaN is neither.
-            raise InputError(self.confidence, "confidence holds values outside of 0 to 1", _MAKE_AGAIN)
-        return confidence.float()
-
-    def read_clipped(self) -> Tensor | None:
-        """Return the share of clipped values of each Gaussian, [N] in [0, 1], as measured with the confidence.
-
-        None if that was not measured.
-        """
-        tensors = self._confidence_tensors(None)
-        return None if tensors is None else tensors.get("clipped")
+        expected = checkpoint.tensors["gaussians.means"].shape[:1]
+        for name, values in tensors.items():
+            if values.shape != expected:
+                problem = f"{name} has shape {tuple(values.shape)}, not {tuple(expected)}"
+                raise InputError(self.confidence, problem, _MAKE_AGAIN)
+            if not bool(((values >= 0) & (values <= 1)).all()):  # NaN is neither.
+                raise InputError(self.confidence, f"{name} holds values outside of 0 to 1", _MAKE_AGAIN)
+        return Confidence(**{name: values.float() for name, values in tensors.items()})
 
     def read_evidence(self, checkpoint: Checkpoint) -> Evidence:
         """Return the evidence of the training photos for a checkpoint's Gaussians.
@@ -272,15 +283,13 @@ class RunFolder:
             InputError: If it was not measured for this checkpoint, or is damaged.
         """
         names = tuple(EVIDENCE_TENSORS.values())
-        tensors = self._confidence_tensors(checkpoint.values["sha256"], names)
+        tensors = self._confidence_tensors(checkpoint, names)
         count = checkpoint.tensors["gaussians.means"].shape[:1]
         if tensors is None or any(tensors[name].shape != count for name in names):
             raise InputError(self.confidence, "is not of the newest checkpoint", "continue with --resume")
         return Evidence(**{field: tensors[name] for field, name in EVIDENCE_TENSORS.items()})
 
-    def _confidence_tensors(
-        self, checkpoint_hash: str | None, names: tuple[str, ...] = ("confidence", "clipped")
-    ) -> dict[str, Tensor] | None:
+    def _confidence_tensors(self, checkpoint: Checkpoint, names: tuple[str, ...]) -> dict[str, Tensor] | None:
         """Return the tensors beside a checkpoint; None if there are none, or they are another checkpoint's."""
         from safetensors import SafetensorError, safe_open
 
@@ -291,7 +300,7 @@ class RunFolder:
         try:
             with safe_open(str(path), framework="pt") as file:
                 metadata = json.loads((file.metadata() or {}).get("sehdr_warp", "{}"))
-                if checkpoint_hash and metadata != confidence_metadata(checkpoint_hash):
+                if metadata != confidence_metadata(checkpoint.values["sha256"]):
                     return None
                 return {name: file.get_tensor(name) for name in names}
         except PermissionError as error:

@@ -127,7 +127,7 @@ def test_a_folder_of_other_things_is_no_run(tmp_path, capfd):
     for flag in ((), ("--overwrite",), ("--resume",)):
         for name in ("letters", "other"):
             assert name in refused(capfd, "train", "embedded", "--out", tmp_path / name, "--device", "cpu", *flag)
-    assert "no such folder" in refused(capfd, "render", tmp_path / "gone", "--out", tmp_path / "out")
+    assert "no such file or folder" in refused(capfd, "render", tmp_path / "gone", "--out", tmp_path / "out")
     assert "dog.ply: is a file, not a run; give the folder" in refused(capfd, "eval", tmp_path / "dog.ply")
     assert snapshot(tmp_path) == before
 

@@ -11,11 +11,12 @@ import torch
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.environment_map import write_environment_map
-from sehdr_warp.output.light_unit import EFFICACY, UNIT_FILE, meter, read_light_unit
+from sehdr_warp.output.light_unit import EFFICACY, meter, read_light_unit
 from sehdr_warp.output.lights import lights_table, write_lights
 from sehdr_warp.output.render_views import render_views
 from sehdr_warp.output.tonemap import LUMINANCE, exposure_of_white
 from sehdr_warp.runs.run import Splats
+from sehdr_warp.runs.values import LIGHT_UNIT_FILE
 from sehdr_warp.scene.hdr_files import read_exr_channels, read_hdr
 
 from .helpers import AnalyticRun, Entry, camera
@@ -137,7 +138,7 @@ def test_a_clipped_place_is_named(run, caplog):
 def test_readings_that_cannot_be_are_refused(run, options, problem):
     with pytest.raises(SehdrError, match=problem):
         meter(run, **{"view": "r_0", "pixel": (16, 12)} | options)
-    assert not (run.path / UNIT_FILE).exists()
+    assert not (run.path / LIGHT_UNIT_FILE).exists()
 
 
 HUGE = f'{{"luminance": 1, "view": "a", "pixel": [1{"0" * 400}, 2], "reading": "x"}}'
@@ -147,6 +148,6 @@ HUGE = f'{{"luminance": 1, "view": "a", "pixel": [1{"0" * 400}, 2], "reading": "
     "text", ["{}", '{"luminance": 0, "view": "a", "pixel": [1, 2], "reading": "x"}', HUGE, "[1]", "{"]
 )
 def test_a_damaged_file_is_named(run, text):
-    (run.path / UNIT_FILE).write_text(text)
-    with pytest.raises(InputError, match=UNIT_FILE):
+    (run.path / LIGHT_UNIT_FILE).write_text(text)
+    with pytest.raises(InputError, match=LIGHT_UNIT_FILE):
         read_light_unit(run)

@@ -46,14 +46,25 @@ def test_an_older_run_gets_it_on_demand(run, scene, caplog):
     ensure_confidence(run, scene)
     torch.testing.assert_close(run.field.confidence, expected)
     torch.testing.assert_close(load_run(run.path).model.confidence, expected)
+    assert torch.equal(run.clipped_share(), load_run(run.path).clipped_share())
     ensure_confidence(run, scene)
     assert caplog.text.count("measuring confidence") == 1
+
+
+def test_a_run_keeps_what_was_measured_of_its_own_gaussians(run):
+    """A training that goes on may replace the file of a run that is open."""
+    clipped = run.clipped_share()
+    assert clipped is not None and clipped.shape == (run.gaussian_count,)
+    metadata = {"sehdr_warp": json.dumps(confidence_metadata("0" * 64))}
+    save_file({"confidence": torch.ones(3), "clipped": torch.ones(3)}, run.folder.confidence, metadata)
+    assert torch.equal(run.clipped_share(), clipped)
 
 
 def test_that_of_another_checkpoint_does_not_count(run):
     metadata = {"sehdr_warp": json.dumps(confidence_metadata("0" * 64))}
     save_file({"confidence": run.field.confidence}, run.folder.confidence, metadata)
-    assert load_run(run.path).model.confidence is None
+    other = load_run(run.path)
+    assert other.model.confidence is None and other.clipped_share() is None
 
 
 @pytest.mark.parametrize(
