@@ -5,14 +5,16 @@ import os
 import signal
 import sys
 
-_OUT_OF_MEMORY = b"sehdr-warp: out of memory; raise the limit (ulimit -v), or use smaller photos (--max-size)\n"
+_OUT_OF_MEMORY = (
+    b"sehdr-warp: out of memory; raise the limit (ulimit -v), or use smaller photos (--max-size) or pictures (--size)\n"
+)
 _LITTLE = 4 << 20  # Bytes of address space; a smaller rest is not enough for a module or a picture
 _LONGEST_CHAIN = 20  # Exceptions that one came from
 
 
 def run() -> None:
     """Run the command line of this process and exit, see cli.main()."""
-    is_interrupted = bool
+    is_interrupted = bool  # Until the import below: bool() is False.
     try:
         from .process import is_interrupted, prepare, use_utf8
 

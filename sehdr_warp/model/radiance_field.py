@@ -331,7 +331,7 @@ class RadianceField(nn.Module):
             opacities = gaussians.opacities().detach()
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities)
-        return self.rasterizer(
+        return self.rasterizer(  # rasterize(), see the class
             *shapes,
             opacities,
             features,

@@ -159,7 +159,7 @@ class PictureHeader:
     Attributes:
         base_time: Seconds at 0 EV.
         colorspace: Primaries of the EXR files.
-        captured: Local time.
+        captured: Local time that the files state as that of the picture.
         provenance: Text by key.
         luminance_of_one: cd/m^2 of a radiance of 1; None if it is not known.
     """
@@ -174,7 +174,7 @@ class PictureHeader:
         """Raise SehdrError for an unknown color space."""
         color_space(self.colorspace)
 
-    def of(self, view: str, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
+    def attributes(self, view: str, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
         """Return the EXR attributes of a picture."""
         values = {**self.provenance, **provenance, "view": view, "baseExposureTime": repr(float(self.base_time))}
         luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
@@ -233,7 +233,7 @@ class Brackets:
             described = {
                 "format": MANIFEST_FORMAT,
                 "software": "sehdr-warp",
-                "units": "relative scene-linear radiance times exposure_time (seconds)",
+                "units": "scene-linear radiance times exposure_time (seconds)",
                 "color_space": self.header.colorspace,
                 "base_exposure_time": self.header.base_time,
                 "multipart": self.multipart,
@@ -283,6 +283,7 @@ class BracketWriter:
         pixels = [linear * exposure.time for exposure in options.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
         pixel = stored_pixel_type(pixels, options.pixel)
+        # write_multipart_exr() gets the raised type alone, so the header says why.
         reason = {"sehdr:pixelType": PAST_HALF} if pixel != options.pixel else {}
         if reason:
             log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)
@@ -290,7 +291,7 @@ class BracketWriter:
         digits = len(str(len(pixels) - 1))  # Tools sort files by name.
         for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
             label = f"b{index:0{digits}d}_{exposure.label}"
-            header = options.header.of(name, exposure.time, camera, ev=repr(exposure.ev)) | reason
+            header = options.header.attributes(name, exposure.time, camera, ev=repr(exposure.ev)) | reason
             parts.append(Part(rgb_channels(image), header, label if options.multipart else ""))
             place = f"{name}/{name}_{label}" if options.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if options.multipart else f"{place}.exr"

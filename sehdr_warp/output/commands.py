@@ -276,14 +276,23 @@ def run_render(args: Render) -> None:
     color_space(args.pictures.colorspace)  # Before anything is loaded
     from .aovs import read_aovs
     from .film import check_rate, film_format, film_library, write_film
-    from .render_views import PATHS, SPLITS, check_cameras, read_size, reframe, render_views, select_cameras
+    from .render_views import (
+        PATHS,
+        check_bracket_options,
+        check_cameras,
+        may_move,
+        read_size,
+        reframe,
+        render_views,
+        select_cameras,
+    )
     from .world_transform import world_transform
 
     if args.out is None and args.video is None:
         problem = "render needs --out, a folder for the pictures, or --video, a film"
         raise UsageError(f"{problem}; see sehdr-warp render --help")
     flags = changed_flags(args.film)
-    if args.out is not None and args.cameras not in SPLITS:
+    if args.out is not None and may_move(args.cameras):
         flags = [flag for flag in flags if flag != "--fps"]
     if args.video is None and flags:
         raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
@@ -294,8 +303,10 @@ def run_render(args: Render) -> None:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
     files, ramp, summary, fps = [], _ramp(args.film.ev_ramp), "", args.film.fps
     check_rate(fps)
-    if args.pictures.aovs:
-        read_aovs(args.pictures.aovs)
+    if (pictures := args.pictures).aovs:
+        read_aovs(pictures.aovs)
+    brackets = {"multipart": pictures.multipart, "ldr_brackets": pictures.ldr_brackets, "group_by": pictures.group_by}
+    check_bracket_options(pictures.evs is not None or pictures.exposures is not None, **brackets)
     size = None if args.size is None else read_size(args.size)
     if args.video is not None:
         film_library()

@@ -1,6 +1,6 @@
 """Scene-linear pictures: OpenEXR, single and multi-part, with the metadata that HDR tools read; and Radiance HDR.
 
-In every file that this package writes, a color pixel is radiance times `expTime` (1 second for a radiance picture).
+In every file that this package writes, a color pixel is radiance times `expTime`, which is 1 in a picture of radiance.
 docs/formats.md lists the attributes and the conventions of the matrices.
 """
 
@@ -54,7 +54,7 @@ def exr_header(
         colorspace: Primaries of the pixels.
         exposure_time: Seconds that radiance was multiplied by.
         camera: Camera of the picture.
-        captured: Local time.
+        captured: Local time that the file states as that of the picture.
         provenance: Text by key, written as `sehdr:<key>`.
         white_luminance: cd/m^2 of a value of 1 in R, G and B.
     """
@@ -90,9 +90,9 @@ PAST_HALF = "float, since half would overflow 65504"
 
 
 def check_pixel_type(pixel: str) -> None:
-    """Raise ValueError unless a pixel type is "half" or "float"."""
+    """Raise SehdrError unless a pixel type is "half" or "float"."""
     if pixel not in _TYPES:
-        raise ValueError(f"pixel type {pixel!r} is not one of {', '.join(_TYPES)}")
+        raise SehdrError(f"pixel type {pixel!r} is not one of {', '.join(_TYPES)}")
 
 
 def stored_pixel_type(arrays: Sequence[np.ndarray], pixel: str = "half") -> str:
@@ -122,8 +122,8 @@ def write_multipart_exr(
 
     Raises:
         InputError: If a value is NaN or infinite (with channel and place), or `path` exists.
-        SehdrError: If the file cannot be written.
-        ValueError: For an unknown pixel type, unequal shapes, or repeated names.
+        SehdrError: If the file cannot be written, or for an unknown pixel type.
+        ValueError: For unequal shapes, or repeated names.
     """
     import OpenEXR
 

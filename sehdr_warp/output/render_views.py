@@ -14,8 +14,9 @@ from ..errors import InputError, SehdrError, did_you_mean
 from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
 from ..progress import track_progress
-from ..scene import Camera, load_cameras
-from ..scene.camera_exchange import EXCHANGE_SUFFIXES, read_exchange_cameras
+from ..scene import Camera
+from ..scene.camera_exchange import EXCHANGE_SUFFIXES
+from ..scene.camera_files import read_camera_file
 from ..scene.images import MAX_PIXELS
 from ..splats import cameras_beside
 from ..subsets import first_names
@@ -41,7 +42,8 @@ PATHS = ("orbit", "interpolate")
 
 _FIT_VIEWS, _FIT_SIZE = 4, 160  # Number and longest side of the pictures that a tone map is fitted to
 _LEAST_ALPHA = 0.01  # Mean coverage below which a picture counts as empty: stray Gaussians are nearly everywhere
-# Written only on request, or only for a path of cameras.
+# Written only on request, or only for a path of cameras: what an earlier render left of them is removed. Every render
+# replaces hdr/ and preview/.
 _OPTIONAL = ("brackets", "brackets_ldr", "brackets.json", "cameras.usda", "cameras.chan", "camera_path.json")
 
 
@@ -75,7 +77,9 @@ def render_views(
     Always written: `hdr/<view>.exr` (R, G, B scene-linear radiance; A coverage; Z distance along the axis, 0 where
     empty; confidence, if the run has it), `preview/<view>.png` (tone-mapped, sRGB) and, for pinholes, `cameras.usda`,
     in which a path of two or more cameras is one moving camera. For such a path also `cameras.chan` (Nuke) and
-    `camera_path.json` (nerfstudio, in the photos' coordinates). A warning names cameras that show nothing of the scene.
+    `camera_path.json` (nerfstudio, in the photos' coordinates). A path is an orbit, an interpolation, or the cameras of
+    a file whose names count up (frame_0001, ...); views of the run and of a COLMAP model are separate photos. A warning
+    names cameras that show nothing of the scene.
 
     Args:
         run: From load_run, train or load_splats.
@@ -125,10 +129,9 @@ def render_views(
             response=run.response,
             group_by=group_by,
         )
-    elif multipart or ldr_brackets or group_by != "view":
-        raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
+    check_bracket_options(brackets is not None, multipart=multipart, ldr_brackets=ldr_brackets, group_by=group_by)
     check_pixel_type(pixel)
-    exposure = exposure_of_white(run, reference_white)
+    hdr_exposure = exposure_of_white(run, reference_white)
     if (ocio is None) != (view is None):
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
     ocio_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
@@ -137,10 +140,9 @@ def render_views(
     if size is not None:
         width, height = read_size(size)
         views = [(name, reframe(camera, width, height)) for name, camera in views]
-    are_photos = str(cameras) in SPLITS or (str(cameras) not in PATHS and Path(cameras).is_dir())
-    camera_files = _camera_files(run, views, transform, fps, moves=not are_photos)
+    camera_files = _camera_files(run, views, transform, fps, moves=may_move(cameras))
     empty = []
-    with ExitStack() as stack:
+    with ExitStack() as stack:  # Closed in reverse order: brackets take their place first, cameras last.
         for name, text in camera_files.items():
             stack.enter_context(atomic_path(out / name, overwrite)).write_text(text, encoding="utf-8")
         hdr_folder = stack.enter_context(atomic_folder(out / "hdr", overwrite))
@@ -150,9 +152,9 @@ def render_views(
         for index, (name, view_camera) in track_progress("rendering views", views, log):
             images = render_images(run, view_camera, transform)
             if images.confidence is None and index == 0:
-                log.info("without a confidence channel: `sehdr-warp report` measures it, from the photos")
-            attributes = header.of(name, exposure, images.camera_in_file)
-            parts = _hdr_parts(images, attributes, colorspace, exposure, aovs)
+                log.info("without a confidence channel; for a run, `sehdr-warp report` measures it, from the photos")
+            attributes = header.attributes(name, hdr_exposure, images.camera_in_file)
+            parts = _hdr_parts(images, attributes, colorspace, hdr_exposure, aovs)
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
             write_picture(preview_folder / f"{name}.png", quantize(to_display(images.hdr)))
@@ -172,6 +174,17 @@ def render_views(
         written = {file.relative_to(out).parts[0] for file in files}
         remove_earlier(out, [name for name in _OPTIONAL if name not in written])
     return files
+
+
+def check_bracket_options(has_exposures: bool, *, multipart: bool, ldr_brackets: str | None, group_by: str) -> None:
+    """Raise SehdrError for options of brackets without exposures; arguments as of render_views."""
+    if not has_exposures and (multipart or ldr_brackets or group_by != "view"):
+        raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
+
+
+def may_move(cameras: str | Path) -> bool:
+    """Return whether a choice of cameras may be one that moves; those of the run and of a COLMAP model are photos."""
+    return str(cameras) in PATHS or (str(cameras) not in SPLITS and not Path(cameras).is_dir())
 
 
 def _hdr_parts(
@@ -311,14 +324,14 @@ def select_cameras(
 
 def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
     """Return the cameras of a file in the scene's coordinates."""
-    views, photos_to_scene = load_cameras(path), from_photos(run)
+    file = read_camera_file(path)
+    views, photos_to_scene = file.cameras, from_photos(run)
     if path.suffix.lower() in EXCHANGE_SUFFIXES:
-        matrix = read_exchange_cameras(path).world_matrix
-        if matrix is None:
+        if file.world_matrix is None:
             to_scene = (transform or world_transform(run)).inverse()
             return [(name, to_scene.camera(camera)) for name, camera in views]
         try:
-            to_photos = WorldTransform.from_matrix(matrix).inverse()
+            to_photos = WorldTransform.from_matrix(file.world_matrix).inverse()
         except ValueError as error:
             raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
         views = [(name, to_photos.camera(camera)) for name, camera in views]

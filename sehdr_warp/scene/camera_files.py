@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import read_json, read_text
 from .camera import Camera, whole_number
-from .camera_exchange import EXCHANGE_SUFFIXES, read_exchange_cameras
+from .camera_exchange import EXCHANGE_SUFFIXES, ExchangeCameras, read_exchange_cameras
 from .colmap_model import find_model, read_model
 from .dataparser import pose_from_camera_to_world
 from .file_names import natural_key
@@ -37,19 +37,23 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     Raises:
         InputError: if the file is damaged, a pose or size is not possible, or two cameras share a name.
     """
-    path = Path(path)
+    return read_camera_file(Path(path)).cameras
+
+
+def read_camera_file(path: Path) -> ExchangeCameras:
+    """Read cameras as load_cameras does, with the transform from the photos' coordinates if the file states it."""
     if path.suffix.lower() in _UNREAD:
         problem = f"{_UNREAD[path.suffix.lower()]} files are not read"
         raise InputError(path, problem, "export the camera as OpenUSD (.usda or .usdc), or from Nuke as .chan")
     if path.is_dir():
-        cameras = _of_colmap(path)
+        file = ExchangeCameras(_of_colmap(path))
     elif path.suffix.lower() in EXCHANGE_SUFFIXES:
-        exchange = read_exchange_cameras(path)
-        cameras = exchange.cameras
-        if not exchange.up_stated:
+        file = read_exchange_cameras(path)
+        if not file.up_stated:
             log.warning("%s: states no upAxis; +Y counts as up, as in USD", path)
     else:
-        cameras = _of_json(path)
+        file = ExchangeCameras(_of_json(path))
+    cameras = file.cameras
     if not cameras:
         raise InputError(path, "lists no cameras", "add at least one")
     names = Counter(name.lower() for name, _ in cameras)
@@ -62,7 +66,7 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
         if camera.width * camera.height > MAX_PIXELS:
             size = f"{camera.width} x {camera.height}"
             raise InputError(path, f"camera {i} is {size}", f"use sizes of 1 to {MAX_PIXELS} pixels")
-    return cameras
+    return file
 
 
 def _of_json(path: Path) -> list[tuple[str, Camera]]:

@@ -122,7 +122,7 @@ def test_full_disk_is_one_line_and_leaves_nothing(tmp_path):
 def test_shapes_must_agree(tmp_path):
     with pytest.raises(ValueError, match="shapes"):
         write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 3)), "G": np.zeros((3, 2))})
-    with pytest.raises(ValueError, match="pixel type"):
+    with pytest.raises(SehdrError, match="pixel type"):
         write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 3))}, pixel="double")
     part = Part({"R": np.zeros((2, 3))}, {}, "b0")
     with pytest.raises(ValueError, match="one name each"):

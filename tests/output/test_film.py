@@ -119,7 +119,8 @@ def test_refusals(tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["mine.mp4"]
     options = {"run": tmp_path, "out": tmp_path}
     still, ramp = Render(**options, film=FilmOptions(fps=25)), Render(**options, film=FilmOptions(ev_ramp="1:2"))
-    for args in (Render(run=tmp_path), still, ramp):
+    photos = Render(**options, cameras=str(tmp_path), film=FilmOptions(fps=25))  # A COLMAP model's folder
+    for args in (Render(run=tmp_path), still, ramp, photos):
         with pytest.raises(UsageError, match="--video"):
             run_render(args)
 
