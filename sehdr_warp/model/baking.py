@@ -160,7 +160,7 @@ def _fuse(field: RadianceField, exposure: np.ndarray) -> np.ndarray:
     """Return fused radiance [N, D, 3] of exposures [N, D, 3] at the base time."""
     assert field.fusion is not None
     logs = torch.from_numpy(np.log(np.maximum(exposure, DARKEST)).reshape(-1, 3).astype(np.float32))
-    fused = field.fusion(logs.to(field.gaussians.means.device))
+    fused = field.fusion(logs.to(field.render_device))
     return fused.cpu().numpy().reshape(exposure.shape).astype(np.float64)
 
 
@@ -239,19 +239,14 @@ def refine(
 
 @torch.no_grad()
 def agreement(
-    gaussians: GaussianArrays, picture: Callable[[Camera], Tensor], cameras: Sequence[Camera], time: float
+    picture: Callable[[Camera], Tensor], reference: Callable[[Camera], Tensor], cameras: Sequence[Camera]
 ) -> float:
-    """Return the PSNR of rendered Gaussians against images, dB, at most 120, over all pixels of some cameras.
+    """Return the PSNR of encoded pictures [H, W, 3] against others, dB, at most 120, over all pixels of some cameras.
 
     Args:
-        gaussians: Gaussians to render, encoded by sRGB.
-        picture: Function from a camera to the encoded reference image [H, W, 3].
+        picture: Function from a camera to the picture.
+        reference: Function from a camera to the picture to compare with.
         cameras: Cameras to compare.
-        time: Exposure time, seconds.
     """
-    field, errors = field_of(gaussians), []
-    for camera in cameras:
-        target = picture(camera)
-        rendered = field.to(target.device).render_ldr(camera, time)
-        errors.append(float((rendered - target).square().mean()))
+    errors = [float((picture(camera) - reference(camera)).square().mean()) for camera in cameras]
     return -10 * math.log10(max(float(np.mean(errors)), 1e-12))

@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..errors import InputError, SehdrError
-from ..files import atomic_path, check_absent
+from ..files import atomic_path
 from ..model.baking import agreement, field_of, gaussians_of, refine
+from ..response import response_by_name
+from ..runs.run import on_device
 from ..scene import Camera
 from ..scene.exposure import shutter
 from ..splats import (
     STREAMED_SOG,
     GaussianArrays,
+    camera_file_of,
+    check_new_file,
     check_suffix,
     color_model_of,
     path_is_lossy,
@@ -56,7 +60,13 @@ def export(
 ) -> Path:
     """Write the Gaussians of a trained run; return the path.
 
-    How well the file keeps the scene is measured on pictures and logged.
+    How well the file keeps the scene is measured on pictures and logged. Harmonics by suffix and kind:
+
+    suffix          kind   color model                   harmonics are fitted, unless the run has
+    .ply            ldr    display                       display colors of this exposure
+    .ply            hdr    linear as the run, else log   linear or log colors without fusion
+    USD             hdr    linear                        linear colors without fusion
+    .glb and small  ldr    display                       display colors of this exposure
 
     Args:
         run: From load_run, train, load_splats or merge_scenes.
@@ -65,8 +75,8 @@ def export(
             scene-linear radiance. None: hdr for USD, else ldr.
         exposure_time: Seconds, of ldr colors; by default the scene's.
         degree: Pad harmonics with zeros up to this degree, for readers that take no other; at most 3.
-        cameras: Also write `<stem>.cameras.json` beside it, in the form of the reference release of 3D Gaussian
-            Splatting.
+        cameras: Also write `<name>.cameras.json` beside it (scene.ply.cameras.json), in the form of the reference
+            release of 3D Gaussian Splatting.
         axes: "upright" or "scene" (see world_transform); None keeps the coordinates of a file of Gaussians, and only
             turns them over if one file has +Y up and the other -Y.
         up: As in world_transform.
@@ -82,37 +92,32 @@ def export(
     file_model = color_model_of(path)
     kind = kind or ("hdr" if file_model == "linear" else "ldr")
     _check(path, kind, file_model, exposure_time, degree)
-    beside = path.with_name(f"{path.stem}.cameras.json")
-    if path.name == STREAMED_SOG:
-        check_absent(path.parent, overwrite, folder=True)
-        if cameras:
-            raise InputError(path, "fills its folder, which has no place for cameras", "leave --cameras out")
-    for file in (path, *[beside] * cameras):
-        check_absent(file, overwrite)  # Before minutes of fitting.
-    upright, to_file = _file_coordinates(run, path, axes, up, scale)
+    check_new_file(path, cameras=cameras, overwrite=overwrite)  # Before minutes of fitting
+    for_edits, to_file = _file_coordinates(run, path, axes, up, scale)
     seconds = run.base_time if exposure_time is None else float(exposure_time)
-    # Colors that are converted to Rec.709 are shown with middle grey as the photos have it.
-    time = seconds if run.color_matrix is None else seconds * display_gain(run.response)
-    radiance = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
-    color_model = "display" if kind == "ldr" else radiance
+    # Colors that are converted to Rec.709 are encoded by sRGB, at the exposure that shows middle grey as the photos do.
+    display_time = seconds if run.color_matrix is None else seconds * display_gain(run.response)
+    hdr_model = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
     means = run.field.gaussians.means.detach().cpu().numpy()
-    edits.check_regions(upright.points(run.field.normalization.scene_points(means)))  # Before minutes of fitting
-    whole = _gaussians_in_colors(run, color_model, time)
-    mask = edits.mask(whole.opacities, upright.points(whole.means), run)
-    gaussians = _select_rows(run, whole, mask, edits, time)
-    file_gaussians = gaussians if to_file.is_identity else gaussians.transformed(to_file.matrix)
+    edits.check_regions(for_edits.points(run.field.normalization.scene_points(means)))  # Before minutes of fitting
+    whole = _gaussians_in_colors(run, "display" if kind == "ldr" else hdr_model, display_time)
+    mask = edits.mask(whole.opacities, for_edits.points(whole.means), run)
+    part = _select_rows(run, whole, mask, edits, display_time)
+    written = part if to_file.is_identity else part.transformed(to_file.matrix)
     if run.world_matrix is not None:
-        file_gaussians = replace(file_gaussians, world_matrix=stored_matrix(run, to_file))
-    write_gaussians(path, file_gaussians.padded(degree or 0), overwrite=overwrite)
+        written = replace(written, world_matrix=stored_matrix(run, to_file))
+    written = written.padded(degree or 0)
+    write_gaussians(path, written, overwrite=overwrite)
     if cameras:
-        _write_cameras(beside, run, to_file, overwrite)
+        _write_cameras(camera_file_of(path), run, to_file, overwrite)
     meaning = f"display colors of {shutter(seconds)}" if kind == "ldr" else "scene-linear radiance"
-    count, harmonics = file_gaussians.count, max(file_gaussians.degree, degree or 0)
-    log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, count, harmonics, meaning)
-    reference = gaussians if edits.shows_part else None
-    _log_loss(run, whole if edits.shows_part else gaussians, kind, time, is_part=edits.shows_part)
+    log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, written.count, written.degree, meaning)
+    if edits.shows_part:
+        _log_loss(run, whole, kind, display_time, note=", before the cut")
+    else:
+        _log_loss(run, part, kind, display_time)
     if path_is_lossy(path):
-        _log_file_loss(path, run, reference, to_file, kind, time)
+        _log_file_loss(path, run, part if edits.shows_part else None, to_file, display_time)
     return path
 
 
@@ -120,11 +125,11 @@ class _FileCoordinates(NamedTuple):
     """Transforms from the scene's coordinates.
 
     Attributes:
-        upright: To those that edits are in: upright ones, or those that export() was asked for.
+        for_edits: To those that the regions of edits are in: `axes`, before a file with -Y up is turned over.
         to_file: To those of the file.
     """
 
-    upright: WorldTransform
+    for_edits: WorldTransform
     to_file: WorldTransform
 
 
@@ -136,39 +141,39 @@ def _file_coordinates(
         turn = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) != is_y_down(path) else np.eye(3)
         turned = WorldTransform(turn, np.zeros(3))
         return _FileCoordinates(turned, turned)
-    upright = world_transform(run, axes, up=up, scale=scale)
-    return _FileCoordinates(upright, file_transform(upright, path) if axes == "upright" else upright)
+    requested = world_transform(run, axes, up=up, scale=scale)
+    return _FileCoordinates(requested, file_transform(requested, path) if axes == "upright" else requested)
 
 
 def _select_rows(
-    run: "RenderableScene",
-    gaussians: GaussianArrays,
-    mask: np.ndarray,
-    edits: SplatEdits,
-    time: float,
+    run: "RenderableScene", gaussians: GaussianArrays, mask: np.ndarray, edits: SplatEdits, display_time: float
 ) -> GaussianArrays:
     """Return the Gaussians of a mask without strays; the most visible ones, refined, if they are too many."""
     part, most = gaussians.rows(mask), edits.max_gaussians
     if most is not None and part.count > most:
         subset = gaussians.rows(most_visible(mask, most, run))
-        picture = _gaussians_renderer(part, time, run) if edits.changes_pictures else _photo_renderer(run, time)
+        # The fit must not bring back what an edit removed, floaters included.
+        picture = _renderer(part, run, display_time) if edits.changes_pictures else _photo_renderer(run, display_time)
         part = refine(subset, picture, training_cameras(run)) if gaussians.color_model == "display" else subset
     return without_strays(part, training_cameras(run))
 
 
-def _gaussians_in_colors(run: "RenderableScene", color_model: str, time: float) -> GaussianArrays:
+def _gaussians_in_colors(run: "RenderableScene", color_model: str, display_time: float) -> GaussianArrays:
     """Return the Gaussians of a run in the scene's coordinates and in the colors of a file.
 
-    Display colors are those of a photo of `time` seconds.
+    Display colors are those of a photo of `display_time` seconds.
     """
     photos = training_cameras(run)
     positions = np.array([camera.position for camera in photos]).reshape(-1, 3)
     if color_model != "display":
         return gaussians_of(run.field, color_model, positions, color_matrix=run.color_matrix)
-    gaussians = gaussians_of(run.field, "display", positions, time, run.color_matrix)
-    if run.field.color_model.name == "display" and time == run.base_time and run.color_matrix is None:
-        return gaussians  # They are the run's own.
-    return refine(gaussians, _photo_renderer(run, time), photos)
+    if run.field.color_model.name == "display" and display_time == run.base_time and run.color_matrix is None:
+        return gaussians_of(run.field, "display", positions)
+    if run.is_paged:
+        problem = f"does not fit into {run.device}, on which display colors are fitted to pictures"
+        raise SehdrError(f"{run.path}: {problem}; use --device cpu, or kind hdr in a .ply")
+    gaussians = gaussians_of(run.field, "display", positions, display_time, run.color_matrix)
+    return refine(gaussians, _photo_renderer(run, display_time), photos)
 
 
 def _check(path: Path, kind: str, file_model: str | None, exposure_time: float | None, degree: int | None) -> None:
@@ -193,50 +198,44 @@ def loss_in_words(decibels: float) -> str:
     return "visible loss"
 
 
-def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, time: float, *, is_part: bool) -> None:
-    """Measure and log how well Gaussians in the scene's coordinates show the scene.
-
-    is_part: The file holds a part of the scene, so these are all of its Gaussians.
-    """
+def _log_loss(
+    run: "RenderableScene", gaussians: GaussianArrays, kind: str, display_time: float, note: str = ""
+) -> None:
+    """Measure and log how well Gaussians in the scene's coordinates show the scene; `note` ends the line's views."""
     views = _cameras_to_compare(run)
-    where = f"{len(views)} view{'s' * (len(views) != 1)}" + ", before the cut" * is_part
+    where = f"{len(views)} view{'s' * (len(views) != 1)}{note}"
     if not views:
         log.info("it is not compared with the scene, which has no cameras of its own")
     elif kind == "ldr":
-        decibels = agreement(gaussians, _photo_renderer(run, time), views, time)
+        decibels = agreement(_renderer(gaussians, run, display_time), _photo_renderer(run, display_time), views)
         words = loss_in_words(decibels)
         text = "kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white"
         log.info(text, decibels, where, words)
     else:
-        dark = time / 2**_DARKER
-        bright, dim = (agreement(gaussians, _display_renderer(run, t), views, t) for t in (time, dark))
+        times = display_time, display_time / 2**_DARKER
+        bright, dim = (agreement(_renderer(gaussians, run, t), _srgb_renderer(run, t), views) for t in times)
         words = loss_in_words(min(bright, dim))
         text = "kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s (%s)"
         log.info(text, bright, dim, _DARKER, where, words)
 
 
 def _log_file_loss(
-    path: Path,
-    run: "RenderableScene",
-    reference: GaussianArrays | None,
-    to_file: WorldTransform,
-    kind: str,
-    time: float,
+    path: Path, run: "RenderableScene", part: GaussianArrays | None, to_file: WorldTransform, display_time: float
 ) -> None:
-    """Measure and log what a compressed file loses, read back, beside the scene or the edited Gaussians."""
+    """Measure and log what a compressed file loses, read back, beside the part that was exported or the scene."""
     views = _cameras_to_compare(run)
     if not views:
         return
     # SPZ does not state the exposure time.
-    gaussians = replace(read_gaussians(path).transformed(to_file.inverse().matrix), base_time=time)
-    if reference is None:
-        picture, beside = _photo_renderer(run, time), "the scene"
+    gaussians = replace(read_gaussians(path).transformed(to_file.inverse().matrix), base_time=display_time)
+    if part is None:
+        reference, name = _photo_renderer(run, display_time), "the scene"
     else:
-        picture, beside = _gaussians_renderer(reference, time, run), "what was exported"
-    decibels = agreement(gaussians, picture, views, time)
+        reference, name = _renderer(part, run, display_time), "what was exported"
+    decibels = agreement(_renderer(gaussians, run, display_time), reference, views)
     files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
     size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
-    log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, beside, loss_in_words(decibels), size)
+    log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, name, loss_in_words(decibels), size)
 
 
 def _cameras_to_compare(run: "RenderableScene") -> Sequence[Camera]:
@@ -246,22 +245,20 @@ def _cameras_to_compare(run: "RenderableScene") -> Sequence[Camera]:
 
 
 def _photo_renderer(run: "RenderableScene", time: float) -> Callable:
-    """Return a function that renders simulated photos, or light for a scene in a sensor's colors."""
-    return _display_renderer(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
+    """Return a function that renders simulated photos; in Rec.709 and sRGB if the photos have a sensor's colors."""
+    return _srgb_renderer(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
 
-def _gaussians_renderer(gaussians: GaussianArrays, time: float, run: "RenderableScene") -> Callable:
-    """Return a function that renders simulated photos of Gaussians in the scene's coordinates, on the run's device."""
-    field = field_of(gaussians).to(run.device)
-    return lambda camera: field.render_ldr(camera, time)
-
-
-def _display_renderer(run: "RenderableScene", time: float) -> Callable:
+def _srgb_renderer(run: "RenderableScene", time: float) -> Callable:
     """Return a function that renders radiance at an exposure time, encoded by sRGB."""
-    from ..response import response_by_name
-
     encode = response_by_name("srgb").encode
     return lambda camera: encode(run.render(camera).hdr * time)
+
+
+def _renderer(gaussians: GaussianArrays, run: "RenderableScene", time: float) -> Callable:
+    """Return a function that renders Gaussians in the scene's coordinates as sRGB, on the run's device."""
+    field = on_device(field_of(gaussians), run.device)
+    return lambda camera: field.render_ldr(camera, time)
 
 
 def _write_cameras(path: Path, run: "RenderableScene", transform: WorldTransform, overwrite: bool) -> None:

@@ -7,8 +7,9 @@ are. It blends into half floats, which light.js exposes: light above white stays
 import base64
 import logging
 import zlib
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from .html import data_block, join, json_block, page_file, page_markup, whole_pa
 from .light_pictures import curve_table
 from .splat_edits import SplatEdits, most_visible, without_strays
 from .tonemap import display_gain
-from .world_transform import world_transform
+from .world_transform import WorldTransform, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -64,6 +65,12 @@ def write_scene_page(
     if edits.shows_part and not cameras:  # What is left is looked at from outside.
         opening = opening_facts(Splats(Path(run.path), field_of(gaussians), ()))
     gaussians.require_finite(path)
+    entries = run.cameras
+    if gaussians.means.dtype == np.float64:  # Map coordinates: a page's float32 would be too coarse.
+        from_middle = WorldTransform(np.eye(3), -gaussians.means.mean(0))
+        gaussians = replace(gaussians, means=from_middle.points(gaussians.means))
+        entries = [replace(entry, camera=from_middle.camera(entry.camera)) for entry in entries]
+        opening = _moved(opening, from_middle)
     harmonics = np.clip(gaussians.harmonics * np.float32(run.base_time), -_HALF, _HALF)
     columns = dict(zip("xyz", gaussians.means.T))
     # As 3DGS has them: a color is 0.5 and the sum.
@@ -74,7 +81,7 @@ def write_scene_page(
     columns |= {f"scale_{i}": column for i, column in enumerate(gaussians.log_scales.T)}
     columns |= {f"rot_{i}": column for i, column in enumerate(gaussians.unit_quaternions.T)}
     values = np.stack(list(columns.values()))
-    facts = facts_of_cameras(run.cameras) | {
+    facts = facts_of_cameras(entries) | {
         **opening,
         "up": transform.rotation[1].tolist(),
         "columns": list(columns),
@@ -99,6 +106,14 @@ def write_scene_page(
         temporary.write_text(page, encoding="utf-8")
     log.info("%s: %d Gaussians, %.1f MB; light above white stays", path.name, gaussians.count, len(page) / 1e6)
     return path
+
+
+def _moved(facts: dict[str, Any], transform: WorldTransform) -> dict[str, Any]:
+    """Return opening_facts() in other coordinates of the same size."""
+    if facts["opening"] is not None:
+        camera = transform.camera(Camera.from_dict(facts["opening"]))
+        facts = facts | {"opening": camera.to_dict()}
+    return facts | {"focus": transform.points(np.array(facts["focus"])).tolist()} if "focus" in facts else facts
 
 
 def _pack(values: np.ndarray) -> str:

@@ -35,7 +35,8 @@ class EditOptions:
     """Gaussians that the file leaves out."""
 
     crop: str | None = None
-    """Keep only this region, in upright coordinates: sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1."""
+    """Keep only this region, in upright coordinates or those of --axes: sphere:x,y,z,radius or
+    box:x0,y0,z0,x1,y1,z1."""
     cut: str | None = None
     """Leave this region out, written as that of --crop."""
     min_opacity: float = 1 / 255
@@ -97,7 +98,8 @@ class Mesh:
     """The file: .usda or .usdc (OpenUSD) or .obj."""
     world: WorldOptions = field(default_factory=WorldOptions)
     crop: str | None = None
-    """Mesh only this region, in upright coordinates: sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1."""
+    """Mesh only this region, in upright coordinates or those of --axes: sphere:x,y,z,radius or
+    box:x0,y0,z0,x1,y1,z1."""
     resolution: int = 160
     """Voxels along the longest side; memory grows with its cube."""
     overwrite: bool = False
@@ -137,18 +139,16 @@ def run_mesh(args: Mesh) -> None:
 
 def run_export(args: Export) -> None:
     """Run `sehdr-warp export`."""
-    from ..splats import check_suffix
+    from ..splats import check_new_file, check_suffix
 
     if args.out.suffix.lower() in _MESH_SUFFIXES:
         raise UsageError(f"{args.out}: meshes are written by sehdr-warp mesh {args.run} --out {args.out.stem}.usdc")
     is_page = check_suffix(args.out, ".html") == ".html"
-    if is_page:
-        from ..files import check_absent
-
-        if flags := [*changed_flags(args.world), *changed_flags(args.file), *["--cameras"] * args.cameras]:
-            refused = ", ".join(flags)
-            raise UsageError(f"{refused}: without effect on a page, which has its own exposure, cameras and axes")
-        check_absent(args.out, args.overwrite)
+    flags = [*changed_flags(args.world), *changed_flags(args.file), *["--cameras"] * args.cameras]
+    if is_page and flags:
+        refused = ", ".join(flags)
+        raise UsageError(f"{refused}: without effect on a page, which has its own exposure, cameras and axes")
+    check_new_file(args.out, cameras=args.cameras, overwrite=args.overwrite)
     edits = _splat_edits(args.edits)
     run = open_scene(args.run, args.device)
     edits = _with_masks(edits, args.edits, run)
@@ -167,7 +167,7 @@ def run_export(args: Export) -> None:
 
 def run_convert(args: Convert) -> None:
     """Run `sehdr-warp convert`."""
-    from ..splats import check_suffix
+    from ..splats import check_new_file, check_suffix
 
     if args.out.suffix.lower() == ".html":
         raise UsageError(f"{args.out}: pages are written by sehdr-warp export {args.source} --out {args.out}")
@@ -176,6 +176,7 @@ def run_convert(args: Convert) -> None:
         raise UsageError(f"{args.source}: is a folder; runs are written by {command}")
     check_suffix(args.source)
     check_suffix(args.out)
+    check_new_file(args.out, overwrite=args.overwrite)
     from .splat_edits import SplatEdits
 
     options = {"axes": None, "edits": SplatEdits(min_opacity=0), "overwrite": args.overwrite}

@@ -76,8 +76,8 @@ class SplatEdits:
     """Gaussians that a file leaves out.
 
     Attributes:
-        crop: Region to keep (see read_region), in upright coordinates.
-        cut: Region to leave out.
+        crop: Region to keep (see read_region), in the coordinates of `axes`, by default upright ones.
+        cut: Region to leave out, in the same coordinates.
         min_opacity: Least opacity of a Gaussian, in [0, 1).
         min_views: Least number of training cameras that show a Gaussian; 2 removes most floaters.
         max_gaussians: Number of Gaussians to keep, those that contribute most to the training views.
@@ -107,20 +107,20 @@ class SplatEdits:
 
     @property
     def shows_part(self) -> bool:
-        """True if the file is meant to show a part of the scene."""
+        """True if the file shows a part of the scene, so that pictures of the whole do not tell what it lost."""
         return bool(self.crop or self.cut or self.mask_views is not None)
 
     @property
     def changes_pictures(self) -> bool:
-        """True if the file is meant to show something else than the scene."""
+        """True if the file shows less than the scene: a part, or the scene without floaters or haze."""
         return bool(self.shows_part or self.min_views or self.min_opacity > LEAST_OPACITY)
 
-    def mask(self, opacities: np.ndarray, upright_means: np.ndarray, run: "RenderableScene") -> np.ndarray:
+    def mask(self, opacities: np.ndarray, means: np.ndarray, run: "RenderableScene") -> np.ndarray:
         """Return [N], which Gaussians stay.
 
         Args:
             opacities: [N] of the run's Gaussians, in [0, 1].
-            upright_means: [N, 3] their positions in upright coordinates.
+            means: [N, 3] their positions in the coordinates of the regions.
             run: The scene, whose training cameras count views.
 
         Raises:
@@ -128,7 +128,7 @@ class SplatEdits:
         """
         too_faint = self.min_opacity <= LEAST_OPACITY
         faint = "too faint for any program to draw" if too_faint else f"of opacity below {self.min_opacity:g}"
-        steps = {faint: opacities < self.min_opacity} | self._outside(upright_means)
+        steps = {faint: opacities < self.min_opacity} | self._outside(means)
         if self.min_views:
             cameras = training_cameras(run)
             if not cameras:
@@ -144,28 +144,28 @@ class SplatEdits:
             if goes.any():
                 log.info("left out: %d Gaussians (%.0f %%) %s", goes.sum(), 100 * goes.mean(), reason)
         if not mask.any():
-            raise _empty_file_error(upright_means)
+            raise _empty_file_error(means)
         return mask
 
-    def check_regions(self, upright_means: np.ndarray) -> None:
-        """Raise SehdrError if crop and cut leave none of the Gaussians at upright_means [N, 3]."""
-        if np.any([np.zeros(len(upright_means), bool), *self._outside(upright_means).values()], axis=0).all():
-            raise _empty_file_error(upright_means)
+    def check_regions(self, means: np.ndarray) -> None:
+        """Raise SehdrError if crop and cut leave none of the Gaussians at means [N, 3]."""
+        if np.any([np.zeros(len(means), bool), *self._outside(means).values()], axis=0).all():
+            raise _empty_file_error(means)
 
-    def _outside(self, upright_means: np.ndarray) -> dict[str, np.ndarray]:
+    def _outside(self, means: np.ndarray) -> dict[str, np.ndarray]:
         """Return [N] which Gaussians crop and cut remove, by what the log says of them."""
         steps = {}
         if self.crop:
-            steps[f"outside of {self.crop}"] = ~read_region(self.crop).contains(upright_means)
+            steps[f"outside of {self.crop}"] = ~read_region(self.crop).contains(means)
         if self.cut:
-            steps[f"inside of {self.cut}"] = read_region(self.cut).contains(upright_means)
+            steps[f"inside of {self.cut}"] = read_region(self.cut).contains(means)
         return steps
 
 
-def _empty_file_error(upright_means: np.ndarray) -> SehdrError:
-    low, high = (np.percentile(upright_means, q, axis=0) for q in (2, 98))
+def _empty_file_error(means: np.ndarray) -> SehdrError:
+    low, high = (np.percentile(means, q, axis=0) for q in (2, 98))
     extent = " to ".join(", ".join(f"{v:.3g}" for v in corner) for corner in (low, high))
-    return SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in upright coordinates")
+    return SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in the coordinates of these regions")
 
 
 def most_visible(mask: np.ndarray, count: int, run: "RenderableScene") -> np.ndarray:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputError
+from ..files import check_absent
 from .arrays import GaussianArrays
 from .compressed_ply import SUFFIX as COMPRESSED_PLY
 from .compressed_ply import write_compressed_ply
@@ -53,7 +54,6 @@ FORMATS = {
 }
 """By suffix, and by name for streamed SOG."""
 SUFFIXES = tuple(suffix for suffix in FORMATS if suffix != STREAMED_SOG)
-LOSSY_SUFFIXES = tuple(suffix for suffix in SUFFIXES if FORMATS[suffix].is_lossy)
 _OTHER = {
     ".splat": "holds 8 bits and no harmonics",
     ".ksplat": "holds a viewer's own compression",
@@ -90,10 +90,27 @@ def color_model_of(path: Path | str) -> str | None:
     return FORMATS[check_suffix(path)].color_model
 
 
+def camera_file_of(path: Path) -> Path:
+    """Return the path of the cameras that are written beside a file of Gaussians, in its coordinates."""
+    return path.with_name(f"{path.name}.cameras.json")
+
+
 def cameras_beside(path: Path) -> Path | None:
     """Return the file beside a file of Gaussians that holds cameras in its coordinates; None if there is none."""
-    names = (f"{path.stem}.cameras.json", "cameras.json")
-    return next((file for name in names if (file := path.with_name(name)).is_file()), None)
+    # A PLY's cameras were once named without .ply. Other files of that stem have other axes than they.
+    once = [path.with_name(f"{path.stem}.cameras.json")] * (path.suffix.lower() == ".ply")
+    files = (camera_file_of(path), *once, path.with_name("cameras.json"))
+    return next((file for file in files if file.is_file()), None)
+
+
+def check_new_file(path: Path, *, cameras: bool = False, overwrite: bool = False) -> None:
+    """Raise InputError if a file of Gaussians, or cameras beside it, would replace what may not be replaced."""
+    if path.name == STREAMED_SOG:
+        check_absent(path.parent, overwrite, folder=True)
+        if cameras:
+            raise InputError(path, "fills its folder, which has no place for cameras", "leave --cameras out")
+    for file in (path, *[camera_file_of(path)] * cameras):
+        check_absent(file, overwrite)
 
 
 def read_gaussians(path: Path | str) -> GaussianArrays:
@@ -124,7 +141,7 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
         far = float(np.abs(gaussians.means).max())
         log.warning(
             "%s: positions up to %.4g are too large for the float32 of the file, which moves Gaussians; "
-            "without --axes scene they are relative to the scene",
+            "use --axes upright, which puts the scene at the origin",
             *(Path(path).name, far),
         )
     FORMATS[check_suffix(path)].write(Path(path), gaussians, overwrite)
@@ -135,7 +152,9 @@ __all__ = [
     "SUFFIXES",
     "USD_SUFFIXES",
     "GaussianArrays",
+    "camera_file_of",
     "cameras_beside",
+    "check_new_file",
     "check_suffix",
     "color_model_of",
     "path_is_lossy",

@@ -16,7 +16,7 @@ from sehdr_warp.output.ocio import ocio_view
 from sehdr_warp.own_files import LIST
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_cameras
-from sehdr_warp.splats import LOSSY_SUFFIXES, USD_SUFFIXES, GaussianArrays, read_gaussians, write_gaussians
+from sehdr_warp.splats import USD_SUFFIXES, GaussianArrays, color_model_of, read_gaussians, write_gaussians
 from tests.ocio_config import ocio_config
 from tests.output.helpers import camera
 
@@ -52,10 +52,8 @@ def make_splats(*suffixes: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
         arrays = [np.full((3, *shape), 0.25, np.float32) for shape in ((3,), (3,), (4,), (), (4, 3))]
         for suffix in suffixes:
-            write_gaussians(
-                folder / f"a{suffix}",
-                GaussianArrays(*arrays, "display" if suffix in (".glb", *LOSSY_SUFFIXES) else "linear", 0.5),
-            )
+            file = folder / f"a{suffix}"
+            write_gaussians(file, GaussianArrays(*arrays, color_model_of(file) or "linear", 0.5))
         if ".usda" in suffixes:
             (folder / "b.usda").write_text(usd_cameras([("a", camera(16, 12)), ("b", camera(8, 8))], np.eye(4)))
         (folder / LIST).unlink()

@@ -102,7 +102,10 @@ def test_export_writes_files_that_render_and_convert(run, tmp_path, capsys):
     assert call("export", run, "--out", file, "--kind", "hdr", "--cameras", "--device", "cpu") == 0
     assert file.read_bytes().startswith(b"ply\n") and str(file) in capsys.readouterr().out
     assert call("convert", file, other, "--degree", 3, "--device", "cpu") == 0
-    assert call("render", other, "--cameras", "train", "--out", tmp_path / "views", "--device", "cpu") == 0
+    assert call("render", file, "--cameras", "train", "--out", tmp_path / "views", "--device", "cpu") == 0
+    view = json.loads((run / "scene.json").read_text())["views"][0]
+    (tmp_path / "mine.json").write_text(json.dumps({"cameras": [{"name": "a", **view["camera"]}]}))
+    assert call("render", other, "--cameras", tmp_path / "mine.json", "--out", tmp_path / "b", "--device", "cpu") == 0
     assert call("convert", file, tmp_path / "scene.splat") == 1
     assert "holds 8 bits" in capsys.readouterr().err and not (tmp_path / "scene.splat").exists()
 

@@ -7,16 +7,18 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of, gaussians_of
-from sehdr_warp.output.export import _gaussians_renderer, export
-from sehdr_warp.output.splat_commands import Export, run_export
+from sehdr_warp.model.paged_field import PagedField
+from sehdr_warp.output.commands import Render, ViewFileOptions, run_render
+from sehdr_warp.output.export import _renderer, export
+from sehdr_warp.output.splat_commands import Convert, Export, run_convert, run_export
 from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras
-from sehdr_warp.splats import LOSSY_SUFFIXES, read_gaussians, write_gaussians
+from sehdr_warp.splats import read_gaussians, write_gaussians
 
 from ..splats.test_other_tools import write_ply
-from ..splats.test_splat_files import gaussians
+from ..splats.test_splat_files import LOSSY_SUFFIXES, gaussians
 from .helpers import Entry, camera
 
 
@@ -84,30 +86,60 @@ def test_colors_of_other_primaries_are_shown_as_srgb(tmp_path, run, logged):
 
 
 def test_colors_are_fitted_on_the_device_of_the_run(tmp_path, device):
-    renderer = _gaussians_renderer(gaussians(degree=1), 0.5, Splats(tmp_path, field_of(gaussians()).to(device), ()))
+    renderer = _renderer(gaussians(degree=1), Splats(tmp_path, field_of(gaussians()).to(device), ()), 0.5)
     assert renderer(camera()).device == torch.device(device)
 
 
 def test_cameras_beside_are_read_again(tmp_path, run):
     export(run, tmp_path / "a.ply", kind="hdr", cameras=True, axes="scene")
-    first = json.loads((tmp_path / "a.cameras.json").read_text())[1]
+    first = json.loads((tmp_path / "a.ply.cameras.json").read_text())[1]
     assert set(first) == {"id", "img_name", "width", "height", "position", "rotation", "fy", "fx"}
     splats = load_splats(tmp_path / "a.ply")
     for entry, original in zip(splats.cameras, run.cameras, strict=True):
         np.testing.assert_allclose(entry.camera.world_to_camera, original.camera.world_to_camera, atol=1e-9)
-    assert [name for name, _ in load_cameras(tmp_path / "a.cameras.json")] == ["0", "1", "2"]
-    (tmp_path / "b.cameras.json").write_text("mine")
+    assert [name for name, _ in load_cameras(tmp_path / "a.ply.cameras.json")] == ["0", "1", "2"]
+    (tmp_path / "b.ply.cameras.json").write_text("mine")
     with pytest.raises(InputError, match=r"cameras.json: exists already"):
         export(run, tmp_path / "b.ply", cameras=True)
     assert not (tmp_path / "b.ply").exists()
+
+
+def test_cameras_are_of_one_file_and_not_of_another_with_its_stem(tmp_path, run):
+    """A PLY is turned over and a GLB is not: cameras of one would see the other upside down."""
+    export(run, tmp_path / "a.ply", cameras=True)
+    export(run, tmp_path / "a.glb")
+    assert load_splats(tmp_path / "a.glb").cameras == () and len(load_splats(tmp_path / "a.ply").cameras) == 3
+    (tmp_path / "a.ply.cameras.json").rename(tmp_path / "a.cameras.json")  # Its earlier name
+    assert load_splats(tmp_path / "a.glb").cameras == () and len(load_splats(tmp_path / "a.ply").cameras) == 3
+
+
+def test_a_scene_that_does_not_fit_into_the_device_is_exported_as_light_alone(tmp_path, run, logged):
+    run.field = PagedField(run.field, torch.device("cpu"), 10**9)
+    with pytest.raises(SehdrError, match="does not fit into cpu.* or kind hdr in a .ply"):
+        export(run, tmp_path / "a.ply")
+    export(run, tmp_path / "a.ply", kind="hdr")
+    assert any(line.startswith("kept: 120.0 dB of the scene at 0 EV") for line in logged)
+
+
+def test_what_is_refused_is_refused_before_the_scene_is_read(tmp_path):
+    (tmp_path / "damaged.ply").write_text("ply")
+    for name in ("a.ply", "a.html", "a.glb.cameras.json"):
+        (tmp_path / name).write_text("mine")
+    for name in ("a.ply", "a.html", "a.glb"):
+        with pytest.raises(InputError, match="exists already"):
+            run_export(Export(run=tmp_path / "damaged.ply", out=tmp_path / name, cameras=name == "a.glb"))
+    with pytest.raises(InputError, match="exists already"):
+        run_convert(Convert(source=tmp_path / "damaged.ply", out=tmp_path / "a.ply"))
+    with pytest.raises(SehdrError, match="brackets need exposures"):
+        run_render(Render(run=tmp_path / "damaged.ply", out=tmp_path, pictures=ViewFileOptions(multipart=True)))
 
 
 def test_panoramas_are_not_among_the_pinholes_beside_a_file(tmp_path, run, logged):
     panorama = replace(camera(64, 32), fx=1.0, fy=1.0, projection="equirectangular")
     run = Splats(run.path, run.field, (*run.cameras, Entry("around", "train", panorama)))
     export(run, tmp_path / "a.ply", cameras=True)
-    assert [name for name, _ in load_cameras(tmp_path / "a.cameras.json")] == ["0", "1", "2"]
-    assert any("a.cameras.json: without around" in line for line in logged)
+    assert [name for name, _ in load_cameras(tmp_path / "a.ply.cameras.json")] == ["0", "1", "2"]
+    assert any("a.ply.cameras.json: without around" in line for line in logged)
 
 
 def test_unusable_requests(tmp_path, run):

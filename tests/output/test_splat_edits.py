@@ -151,7 +151,9 @@ def test_the_pixels_of_a_panorama_are_no_mask(tmp_path):
 
 
 def test_edits_that_leave_nothing_say_where_the_scene_is(tmp_path, run, monkeypatch):
-    with pytest.raises(SehdrError, match=r"leave no Gaussian; the scene lies at .* in upright coordinates"):
+    with pytest.raises(
+        SehdrError, match=r"leave no Gaussian; the scene lies at .* in the coordinates of these regions"
+    ):
         export(run, tmp_path / "a.ply", edits=SplatEdits(crop="sphere:99,0,0,1"))
     with monkeypatch.context() as patch:
         patch.setattr("sehdr_warp.output.export.gaussians_of", lambda *_, **__: pytest.fail("colors were fitted first"))

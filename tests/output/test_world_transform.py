@@ -208,7 +208,7 @@ def test_pictures_of_a_turned_file_state_the_way_from_the_photos(tmp_path, axes)
         ("out/camera_path.json", file, path),
         ("out/cameras.usda", run, map(to_photos.camera, path)),
         ("out/camera_path.json", run, map(to_photos.camera, path)),
-        ("turned.cameras.json", file, own),
+        ("turned.ply.cameras.json", file, own),
     ):
         for (_, a), b in zip(select_cameras(scene, tmp_path / source), expected, strict=True):
             np.testing.assert_allclose(a.world_to_camera, b.world_to_camera, atol=1e-5)

@@ -14,10 +14,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.splats import LOSSY_SUFFIXES, GaussianArrays, check_suffix, read_gaussians, write_gaussians
+from sehdr_warp.splats import GaussianArrays, check_suffix, read_gaussians, write_gaussians
 
 from .test_npm_parsers import package
-from .test_splat_files import gaussians
+from .test_splat_files import LOSSY_SUFFIXES, gaussians
 
 SHARED = Path(os.environ.get("SEHDR_SHARED", "../shared")) / "data" / "splats"
 

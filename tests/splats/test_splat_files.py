@@ -7,8 +7,9 @@ import pytest
 from plyfile import PlyData
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.splats import GaussianArrays, read_gaussians, write_gaussians
+from sehdr_warp.splats import SUFFIXES, GaussianArrays, path_is_lossy, read_gaussians, write_gaussians
 
+LOSSY_SUFFIXES = [suffix for suffix in SUFFIXES if path_is_lossy(f"a{suffix}")]
 ARRAYS = ("means", "log_scales", "opacity_logits", "harmonics", "unit_quaternions")
 
 

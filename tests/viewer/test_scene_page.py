@@ -1,8 +1,10 @@
 """The page to send, in a real browser and from disk: the light is that of our own renders."""
 
+import base64
 import json
 import re
 import time
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError, UsageError
+from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.export import export
 from sehdr_warp.output.images import as_array
 from sehdr_warp.output.scene_page import write_scene_page
@@ -17,10 +20,11 @@ from sehdr_warp.output.splat_commands import Export, run_export
 from sehdr_warp.output.splat_edits import SplatEdits
 from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.output.world_transform import world_transform
-from sehdr_warp.runs.run import load_splats
+from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera
 from sehdr_warp.training.train import train
 
+from ..output.helpers import Entry, camera
 from ..output.test_splat_edits import run_of, splats
 from ..training.toy import toy_scene
 from .browser import browser, page_of, pinch, pixels
@@ -98,10 +102,37 @@ def test_a_part_of_a_file_without_cameras_is_framed(tmp_path):
     scene.cameras = ()
     x, y, z = world_transform(scene).points(np.array([8.0, 0, 0]))
     file = write_scene_page(scene, tmp_path / "part.html", edits=SplatEdits(crop=f"sphere:{x},{y},{z},2"))
-    facts = json.loads(re.search(r'id="facts">(.*?)</script>', file.read_text())[1])
-    opening = Camera.from_dict(facts["opening"])
+    opening = Camera.from_dict(read_page(file)[0]["opening"])
     _, column, _, inside = opening.project(places[40:])
     assert inside.mean() > 0.8 and np.ptp(column[inside]) > 0.3 * opening.width
+
+
+@pytest.mark.parametrize("has_cameras", [True, False])
+def test_a_page_of_map_coordinates_is_that_of_the_scene_near_the_origin(tmp_path, has_cameras):
+    """float32 would move Gaussians of UTM coordinates by up to 0.25 m."""
+    random = np.random.default_rng(0)
+    places, pages = random.normal(size=(40, 3)), []
+    places -= places.mean(0)
+    for at in (np.zeros(3), np.array([5e5, 5.4e6, 100.0])):
+        gaussians = replace(splats(places, np.full(40, 0.9), scale=0.1), means=places + at)
+        views = [camera(position=at + np.array([i, 0, -6]), target=at) for i in range(3)] if has_cameras else []
+        entries = tuple(Entry(str(i), "train", view) for i, view in enumerate(views))
+        pages.append(write_scene_page(Splats(tmp_path / "s", field_of(gaussians), entries), tmp_path / f"{at[0]}.html"))
+    (facts, means), (far_facts, far_means) = map(read_page, pages)
+    np.testing.assert_allclose(far_means, means, atol=1e-6)
+    assert len(facts["views"]) == len(far_facts["views"]) == (3 if has_cameras else 0)
+    cameras = zip(*([each["opening"], *(view["camera"] for view in each["views"])] for each in (facts, far_facts)))
+    for near, far in cameras:
+        np.testing.assert_allclose(far["world_to_camera"], near["world_to_camera"], atol=1e-5)
+    np.testing.assert_allclose(far_facts["focus"], facts["focus"], atol=1e-5)
+
+
+def read_page(file):
+    """Return the facts and the means [3, N] of a page."""
+    text = file.read_text()
+    facts = json.loads(re.search(r'id="facts">(.*?)</script>', text)[1])
+    packed = re.search(r'id="means">(.*?)</script>', text)[1]
+    return facts, np.frombuffer(zlib.decompress(base64.b64decode(packed)), "<f4").reshape(3, -1)
 
 
 def test_two_fingers_come_nearer_and_one_turns(run, tmp_path):
