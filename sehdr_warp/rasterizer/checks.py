@@ -5,7 +5,7 @@ Nothing here waits for a GPU: values are looked at on the CPU alone.
 
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any
 
@@ -53,6 +53,14 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
         raise ValueError(f"{first_name} is on {first.device}, expected the CPU or a CUDA device")
 
 
+def check_shape(name: str, value: Any, shape: Sequence[int]) -> None:
+    """Raise TypeError or ValueError if a value is not a tensor of this shape, of any dtype."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} is a {type(value).__name__}, expected a tensor {list(shape)}")
+    if value.shape != torch.Size(shape):
+        raise ValueError(f"{name} has shape {list(value.shape)}, expected {list(shape)}")
+
+
 def integer(name: str, value: Any, least: int, most: int) -> int:
     """Return the value as an int; raise TypeError for another kind of number, ValueError for one out of range."""
     try:
@@ -94,9 +102,10 @@ def check_render_options(near_plane: Any, alpha_threshold: Any, **flags: Any) ->
     flags: by name, options that are True or False.
     """
     real("near_plane", near_plane, is_positive, "a positive number")
-    real("alpha_threshold", alpha_threshold, lambda number: 0.0 < number < 1.0, "between 0 and 1")
+    # A float32 below 1e-37 is less exact than others, and soon 0.
+    real("alpha_threshold", alpha_threshold, lambda number: 1e-37 < number < 1.0, "between 1e-37 and 1")
     for name, flag in flags.items():
-        if flag not in (True, False):
+        if not isinstance(flag, bool):
             raise TypeError(f"{name} is {flag!r:.60}, expected True or False")
 
 

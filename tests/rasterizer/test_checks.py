@@ -73,7 +73,9 @@ def with_nan_and_logits(opacities):
         ("alpha_threshold", lambda _: float("nan"), ValueError, "alpha_threshold nan is not"),
         ("near_plane", lambda _: None, TypeError, "near_plane is None, expected a number"),
         ("eps2d", lambda _: torch.tensor(0.3), TypeError, r"eps2d is tensor\(0.3000\), expected a number"),
+        ("alpha_threshold", lambda _: 1e-50, ValueError, "alpha_threshold 1e-50 is not between 1e-37 and 1"),
         ("antialiased", lambda _: "no", TypeError, "antialiased is 'no', expected True or False"),
+        ("depth", lambda _: np.bool_(1), TypeError, "depth is .*True_?, expected True or False"),
     ],
 )
 def test_misfits_of_a_render_are_named(name, change, kind, message):
@@ -89,7 +91,7 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
         ("focal_length", "60", TypeError, "focal_length is '60', expected a number"),
         ("pixel_angle", NAN, ValueError, "pixel_angle nan is not a number from 0"),
         ("near_plane", -1.0, ValueError, "near_plane -1.0 is not a positive number"),
-        ("alpha_threshold", 1.0, ValueError, "alpha_threshold 1.0 is not between 0 and 1"),
+        ("alpha_threshold", 1.0, ValueError, "alpha_threshold 1.0 is not between 1e-37 and 1"),
         ("antialiased", None, TypeError, "antialiased is None, expected True or False"),
         (
             "position",

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from ...rasterizer import spherical_harmonics as evaluate
-from ...rasterizer.checks import check_tensors
+from ...rasterizer.checks import check_shape, check_tensors, integer
 from ...rasterizer.harmonics import MAX_DEGREE
 
 
@@ -27,8 +27,8 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
     check_degree("degrees_to_use", degrees_to_use)
     batch = tuple(dirs.shape[:-1]) if isinstance(dirs, Tensor) else ()
     check_tensors(dirs=(dirs, (*batch, 3)), coeffs=(coeffs, (*batch, "K", 3)))
-    if masks is not None and masks.shape != batch:
-        raise ValueError(f"masks has shape {list(masks.shape)}, expected {list(batch)}")
+    if masks is not None:
+        check_shape("masks", masks, batch)
     shape = dirs.shape
     origin = dirs.new_zeros(3)
     values = evaluate(degrees_to_use, coeffs.reshape(-1, *coeffs.shape[-2:]), dirs.reshape(-1, 3), origin)
@@ -37,6 +37,9 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
 
 
 def check_degree(name: str, degree: int) -> None:
-    """Raise ValueError for a degree that gsplat has and the rasterizer does not."""
-    if degree > MAX_DEGREE:
+    """Raise TypeError or ValueError for what is not a degree, and for one that gsplat has and the rasterizer does not.
+
+    gsplat's own are 0 to 4.
+    """
+    if integer(name, degree, 0, 4) > MAX_DEGREE:
         raise ValueError(f"{name} {degree} is not supported, expected 0 to {MAX_DEGREE}")

@@ -1,14 +1,14 @@
-"""The arguments of rasterization(): checked, and taken apart by camera."""
+"""The arguments of rasterization(): checked, and split by camera."""
 
 import math
-from collections.abc import Iterator
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ...rasterizer import spherical_harmonics
-from ...rasterizer.checks import check_tensors, integer
+from ...rasterizer.checks import check_tensors
 from .harmonics import check_degree
 
 UNSUPPORTED = {
@@ -44,7 +44,10 @@ def check_supported(values: dict[str, Any], rolling_shutter: Any) -> None:
 
 
 class View(NamedTuple):
-    """The inputs of one camera of one batch."""
+    """The tensors of one camera of one scene, as rasterization() takes them without batch and camera axes.
+
+    position: [3] of the camera, for harmonics; None without them.
+    """
 
     means: Tensor
     quats: Tensor | None
@@ -55,7 +58,7 @@ class View(NamedTuple):
     extra_signals: Tensor | None
     viewmat: Tensor
     K: Tensor
-    position: Tensor
+    position: Tensor | None
     background: Tensor | None
 
     def features(self, sh_degree: int | None, rows: Tensor | None) -> list[Tensor]:
@@ -65,118 +68,94 @@ class View(NamedTuple):
             return tensor if rows is None else tensor[rows]
 
         features = [of_rows(tensor) for tensor in (self.colors, self.extra_signals) if tensor is not None]
-        if sh_degree is not None and self.colors is not None:
+        if self.position is not None and sh_degree is not None:
             values = spherical_harmonics(sh_degree, features[0], of_rows(self.means), self.position)
             features[0] = (values + 0.5).clamp_min(0.0)
         return features
 
 
-class Inputs(NamedTuple):
-    """The arguments with one batch axis of B."""
+def split_views(
+    means: Any,
+    quats: Any,
+    scales: Any,
+    covars: Any,
+    opacities: Any,
+    colors: Any,
+    extra_signals: Any,
+    viewmats: Any,
+    Ks: Any,
+    backgrounds: Any,
+    sh_degree: int | None,
+) -> list[View]:
+    """Check shapes, types and devices of rasterization()'s tensors; return those of each camera, scene by scene.
 
-    means: Tensor
-    quats: Tensor | None
-    scales: Tensor | None
-    covars: Tensor | None
-    opacities: Tensor
-    colors: Tensor | None
-    extra_signals: Tensor | None
-    viewmats: Tensor
-    Ks: Tensor
-    backgrounds: Tensor | None
-    by_camera: tuple[bool, bool]
+    All have the batch axes of means. covars take the place of quats and scales. Colors, extra_signals and backgrounds
+    may be None.
+    """
+    batch = tuple(means.shape[:-2]) if isinstance(means, Tensor) else ()
+    color_axes: tuple[int | str, ...] = ("N", "D")
+    if sh_degree is not None:
+        check_degree("sh_degree", sh_degree)
+        color_axes = ("N", "K", 3)
+        if isinstance(colors, Tensor) and colors.ndim == 3:  # gsplat 1.6 shares coefficients among scenes.
+            colors = colors.expand(batch + colors.shape)
+    feature_axes = {"colors": (colors, color_axes), "extra_signals": (extra_signals, ("N", "E"))}
+    features = {name: each for name, each in feature_axes.items() if each[0] is not None}
+    by_camera = {
+        name
+        for name, (tensor, axes) in features.items()
+        if isinstance(tensor, Tensor) and tensor.ndim == len(batch) + len(axes) + 1
+    }
 
-    @staticmethod
-    def flattened(
-        means: Any,
-        quats: Any,
-        scales: Any,
-        opacities: Any,
-        colors: Any,
-        extra_signals: Any,
-        viewmats: Any,
-        Ks: Any,
-        backgrounds: Any,
-        covars: Any,
-        sh_degree: int | None,
-    ) -> "Inputs":
-        """Check the arguments' shapes, types and devices, and flatten their batch axes to one.
+    shapes: dict[str, Any] = {"means": (means, (*batch, "N", 3))}
+    if covars is None:
+        shapes |= {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
+    else:
+        quats = scales = None
+        shapes["covars"] = (covars, (*batch, "N", 3, 3))
+    shapes |= {
+        "opacities": (opacities, (*batch, "N")),
+        "viewmats": (viewmats, (*batch, "C", 4, 4)),
+        "Ks": (Ks, (*batch, "C", 3, 3)),
+    }
+    for name, (tensor, axes) in features.items():
+        shapes[name] = (tensor, (*batch, *(("C",) if name in by_camera else ()), *axes))
+    if backgrounds is not None:
+        channels = sum(
+            tensor.shape[-1] for tensor, _ in features.values() if isinstance(tensor, Tensor) and tensor.ndim
+        )
+        shapes["backgrounds"] = (backgrounds, (*batch, "C", channels))
+    check_tensors(**shapes)
+    if colors is not None and sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
+        raise ValueError(
+            f"colors has shape {list(colors.shape)}, but sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} "
+            "coefficients"
+        )
+    if not math.prod(viewmats.shape[:-2]):
+        raise ValueError(f"viewmats has shape {list(viewmats.shape)}, which has no camera")
+    for name, (tensor, _) in features.items():
+        if not tensor.shape[-1]:
+            raise ValueError(f"{name} has shape {list(tensor.shape)}, which has no channel")
 
-        colors and extra_signals may be None.
-        """
-        batch = tuple(means.shape[:-2]) if isinstance(means, Tensor) else ()
-        inner: tuple[int | str, ...] = ("N", "D")
-        if sh_degree is not None:
-            check_degree("sh_degree", integer("sh_degree", sh_degree, 0, 4))
-            inner = ("N", "K", 3)
-            if isinstance(colors, Tensor) and colors.ndim == 3:  # gsplat 1.6 shares coefficients among scenes.
-                colors = colors.expand(batch + colors.shape)
+    # The inverse of a singular matrix is not finite: its camera shows nothing.
+    positions = None if sh_degree is None else torch.linalg.inv_ex(viewmats)[0][..., :3, 3]
 
-        def by_camera(features: Any, inner: tuple) -> bool:
-            return isinstance(features, Tensor) and features.ndim == len(batch) + len(inner) + 1
+    def own(tensor: Tensor | None, index: tuple[int, ...]) -> Tensor | None:
+        return None if tensor is None else tensor[index]
 
-        def feature_shape(features: Any, inner: tuple) -> tuple:
-            return *batch, *(("C",) if by_camera(features, inner) else ()), *inner
-
-        shapes: dict[str, Any] = {"means": (means, (*batch, "N", 3))}
-        if covars is None:
-            shapes |= {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
-        else:
-            shapes["covars"] = (covars, (*batch, "N", 3, 3))
-        shapes |= {
-            "opacities": (opacities, (*batch, "N")),
-            "viewmats": (viewmats, (*batch, "C", 4, 4)),
-            "Ks": (Ks, (*batch, "C", 3, 3)),
-        }
-        if colors is not None:
-            shapes["colors"] = (colors, feature_shape(colors, inner))
-        if extra_signals is not None:
-            shapes["extra_signals"] = (extra_signals, feature_shape(extra_signals, ("N", "E")))
-        if backgrounds is not None:
-            features = [tensor for tensor in (colors, extra_signals) if isinstance(tensor, Tensor) and tensor.ndim]
-            shapes["backgrounds"] = (backgrounds, (*batch, "C", sum(tensor.shape[-1] for tensor in features)))
-        check_tensors(**shapes)
-        if colors is not None and sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
-            raise ValueError(
-                f"colors has shape {list(colors.shape)}, but sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} "
-                "coefficients"
-            )
-        if not math.prod(viewmats.shape[:-2]):
-            raise ValueError(f"viewmats has shape {list(viewmats.shape)}, which has no camera")
-        for name, features in (("colors", colors), ("extra_signals", extra_signals)):
-            if features is not None and not features.shape[-1]:
-                raise ValueError(f"{name} has shape {list(features.shape)}, which has no channel")
-
-        def flat(tensor: Tensor | None) -> Tensor | None:
-            if tensor is None or len(batch) == 1:
-                return tensor
-            return tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :])
-
-        values = means, quats, scales, covars, opacities, colors, extra_signals, viewmats, Ks, backgrounds
-        both = by_camera(colors, inner), by_camera(extra_signals, ("N", "E"))
-        return Inputs(*map(flat, values), both)  # pyright: ignore[reportCallIssue]
-
-    def views(self) -> Iterator[View]:
-        """Yield the inputs of each camera, batch by batch."""
-
-        def own(features: Tensor | None, batch: int, camera: int, by_camera: bool) -> Tensor | None:
-            if features is None:
-                return None
-            return features[batch, camera] if by_camera else features[batch]
-
-        inverse, _ = torch.linalg.inv_ex(self.viewmats)  # Of a singular matrix not finite: it then shows nothing.
-        for batch in range(len(self.means)):
-            for camera in range(self.viewmats.shape[1]):
-                yield View(
-                    self.means[batch],
-                    None if self.quats is None else self.quats[batch],
-                    None if self.scales is None else self.scales[batch],
-                    None if self.covars is None else self.covars[batch],
-                    self.opacities[batch],
-                    own(self.colors, batch, camera, self.by_camera[0]),
-                    own(self.extra_signals, batch, camera, self.by_camera[1]),
-                    self.viewmats[batch, camera],
-                    self.Ks[batch, camera],
-                    inverse[batch, camera, :3, 3],
-                    None if self.backgrounds is None else self.backgrounds[batch, camera],
-                )
+    return [
+        View(
+            means[camera[:-1]],
+            own(quats, camera[:-1]),
+            own(scales, camera[:-1]),
+            own(covars, camera[:-1]),
+            opacities[camera[:-1]],
+            own(colors, camera if "colors" in by_camera else camera[:-1]),
+            own(extra_signals, camera if "extra_signals" in by_camera else camera[:-1]),
+            viewmats[camera],
+            Ks[camera],
+            own(positions, camera),
+            own(backgrounds, camera),
+        )
+        for camera in product(*map(range, viewmats.shape[:-2]))
+    ]

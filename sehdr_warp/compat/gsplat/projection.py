@@ -1,15 +1,16 @@
-"""gsplat's projection: any of its cameras that a matrix describes, covariances, and the tiles that Gaussians touch."""
+"""gsplat's projection: any of its cameras that a matrix describes, and covariances."""
 
 import math
-from itertools import product
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ...rasterizer.checks import check_tensors
+from ...rasterizer.checks import check_tensors, integer, is_not_negative, real
 from ...rasterizer.projection import FRUSTUM_MARGIN, ProjectedGaussians, project_to_camera
-from ...rasterizer.render_options import ALPHA_THRESHOLD, RenderOptions
+from ...rasterizer.render_options import ALPHA_THRESHOLD, MAX_SIDE, RenderOptions
+from .inputs import View, split_views
+from .splats import JoinedSplats
 
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS = "pinhole", "ortho", "fisheye"
@@ -17,81 +18,60 @@ SMALLEST_SIZE = 1e-30  # A size of 0 has no logarithm; its gradient is 0 as the 
 LARGEST_SIZE = 1e12  # Scene units. The squares of larger ones are not finite in an image.
 
 
-def check_camera_model(camera_model: Any) -> None:
-    """Raise ValueError if it is not one of CAMERA_MODELS."""
-    if camera_model not in CAMERA_MODELS:
-        raise ValueError(f"camera_model {camera_model!r} is none of {', '.join(CAMERA_MODELS)}")
-
-
-class Culling(NamedTuple):
-    """Limits beyond which Gaussians are left out.
+class ProjectionOptions(NamedTuple):
+    """The arguments of a projection that are not tensors.
 
     Attributes:
+        width: of the images, pixels.
+        height: of the images, pixels.
         near_plane: least depth, scene units.
         far_plane: largest depth, scene units.
         radius_clip: Gaussians whose radii in pixels are not larger are left out.
-    """
-
-    near_plane: float = 0.01
-    far_plane: float = 1e10
-    radius_clip: float = 0.0
-
-
-def project_gaussians(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    *,
-    eps2d: float,
-    culling: Culling,
-    antialiased: bool,
-    camera_model: CameraModel,
-) -> ProjectedGaussians:
-    """Project N Gaussians to one camera, by the rasterizer's kernel if it can, else by torch's operations.
-
-    Args:
-        means: [N, 3].
-        quats: [N, 4]; None with covars.
-        scales: [N, 3]; None with covars.
-        covars: [N, 3, 3], in place of quats and scales.
-        opacities: [N].
-        viewmat: [4, 4].
-        K: [3, 3].
-        width: of the image, pixels.
-        height: of the image, pixels.
         eps2d: variance in square pixels added to each 2D Gaussian.
-        culling: limits of depth and radius.
         antialiased: lower opacities so that eps2d keeps a Gaussian's energy.
-        camera_model: "pinhole", "ortho" or "fisheye".
+        camera_model: one of CAMERA_MODELS.
     """
-    near = max(culling.near_plane, 1e-30)
-    if camera_model == "pinhole" and quats is not None and scales is not None:
+
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    antialiased: bool
+    camera_model: CameraModel
+
+    def checked(self) -> "ProjectionOptions":
+        """Return the options with sizes as plain integers; raise TypeError or ValueError for values out of range."""
+        if self.camera_model not in CAMERA_MODELS:
+            raise ValueError(f"camera_model {self.camera_model!r} is none of {', '.join(CAMERA_MODELS)}")
+        for name in ("near_plane", "far_plane", "radius_clip"):
+            real(name, getattr(self, name), lambda number: not math.isnan(number), "a number")
+        real("eps2d", self.eps2d, is_not_negative, "a number from 0")
+        width, height = integer("width", self.width, 1, MAX_SIDE), integer("height", self.height, 1, MAX_SIDE)
+        return self._replace(width=width, height=height)
+
+
+def project_gaussians(view: View, options: ProjectionOptions) -> ProjectedGaussians:
+    """Project the N Gaussians of a view, by the rasterizer's kernel if it can, else by torch's operations."""
+    near_plane = max(options.near_plane, 1e-30)
+    if options.camera_model == "pinhole" and view.quats is not None and view.scales is not None:
+        K, size = view.K, (options.width, options.height)
         intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-        options = RenderOptions(width, height, near, eps2d, ALPHA_THRESHOLD, antialiased)
-        log_scales = scales.abs().clamp_min(SMALLEST_SIZE).log()
+        log_scales = view.scales.abs().clamp_min(SMALLEST_SIZE).log()
         projected = project_to_camera(
-            means, log_scales, quats, opacities, viewmat, intrinsics, options, differentiate_compensation=True
+            *(view.means, log_scales, view.quats, view.opacities, view.viewmat, intrinsics),
+            RenderOptions(*size, near_plane, options.eps2d, ALPHA_THRESHOLD, options.antialiased),
+            differentiate_compensation=True,
         )
     else:
-        if covars is None:
-            assert quats is not None and scales is not None
-            covars = _finite_covariances(quats, scales)
-        assert covars is not None
-        projected = _project_covariances(
-            means, covars, opacities, viewmat, K, width, height, eps2d, near, antialiased, camera_model
-        )
+        projected = _project_covariances(view, options._replace(near_plane=near_plane))
     extents = projected.extents
-    if culling.far_plane < 1e10:
-        extents = extents * (projected.depths.detach() <= culling.far_plane)[:, None]
-    if culling.radius_clip > 0:
-        extents = extents * (extents.ceil() > culling.radius_clip).any(1, keepdim=True)
-    return projected if extents is projected.extents else projected._replace(extents=extents)
+    if options.far_plane < 1e10:
+        extents = extents * (projected.depths.detach() <= options.far_plane)[:, None]
+    if options.radius_clip > 0:
+        extents = extents * (extents.ceil() > options.radius_clip).any(1, keepdim=True)
+    return projected._replace(extents=extents)
 
 
 def _finite_covariances(quats: Tensor, scales: Tensor) -> Tensor:
@@ -103,42 +83,34 @@ def _finite_covariances(quats: Tensor, scales: Tensor) -> Tensor:
     return torch.where(usable[:, None, None], covars, math.nan)
 
 
-def _project_covariances(
-    means: Tensor,
-    covars: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    eps2d: float,
-    near_plane: float,
-    antialiased: bool,
-    camera_model: CameraModel,
-) -> ProjectedGaussians:
+def _project_covariances(view: View, options: ProjectionOptions) -> ProjectedGaussians:
+    means, opacities, viewmat, K, covars = view.means, view.opacities, view.viewmat, view.K, view.covars
+    if covars is None:
+        assert view.quats is not None and view.scales is not None
+        covars = _finite_covariances(view.quats, view.scales)
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     finite = means.isfinite().all(1) & covars.isfinite().all(2).all(1) & opacities.isfinite()
     opacities = torch.where(finite, opacities, 0.0)
     centers = torch.where(finite[:, None], means, 0.0) @ rotation.T + translation
-    inside = finite & (centers[:, 2] > near_plane) & viewmat.isfinite().all() & K.isfinite().all()
+    inside = finite & (centers[:, 2] > options.near_plane) & viewmat.isfinite().all() & K.isfinite().all()
     # What is culled takes part as a point in front of the camera, so that its derivatives are finite.
     centers = torch.where(inside[:, None], centers, centers.new_tensor([0.0, 0.0, 1.0]))
     covars = torch.where(inside[:, None, None], covars, torch.eye(3, dtype=covars.dtype, device=covars.device))
-    means2d, jacobian = _linearize(centers, K, width, height, camera_model)
+    means2d, jacobian = _linearize(centers, K, options)
     to_image = jacobian @ rotation
     covars2d = to_image @ covars @ to_image.transpose(1, 2)
     xx, xy, yy = covars2d[:, 0, 0], covars2d[:, 0, 1], covars2d[:, 1, 1]
-    unblurred, xx, yy = xx * yy - xy * xy, xx + eps2d, yy + eps2d
+    unblurred, xx, yy = xx * yy - xy * xy, xx + options.eps2d, yy + options.eps2d
     determinant = xx * yy - xy * xy
     inside = inside & (determinant > 0) & determinant.isfinite()
     determinant = torch.where(inside, determinant, 1.0)
-    if antialiased:
+    if options.antialiased:
         opacities = opacities * (unblurred / determinant).clamp_min(1e-12).sqrt()
     with torch.no_grad():
         cutoffs = 2 * torch.log((opacities / ALPHA_THRESHOLD).clamp_min(1.0))
         extents = (cutoffs[:, None] * torch.stack([xx, yy], 1)).clamp_min(0.0).sqrt()
         inside = inside & (opacities > ALPHA_THRESHOLD)
-        size = means2d.new_tensor([width, height])
+        size = means2d.new_tensor([options.width, options.height])
         inside = inside & ((means2d + extents > 0) & (means2d - extents < size)).all(1)
         extents = torch.where(inside[:, None], extents, 0.0)
     conics = torch.stack([yy, -xy, xx], 1) / determinant[:, None]
@@ -151,15 +123,15 @@ def _project_covariances(
     )
 
 
-def _linearize(centers: Tensor, K: Tensor, width: int, height: int, camera_model: CameraModel) -> tuple[Tensor, Tensor]:
+def _linearize(centers: Tensor, K: Tensor, options: ProjectionOptions) -> tuple[Tensor, Tensor]:
     """Return the pixels [N, 2] of places in front of the camera [N, 3] and the Jacobian there [N, 2, 3]."""
     x, y, z = centers.unbind(1)
     focal, principal = torch.stack([K[0, 0], K[1, 1]]), torch.stack([K[0, 2], K[1, 2]])
     zero, one = torch.zeros_like(x), torch.ones_like(x)
-    if camera_model == "ortho":
+    if options.camera_model == "ortho":
         by_place = [one, zero, zero], [zero, one, zero]
         rays = torch.stack([x, y], 1)
-    elif camera_model == "fisheye":
+    elif options.camera_model == "fisheye":
         squared = x * x + y * y + 1e-14
         radius = squared.sqrt()
         angle, distance = torch.atan2(radius, z), squared + z * z
@@ -172,7 +144,7 @@ def _linearize(centers: Tensor, K: Tensor, width: int, height: int, camera_model
         rays = torch.stack([x, y], 1) * stretch[:, None]
     else:
         rays = torch.stack([x, y], 1) / z[:, None]
-        size = K.new_tensor([width, height])
+        size = K.new_tensor([options.width, options.height])
         margin = FRUSTUM_MARGIN * size / 2
         clamped_rays = torch.minimum(
             torch.maximum(rays, -(principal + margin) / focal), (size - principal + margin) / focal
@@ -275,124 +247,22 @@ def fully_fused_projection(
     """
     if sparse_grad:
         raise ValueError("sparse_grad = True is not supported, expected False")
-    check_camera_model(camera_model)
+    options = ProjectionOptions(
+        *(width, height, near_plane, far_plane, radius_clip, eps2d, calc_compensations, camera_model)
+    ).checked()
     if isinstance(covars, Tensor) and covars.shape[-1] == 6:
         covars = covars[..., (0, 1, 2, 1, 3, 4, 2, 4, 5)].unflatten(-1, (3, 3))
-    batch = tuple(means.shape[:-2]) if isinstance(means, Tensor) else ()
-    shapes: dict[str, tuple[Any, tuple[int | str, ...]]] = {"covars": (covars, (*batch, "N", 3, 3))}
-    if covars is None:
-        shapes = {"quats": (quats, (*batch, "N", 4)), "scales": (scales, (*batch, "N", 3))}
-    if opacities is not None:
-        shapes["opacities"] = opacities, (*batch, "N")
-    cameras = {"viewmats": (viewmats, (*batch, "C", 4, 4)), "Ks": (Ks, (*batch, "C", 3, 3))}
-    check_tensors(means=(means, (*batch, "N", 3)), **shapes, **cameras)
-    alphas = torch.ones_like(means[..., 0]) if opacities is None else opacities
-    indices = list(product(*map(range, (*batch, viewmats.shape[-3]))))
-    if not indices:
-        raise ValueError(f"viewmats has shape {list(viewmats.shape)}, expected a camera at least")
-    views = [
-        project_gaussians(
-            means[scene], _row(quats, scene), _row(scales, scene), _row(covars, scene), alphas[scene],
-            viewmats[*scene, camera], Ks[*scene, camera], width, height, eps2d=eps2d,
-            culling=Culling(near_plane, far_plane, radius_clip), antialiased=calc_compensations,
-            camera_model=camera_model,
-        )
-        for *axes, camera in indices
-        for scene in (tuple(axes),)
-    ]  # fmt: skip
-    shape = *batch, viewmats.shape[-3]
-    means2d, conics, depths, lowered, extents = (torch.stack(v).unflatten(0, shape) for v in zip(*views, strict=True))
-    compensations = lowered / alphas[..., None, :].clamp_min(1e-30) if calc_compensations else None
-    radii = extents.ceil().int()
-    if not packed:
-        return radii, means2d, depths, conics, compensations
-    batch_ids, camera_ids, gaussian_ids = (radii > 0).all(-1).reshape(-1, *radii.shape[-3:-1]).nonzero(as_tuple=True)
-    rows = (batch_ids * shape[-1] + camera_ids) * radii.shape[-2] + gaussian_ids
-    packed_compensations = None if compensations is None else compensations.reshape(-1)[rows]
-    values = (value.flatten(0, -2)[rows] for value in (radii, means2d, depths[..., None], conics))
-    packed_radii, packed_means, packed_depths, packed_conics = values
-    parts = packed_radii, packed_means, packed_depths[:, 0], packed_conics, packed_compensations
-    return batch_ids, camera_ids, gaussian_ids, *parts
-
-
-def _row(tensor: Tensor | None, place: tuple[int, ...]) -> Tensor | None:
-    return None if tensor is None else tensor[place]
-
-
-def isect_tiles(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
-    sort: bool = True,
-    segmented: bool = False,
-    packed: bool = False,
-    n_images: int | None = None,
-    image_ids: Tensor | None = None,
-    gaussian_ids: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the tiles that the bounding rectangles of 2D Gaussians touch.
-
-    Args:
-        means2d: [..., N, 2] or, packed, [nnz, 2].
-        radii: [..., N, 2] or [nnz, 2] int32.
-        depths: [..., N] or [nnz], positive.
-        tile_size: in pixels.
-        tile_width: tiles across.
-        tile_height: tiles down.
-        sort: whether to sort by image, tile and depth.
-        segmented: has no effect.
-        packed: whether inputs are packed.
-        n_images: has no effect beside image_ids.
-        image_ids: [nnz] if packed.
-        gaussian_ids: has no effect.
-
-    Returns:
-        tiles_per_gauss [..., N] or [nnz] int32; isect_ids [M] int64, in bits from the highest: image, tile, 32 bits of
-        the depth; flatten_ids [M] int32, the index in the flattened inputs.
-
-    Raises:
-        TypeError: for what is not a tensor.
-        ValueError: for shapes, dtypes or devices that do not fit.
-    """
-    batch = tuple(depths.shape[:-1]) if isinstance(depths, Tensor) else ()
-    check_tensors(depths=(depths, (*batch, "N")), means2d=(means2d, (*batch, "N", 2)))
-    if not isinstance(radii, Tensor) or radii.shape != means2d.shape:
-        problem = f"has shape {list(radii.shape)}" if isinstance(radii, Tensor) else f"is a {type(radii).__name__}"
-        raise ValueError(f"radii {problem}, expected a tensor {list(means2d.shape)}")
-    shape = depths.shape
-    if image_ids is None:
-        images = math.prod(shape[:-1])
-        image_ids = torch.arange(images, device=depths.device).repeat_interleave(shape[-1]).reshape(-1)
-    centers, reach, depths = means2d.detach().reshape(-1, 2), radii.reshape(-1, 2), depths.detach().reshape(-1)
-    limits = torch.tensor([tile_width, tile_height], device=centers.device)
-    low = ((centers - reach) / tile_size).floor().clamp_min(0).minimum(limits).long()
-    high = ((centers + reach) / tile_size).ceil().clamp_min(0).minimum(limits).long()
-    spans = torch.where((reach > 0).all(1, keepdim=True), (high - low).clamp_min(0), 0)
-    counts = spans.prod(1)
-    flatten_ids = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-    places = torch.arange(len(flatten_ids), device=counts.device) - (counts.cumsum(0) - counts)[flatten_ids]
-    across = spans[flatten_ids, 0].clamp_min(1)
-    tiles = (low[flatten_ids, 1] + places // across) * tile_width + low[flatten_ids, 0] + places % across
-    bits = depths.float().view(torch.int32).long() & 0xFFFFFFFF
-    keys = (image_ids[flatten_ids] << _tile_bits(tile_width, tile_height)) | tiles
-    isect_ids = (keys << 32) | bits[flatten_ids]
-    if sort:
-        isect_ids, order = isect_ids.sort(stable=True)
-        flatten_ids = flatten_ids[order]
-    return counts.int().reshape(shape), isect_ids, flatten_ids.int()
-
-
-def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
-    """Return [C, tile_height, tile_width] int32: where each tile's intersections begin among sorted isect_ids."""
-    tiles = torch.arange(n_images * tile_width * tile_height, device=isect_ids.device)
-    image, tile = tiles // (tile_width * tile_height), tiles % (tile_width * tile_height)
-    keys = (image << _tile_bits(tile_width, tile_height)) | tile
-    offsets = torch.searchsorted((isect_ids >> 32).contiguous(), keys)
-    return offsets.int().reshape(n_images, tile_height, tile_width)
-
-
-def _tile_bits(tile_width: int, tile_height: int) -> int:
-    return math.floor(math.log2(tile_width * tile_height)) + 1
+    if opacities is None:
+        check_tensors(means=(means, (*means.shape[:-1], 3) if isinstance(means, Tensor) else ("N", 3)))
+        opacities = torch.ones_like(means[..., 0])
+    views = split_views(means, quats, scales, covars, opacities, None, None, viewmats, Ks, None, None)
+    projections = [project_gaussians(view, options) for view in views]
+    if calc_compensations:
+        projections = [
+            projected._replace(opacities=projected.opacities / view.opacities.clamp_min(1e-30))
+            for projected, view in zip(projections, views, strict=True)
+        ]
+    splats = JoinedSplats.of(projections, packed, viewmats.shape[:-2])
+    means2d, conics, depths, compensations, extents = splats.all
+    values = extents.ceil().int(), means2d, depths, conics, compensations if calc_compensations else None
+    return (*splats.ids(viewmats.shape[-3]), *values) if packed else values

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ...rasterizer.checks import check_tensors
+from ...rasterizer.checks import check_shape, check_tensors
 from ...rasterizer.relocation import MOST_COPIES, relocation_sums
 
 
@@ -24,8 +24,7 @@ def compute_relocation(
         ValueError: for shapes, dtypes or devices that do not fit.
     """
     check_tensors(opacities=(opacities, ("N",)), scales=(scales, ("N", 3)))
-    if ratios.shape != opacities.shape:
-        raise ValueError(f"ratios has shape {list(ratios.shape)}, expected [N] with N = {len(opacities)}")
+    check_shape("ratios", ratios, opacities.shape)
     count = ratios.long().clamp(1, MOST_COPIES)
     shared = 1 - (1 - opacities.double()).pow(1 / count)
     powers = shared[:, None] ** torch.arange(1, MOST_COPIES + 1, device=opacities.device)

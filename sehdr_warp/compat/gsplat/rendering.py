@@ -1,19 +1,18 @@
 """gsplat's rasterization() made of the rasterizer's stages."""
 
-import math
-from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from ...rasterizer.checks import integer, is_not_negative, real
+from ...rasterizer.checks import integer
 from ...rasterizer.memory import oom_context
 from ...rasterizer.rasterization import render_projected
 from ...rasterizer.render_options import MAX_SIDE, RenderOptions
 from ...rasterizer.torch_contract import torch_operation
-from .inputs import UNSUPPORTED, Inputs, check_supported
-from .projection import CameraModel, Culling, check_camera_model, project_gaussians
+from .inputs import UNSUPPORTED, check_supported, split_views
+from .projection import CameraModel, ProjectionOptions, project_gaussians
 from .splats import JoinedSplats, make_meta
 
 RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
@@ -131,53 +130,45 @@ def rasterization(
     check_supported({name: values[name] for name in UNSUPPORTED}, rolling_shutter)
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode {render_mode!r} is none of {', '.join(RENDER_MODES)}")
-    check_camera_model(camera_model)
     if rasterize_mode not in RASTERIZE_MODES:
         raise ValueError(f"rasterize_mode {rasterize_mode!r} is none of {', '.join(RASTERIZE_MODES)}")
-    for name in ("near_plane", "far_plane", "radius_clip"):
-        real(name, values[name], lambda number: not math.isnan(number), "a number")
-    real("eps2d", eps2d, is_not_negative, "a number from 0")
-    if covars is not None:
-        quats = scales = None
     antialiased, has_depth, has_color = rasterize_mode == "antialiased", "D" in render_mode, "RGB" in render_mode
+    options = ProjectionOptions(
+        *(width, height, near_plane, far_plane, radius_clip, eps2d, antialiased, camera_model)
+    ).checked()
+    tile_size = integer("tile_size", DEFAULT_TILE_SIZE if tile_size is None else tile_size, 1, MAX_SIDE)
     if colors is None and has_color:
         raise TypeError(f"colors is None, and render_mode {render_mode!r} renders them")
     if not has_color:
         colors = sh_degree = backgrounds = None
-    inputs = Inputs.flattened(
-        means, quats, scales, opacities, colors, extra_signals, viewmats, Ks, backgrounds, covars, sh_degree
+    views = split_views(
+        means, quats, scales, covars, opacities, colors, extra_signals, viewmats, Ks, backgrounds, sh_degree
     )
-    size = integer("width", width, 1, MAX_SIDE), integer("height", height, 1, MAX_SIDE)
-    tile_size = integer("tile_size", DEFAULT_TILE_SIZE if tile_size is None else tile_size, 1, MAX_SIDE)
-    culling = Culling(near_plane, far_plane, radius_clip)
+    size, shape = (options.width, options.height), viewmats.shape[:-2]
     with oom_context(means.device, lambda: (means.shape[-2], *size)):
-        views = list(inputs.views())
-        projected = [
-            project_gaussians(
-                *(view.means, view.quats, view.scales, view.covars, view.opacities, view.viewmat, view.K, *size),
-                eps2d=eps2d,
-                culling=culling,
-                antialiased=antialiased,
-                camera_model=camera_model,
-            )
-            for view in views
-        ]
-        shape = *means.shape[:-2], viewmats.shape[-3]
-        splats = JoinedSplats.of(projected, packed, shape)
+        splats = JoinedSplats.of([project_gaussians(view, options) for view in views], packed, shape)
         means2d = splats.all.means2d
+        absolute = None
         if absgrad and means2d.requires_grad:
             means2d.absgrad = torch.zeros_like(means2d)  # pyright: ignore[reportAttributeAccessIssue]
+            absolute = splats.by_view(means2d.absgrad)  # pyright: ignore[reportAttributeAccessIssue]
         images, alphas, extras = [], [], []
-        for place, view in enumerate(views):
-            mine = splats.of_view(place)
-            features = view.features(sh_degree, mine.gaussian_ids)
+        for index, view in enumerate(views):
+            rows = splats.rows[index]
+            projected = splats.of_view(index)
+            features = view.features(sh_degree, None if splats.gaussian_ids is None else splats.gaussian_ids[rows])
             if has_depth:
-                features.append(mine.projected.depths[:, None])
+                features.append(projected.depths[:, None])
             features = torch.cat(features, 1) if len(features) > 1 else features[0]
-            store = _store(splats, mine.rows) if absgrad and means2d.requires_grad else None
+            store = None if absolute is None else partial(absolute.__setitem__, rows)
             # The number of packed Gaussians differs from view to view, so no CUDA graph fits two of them.
-            options = RenderOptions(*size)  # The others were read by the projection.
-            rendering = render_projected(mine.projected, features, options, replays=not packed, store_absolute=store)
+            rendering = render_projected(
+                projected,
+                features,
+                RenderOptions(*size),  # The projection has read the others.
+                replays=not packed,
+                store_absolute=store,
+            )
             image, transmittance = rendering.image, rendering.transmittance
             if view.background is not None:
                 behind = view.background
@@ -198,13 +189,3 @@ def rasterization(
     if extras:
         meta["render_extra_signals"] = torch.stack(extras).unflatten(0, shape)
     return torch.stack(images).unflatten(0, shape), torch.stack(alphas).unflatten(0, shape), meta
-
-
-def _store(splats: JoinedSplats, rows: Any) -> Callable[[Tensor], None]:
-    """Return what writes a view's absolute gradients to its rows of means2d.absgrad."""
-    absgrad = splats.by_view(splats.all.means2d.absgrad)  # pyright: ignore[reportAttributeAccessIssue]
-
-    def store(absolute: Tensor) -> None:
-        absgrad[rows] = absolute
-
-    return store

@@ -8,6 +8,8 @@ from sehdr_warp.compat.gsplat import fully_fused_projection, quat_scale_to_covar
 
 from .scenes import gradients, scene
 
+HARMONICS = torch.ones(3, 3), torch.ones(3, 4, 3)
+
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 def test_covariances_and_cameras_are_projected_alike(model, device):
@@ -22,6 +24,10 @@ def test_covariances_and_cameras_are_projected_alike(model, device):
     torch.testing.assert_close(colors, same, rtol=1e-6, atol=1e-8)
     for one, two in zip(gradients(colors, leaves), gradients(same, leaves), strict=True):
         torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-7)
+    projected = fully_fused_projection(
+        leaves[0], covars, leaves[1], 9 * leaves[2], **place._asdict(), camera_model=model, opacities=leaves[3]
+    )
+    torch.testing.assert_close(projected[3], info["conics"], rtol=1e-6, atol=1e-8)  # Covariances take precedence.
     assert bool((info["radii"] > 0).any())
     few = [leaf.detach()[:3].requires_grad_() for leaf in leaves[:4]]
 
@@ -92,6 +98,9 @@ def test_projections_of_batches_are_those_of_each_scene(packed, device):
         ({"quats": None}, r"quats is a builtins.NoneType, expected a torch tensor \[N, 4\]"),
         ({"scales": torch.ones(3, 3)}, r"scales has shape \[3, 3\], expected \[N, 3\]"),
         ({"opacities": torch.ones(3)}, r"opacities has shape \[3\], expected \[N\]"),
+        ({"width": 0}, "width 0 is not in 1.."),
+        ({"height": 31.5}, "height is 31.5, expected a whole number"),
+        ({"eps2d": -1.0}, "eps2d -1.0 is not a number from 0"),
     ],
 )
 def test_misfits_of_a_projection_are_named(options, message):
@@ -111,7 +120,7 @@ def test_misfits_of_intersections_are_named():
     for name, value, message in (
         ("depths", torch.ones(5), r"means2d has shape \[2, 5, 2\], expected \[N, 2\]"),
         ("means2d", torch.zeros(2, 5, 3), r"means2d has shape \[2, 5, 3\], expected \[2, N, 2\]"),
-        ("radii", torch.ones(2, 5), r"radii has shape \[2, 5\], expected a tensor \[2, 5, 2\]"),
+        ("radii", torch.ones(2, 5), r"radii has shape \[2, 5\], expected \[2, 5, 2\]"),
         ("radii", None, "radii is a NoneType"),
         ("depths", [1.0], "depths is a builtins.list"),
     ):
@@ -130,8 +139,12 @@ def test_misfits_of_intersections_are_named():
         (lambda: gsplat.spherical_harmonics(1, torch.ones(3, 3), torch.ones(2, 4, 3)), r"coeffs has shape \[2, 4, 3\]"),
         (lambda: gsplat.spherical_harmonics(1, torch.ones(3, 2), torch.ones(3, 4, 3)), r"dirs has shape \[3, 2\]"),
         (lambda: quat_scale_to_covar_preci(torch.ones(3, 4), torch.ones(2, 3)), r"scales has shape \[2, 3\]"),
+        (lambda: gsplat.compute_relocation(torch.ones(3), torch.ones(3, 3), [1] * 3), "ratios is a list"),
+        (lambda: gsplat.spherical_harmonics("1", *HARMONICS), "degrees_to_use is '1', expected a whole number"),
+        (lambda: gsplat.spherical_harmonics(4, *HARMONICS), "degrees_to_use 4 is not supported, expected 0 to 3"),
+        (lambda: gsplat.spherical_harmonics(1, *HARMONICS, masks=[True] * 3), "masks is a list"),
     ],
 )
 def test_misfits_of_other_functions_are_named(call, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         call()
