@@ -272,6 +272,9 @@ def _write_cameras(path: Path, run: "RenderableScene", transform: WorldTransform
         pose = camera.camera_to_world
         size = {"width": camera.width, "height": camera.height}
         place = {"position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()}
-        described.append({"id": index, "img_name": entry.name, **size, **place, "fy": camera.fy, "fx": camera.fx})
+        lens = {"fy": camera.fy, "fx": camera.fx}
+        if (camera.cx, camera.cy) != (camera.width / 2, camera.height / 2):  # An addition to the reference release's
+            lens |= {"cx": camera.cx, "cy": camera.cy}
+        described.append({"id": index, "img_name": entry.name, **size, **place, **lens})
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(json.dumps(described), encoding="utf-8")

@@ -104,11 +104,15 @@ def _cameras(path: Path, entries: list, read) -> list[tuple[str, Camera]]:
 
 
 def _inria(entry: dict, path: Path) -> Camera:
-    """Read position and rotation (rows) of camera to world in OpenCV axes, fx and fy in pixels; centred axis."""
+    """Read position and rotation (rows) of camera to world in OpenCV axes, fx and fy in pixels.
+
+    The reference release states no cx and cy, as its axes are centered; export writes those that are not.
+    """
     width, height = (whole_number(entry[name], name) for name in ("width", "height"))
     matrix = np.c_[np.array(entry["rotation"], np.float64).reshape(3, 3), np.array(entry["position"], np.float64)]
     pose = pose_from_camera_to_world(matrix, path, str(entry["img_name"]))
-    return Camera(width, height, float(entry["fx"]), float(entry["fy"]), width / 2, height / 2, pose)
+    cx, cy = float(entry.get("cx", width / 2)), float(entry.get("cy", height / 2))
+    return Camera(width, height, float(entry["fx"]), float(entry["fy"]), cx, cy, pose)
 
 
 def _nerfstudio(entry, index: int, values: dict, path: Path, back: np.ndarray | None) -> Camera:

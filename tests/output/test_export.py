@@ -93,10 +93,11 @@ def test_colors_are_fitted_on_the_device_of_the_run(tmp_path, device):
 def test_cameras_beside_are_read_again(tmp_path, run):
     export(run, tmp_path / "a.ply", kind="hdr", cameras=True, axes="scene")
     first = json.loads((tmp_path / "a.ply.cameras.json").read_text())[1]
-    assert set(first) == {"id", "img_name", "width", "height", "position", "rotation", "fy", "fx"}
+    assert set(first) == {"id", "img_name", "width", "height", "position", "rotation", "fy", "fx", "cx", "cy"}
     splats = load_splats(tmp_path / "a.ply")
     for entry, original in zip(splats.cameras, run.cameras, strict=True):
         np.testing.assert_allclose(entry.camera.world_to_camera, original.camera.world_to_camera, atol=1e-9)
+        assert (entry.camera.cx, entry.camera.cy) == (original.camera.cx, original.camera.cy), "photos off center"
     assert [name for name, _ in load_cameras(tmp_path / "a.ply.cameras.json")] == ["0", "1", "2"]
     (tmp_path / "b.ply.cameras.json").write_text("mine")
     with pytest.raises(InputError, match=r"cameras.json: exists already"):
@@ -177,4 +178,4 @@ def test_the_mark_of_opacity_compensation_passes_through_a_conversion(tmp_path, 
         scene = load_splats(write_ply(tmp_path / f"{name}.ply", [f"SplatRenderMode: {mode}"]))
         assert scene.field.antialiased == (mode == "mip")
         file = export(scene, tmp_path / f"{name}_new{suffix}")
-        assert read_gaussians(file).compensated == (mode == "mip")
+        assert read_gaussians(file).antialiased == (mode == "mip")
