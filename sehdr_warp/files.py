@@ -2,7 +2,7 @@
 
 A file is written beside its place, flushed to the disk, then renamed. Leftovers of a killed process are removed when
 something is written to the same folder again. The list of the folder (see own_files.py) gets its hash, because only a
-file that is as listed is ever replaced.
+file that is as listed is ever replaced. What is written within atomic_folder() is listed with the folder, once.
 """
 
 import errno
@@ -23,7 +23,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from .errors import InputError, SehdrError
-from .own_files import first_foreign, list_file, seal
+from .own_files import first_unlisted, list_file, list_folder
 
 _REFUSALS = "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE"
 _WRITE_ERRORS = {getattr(errno, name) for name in _REFUSALS.split() if hasattr(errno, name)}
@@ -75,7 +75,7 @@ def _written_beside(path: Path, overwrite: bool, internal: bool, folder: bool) -
         try:
             yield temporary
             if folder and not internal:
-                seal(temporary)
+                list_folder(temporary)
             for file in (temporary, *temporary.rglob("*")):
                 _sync(file)
             check_absent(path, overwrite, folder=folder, internal=internal)
@@ -256,7 +256,7 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
         return
     if not overwrite:
         raise InputError(path, "exists already", "choose another place, or ask for it to be replaced (--overwrite)")
-    if (other := first_foreign(path)) is not None:
+    if (other := first_unlisted(path)) is not None:
         problem = "was not written by sehdr-warp, or was changed since, and is never replaced"
         raise InputError(other, problem, "move it away, or choose another place")
 

@@ -17,19 +17,19 @@ _LARGEST_LIST = 256 << 20
 """Bytes of a list that is read; a list of a million files has a third of it."""
 
 
-def seal(folder: Path) -> None:
+def list_folder(folder: Path) -> None:
     """List all files of a folder as they are."""
     (folder / LIST).write_bytes(b"".join(line + b"\n" for line in _lines(folder)))
 
 
-def is_sealed(folder: Path) -> bool:
+def is_as_listed(folder: Path) -> bool:
     """Return whether a folder holds the files of its list, all of them unchanged."""
     with suppress(OSError):
         return set() != read_list(folder) <= set(_lines(folder))
     return False
 
 
-def first_foreign(path: Path) -> Path | None:
+def first_unlisted(path: Path) -> Path | None:
     """Return the first file at or in a path that this program did not write, or that was changed since; else None."""
     folder = path if path.is_dir() else path.parent
     own = read_list(folder)
@@ -44,7 +44,7 @@ def first_foreign(path: Path) -> Path | None:
 def is_own(path: Path) -> bool:
     """Return whether this program wrote a file, or all files of a folder, and nobody changed them since."""
     listed = not path.is_symlink() and read_list(path if path.is_dir() else path.parent)
-    return bool(listed) and first_foreign(path) is None
+    return bool(listed) and first_unlisted(path) is None
 
 
 def hash_line(file: Path, name: str) -> bytes:

@@ -9,7 +9,7 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import atomic_folder, atomic_path, has_file, read_bytes, read_json, read_lines, write_json
-from sehdr_warp.own_files import LIST, is_sealed, seal
+from sehdr_warp.own_files import LIST, is_as_listed, list_folder
 from sehdr_warp.splats import read_gaussians
 
 from .full_disk import full_disk
@@ -97,14 +97,14 @@ def test_what_has_the_name_of_a_file_is_not_taken_for_a_missing_one(tmp_path):
             has_file(tmp_path / name)
 
 
-def test_damage_to_a_sealed_folder_is_found(tmp_path):
+def test_damage_to_a_listed_folder_is_found(tmp_path):
     def make_folder():
         folder = tmp_path / "set"
         shutil.rmtree(folder, ignore_errors=True)
         (folder / "deep").mkdir(parents=True)
         for name in ("a", "deep/b", "deep/\udcff\n"):
             (folder / name).write_text(name.encode("utf-8", "replace").decode())
-        seal(folder)
+        list_folder(folder)
         return folder
 
     changes = [
@@ -113,11 +113,11 @@ def test_damage_to_a_sealed_folder_is_found(tmp_path):
         lambda folder: (folder / LIST).write_text(""),
         lambda folder: (folder / LIST).unlink(),
     ]
-    assert is_sealed(make_folder())
+    assert is_as_listed(make_folder())
     for change in changes:
         folder = make_folder()
         change(folder)
-        assert not is_sealed(folder)
+        assert not is_as_listed(folder)
 
 
 def test_file_that_appears_meanwhile_is_kept(tmp_path):

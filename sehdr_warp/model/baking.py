@@ -56,7 +56,7 @@ def field_of(gaussians: GaussianArrays) -> RadianceField:
     )
     model = Gaussians(means, log_scales, quaternions, logits, harmonics[:, :1], harmonics[:, 1:])
     options = {"base_time": gaussians.base_time, "color_model": gaussians.color_model}
-    options |= {"normalization": Normalization(center), "antialiased": gaussians.compensated}
+    options |= {"normalization": Normalization(center), "antialiased": gaussians.antialiased}
     return RadianceField(model, response_by_name("srgb"), **options).requires_grad_(False)
 
 
@@ -148,7 +148,7 @@ def _arrays_of(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
     tensors: dict[str, Any] = {name: value.cpu().numpy() for name, value in field.gaussians.tensors().items()}
     harmonics = np.concatenate([tensors.pop("harmonics_dc"), tensors.pop("harmonics_rest")], axis=1)
     name = field.color_model.name
-    facts = {"color_model": name, "base_time": field.base_time, "compensated": field.antialiased}
+    facts = {"color_model": name, "base_time": field.base_time, "antialiased": field.antialiased}
     gaussians = GaussianArrays(**tensors, harmonics=harmonics, **facts)
     if field.color_model.encoded:
         return gaussians, lambda encoded: field.response.decode(np.clip(encoded, 0, 1)) / field.base_time

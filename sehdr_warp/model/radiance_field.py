@@ -168,7 +168,7 @@ class RadianceField(nn.Module):
         return self.response.white / self.base_time
 
     @torch.no_grad()
-    @without_replays()
+    @without_replays()  # Views differ in size, and each graph would fit one size.
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
         """Render the HDR view of a camera, with depth as a fourth channel of the same rasterization.
 
@@ -180,7 +180,7 @@ class RadianceField(nn.Module):
             depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         else:
             depth = (self.gaussians.means - tensors.position).norm(dim=1, keepdim=True)
-        rendering = self._rasterize(tensors, torch.cat([self._colors(tensors.position, degree), depth], dim=1))
+        rendering = self._rasterize(tensors, torch.cat([self._blended_colors(tensors.position, degree), depth], dim=1))
         depth = _unpremultiply(rendering.image[..., 3], rendering.alpha).mul_(self.normalization.unit)
         # In bands, because decoding takes many times the memory of what it decodes.
         image, rows = rendering.image, max(1, _DECODED_AT_ONCE // camera.width)
@@ -217,7 +217,7 @@ class RadianceField(nn.Module):
         gaussians = self.gaussians
         origin = self.normalization.points(position)
         origin = torch.tensor(origin, dtype=torch.float32, device=gaussians.means.device)
-        colors = self._colors(origin, degree)
+        colors = self._blended_colors(origin, degree)
         for index in without:
             colors = colors.index_fill(0, index, 0.0)
         features = [colors, (gaussians.means - origin).norm(dim=1, keepdim=True)]
@@ -274,7 +274,7 @@ class RadianceField(nn.Module):
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
         """Return the radiance [N, 3] of each Gaussian towards a point [3] in scene coordinates."""
         place = torch.tensor(self.normalization.points(position), dtype=torch.float32)
-        return self._decoded(self._colors(place.to(self.gaussians.means.device), degree)) / self.base_time
+        return self._decoded(self._blended_colors(place.to(self.gaussians.means.device), degree)) / self.base_time
 
     @without_replays()
     def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:
@@ -296,7 +296,7 @@ class RadianceField(nn.Module):
         coefficients = (constant.detach(), rest.detach()) if detach_harmonics else (constant, rest)
         return spherical_harmonics(sh_degree, coefficients, gaussians.means, position)
 
-    def _colors(self, position: Tensor, degree: int | None) -> Tensor:
+    def _blended_colors(self, position: Tensor, degree: int | None) -> Tensor:
         """Return the colors [N, 3] of the HDR image towards a position [3]; see _decoded()."""
         values = self._evaluate_sh(position, degree)
         return self.color_model.colors(values) if self.color_model.encoded else self._exposures(values)[1]

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import InputError, SehdrError
 from ..files import atomic_path, check_absent
-from ..own_files import first_foreign
+from ..own_files import first_unlisted
 from ..progress import track_progress
 from ..scene import Scene, View
 from ..scene.exposure import shutter
@@ -36,7 +36,7 @@ def check_report_folder(out: Path) -> None:
         return
     files = (file for file in sorted(out.iterdir()) if not file.name.startswith("."))  # As what a stopped report left.
     pictures = (file for file in files if file.suffix.lower() in (*LDR_SUFFIXES, *RAW_SUFFIXES))
-    photos = list(islice((file for file in pictures if first_foreign(file) is not None), _PHOTOS))
+    photos = list(islice((file for file in pictures if first_unlisted(file) is not None), _PHOTOS))
     if len(photos) == _PHOTOS:
         raise InputError(out, f"holds photos ({photos[0].name} ...)", "name a folder for the report alone")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from ..caches import cache_folder, usable
 from ..errors import SehdrError
 from ..files import atomic_folder
-from ..own_files import is_sealed
+from ..own_files import is_as_listed
 
 _log = logging.getLogger("sehdr_warp.scene")
 _temporaries: list[tempfile.TemporaryDirectory] = []
@@ -28,10 +28,10 @@ def cached_folder(cache: Path | str | None, name: str, fill: Callable[[Path], No
     """
     folder = cache_folder(cache)
     place = (folder or Path()) / name
-    if folder and place.is_dir() and not is_sealed(place):
+    if folder and place.is_dir() and not is_as_listed(place):
         _log.warning("%s is damaged and is made again", place)
         shutil.rmtree(place, ignore_errors=True)
-    if folder and place.is_dir() and is_sealed(place):
+    if folder and place.is_dir() and is_as_listed(place):
         _log.info("using the cached result %s", place)
         return place
     if cache is None and not (folder and usable(folder) and not place.exists()):
@@ -41,6 +41,6 @@ def cached_folder(cache: Path | str | None, name: str, fill: Callable[[Path], No
         with atomic_folder(place) as result:
             fill(result)
     except SehdrError:
-        if not (place.is_dir() and is_sealed(place)):  # Else another process was first; its result is used.
+        if not (place.is_dir() and is_as_listed(place)):  # Else another process was first; its result is used.
             raise
     return place

@@ -41,8 +41,8 @@ class GaussianArrays:
         base_time: Seconds at which the scene was photographed; for display colors, the exposure time of the photo that
             they show.
         world_matrix: [4, 4] float64 from the photos' coordinates to these; None if they are the same.
-        compensated: trained with opacity compensation (antialiased, "mip"): renderers of the common mode show small
-            Gaussians brighter than they were trained.
+        antialiased: Trained with opacity compensation (gsplat's mode "antialiased", "mip" in PLY): renderers of the
+            common mode show small Gaussians brighter than they were trained.
     """
 
     means: np.ndarray
@@ -53,7 +53,7 @@ class GaussianArrays:
     color_model: str
     base_time: float
     world_matrix: np.ndarray | None = None
-    compensated: bool = False
+    antialiased: bool = False
 
     @property
     def count(self) -> int:
@@ -147,9 +147,9 @@ class GaussianArrays:
 _ARRAYS = tuple(field.name for field in fields(GaussianArrays))[:5]
 
 
-def warn_of_compensation(path: Path, compensated: bool, statement: str) -> None:
+def warn_of_compensation(path: Path, antialiased: bool, statement: str) -> None:
     """Warn of Gaussians that were trained with opacity compensation, as a file states it."""
-    if compensated:
+    if antialiased:
         log.warning(
             "%s: was trained with opacity compensation (%s), and is rendered with it; programs without it, like most "
             "viewers, show its small Gaussians too bright; PLY, SPZ and SOG keep the mark, other formats cannot",

@@ -63,7 +63,7 @@ def write_compressed_ply(path: Path, gaussians: GaussianArrays, overwrite: bool)
             higher[f"f_rest_{i}"] = column
         elements.append(PlyElement.describe(higher, "sh"))
     comments = ["sehdr:color_model display", f"sehdr:base_exposure_time {gaussians.base_time!r}"]
-    comments += ["SplatRenderMode: mip"] * gaussians.compensated
+    comments += ["SplatRenderMode: mip"] * gaussians.antialiased
     if gaussians.world_matrix is not None:
         matrix = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
         comments.append(f"sehdr:world_matrix {matrix}")

@@ -66,7 +66,7 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     if gaussians.world_matrix is not None:
         facts["world_matrix"] = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
     comments = [f"sehdr:{name} {value}" for name, value in facts.items()]
-    comments += [_MIP] * gaussians.compensated
+    comments += [_MIP] * gaussians.antialiased
     with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
 
@@ -87,7 +87,7 @@ def read_ply(path: Path) -> GaussianArrays:
             facts = _facts(read.comments, path)
             arguments: dict[str, Any] = {**unpack_ply(read, path), "color_model": "display"}
             shared = {"base_time": facts.base_time, "world_matrix": facts.world_matrix}
-            return GaussianArrays(**arguments, **shared, compensated=facts.compensated)
+            return GaussianArrays(**arguments, **shared, antialiased=facts.antialiased)
         flat = "scale_2" not in names and {"scale_0", "scale_1", "rot_3"} <= names
         rgb = not names & {"f_dc_0", "f_dc_1", "f_dc_2"} and all(_is_byte(vertex, name) for name in _RGB)
         present = names | ({"scale_2"} if flat else set()) | (set(_GROUPS[-1].split()) if rgb else set())
@@ -135,7 +135,7 @@ def read_ply(path: Path) -> GaussianArrays:
         color_model=facts.color_model,
         base_time=facts.base_time,
         world_matrix=facts.world_matrix,
-        compensated=facts.compensated,
+        antialiased=facts.antialiased,
     )
 
 
@@ -216,7 +216,7 @@ class _Facts(NamedTuple):
     color_model: str
     base_time: float
     world_matrix: np.ndarray | None
-    compensated: bool = False
+    antialiased: bool = False
 
 
 def _facts(comments: list[str], path: Path) -> _Facts:
@@ -232,6 +232,6 @@ def _facts(comments: list[str], path: Path) -> _Facts:
         raise InputError(
             path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a time of {SHORTEST_TIME} to {LONGEST_TIME} s"
         )
-    compensated = any(re.fullmatch(r"SplatRenderMode:\s*mip", line.strip(), re.IGNORECASE) for line in comments)
-    warn_of_compensation(path, compensated, _MIP)
-    return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path), compensated)
+    antialiased = any(re.fullmatch(r"SplatRenderMode:\s*mip", line.strip(), re.IGNORECASE) for line in comments)
+    warn_of_compensation(path, antialiased, _MIP)
+    return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path), antialiased)

@@ -57,7 +57,7 @@ def sog_files(gaussians: GaussianArrays) -> Iterator[tuple[str, str | bytes]]:
         "version": 2,
         "asset": {"generator": f"sehdr-warp {__version__}"},
         "count": gaussians.count,
-        "antialias": gaussians.compensated,
+        "antialias": gaussians.antialiased,
         "means": {
             "mins": low.tolist(),
             "maxs": high.tolist(),
@@ -137,7 +137,7 @@ def read_sog(path: Path) -> GaussianArrays:
             return archive.read(above + name)
 
         gaussians = gaussians_of_files(read, path)
-    warn_of_compensation(path, gaussians.compensated, "its meta.json says antialias")
+    warn_of_compensation(path, gaussians.antialiased, "its meta.json says antialias")
     return gaussians
 
 
@@ -207,7 +207,7 @@ def _gaussians(read: Callable[[str, int], bytes], meta: dict[str, Any], path: Pa
         color_model="display",
         base_time=float(facts.get("base_exposure_time", 1.0)),
         world_matrix=read_matrix(facts.get("world_matrix"), path),
-        compensated=meta.get("antialias") is True,
+        antialiased=meta.get("antialias") is True,
     )
 
 

@@ -50,7 +50,7 @@ def write_spz(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         packed = (packed << 10) | ((column < 0).astype(np.uint32) << 9) | size
     parts = [
         _HEADER.pack(
-            _MAGIC, _VERSION, gaussians.count, gaussians.degree, fraction, _ANTIALIASED * gaussians.compensated, 0
+            _MAGIC, _VERSION, gaussians.count, gaussians.degree, fraction, _ANTIALIASED * gaussians.antialiased, 0
         ),
         positions.tobytes(),
         np.rint(gaussians.opacities * 255).astype(np.uint8).tobytes(),
@@ -108,9 +108,9 @@ def read_spz(path: Path) -> GaussianArrays:
         harmonics=harmonics,
         color_model="display",
         base_time=1.0,
-        compensated=bool(flags & _ANTIALIASED),
+        antialiased=bool(flags & _ANTIALIASED),
     )
-    warn_of_compensation(path, gaussians.compensated, "its header says antialiased")
+    warn_of_compensation(path, gaussians.antialiased, "its header says antialiased")
     if flags & _EXTENDED:
         log.warning("%s: its extensions are not read; one of them may state other axes than SPZ's", path)
     turned = gaussians.transformed(np.linalg.inv(_TO_FILE))

@@ -81,7 +81,7 @@ def read_streamed_sog(path: Path) -> GaussianArrays:
         if not chunks:
             raise ValueError("no node has Gaussians of level 0")
     gaussians = join_gaussians([*chunks.values()])
-    warn_of_compensation(path, gaussians.compensated, "the meta.json of its chunks says antialias")
+    warn_of_compensation(path, gaussians.antialiased, "the meta.json of its chunks says antialias")
     return gaussians
 
 

@@ -63,12 +63,12 @@ def test_properties_of_other_models_are_named(tmp_path, caplog):
 def test_the_mark_of_opacity_compensation_is_kept_and_warned_of(tmp_path, caplog):
     comments = ["Exported from Brush", "SplatRenderMode: mip"]
     read = read_gaussians(write_ply(tmp_path / "a.ply", comments))
-    assert read.compensated and "SplatRenderMode: mip" in caplog.text
+    assert read.antialiased and "SplatRenderMode: mip" in caplog.text
     write_gaussians(tmp_path / "b.ply", read)
     assert b"comment SplatRenderMode: mip\n" in (tmp_path / "b.ply").read_bytes()
     caplog.clear()
     other = read_gaussians(write_ply(tmp_path / "c.ply", ["SplatRenderMode: default"]))
-    assert not other.compensated and not caplog.records
+    assert not other.antialiased and not caplog.records
     write_gaussians(tmp_path / "d.ply", other)
     assert b"SplatRenderMode" not in (tmp_path / "d.ply").read_bytes()
 
@@ -133,7 +133,7 @@ def test_harmonics_beyond_degree_3_are_named(tmp_path):
 
 def test_comments_in_any_encoding(tmp_path):
     read = read_gaussians(write_ply(tmp_path / "a.ply", ["Müller, 5 \xb5m", "SplatRenderMode: mip"]))
-    assert read.count == 3 and read.compensated
+    assert read.count == 3 and read.antialiased
 
 
 def rewrite(path, change):

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sehdr_warp.output.tonemap import encode_srgb
-from sehdr_warp.own_files import LIST, first_foreign
+from sehdr_warp.own_files import LIST, first_unlisted
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Camera, look_at
 from tests.scene.clips import write_clip
@@ -97,7 +97,7 @@ def test_commands_killed_at_a_change_of_the_disk(space, name, number):
     run = shutil.copytree(space / "run", space / "copy")
     assert call(*words, folder=space, kill_at=1 + number * changes // KILLS_EACH).code in (0, -9)
     for path in (*(space / "made").glob("[!.]*"), space / "set"):
-        theirs = first_foreign(path) if path.exists() else None
+        theirs = first_unlisted(path) if path.exists() else None
         assert theirs is None or theirs.name == "notes.txt" or path.name == "jobs", f"{theirs} is not whole"
     assert call(*words, folder=space).code == 0
     assert (space / "made" / "notes.txt").read_text() == "mine"
