@@ -37,7 +37,7 @@ from sehdr_warp.model.gaussians import PARAMETER_NAMES
 from sehdr_warp.process import calm_threads
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import config_from_dict, load_config, override_config
-from sehdr_warp.runs.open import load_saved_scene
+from sehdr_warp.runs.open import load_scene_and_log_notes
 from sehdr_warp.runs.run import Run, load_run
 from sehdr_warp.runs.run_writer import RunWriter
 from sehdr_warp.runs.values import LoadArguments
@@ -171,7 +171,7 @@ def run_study(study: Study) -> None:
     study.add("merging and refining borders", seconds=seconds, peak_memory_bytes=memory)
     run = load_run(study.out / "at_once", device=study.device)
     held_out = [entry.name for entry in run.cameras if entry.split == "test"]
-    views = load_saved_scene({**data, "views": held_out}, response="srgb").views
+    views = load_scene_and_log_notes({**data, "views": held_out}, response="srgb").views
     figures = {"gaussians": run.gaussian_count, "seconds": max(end for _, end in spans.values())}
     peak = max(row["peak_memory_bytes"] or 0 for row in study.rows)
     errors = measure_seams(run, views, plan.division)
@@ -232,7 +232,7 @@ def _warm_up(study: Study, plan: BlockPlan, at_once: int) -> None:
 def _train_whole(data: LoadArguments, config: Mapping[str, Any], out: Path, device: str) -> None:
     """Train the whole survey, in a process of its own."""
     logging.basicConfig(filename=out.with_suffix(".log"), level=logging.INFO, format="%(asctime)s %(message)s")
-    scene = load_saved_scene(data, response="srgb")
+    scene = load_scene_and_log_notes(data, response="srgb")
     create_trainer(scene, out, config_from_dict(dict(config), "config"), device=device, overwrite=True).train()
 
 

@@ -130,10 +130,10 @@ def update_by_adam(
 
 @wp.func
 def is_finite(values: _floats, index: int) -> bool:
-    """Return whether a number is finite; true beyond the end."""
+    """Return whether a number is finite and its square, which Adam's second moment takes; true beyond the end."""
     finite = bool(True)
     if index < values.shape[0]:
-        finite = wp.isfinite(values[index])
+        finite = wp.isfinite(values[index] * values[index])
     return finite
 
 
@@ -227,7 +227,7 @@ def add_gradient_statistics(
     range_start: int,
     gradients: wp.array(dtype=wp.vec2), radii: wp.array(dtype=wp.float32), usable: wp.array(dtype=wp.float32),
     half_width: float, half_height: float,
-    gradient_sum: wp.array(dtype=wp.float32), visits: wp.array(dtype=wp.float32),
+    gradient_sum: wp.array(dtype=wp.float32), photo_count: wp.array(dtype=wp.float32),
 ):
     """Add, for each Gaussian with a radius, the length of its gradient by the projected center, and 1.
 
@@ -243,7 +243,7 @@ def add_gradient_statistics(
         if larger > 0.0:
             length = larger * wp.sqrt((x / larger) * (x / larger) + (y / larger) * (y / larger))
         gradient_sum[i] = gradient_sum[i] + length
-        visits[i] = visits[i] + 1.0
+        photo_count[i] = photo_count[i] + 1.0
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)

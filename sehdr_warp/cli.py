@@ -4,7 +4,6 @@ Each command is a dataclass of options and a function that takes them, in the `c
 one, add a line to COMMANDS. A module is imported when its command runs, so nothing here imports torch.
 """
 
-import inspect
 import os
 import shutil
 import sys
@@ -26,12 +25,14 @@ class Command(NamedTuple):
     options: str
     """Dataclass of its options; the first sentence of its docstring is the command's summary."""
     run: str
-    """Function that takes the options, and the words of the command line if it has a parameter `argv`."""
+    """Function that takes the options."""
+    takes_argv: bool = False
+    """Whether the function also takes the words of the command line."""
 
 
 COMMANDS = {
     "train and use a scene": {
-        "train": Command("training.commands", "Train", "run_train"),
+        "train": Command("training.commands", "Train", "run_train", takes_argv=True),
         "render": Command("output.commands", "Render", "run_render"),
         "view": Command("viewer.commands", "View", "run_view"),
         "eval": Command("evaluation.commands", "Evaluate", "run_evaluate"),
@@ -181,8 +182,8 @@ def _run(argv: list[str]) -> None:
             return
     run, options = parse_command(words)
     with stages_on_terminal():
-        if "argv" in inspect.signature(run).parameters:
-            run(options, argv=argv)
+        if _COMMANDS[words[0]].takes_argv:
+            run(options, argv)
         else:
             run(options)
 

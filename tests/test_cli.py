@@ -66,10 +66,10 @@ def test_help_is_a_word_too(capsys):
     [
         ("train prak --out runs/x", "prak: not found; did you mean park?"),
         ("train elsewhere --out runs/x", "elsewhere: not found; give a folder of photos, or 'embedded'"),
-        ("render runs/caslte --out views", "runs/caslte: no such folder; did you mean runs/castle?"),
+        ("render runs/caslte --out views", "runs/caslte: no such file or folder; did you mean runs/castle?"),
         ("render runs/castle --out x --colorspace srgb", "color space 'srgb' is an encoding"),
         ("envmap runs/castle --out x.exr --at 0,0", "point '0,0' is neither x,y,z"),
-        ("view prk", "prk: no such folder; did you mean park?"),
+        ("view prk", "prk: no such file or folder; did you mean park?"),
     ],
 )
 def test_what_needs_no_scene_is_refused_before_one_is_opened(line, message, tmp_path, monkeypatch, capsys):

@@ -15,7 +15,8 @@ from sehdr_warp.rasterizer.photo_loss import ClippedWeights, clipped_light_energ
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response.table import TabulatedResponse
 from sehdr_warp.runs.config import LossConfig
-from sehdr_warp.training.losses import CODE, Target, code_scale, ldr_loss
+from sehdr_warp.training.losses import ldr_loss
+from sehdr_warp.training.targets import CODE, Target, code_scale
 
 CURVES = ("linear", "gamma-2.2", "srgb", "rec709", "reinhard-gamma", "filmic", "aces")
 BRACKETS = (1 / 8, 1 / 4, 1.0, 8.0, 16.0)

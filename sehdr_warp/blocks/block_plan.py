@@ -21,7 +21,7 @@ from ..files import read_json, refuse_links, write_json
 from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_from_dict, field_and_problem, override_config
-from ..runs.open import load_saved_scene
+from ..runs.open import load_scene_and_log_notes
 from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationValues
 from ..scene import Scene, View
 from ..scene.exposure_compensation import ExposureCompensation
@@ -222,7 +222,7 @@ def make_block_plan(
     """
     _check(config, data)
     size = min(data.get("max_size") or LARGEST_SIDE, LARGEST_SIDE)
-    scene = load_saved_scene(data | {"max_size": size}, response=config.response.name, **selection)
+    scene = load_scene_and_log_notes(data | {"max_size": size}, response=config.response.name, **selection)
     check_views(scene)
     response = response_for_training(scene, config)
     times = {view.name: view.exposure_time for view in scene.views}

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import SehdrError, as_user_error
-from ..runs.open import load_saved_scene, response_for_loading
+from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.run_folder import RunFolder
 from ..scene import Scene
 from ..training.launch import installed_versions
@@ -104,7 +104,7 @@ def _train(
     data = plan.data | {"views": list(block.views)}
     config = plan.config_of(block)
     response = response_for_loading(config, plan.response)
-    scene = shared_scene(plan, index, load_saved_scene(data, response=response, photo_storage=photo_storage))
+    scene = shared_scene(plan, index, load_scene_and_log_notes(data, response=response, photo_storage=photo_storage))
     plan.check_photos(scene.views)
     trainer = create_trainer(scene, folder, config, device=device, resume=True, data=data, shared=plan.shared)
     for _ in trainer:

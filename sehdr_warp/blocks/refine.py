@@ -18,7 +18,7 @@ from torch import Tensor
 from ..model.gaussians import Gaussians
 from ..model.paged_field import boxes_in_view
 from ..runs.config_files import override_config
-from ..runs.open import load_saved_scene, response_for_loading
+from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.run import assemble_field
 from ..runs.run_folder import RunFolder
 from ..scene import Camera, Scene
@@ -70,7 +70,7 @@ def _border_photos(plan: BlockPlan, index: int, points: np.ndarray, photo_storag
     """Return the block's scene with the training photos that show points [M, 3] near its borders; None for none."""
     data = plan.data | {"views": list(plan.blocks[index].views)}
     response = response_for_loading(plan.config_of(plan.blocks[index]), plan.response)
-    scene = shared_scene(plan, index, load_saved_scene(data, response=response, photo_storage=photo_storage))
+    scene = shared_scene(plan, index, load_scene_and_log_notes(data, response=response, photo_storage=photo_storage))
     views = tuple(
         view
         for view in scene.train_views  # Occlusion is ignored.

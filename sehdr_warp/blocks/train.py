@@ -11,7 +11,7 @@ import torch
 from ..errors import InputError
 from ..files import make_parents, refuse_links, writing
 from ..runs.config import Config
-from ..runs.open import load_saved_scene, response_for_loading
+from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.run import Run, load_run
 from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter
@@ -155,6 +155,6 @@ def _measure(run: Run, plan: BlockPlan, photo_storage: str) -> SeamErrors | None
     if not names:
         return None
     response = response_for_loading(plan.config, plan.response)
-    scene = load_saved_scene(plan.data | {"views": names}, response=response, photo_storage=photo_storage)
+    scene = load_scene_and_log_notes(plan.data | {"views": names}, response=response, photo_storage=photo_storage)
     views = tuple(replace(view, exposure_time=plan.exposure_times[view.name]) for view in scene.views)
     return measure_seams(run, run.normalize_photos(replace(scene, views=views)).views, plan.division)

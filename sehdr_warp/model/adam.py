@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..rasterizer import HarmonicsGradients
-from ..rasterizer.step_updates import AdamStep, adam_steps, harmonics_adam_step
+from ..rasterizer.step_updates import AdamStep, StepFlags, adam_steps, harmonics_adam_step
 from .gaussians import PARAMETER_NAMES
 
 FIRST_HARMONIC = {"harmonics_dc": 0, "harmonics_rest": 1}
@@ -53,16 +53,15 @@ class Adam:
     @torch.no_grad()
     def step(
         self,
-        skipped: Tensor | None = None,
-        applied: Tensor | None = None,
+        flags: StepFlags | None = None,
         harmonics: HarmonicsGradients | None = None,
         active_count: Tensor | None = None,
     ) -> None:
         """Update all parameters that have a gradient.
 
         Args:
-            skipped: Scalar on the device; 1 leaves parameters, moments and step counts as they are. Default: 0.
-            applied: Scalar 1 - skipped.
+            flags: Whether the step is skipped, which leaves parameters, moments and step counts as they are; by default
+                it is applied.
             harmonics: Gradients of the harmonics in factored form, for groups whose parameters have no gradient of
                 their own.
             active_count: [1] int32, number of Gaussians, if parameters have more rows; the gradients of the other rows
@@ -70,12 +69,12 @@ class Adam:
         """
         grouped = self._with_gradient(factored=harmonics is not None)
         parameters = [parameter for _, parameter in grouped]
-        skipped = parameters[0].new_zeros(()) if skipped is None else skipped
-        applied = 1 - skipped if applied is None else applied
+        if flags is None:
+            flags = StepFlags(parameters[0].new_zeros(()), parameters[0].new_ones(()))
         self._create_states(parameters)
         # A list on both sides: torch reads a single tensor on the host, which CUDA graph capture does not allow.
         steps = [self.state[p]["step"] for p in parameters]
-        torch._foreach_add_(steps, [applied] * len(steps))  # pyright: ignore[reportPrivateImportUsage]
+        torch._foreach_add_(steps, [flags.applied] * len(steps))  # pyright: ignore[reportPrivateImportUsage]
         steps_with_gradient = []
         options: dict = {"betas": self.betas, "epsilon": EPSILON, "active_count": active_count}
         for group, parameter in grouped:
@@ -88,9 +87,9 @@ class Adam:
             elif harmonics is not None:
                 start = FIRST_HARMONIC[group["name"]]
                 turns = self.sh_update_interval if start else 1
-                arguments = values, start, harmonics, first, second, step, skipped
+                arguments = values, start, harmonics, first, second, step, flags.skipped
                 harmonics_adam_step(*arguments, rate=group["lr"], turns=turns, **options)
-        adam_steps(steps_with_gradient, skipped, **options)
+        adam_steps(steps_with_gradient, flags.skipped, **options)
 
     def _with_gradient(self, *, factored: bool) -> list[tuple[dict, Tensor]]:
         """Return group and parameter of all that have a gradient; those of factored harmonics come first.

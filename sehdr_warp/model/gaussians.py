@@ -169,8 +169,9 @@ class Gaussians(nn.Module):
     def surround(self, rows: dict[str, Tensor], optimizer: Optimizer | None = None) -> None:
         """Reserve rows for Gaussians that steps render, but that are no part of count and tensors().
 
-        Call this before the first step, and not if the number of Gaussians will change: that takes the rows. They stay
-        as they are if the optimizer trains the others alone (Adam.trained_rows).
+        A block is refined so beside the rest of the scene (blocks/refine.py). Call this before the first step, and not
+        if the number of Gaussians will change: that takes the rows. They stay as they are if the optimizer trains the
+        others alone (Adam.trained_rows).
 
         Args:
             rows: Tensors of M Gaussians as returned by rows().
@@ -287,7 +288,7 @@ class ReservedRows:
 
     A CUDA graph fixes the addresses and the row counts of its tensors. It therefore runs on all reserved rows; those
     beyond the count are Gaussians of opacity 0, which no camera sees. Their moments and gradients are 0, so no step
-    changes them.
+    changes them. StepGraphs reserves them, a gradient step sees all_rows(), and everything else the first `count`.
 
     Attributes:
         rows: Number of rows.

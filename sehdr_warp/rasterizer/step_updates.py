@@ -30,7 +30,9 @@ def decide_step(
     step_counters: Tensor | None = None,
     intersections: Tensor | None = None,
 ) -> StepFlags:
-    """Return whether a step is skipped: if its loss or a value of `finiteness` is not finite, or `overflow` is true.
+    """Decide whether a step is skipped: if its loss or a value of `finiteness` is not finite, or on overflow.
+
+    Returns the decision, and counts it in step_counters.
 
     Args:
         loss: float32 scalar.
@@ -52,7 +54,10 @@ def decide_step(
 
 @torch.no_grad()
 def finiteness_of(gradients: Sequence[Tensor]) -> Tensor:
-    """Return [K] float32, all finite if all gradients are: on a CPU their norms; on a GPU one number, 0 or infinity."""
+    """Return [K] float32, all finite if all gradients and their squares are, which Adam's second moments take.
+
+    On a CPU they are the norms of the gradients; on a GPU one number, 0 or infinity.
+    """
     if gradients[0].device.type == "cuda":
         return _nonfinite_by_kernel(gradients)
     with torch_threads(gradients[0].device):  # Threads change the last bits, but only finiteness counts.
@@ -209,15 +214,15 @@ def _decays(betas: tuple[float, float]) -> tuple[float, ...]:
 
 @torch.no_grad()
 def add_gradient_statistics(
-    gradients: Tensor, radii: Tensor, usable: Tensor, width: int, height: int, gradient_sum: Tensor, visits: Tensor
+    gradients: Tensor, radii: Tensor, usable: Tensor, width: int, height: int, gradient_sum: Tensor, photo_count: Tensor
 ) -> None:
-    """Add the lengths of gradients [N, 2] of projected centers to gradient_sum [N], and 1 to visits [N].
+    """Add the lengths of gradients [N, 2] of projected centers to gradient_sum [N], and 1 to photo_count [N].
 
     Lengths are in normalized screen units (the screen is 2 wide). Only Gaussians with radii [N] above 0 count, and
     nothing is added if the scalar usable is 0. width, height: of the image in pixels. All float32 on one device.
     """
     inputs = gradients.contiguous(), radii, usable, width / 2, height / 2
-    launch(kernels.add_gradient_statistics, len(radii), *inputs, gradient_sum, visits)
+    launch(kernels.add_gradient_statistics, len(radii), *inputs, gradient_sum, photo_count)
 
 
 @torch.no_grad()

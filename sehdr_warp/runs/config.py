@@ -272,6 +272,11 @@ class Config(_Table):
         """Scale an iteration number of the config to the length of this training, at least 1."""
         return max(1, round(iteration * self.schedule.iterations / REFERENCE_ITERATIONS))
 
+    @property
+    def checkpoint_interval(self) -> int:
+        """Iterations of this training between checkpoints."""
+        return self.scaled(self.schedule.checkpoint_every)
+
     def degree_at(self, iteration: int) -> int:
         """Return the SH degree of step `iteration`, counted from 1: one more every sh_degree_interval."""
         return min(self.model.sh_degree, iteration // self.scaled(self.schedule.sh_degree_interval))

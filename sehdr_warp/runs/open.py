@@ -59,8 +59,8 @@ def _require(
         raise missing(path, problem, remedy)
 
 
-def load_saved_scene(data: LoadArguments, **options: Any) -> Scene:
-    """Load the scene that saved arguments describe, and log its notes.
+def load_scene_and_log_notes(data: LoadArguments, **options: Any) -> Scene:
+    """Load the scene that arguments as a run saves them describe, and log its notes.
 
     Args:
         data: The arguments, with a path.
@@ -95,7 +95,7 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).exists():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    return load_saved_scene(run.data | {"path": place}, response=response_for_loading(run.config, run.response))
+    return load_scene_and_log_notes(run.data | {"path": place}, response=response_for_loading(run.config, run.response))
 
 
 def load_run_scene_with_confidence(run: Run, data: str | None) -> Scene:

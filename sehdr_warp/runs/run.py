@@ -286,9 +286,8 @@ class Run(RenderableScene):
         """
         truth = self.config.loss.uses_hdr
         views = self.normalize_photos(scene).train_views
-        estimates = None
-        if not (truth or self.field.color_model.encoded):
-            estimates = light_estimates(views, self.field.response, self.config.loss, self.device)
+        response = None if truth or self.field.color_model.encoded else self.field.response
+        estimates = light_estimates(views, response, self.config.loss, self.device)
         certainties = None if estimates is None else [estimate.certainty for estimate in estimates]
         evidence = gather_evidence(self.field, views, degree=self.degree, truth=truth, certainties=certainties)
         self.field.confidence, self._clipped = evidence.confidence(), evidence.clipped

@@ -21,7 +21,7 @@ from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
-from ..runs.open import load_saved_scene
+from ..runs.open import load_scene_and_log_notes
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
@@ -30,9 +30,12 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
+# The texts of these classes are empty, because each would be one more line of the help.
+
+
 @dataclass(frozen=True)
 class SceneOptions:
-    """"""  # noqa: D419  (a text would be one more line of the help)
+    """"""  # noqa: D419
 
     response: str | None = None
     """Camera response: a name of `sehdr-warp responses`, a file, auto (the default) or learned."""
@@ -46,7 +49,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """"""  # noqa: D419  (a text would be one more line of the help)
+    """"""  # noqa: D419
 
     preset: str | None = None
     """A name of `sehdr-warp presets` or a TOML file. (default: default, or what --resume continues)"""
@@ -62,7 +65,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """"""  # noqa: D419  (a text would be one more line of the help)
+    """"""  # noqa: D419
 
     out: Path | None = None
     """Folder for the run."""
@@ -80,7 +83,7 @@ class OutputOptions:
 
 @dataclass(frozen=True)
 class MachineOptions:
-    """"""  # noqa: D419  (a text would be one more line of the help)
+    """"""  # noqa: D419
 
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
@@ -108,6 +111,7 @@ class Train:
     training: TrainingOptions = TrainingOptions()
     output: OutputOptions = OutputOptions()
     machine: MachineOptions = MachineOptions()
+    # Name and text of each field of the config whose flag was used.
     fields: Annotated[configs.flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
 
 
@@ -134,7 +138,10 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
 
         device_of_rank(gpus - 1, args.machine.device)
         launch(gpus, _run_as_rank, list(argv))
-    elif rank_info is None or args.training.plan_only:
+    elif args.training.plan_only:
+        if rank_info is None or rank_info.rank == 0:
+            _train(args)
+    elif rank_info is None:
         _train(args)
     elif gpus not in (1, rank_info.local_count):
         raise UsageError(f"--gpus {gpus}, but {rank_info.local_count} ranks were started; leave it out")
@@ -165,7 +172,7 @@ def _train(args: Train, ranks=None) -> None:
 
     plan_only, output = args.training.plan_only, args.output
     # What can be refused is refused before the photos are read, which may take minutes.
-    resumed = None if plan_only else _run_to_resume(output)
+    resumed = None if plan_only else _prepare_folder(output)
     data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
     config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(args.machine.device) if ranks is None else ranks.device
@@ -178,7 +185,7 @@ def _train(args: Train, ranks=None) -> None:
             from .following import PhotoRequest
 
             ranks.request_photos(PhotoRequest(data, loading))
-        scene = load_saved_scene(data, **loading)
+        scene = load_scene_and_log_notes(data, **loading)
         if plan_only:
             _print_plan(args, scene, config, device)
             return
@@ -187,7 +194,7 @@ def _train(args: Train, ranks=None) -> None:
         from .advice import advice, option_words, options_of_run
         from .train import create_trainer
 
-        assert output.out is not None, "_run_to_resume() refuses a training without --out"
+        assert output.out is not None, "_prepare_folder() refuses a training without --out"
         trainer = create_trainer(
             scene,
             output.out,
@@ -211,8 +218,11 @@ def _train(args: Train, ranks=None) -> None:
     _print_result(args, trainer.run, hints)
 
 
-def _run_to_resume(output: OutputOptions) -> "RunWriter | None":
-    """Return the run that --resume continues, None for a new one; raise SehdrError if --out cannot be used."""
+def _prepare_folder(output: OutputOptions) -> "RunWriter | None":
+    """Prepare --out as RunWriter.prepare(); return the run that --resume continues, None for a new one.
+
+    Raises SehdrError if --out cannot be used.
+    """
     from ..runs.run_writer import RunWriter
 
     if output.out is None:

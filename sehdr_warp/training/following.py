@@ -11,7 +11,7 @@ import torch
 from ..errors import InputError, SehdrError
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
-from ..runs.open import load_saved_scene
+from ..runs.open import load_scene_and_log_notes
 from ..runs.run import exposure_compensation, field_from_checkpoint
 from ..runs.run_folder import describe_scene, scene_difference
 from ..runs.values import LoadArguments
@@ -97,7 +97,7 @@ def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
     if reads:
         request: PhotoRequest = ranks.requested_photos()
         data = request.data if path is None else request.data | {"path": path}
-        scene = load_saved_scene(data, **request.options)
+        scene = load_scene_and_log_notes(data, **request.options)
     shared: SharedTraining = ranks.broadcast_object()
     config = shared.config
     tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in shared.layout.items()}

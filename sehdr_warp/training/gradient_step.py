@@ -43,7 +43,9 @@ class StepOptions:
 
 
 class GraphKey(NamedTuple):
-    """Everything that changes which kernels a step launches; steps of one key share a CUDA graph.
+    """Everything that changes which kernels a step launches.
+
+    Consecutive steps of one key share a CUDA graph; only one is kept, so another key is captured anew.
 
     Attributes:
         degree: SH degree.
@@ -67,7 +69,7 @@ class Gradients:
     Attributes:
         loss: Scalar loss of this rank's photo.
         image: [H, W, 3] rendered image that was compared with the photo.
-        rendering: Result of the rasterizer; tensors that nothing reads any more are None.
+        rendering: Result of the rasterizer, of which only what apply_gradients() reads is set; other tensors are None.
         harmonics: Gradients of the harmonics in factored form; None if the parameters hold them.
     """
 
@@ -101,7 +103,7 @@ class GradientStep:
         ranks: Processes that train together.
         needs_encoded: Whether the loss compares encoded photos; if it compares exposures, they are not computed.
         defer_sh_gradients: Keep the gradients of the harmonics in factored form until the optimizer step: a gradient by
-            one color per Gaussian in place of 48 numbers.
+            one color per Gaussian in place of 48 numbers; see HarmonicsGradients for their way.
     """
 
     def __init__(
@@ -151,9 +153,9 @@ class GradientStep:
     def compute_and_apply(self, compute: Callable[[], Gradients], apply: Callable[[Gradients], Tensor]) -> StepResult:
         """Compute gradients, average them over the ranks, and apply them.
 
-        `compute` and `apply` are the two functions below, or replay their CUDA graphs.
+        `compute` and `apply` are the two functions below, or replay their CUDA graphs; see StepGraphs.run().
         """
-        with self.field.gaussians.all_rows(self.optimizer):
+        with self.field.gaussians.all_rows(self.optimizer):  # CUDA graphs have the reserved rows, too.
             if self.ranks is not None:
                 self._flat_gradients(self.ranks)  # Allocated here, not in the memory of a CUDA graph.
             gradients = compute()

@@ -92,9 +92,9 @@ def guarded_step(
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.grad_colors]
-    skipped, applied = decide_step(loss, finiteness_of(gradients), overflow, step_counters, intersections)
-    optimizer.step(skipped, applied, harmonics, active_count)
-    return applied
+    flags = decide_step(loss, finiteness_of(gradients), overflow, step_counters, intersections)
+    optimizer.step(flags, harmonics, active_count)
+    return flags.applied
 
 
 class FlatGradients:
@@ -161,6 +161,7 @@ class FlatGradients:
         harmonics = None
         if self._degree is not None:
             grad_colors, positions = self._views[-2:]
+            # Positions are no mean: each is in one rank's slot, and all_reduce_mean() has divided it by the count.
             harmonics = HarmonicsGradients(grad_colors, positions * self._count, self._means, self._degree)
         return self.numbers[0], self.numbers[1] > 0, harmonics
 

@@ -52,9 +52,8 @@ class RunOutput:
         self.folder, self._is_block = folder, is_block
         total = config.schedule.iterations
         self._evaluate_at = {config.scaled(n) for n in config.schedule.evaluate_at} | {total}
-        every = config.schedule.checkpoint_every
-        self._checkpoint_every = config.scaled(every)
-        is_set = every != ScheduleConfig().checkpoint_every or "schedule.checkpoint_every" in config.plan.keep
+        is_default = config.schedule.checkpoint_every == ScheduleConfig().checkpoint_every
+        is_set = not is_default or "schedule.checkpoint_every" in config.plan.keep
         self._least_seconds = 0.0 if is_set else LEAST_SECONDS
         self._saved_at = time.monotonic()
         self._log_every = max(1, total // CURVE_POINTS)
@@ -72,7 +71,7 @@ class RunOutput:
         iteration = trainer.iteration
         evaluate = not self._evaluate_at.isdisjoint(range(iteration - trainer.step_batch + 1, iteration + 1))
         evaluate &= iteration < trainer.total
-        save = trainer.came_to(self._checkpoint_every)
+        save = trainer.came_to(trainer.config.checkpoint_interval)
         if evaluate or save:
             trainer.synchronize()
         if evaluate:
@@ -189,7 +188,7 @@ class RunOutput:
 def remove_unseen(trainer: Trainer) -> Evidence:
     """Remove the Gaussians that no training photo shows; return the evidence of the photos for the others."""
     views, truth = trainer.scene.train_views, trainer.config.loss.uses_hdr
-    estimates = None if truth else trainer.views.estimates
+    estimates = None if truth else trainer.views.light_estimates
     certainties = None if estimates is None else [estimate.certainty for estimate in estimates]
     evidence = gather_evidence(trainer.field, views, degree=trainer.degree, truth=truth, certainties=certainties)
     count, contributes = trainer.field.gaussians.count, evidence.contributes

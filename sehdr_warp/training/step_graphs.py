@@ -48,7 +48,11 @@ class StepGraphs:
         self._eager_keys: set[GraphKey] = set()
 
     def run(self, views: Views, index: int, following: int | None, options: StepOptions, iteration: int) -> StepResult:
-        """Take a gradient step on view `index`; view `following` is fetched meanwhile if photos are streamed."""
+        """Take a gradient step on view `index`; view `following` is fetched meanwhile if photos are streamed.
+
+        Kernel by kernel, it is compute_and_apply(compute_gradients, apply_gradients). On one GPU, one graph replays all
+        of that; on several, one graph replays compute_gradients() and another apply_gradients().
+        """
         step, gaussians = self._step, self._step.field.gaussians
         # Gaussians.surround() has reserved rows for another purpose.
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
@@ -58,6 +62,7 @@ class StepGraphs:
         if self._capacity.has_counts and self.can_replay(views, key):
             return self._replay(views, index, following, options, key, iteration)
         with self.on_capture_stream():
+            # Without a capacity, so that result.intersections is their number.
             result = step.compute_and_apply(lambda: step.compute_gradients(views[index], options), step.apply_gradients)
         self._capacity.observe(result.intersections)
         if key is not None:
@@ -67,7 +72,7 @@ class StepGraphs:
     def can_replay(self, views: Views, key: GraphKey | None) -> TypeGuard[ViewStack | PhotoStream]:
         """Return whether a step can be a graph: its photo is selected by an index on the device, and its kernels ran.
 
-        A kernel must have run before it is captured, so the first step of a key runs kernel by kernel.
+        A kernel must have been compiled before it is captured, so the first step of a key runs kernel by kernel.
         """
         return self._first is not None and isinstance(views, ViewStack | PhotoStream) and key in self._eager_keys
 

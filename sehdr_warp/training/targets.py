@@ -1,5 +1,6 @@
-"""Training views: photos, cameras and HDR truth as tensors on the device."""
+"""Training views: photos, cameras and HDR truth as tensors on the device, and the scale that compares photos."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,10 +10,107 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..model.renders import CameraTensors
-from ..rasterizer.code_residual import code_tensor
+from ..rasterizer.code_residual import CodeScale, code_tensor, code_values
 from ..response import Response
 from ..scene import View
-from .losses import Target, code_scale, select_view
+
+CODE = 1 / 255  # One step of an 8-bit photo
+MU = 5000.0  # Parameter of the mu-law in which HDR images are compared
+KNEE = 8.0  # Code of 255 above black at white / mu in the mu-law of photos, linear below and logarithmic above
+GAIN_MAP_KNEE = 0.5  # The same exposure, where codes hold four stops more
+
+
+@dataclass(frozen=True)
+class Target:
+    """One training photo on the device.
+
+    Attributes:
+        codes: [H, W, 3] as from code_tensor(); or, with an index, a stack [V, H, W, 3] that contains the photo.
+        scale: Values and intervals that the codes stand for.
+        mask: [H, W, 1] in [0, 1].
+        exposure_truth: [H, W, 3] radiance of HDR truth times the base time.
+        estimates: Estimates of the light of clipped pixels, as in clipped_light_energy().
+        index: [1] int64, position of the photo in the stack.
+    """
+
+    codes: Tensor
+    scale: CodeScale
+    mask: Tensor | None = None
+    exposure_truth: Tensor | None = None
+    index: Tensor | None = None
+    estimates: Tensor | None = None
+
+    @property
+    def encoded(self) -> Tensor:
+        """Encoded values [H, W, 3] in [0, 1], computed from the codes at each access."""
+        return code_values(select_view(self.codes, self.index))
+
+    def psnr(self, encoded: Tensor) -> float:
+        """Return the PSNR of encoded values [H, W, 3] against the photo inside the mask, dB."""
+        squared = (encoded.clamp(0, 1) - self.encoded).square().mean(2, keepdim=True)
+        weights = torch.ones_like(squared) if self.mask is None else self.mask
+        mean = (squared * weights).sum() / weights.sum().clamp_min(1e-6)
+        return float(-10 * mean.clamp_min(1e-10).log10())
+
+
+def select_view(stack: Tensor, index: Tensor | None) -> Tensor:
+    """Return a copy of element index [1] of a stack [V, ...], on its device; without an index the tensor itself."""
+    return stack if index is None else stack.index_select(0, index)[0]
+
+
+def code_scale(
+    largest: int, response: Response | None, device, *, clipping: bool = True, dtype: torch.dtype = torch.float32
+) -> CodeScale:
+    """Return how photos are compared: in the mu-law of decoded exposures, or without a response as encoded values.
+
+    With `clipping`, white means at least white less half an 8-bit code, and 0 at most half a code. The half code, for
+    16 bits too, keeps a response that never quite reaches white from being pulled up.
+
+    If exposures are compared, a code stands for the middle of the interval of exposures that round to it. Near white
+    an interval may span stops. CodeScale.widen() makes all of it equally good, less the finest 8-bit step at its ends,
+    so that codes with finer intervals stay values.
+
+    Args:
+        largest: Largest code, 255 or 65535.
+        response: Response that decodes the codes; None to compare encoded values.
+        device: Torch device of the tables.
+        clipping: Treat the smallest and the largest code as intervals.
+        dtype: Type of the tables.
+    """
+    mu, white = (0.0, 1.0) if response is None else (mu_of_knee(response), response.white)
+
+    def to_scale(encoded: Tensor) -> Tensor:
+        return encoded if response is None else mu_law(response.decode(encoded), white, mu)
+
+    values = torch.arange(largest + 1, dtype=torch.float64) / largest
+    centers, between = to_scale(values), to_scale(values[:-1] + 0.5 / largest)
+    if response is not None:
+        centers[1:-1] = (between[1:] + between[:-1]) / 2
+    table, wide = torch.stack([centers, centers, centers], 1), None
+    if clipping:
+        table[0, 1], table[-1, 2] = -math.inf, math.inf
+        table[0, 2], table[-1, 1] = to_scale(values.new_tensor([CODE / 2, 1 - CODE / 2]))
+        if response is not None:
+            finest = to_scale((torch.arange(255) + 0.5).double() / 255).diff().min()
+            ends = torch.stack([between[:-1] + finest, between[1:] - finest], 1)
+            wide = table.clone()
+            wide[1:-1, 1:] = torch.where(ends[:, :1] < ends[:, 1:], ends, table[1:-1, 1:])
+            wide = wide.to(device, dtype)
+    return CodeScale(table.to(device, dtype), mu, white, wide)
+
+
+def mu_of_knee(response: Response) -> float:
+    """Return the mu whose knee, white / mu, is the exposure of code KNEE of 255 above black, for any response.
+
+    Log curves have black at a tenth of their codes and more.
+    """
+    knee = GAIN_MAP_KNEE if response.name == "gain-map" else KNEE
+    return response.white / max(float(response.decode(float(response.black) + knee / 255)), 1e-12)
+
+
+def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
+    """Return log(1 + mu x / white) / log(1 + mu): 0 for no light, 1 for the exposure that photos show as white."""
+    return torch.log1p(exposure * (mu / white)) / math.log1p(mu)
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def create_trainer(
     if tensorboard:
         summary_writer()
     with oom_context(device, lambda: sizes_of(scene), TRAINING_REMEDY):
-        resumes = folder.prepare(resume=resume, overwrite=overwrite)
+        resumes = folder.prepare(resume=resume, overwrite=overwrite)  # Again, for those who call this function.
         try:
             if resumes:
                 trainer = _resumed_trainer(
@@ -127,10 +127,13 @@ def _new_trainer(
     *,
     overwrite: bool,
 ) -> Trainer:
-    """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder."""
+    """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder.
+
+    The callees take the scene in its own coordinates and normalize it themselves, but for the plan.
+    """
     normalization = normalization_of(scene)
     config, plan = apply_plan(normalization.scene(scene), config, device)
-    check_scene_truth(scene, config.loss)
+    check_scene_truth(scene, config.loss)  # Here, before the photos are matched; GradientStep repeats it.
     response = response_for_training(scene, config)
     started = time.perf_counter()
     prepared = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
@@ -140,9 +143,9 @@ def _new_trainer(
     output = RunOutput(folder, config, tensorboard=tensorboard, is_block=shared is not None)
     trainer = Trainer(prepared.scene, config, field, get_matcher=prepared.get_matcher, ranks=ranks, output=output)
     started = time.perf_counter()
-    estimates = trainer.views.loss_estimates
-    if estimates is not None and not config.model.init_file:
-        brighten_clipped(field, normalization.scene(prepared.scene).train_views, estimates)
+    light = trainer.views.loss_light_estimates
+    if light is not None and not config.model.init_file:
+        brighten_clipped(field, normalization.scene(prepared.scene).train_views, light)
     trainer.seconds = seconds + time.perf_counter() - started
     if plan is not None and prepared.decision is not None:
         plan = plan.with_decision(prepared.decision)

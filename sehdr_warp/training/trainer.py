@@ -137,7 +137,6 @@ class Trainer:
         self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
         self._result: StepResult | None = None
         self._view_index = 0
-        self._checkpoint_every = config.scaled(config.schedule.checkpoint_every)
         self.interrupted, self._stopped, self._all_end, self._pace = threading.Event(), False, False, Pace()
 
     # The loop
@@ -186,7 +185,10 @@ class Trainer:
             yield
 
     def _agree_to_continue(self) -> bool:
-        """Return whether there is a next step; any rank may end the training, and rank 0 may pause() it."""
+        """Return whether there is a next step; any rank may end the training, and rank 0 may pause() it.
+
+        Other ranks repeat the exchange while rank 0 is in pause(); without ranks there is no exchange.
+        """
         agreed = END if self._all_end else WAIT
         while agreed == WAIT:
             agreed = GO if self.iteration < self.total and not self.ending else END
@@ -237,7 +239,8 @@ class Trainer:
         self.average.update(self.iteration, self.step_batch, self.field.gaussians)
         if self.came_to(CHECK_EVERY):
             self.check(wait=False)
-        if self.came_to(COMPARE_EVERY) or self.came_to(self._checkpoint_every):
+        # Before RunOutput.after_step() writes a checkpoint.
+        if self.came_to(COMPARE_EVERY) or self.came_to(self.config.checkpoint_interval):
             self.gather()
 
     def _densify(self) -> None:

@@ -23,8 +23,8 @@ from ..model.renders import CameraTensors
 from ..runs.config import Config
 from ..runs.light_estimates import ClippedLight, light_estimates
 from ..scene import Scene, View
-from .losses import Target, compares_exposures, select_view
-from .targets import PhotoSource, TrainingView, ViewStack
+from .losses import compares_exposures
+from .targets import PhotoSource, Target, TrainingView, ViewStack, select_view
 
 log = logging.getLogger(__name__)
 
@@ -222,6 +222,8 @@ class PhotoStream:
 
 
 Views = ViewStack | PhotoStream | Sequence[TrainingView]
+"""What steps select views from: a ViewStack if all photos are on a GPU, a PhotoStream if they are streamed to it, a
+PhotoSource on a CPU; a PhotoSource or a list on a GPU without CUDA graphs."""
 
 
 class TrainingViews:
@@ -236,17 +238,16 @@ class TrainingViews:
         self._widened = False
 
     @cached_property
-    def estimates(self) -> list[ClippedLight] | None:
-        """Estimates of each view's clipped light; None as by light_estimates(), or if colors are encoded values."""
+    def light_estimates(self) -> list[ClippedLight] | None:
+        """Estimates of each view's clipped light; None if there are none, or if colors are encoded values."""
         field = self._field
-        if field.color_model.encoded:
-            return None
-        return light_estimates(self._views, field.response, self._config.loss, field.gaussians.means.device)
+        response = None if field.color_model.encoded else field.response
+        return light_estimates(self._views, response, self._config.loss, field.gaussians.means.device)
 
     @property
-    def loss_estimates(self) -> list[Tensor] | None:
+    def loss_light_estimates(self) -> list[Tensor] | None:
         """The estimates [h, w, 6] that the loss pulls clipped light towards; None if it compares no exposures."""
-        estimates = self.estimates if compares_exposures(self._config.loss, self._field) else None
+        estimates = self.light_estimates if compares_exposures(self._config.loss, self._field) else None
         return None if estimates is None else [estimate.log_light for estimate in estimates]
 
     def widen_codes(self) -> None:
@@ -272,6 +273,6 @@ class TrainingViews:
             device,
             clipping=loss.clipping,
             compare_by=response,
-            estimates=self.loss_estimates,
+            estimates=self.loss_light_estimates,
             truth=loss.uses_hdr,
         )

@@ -8,7 +8,7 @@ from sehdr_warp.blocks.job import folder_of
 from sehdr_warp.blocks.refine import BAND, refine_borders
 from sehdr_warp.blocks.seams import measure_seams
 from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
-from sehdr_warp.runs.open import load_saved_scene
+from sehdr_warp.runs.open import load_scene_and_log_notes
 from sehdr_warp.runs.run import load_run
 
 from .two_blocks import train_two_blocks
@@ -53,7 +53,7 @@ def test_only_gaussians_near_borders_change_and_the_border_gets_better(town):
     run = load_run(folder_of(out, plan, 0))
     run.field.normalization = plan.normalization
     names = [entry for entry in plan.exposure_times if int(entry[-5:]) % 8 == 4]
-    views = load_saved_scene(plan.data | {"views": names}, response="srgb").views
+    views = load_scene_and_log_notes(plan.data | {"views": names}, response="srgb").views
     errors = []
     for tensors in (before, after):
         run.field.gaussians = Gaussians(**tensors)

@@ -82,11 +82,12 @@ def test_many_parameters_step_as_each_by_itself(device, function):
 
 
 @pytest.mark.parametrize("function", [finiteness_of, step_updates._nonfinite_by_kernel])
+@pytest.mark.parametrize("value", [math.inf, math.nan, 1e20])  # The square of the last is infinite.
 @pytest.mark.parametrize("place", [None, 0, 9])
-def test_one_number_that_is_not_finite_shows_in_the_result(device, place, function):
+def test_one_number_that_is_not_finite_shows_in_the_result(device, place, value, function):
     gradients = [torch.ones(7 * k + 1, 3, device=device) for k in range(10)]
     if place is not None:
-        gradients[place][-1, 2] = float("inf")
+        gradients[place][-1, 2] = value
     assert bool(function(gradients).isfinite().all()) == (place is None)
 
 

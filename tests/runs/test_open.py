@@ -20,7 +20,7 @@ def test_photos_of_a_folder_and_of_a_video_are_loaded_again(monkeypatch, tmp_pat
         place.write_bytes(b"")
     else:
         place.mkdir()
-    monkeypatch.setattr(opening, "load_saved_scene", lambda data, **_: data["path"])
+    monkeypatch.setattr(opening, "load_scene_and_log_notes", lambda data, **_: data["path"])
     assert opening.load_run_scene(run, None) == str(place)
 
 

@@ -12,7 +12,8 @@ from sehdr_warp.rasterizer.code_residual import code_tensor
 from sehdr_warp.rasterizer.ssim import ssim
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import LossConfig
-from sehdr_warp.training.losses import CODE, Target, code_scale, image_loss, ldr_loss, linear_loss, mu_law, mu_of_knee
+from sehdr_warp.training.losses import image_loss, ldr_loss, linear_loss
+from sehdr_warp.training.targets import CODE, Target, code_scale, mu_law, mu_of_knee
 
 
 def images(seed=0, shape=(12, 14, 3)):

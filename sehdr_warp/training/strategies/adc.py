@@ -162,7 +162,7 @@ class AdcStrategy(Strategy):
         gaussians.overwrite({"opacity_logits": logits}, optimizer=optimizer)
 
     def state_dict(self, count: int) -> dict[str, Tensor]:
-        """Return the gradient statistics of `count` Gaussians."""
+        """Return the gradient statistics of `count` Gaussians; photo_count is named as in earlier checkpoints."""
         statistics = {"gradient_sum": self.gradient_sum, "seen": self.photo_count}
         return {name: values[:count] for name, values in statistics.items() if values is not None}
 

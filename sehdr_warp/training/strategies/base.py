@@ -36,7 +36,7 @@ Propose = Callable[[Tensor, int], Proposals]
 
 @dataclass
 class Schedule:
-    """Iterations of this training at which a strategy refines."""
+    """Iterations of this training at which a strategy refines: multiples of `every` in the open range (start, stop)."""
 
     start: int
     stop: int
@@ -62,7 +62,7 @@ class Schedule:
         return (self.stop - 1) // self.every - iteration // self.every + 1
 
     def is_over(self, iteration: int) -> bool:
-        """Return whether no refinement follows after an iteration."""
+        """Return whether no refinement follows after an iteration, which may be before the first."""
         return (max(iteration, self.start) // self.every + 1) * self.every >= self.stop
 
 

@@ -35,7 +35,7 @@ class RelocationSlots:
     """Rows to fill in a refinement: those of the dead Gaussians, then the new ones.
 
     Attributes:
-        of_row: [N] int32, slot of each row in that order; negative for rows that stay.
+        of_row: [N] int32 with the new rows, slot of each row in that order; negative for rows that stay.
         changed: [N] bool, rows whose optimizer state is to be reset, see reset_moments().
     """
 
@@ -93,7 +93,9 @@ class McmcStrategy(Strategy):
     ) -> bool:
         """Relocate dead Gaussians and add new ones, if this iteration is due.
 
-        Only the device knows how many Gaussians are dead, so all counts stay there.
+        The slots are filled from the first on: [0, seeded) by seeding, [seeded, dead_count) by copies of living
+        Gaussians, and the new rows that are left, up to dead_count + added, by copies sampled by opacity. Only the
+        device knows how many Gaussians are dead, so these counts stay there.
         """
         if not self.is_due(iteration, step_batch):
             return False
@@ -223,7 +225,8 @@ class McmcStrategy(Strategy):
 def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tensor, left: float) -> None:
     """Clear Adam's first moments of the rows marked in `which` [N] bool; of their second moments `left` is kept.
 
-    These are the sources of copies, whose state the authors clear. Adam then moves a source, and a new copy, by 3 to 6
+    These are the sources of copies, whose state the authors clear; relocated copies keep that of their row, and new
+    rows have none. Adam then moves a source, and a new row, by 3 to 6
     times its rate for about 50 steps. That parts the two, but where Gaussians are small beside such a step, the
     rendering collapses. If all of the second moments stay, sources and copies part too slowly. So a tenth stays. In
     large and dense scenes, where Gaussians are small and their next photo comes late, more stays, and copies take over
