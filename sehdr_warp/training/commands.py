@@ -12,7 +12,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 from tyro.conf import Positional
@@ -30,12 +30,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-# The texts of these classes are empty, because each would be one more line of the help.
-
-
 @dataclass(frozen=True)
 class SceneOptions:
-    """"""  # noqa: D419
+    """"""  # noqa: D419  (here and below: a text would be one more line of the help)
 
     response: str | None = None
     """Camera response: a name of `sehdr-warp responses`, a file, auto (the default) or learned."""
@@ -133,14 +130,14 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         if _train_blocks(args):
             return
         argv = _without_blocks(argv)
-    if rank_info is None and gpus > 1 and not args.training.plan_only:
+    if args.training.plan_only:
+        if rank_info is None or rank_info.rank == 0:
+            _print_plan(args)
+    elif rank_info is None and gpus > 1:
         from .launch import launch
 
         device_of_rank(gpus - 1, args.machine.device)
         launch(gpus, _run_as_rank, list(argv))
-    elif args.training.plan_only:
-        if rank_info is None or rank_info.rank == 0:
-            _train(args)
     elif rank_info is None:
         _train(args)
     elif gpus not in (1, rank_info.local_count):
@@ -167,28 +164,24 @@ def _run_as_rank(words: list[str]) -> None:
 
 
 def _train(args: Train, ranks=None) -> None:
-    """Train or resume a run, or print a plan, on this rank."""
+    """Train or resume a run, on this rank."""
+    from .machine import precompiling
     from .scene_facts import check_dataset_truth
 
-    plan_only, output = args.training.plan_only, args.output
+    output, machine = args.output, args.machine
     # What can be refused is refused before the photos are read, which may take minutes.
-    resumed = None if plan_only else _prepare_folder(output)
+    resumed = _prepare_folder(output)
     data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
     config = _config(args, None if resumed is None else resumed.read_config())
-    device = pick_device(args.machine.device) if ranks is None else ranks.device
-    loading = {"response": config.response.name, "method": config.response.method}
-    loading |= {"candidates": config.response.candidates, "photo_storage": _photo_storage(config)}
-    if not plan_only:
-        check_dataset_truth(data, config)
-    with nullcontext() if plan_only or device.type != "cpu" else _precompiling(config):
+    device = pick_device(machine.device) if ranks is None else ranks.device
+    loading = _loading(config)
+    check_dataset_truth(data, config)
+    with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
             from .following import PhotoRequest
 
             ranks.request_photos(PhotoRequest(data, loading))
         scene = load_scene_and_log_notes(data, **loading)
-        if plan_only:
-            _print_plan(args, scene, config, device)
-            return
         from ..console import run_with_progress
         from ..viewer.live import serve_training
         from .advice import advice, option_words, options_of_run
@@ -213,6 +206,7 @@ def _train(args: Train, ranks=None) -> None:
     photos = len(trainer.scene.train_views)
     typed = configs.named_fields(args.fields) | {"response": args.scene.response, "preset": args.training.preset}
     options = options_of_run(trainer.run) if output.resume else typed | {"seed": args.training.seed}
+    options |= {"device": machine.device, "gpus": machine.gpus if machine.gpus > 1 else None}
     words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
     hints = partial(advice, train_photos=photos, scene=data.get("path") or "SCENE", options=words)
     _print_result(args, trainer.run, hints)
@@ -235,20 +229,23 @@ def _prepare_folder(output: OutputOptions) -> "RunWriter | None":
     return None
 
 
-def _print_plan(args: Train, scene, config, device) -> None:
+def _print_plan(args: Train) -> None:
     """Print the plan of a training and its cost."""
     from ..blocks import estimate
     from .plan import make_plan
 
-    plan = make_plan(scene, config, device)
+    data, config, device = _load_arguments(args, None), _config(args, None), pick_device(args.machine.device)
+    plan = make_plan(load_scene_and_log_notes(data, **_loading(config)), config, device)
     cost = estimate.estimate(plan, device, args.machine.gpus)
     values = plan.to_dict() | {"cost": estimate.to_dict(*cost)}
     print(json.dumps(values) if args.output.json else plan.table() + estimate.table(*cost))
 
 
-def _photo_storage(config) -> str:
-    """Return where load_scene() stores the photos of a training."""
-    return "memory" if config.schedule.photo_cache == "device" else config.schedule.photo_cache
+def _loading(config) -> dict[str, Any]:
+    """Return the arguments of load_scene() that a config states."""
+    response, cache = config.response, config.schedule.photo_cache
+    options = {"response": response.name, "method": response.method, "candidates": response.candidates}
+    return options | {"photo_storage": "memory" if cache == "device" else cache}
 
 
 def _print_result(args: Train, run, advice: Callable[[Path, dict], list[str]] | None = None) -> None:
@@ -318,33 +315,22 @@ def _train_blocks(args: Train) -> bool:
         slurm_device="cpu" if device.type == "cpu" and machine.device is not None else None,
         resume=output.resume,
         overwrite=output.overwrite,
-        photo_storage=_photo_storage(config),
+        photo_storage=_loading(config)["photo_storage"],
     )
     if run is not None:
         _print_result(args, run)
     return run is not None
 
 
-def _precompiling(config):
-    """Return a context that compiles, in the background, the kernels that a training will launch."""
-    from ..rasterizer.precompile import precompiled, training_kernels
-
-    plain = config.model.tone_map == "pixel" and not config.fusion.enabled
-    kernels = training_kernels(3 if plain else None, config.model.antialiased)
-    return precompiled(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
-
-
 def _refuse_run(args: Train) -> None:
     """Raise UsageError if SCENE is a run, which --resume continues by the name after --out."""
     from ..runs.run_folder import RunFolder
 
-    if args.data is None or not all(
-        file.is_file() for file in (RunFolder(args.data).config_file, RunFolder(args.data).info_file)
-    ):
-        return
-    steps = "" if args.training.iterations is None else f" --iterations {args.training.iterations}"
-    command = f"sehdr-warp train --resume --out {shlex.quote(args.data)}{steps}"
-    raise UsageError(f"{args.data}: is a run, not photos; {command} continues it")
+    folder = RunFolder(args.data or "")
+    if args.data is not None and folder.config_file.is_file() and folder.info_file.is_file():
+        steps = "" if args.training.iterations is None else f" --iterations {args.training.iterations}"
+        command = f"sehdr-warp train --resume --out {shlex.quote(args.data)}{steps}"
+        raise UsageError(f"{args.data}: is a run, not photos; {command} continues it")
 
 
 def _require_scene(args: Train) -> None:

@@ -1,17 +1,19 @@
-"""Process settings of a training: torch's settings, memory figures, and tidy interrupts."""
+"""Process settings of a training: torch's settings, kernels compiled ahead, memory figures, and tidy interrupts."""
 
 import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import torch
 
 from ..errors import require_extra
 from ..parallel import thread_count
+from ..rasterizer.precompile import precompiled, training_kernels
+from ..runs.config import Config
 
 SWITCH_SECONDS = 2e-4  # Interval after which a waiting thread requests the interpreter's lock; Python's 5 ms are long
 
@@ -28,6 +30,13 @@ def machine_figures(device: torch.device) -> dict:
     if cuda:
         figures["peak_gpu_memory_bytes"] = torch.cuda.max_memory_allocated(device)
     return figures
+
+
+def precompiling(config: Config) -> AbstractContextManager[None]:
+    """Return a context that compiles, in the background, the kernels that a training will launch."""
+    plain = config.model.tone_map == "pixel" and not config.fusion.enabled
+    kernels = training_kernels(3 if plain else None, config.model.antialiased)
+    return precompiled(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
 
 
 @contextmanager
