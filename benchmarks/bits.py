@@ -9,19 +9,15 @@ with 5.
 
 import logging
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 
 from sehdr_warp.evaluation.evaluate import evaluate
-from sehdr_warp.files import write_json
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene, codes_of, load_scene
@@ -29,7 +25,8 @@ from sehdr_warp.scene.raw import linear_codes
 from sehdr_warp.synth.expose import SensorNoise, exposure_ladder, noisy
 from sehdr_warp.training.train import train
 
-from .results import finish, new_result
+from .results import new_result
+from .study import add_rows, run
 
 LOG = logging.getLogger("bits")
 SCENES = ("window", "lamps", "sunlit", "night")
@@ -46,19 +43,24 @@ def main(
     jobs: int = 1,
     device: str = "cuda",
 ) -> None:
-    """Train every kind of photo of each scene at some exposures of its ladder, of which 2 is the middle."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    """Train every kind of photo of each scene.
+
+    Args:
+        json: file of the result.
+        scenes: names of embedded scenes.
+        exposures: out of a ladder of five, 0 to 4.
+        iterations: of a training.
+        max_size: longest side of the photos, pixels.
+        jobs: trainings at one time.
+        device: cpu or cuda:N.
+    """
     result = new_result("bits", torch.device(device), {"iterations": iterations, "max_size": max_size})
     result["command"] = "python -m benchmarks.bits --json docs/reports/results/bits.json"
     measure_row = partial(row, iterations=iterations, max_size=max_size, device=device)
     # Kernels are compiled once, not by each worker.
     row((scenes[0], exposures[0], *PHOTOS[0]), iterations=30, max_size=max_size, device=device)
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as workers:
-        combinations = [(scene, exposure, *photos) for exposure, scene, photos in product(exposures, scenes, PHOTOS)]
-        for result_row in workers.map(measure_row, combinations):
-            result["rows"].append(result_row)
-            write_json(json, result, overwrite=True)  # What has ended outlives an interruption.
-    finish(result, json, overwrite=True)
+    combinations = [(scene, exposure, *photos) for exposure, scene, photos in product(exposures, scenes, PHOTOS)]
+    add_rows(result, json, measure_row, combinations, jobs)
 
 
 def row(job: tuple[str, int, int, str, str], *, iterations: int, max_size: int | None, device: str) -> dict:
@@ -97,4 +99,4 @@ def photograph(truth: Scene, curve: Response, time: float, bits: int, kind: str,
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

@@ -45,6 +45,7 @@ from sehdr_warp.scene import Camera, View
 from sehdr_warp.training.train import create_trainer
 
 from .results import new_result
+from .study import run
 from .survey import write_survey
 from .timing import forget_peaks
 
@@ -360,7 +361,6 @@ def _milliseconds(times: Sequence[float]) -> dict[str, float]:
 def main(study: Study) -> None:
     """Run the study."""
     calm_threads()  # For the processes that this one starts
-    logging.basicConfig(level=logging.INFO, format="%(relativeCreated)7d %(message)s", stream=sys.stdout)
     study.out.mkdir(parents=True, exist_ok=True)
     settings = {"views": study.views, "size": study.size, "gaussians": study.gaussians, "steps": study.steps}
     settings |= {"blocks": study.count, "GPUs": len(study.devices) if study.device.type == "cuda" else 0}
@@ -374,4 +374,4 @@ def main(study: Study) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Study))
+    run(main)

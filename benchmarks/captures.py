@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 from sehdr_warp.evaluation.metrics import psnr, ssim
@@ -33,6 +32,7 @@ from sehdr_warp.training.train import train
 
 from .gsplat_trainer import STEPS, STRATEGIES, GsplatScene, Snapshot, train_gsplat
 from .results import finish, new_result
+from .study import run
 from .timing import forget_peaks
 
 LOG = logging.getLogger("captures")
@@ -41,7 +41,7 @@ LOOK_AT = (7_000, STEPS)  # simple_trainer.py's eval_steps
 
 
 def main(
-    folders: tyro.conf.Positional[tuple[Path, ...]],
+    folders: tuple[Path, ...],
     /,
     json: Path,
     max_size: int = 500,
@@ -59,7 +59,6 @@ def main(
         lpips: a folder with LPIPS weights.
         strategies: gsplat's.
     """
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
     result = new_result("captures", torch.device("cuda"), {"max_size": max_size})
     for folder in folders:
         scene = load_scene(folder, max_size=max_size)
@@ -137,4 +136,4 @@ def figures(image: Tensor, view: View, response: Response, metric, device: str) 
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

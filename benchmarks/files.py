@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 
 import sehdr_warp as sw
 from sehdr_warp.errors import SehdrError
@@ -28,6 +27,7 @@ from sehdr_warp.runs.run import load_splats
 from sehdr_warp.splats import GaussianArrays, read_gaussians
 
 from .results import finish, new_result
+from .study import run
 
 LOG = logging.getLogger("files")
 SUFFIXES = (".usdc", ".glb", ".ply", ".sog")
@@ -35,14 +35,20 @@ VIEWS = 4  # Held-out views that are compared
 
 
 def main(
-    runs: tyro.conf.Positional[tuple[str, ...]],
+    runs: tuple[str, ...],
     /,
     work: Path = Path("files_work"),
     json: Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Export each run to every kind of file and judge the files."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    """Export each run to every kind of file and judge the files.
+
+    Args:
+        runs: folders of runs, RUN or RUN=X,Y,Z.
+        work: folder for the files.
+        json: file of the result.
+        overwrite: replace it.
+    """
     if not runs:
         raise SehdrError("no runs; name folders of trained runs")
     result = new_result("files", torch.device("cuda" if torch.cuda.is_available() else "cpu"), {"runs": len(runs)})
@@ -120,4 +126,4 @@ def _angle(up: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

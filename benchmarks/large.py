@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import Config
@@ -29,6 +28,7 @@ from .captures import figures, photograph
 from .gsplat_trainer import GsplatScene, Snapshot, train_gsplat
 from .results import finish, new_result
 from .splats import Size, make_photo_scene, parse_size
+from .study import run
 from .timing import forget_peaks, held_memory, wait
 
 LOG = logging.getLogger("large")
@@ -39,9 +39,15 @@ HELD_OUT = 8
 """Of so many photos one is held out."""
 
 
-def main(sizes: tyro.conf.Positional[tuple[str, ...]], /, json: Path, photos: int = 24, iterations: int = 1000) -> None:
-    """Compare on scenes of these sizes, Gaussians@WIDTHxHEIGHT."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+def main(sizes: tuple[str, ...], /, json: Path, photos: int = 24, iterations: int = 1000) -> None:
+    """Compare on synthetic scenes.
+
+    Args:
+        sizes: Gaussians@WIDTHxHEIGHT, such as 1M@1600x1200.
+        json: file of the result.
+        photos: of a scene, of which one in eight is held out.
+        iterations: of a training.
+    """
     result = new_result("large", torch.device("cuda"), {"photos": photos, "iterations": iterations})
     for size in map(parse_size, sizes):
         result["rows"] += compare(size, photos, iterations)
@@ -112,4 +118,4 @@ def _means(render: Callable, scene: Scene, device: str) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

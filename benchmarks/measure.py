@@ -14,20 +14,24 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-import tyro
-
 from sehdr_warp.check.result import build
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import read_json, write_json
 
 from .report_pages import PAGES, REPORTS, ROOT, write_readme, write_reports
+from .study import run
 
 
-def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), /, work: Path = Path("measured")) -> None:
-    """Measure for pages, by default for all that can be measured."""
+def main(pages: tuple[str, ...] = (), /, work: Path = Path("measured")) -> None:
+    """Measure for pages and write them.
+
+    Args:
+        pages: names of docs/reports; by default all that can be measured.
+        work: folder of the results and jobs, which an interrupted measurement continues.
+    """
     names = [name for name, page in PAGES.items() if "command" in page]
     if wrong := set(pages) - set(names):
-        sys.exit(f"measure.py: {min(wrong)} is no page to measure: {', '.join(names)}")
+        raise SehdrError(f"{min(wrong)} is not a page to measure; use {', '.join(names)}")
     failed = []
     for name in pages or names:
         print(f"== {name}", flush=True)
@@ -39,7 +43,7 @@ def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), /, work: Path = Path
     write_reports(REPORTS)
     write_readme(ROOT / "README.md", read_json(REPORTS / "results" / "quality.json"))
     if failed:
-        sys.exit(f"measure.py: not measured, and their pages stay: {', '.join(failed)}")
+        raise SehdrError(f"not measured, and their pages stay: {', '.join(failed)}")
 
 
 def measure(page: Mapping, out: Path) -> dict:
@@ -64,4 +68,4 @@ def measure(page: Mapping, out: Path) -> dict:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

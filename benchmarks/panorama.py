@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 
 from scenes.generator.light import map_rays
 from scenes.generator.recipes import RECIPES
@@ -31,6 +30,7 @@ from sehdr_warp.training.plan import PRUNE_NEAR_ANGLE
 from sehdr_warp.training.train import train
 
 from .results import finish, new_result
+from .study import run
 
 LOG = logging.getLogger("panorama")
 RECIPE = "study"
@@ -63,7 +63,6 @@ def main(
         iterations: of the training.
         device: cpu or cuda:N.
     """
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
     work.mkdir(parents=True, exist_ok=True)
     places = PLACE + SPREAD * np.random.default_rng(0).uniform(-1, 1, (views, 3))
     cameras = [_camera(size, place, out) for place, out in zip(places, sphere_directions(views), strict=True)]
@@ -195,4 +194,4 @@ def _squared_distance(image: np.ndarray, truth: np.ndarray, peak: float) -> np.n
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

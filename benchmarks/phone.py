@@ -11,17 +11,14 @@ import io
 import logging
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import product
 from math import atan
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from PIL import Image
 
 from sehdr_warp.evaluation.evaluate import evaluate
@@ -33,7 +30,8 @@ from sehdr_warp.scene import load_scene
 from sehdr_warp.synth.expose import exposure_ladder, write_radiance
 from sehdr_warp.training.train import train
 
-from .results import finish, new_result
+from .results import new_result
+from .study import add_rows, run
 
 LOG = logging.getLogger("phone")
 SCENES = ("study", "window", "lamps", "night", "glass", "metal")
@@ -51,18 +49,24 @@ def main(
     jobs: int = 1,
     device: str = "cuda",
 ) -> None:
-    """Train every kind of photos of each scene, at photos' sizes of at most `sizes` pixels."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    """Train every kind of photos of each scene.
+
+    Args:
+        json: file of the result.
+        scenes: names of embedded scenes.
+        photos: kinds of photos.
+        sizes: longest sides of the photos, pixels.
+        seeds: of the trainings.
+        iterations: of a training.
+        jobs: trainings at one time.
+        device: cpu or cuda:N.
+    """
     result = new_result("phone", torch.device(device), {"iterations": iterations})
     result["command"] = "python -m benchmarks.phone --json docs/reports/results/phone.json"
     measure = partial(row, iterations=iterations, device=device)
     # Kernels are compiled once, not by each worker.
     row((seeds[0], sizes[0], scenes[0], photos[0]), iterations=30, device=device)
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as workers:
-        for result_row in workers.map(measure, product(seeds, sizes, scenes, photos)):
-            result["rows"].append(result_row)
-            write_json(json, result, overwrite=True)  # What has ended outlives an interruption.
-    finish(result, json, overwrite=True)
+    add_rows(result, json, measure, product(seeds, sizes, scenes, photos), jobs)
 
 
 def row(job: tuple[int, int, str, str], *, iterations: int, device: str) -> dict:
@@ -160,4 +164,4 @@ KINDS = {
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

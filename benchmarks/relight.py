@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 
 from scenes.generator.render import load_mitsuba
 from sehdr_warp.errors import SehdrError
@@ -28,6 +27,7 @@ from sehdr_warp.scene import embedded_folder, look_at
 from .irradiance import LIGHT, LightMap, read_light, read_light_maps
 from .quality import KNOWN, RESULT
 from .results import finish, new_result
+from .study import run
 
 LOG = logging.getLogger("relight")
 SIZE, SAMPLES, DEPTH = 96, 256, 3  # Pixels of a ball, paths of a pixel, and surfaces of a path
@@ -38,7 +38,7 @@ METHODS = "default", "3dgs", "paper", "truth"
 PICTURED = ("default", "map"), ("default", "lights"), ("3dgs", "map"), ("paper", "map")
 
 
-def main(jobs: tyro.conf.Positional[Path], /, json: Path, picture: Path | None = None, samples: int = SAMPLES) -> None:
+def main(jobs: Path, /, json: Path, picture: Path | None = None, samples: int = SAMPLES) -> None:
     """Light the balls and compare.
 
     Args:
@@ -48,7 +48,6 @@ def main(jobs: tyro.conf.Positional[Path], /, json: Path, picture: Path | None =
             3dgs and of paper.
         samples: paths of a pixel.
     """
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
     mi: Any = load_mitsuba()
     result = new_result("relight", torch.device("cpu"), {"samples": samples})
     strips, truths = [], {}
@@ -157,4 +156,4 @@ def _montage(strips: Sequence[tuple[str, np.ndarray, dict[tuple[str, str], np.nd
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

@@ -14,6 +14,7 @@ from . import report_plots as plots
 from .quality_tables import FIRST_TITLE, quality_tables, readme_table
 from .report_tables import PAGES, TABLES
 from .results import groups, machine_line, markdown_table
+from .study import run
 
 ROOT = Path(__file__).resolve().parents[1]
 REPORTS = ROOT / "docs" / "reports"
@@ -97,6 +98,11 @@ def _tried_page(path: Path) -> list[str]:
     return ["# Negative results", text, *tables]
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Write the pages and the README's table."""
     print(*write_reports(REPORTS), sep="\n")
     write_readme(ROOT / "README.md", _read(REPORTS / "results" / "quality.json"))
+
+
+if __name__ == "__main__":
+    run(main)

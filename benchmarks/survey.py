@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
@@ -22,6 +21,8 @@ from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.parallel import prefetch_map
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, codes_of, look_at
+
+from .study import run
 
 TIME = 1 / 500  # Exposure time of the photos, seconds
 ASPECT = 0.75
@@ -97,7 +98,8 @@ def make_cameras(views: int, size: int, length: float, width: float) -> list[Cam
 
 
 def write_survey(
-    folder: tyro.conf.Positional[Path],
+    folder: Path,
+    /,
     views: int = 400,
     size: int = 640,
     gaussians: int = 2_000_000,
@@ -155,4 +157,4 @@ def _write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(write_survey)
+    run(write_survey)

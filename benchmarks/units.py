@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-import tyro
 
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene, load_scene
 from sehdr_warp.training.train import train
 
 from .results import finish, new_result
+from .study import run
 
 LOG = logging.getLogger("units")
 FAR = 30  # Units of the normalized world: beyond them a Gaussian of a room is astray
@@ -49,7 +49,6 @@ def main(json: Path, max_size: int = 100, iterations: int = 1500, device: str = 
         iterations: of each training.
         device: "cpu", "cuda:0", ...
     """
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
     result = new_result("units", torch.device(device), {"max_size": max_size, "iterations": iterations})
     scene = load_scene("embedded", max_size=max_size)
     result["rows"] = [measure(scene, world, iterations, device) for world in WORLDS]
@@ -80,4 +79,4 @@ def in_world(scene: Scene, world: World) -> Scene:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)

@@ -3,12 +3,13 @@
 `python -m priors.average OUT A.safetensors=0.7 B.safetensors=0.3`; shares are divided by their sum.
 """
 
-import argparse
 from pathlib import Path
 
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+
+from benchmarks.study import run
 
 
 def average(weights: dict[Path, float], out: Path) -> None:
@@ -24,15 +25,16 @@ def average(weights: dict[Path, float], out: Path) -> None:
     save_file(tensors, out, {"deviation_scale": f"{scale:.4f}"})
 
 
-def main() -> None:
-    """Average the files of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("weights", nargs="+", metavar="FILE=SHARE")
-    args = parser.parse_args()
-    pairs = [each.rpartition("=") for each in args.weights]
-    average({Path(path): float(share) for path, _, share in pairs}, args.out)
+def main(out: Path, weights: tuple[str, ...], /) -> None:
+    """Average weights of the prior, which went on from the same weights.
+
+    Args:
+        out: the file to write.
+        weights: FILE=SHARE of each; shares are divided by their sum.
+    """
+    pairs = [each.rpartition("=") for each in weights]
+    average({Path(path): float(share) for path, _, share in pairs}, out)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -4,7 +4,6 @@
 it judges any weights on the panoramas of a folder, such as those that sources.toml lists as `checked`.
 """
 
-import argparse
 import itertools
 import json
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.study import run
 from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import STOPS, LightNetwork, network_input
 
@@ -22,6 +22,7 @@ from .panoramas import Pack, pack_of_folder, read_pack
 from .photos import Camera, Photos
 from .rooms import LitRooms
 
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 PHOTOS, BATCH, SIZE = 384, 32, 96
 LIT_ROOMS = 50  # Other ones than those of a training
 RIDGE = 10.0
@@ -103,25 +104,25 @@ def judge(
     return result
 
 
-def main() -> None:
-    """Judge weights and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("pack", type=Path)
-    parser.add_argument("weights", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, help="judge on the .hdr and .exr panoramas of a folder instead")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    args = parser.parse_args()
-    pack, prior = read_pack(args.pack), load_prior(args.device, args.weights)
-    unseen, chosen = np.flatnonzero(pack.held_out), np.flatnonzero(~pack.held_out)
-    learned = pack
-    if args.folder:
-        pack = pack_of_folder(args.folder, pack)
-        unseen = np.arange(len(pack.panoramas))
+def main(pack: Path, weights: Path, /, out: Path, folder: Path | None = None, device: str = DEVICE) -> None:
+    """Judge weights and write the figures.
+
+    Args:
+        pack: the panoramas.
+        weights: of the prior.
+        out: JSON file of the figures.
+        folder: judge on the .hdr and .exr panoramas of a folder instead.
+        device: cpu or cuda:N.
+    """
+    learned, prior = read_pack(pack), load_prior(device, weights)
+    judged, unseen, chosen = learned, np.flatnonzero(learned.held_out), np.flatnonzero(~learned.held_out)
+    if folder:
+        judged = pack_of_folder(folder, learned)
+        unseen = np.arange(len(judged.panoramas))
     figures = judge(
-        prior.network, prior.deviation_scale, pack, unseen, chosen, seed=2, device=args.device, learned=learned
+        prior.network, prior.deviation_scale, judged, unseen, chosen, seed=2, device=device, learned=learned
     )
-    args.out.write_text(json.dumps(figures))
+    out.write_text(json.dumps(figures))
 
 
 @torch.no_grad()
@@ -227,4 +228,4 @@ def _psnr(guess: np.ndarray, truth: np.ndarray, clipped: np.ndarray, exposure: n
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,10 +1,10 @@
 """Pack the listed panoramas, rooms and camera curves into one file: `python -m priors.pack DATA PACK`."""
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.study import run
 from sehdr_warp.scene.hdr_files import read_hdr
 
 from .panoramas import ROOM_SIZE, WIDTH, half_size, listed_sources, to_rgbe, write_pack
@@ -14,25 +14,26 @@ STEPS = 256  # Of a curve, even in the cube root of exposure
 WHITE_OF_REINHARD = 231.0  # The exposure that HDR-NeRF's curve shows as the last code
 
 
-def main() -> None:
-    """Read the data folder and write the pack."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("data", type=Path, help="folder with the panoramas of sources.toml, room*/groups and crf/")
-    parser.add_argument("pack", type=Path, help="the .npz to write")
-    args = parser.parse_args()
+def main(data: Path, pack: Path, /) -> None:
+    """Pack the listed panoramas, rooms and camera curves into one file.
+
+    Args:
+        data: folder with the panoramas of sources.toml, room*/groups and crf/.
+        pack: the .npz to write.
+    """
     sources = listed_sources()
-    panoramas = [to_rgbe(half_size(read_hdr(args.data / source.file), WIDTH)) for source in sources]
+    panoramas = [to_rgbe(half_size(read_hdr(data / source.file), WIDTH)) for source in sources]
     write_pack(
-        args.pack,
+        pack,
         {
             "panoramas": np.stack(panoramas),
             "held_out": np.array([source.held_out for source in sources]),
             "names": np.array([source.name for source in sources]),
-            "rooms": to_rgbe(np.stack(list(room_views(args.data)))),
-            "curves": curves(args.data / "crf" / "201_CRF_data.mat"),
+            "rooms": to_rgbe(np.stack(list(room_views(data)))),
+            "curves": curves(data / "crf" / "201_CRF_data.mat"),
         },
     )
-    print(f"{args.pack}: {len(sources)} panoramas, {args.pack.stat().st_size / 1e6:.1f} MB")
+    print(f"{pack}: {len(sources)} panoramas, {pack.stat().st_size / 1e6:.1f} MB")
 
 
 def room_views(data: Path):
@@ -65,4 +66,4 @@ def curves(measured: Path) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -3,12 +3,13 @@
 python -m priors.report FIGURES.json docs
 """
 
-import argparse
 import json
 from math import erf
 from pathlib import Path
 
 import numpy as np
+
+from benchmarks.study import run
 
 PAGE = "light-prior"
 _COLUMNS = {
@@ -58,13 +59,14 @@ that clip in a photo of 96 x 96 pixels. Trainings count half of the variance, so
 """
 
 
-def main() -> None:
-    """Write page and plot."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("figures", type=Path)
-    parser.add_argument("folder", type=Path)
-    args = parser.parse_args()
-    figures = json.loads(args.figures.read_text())
+def main(figures_file: Path, folder: Path, /) -> None:
+    """Write page and plot of the prior.
+
+    Args:
+        figures_file: JSON file of priors.judge.
+        folder: docs.
+    """
+    figures = json.loads(figures_file.read_text())
     tables = "\n\n".join(
         f"**{name}: {title}**\n\n{_table(figures[name])}" for name, title in _SETS.items() if name in figures
     )
@@ -74,8 +76,8 @@ def main() -> None:
     energies = [f"| {name} | {' | '.join(f'{row[area]:.2f}' for area in _AREAS)} |" for name, row in ratios.items()]
     values = {"page": PAGE, "tables": tables, "within": network["within_one_deviation"], "quarters": "\n".join(rows)}
     values |= {"areas": " | ".join(_AREAS.values()), "rules": " -: |" * len(_AREAS), "energies": "\n".join(energies)}
-    (args.folder / f"{PAGE}.md").write_text(_TEXT.format(**values))
-    _plot(np.array(network["sample"]), args.folder / "images" / f"{PAGE}.png")
+    (folder / f"{PAGE}.md").write_text(_TEXT.format(**values))
+    _plot(np.array(network["sample"]), folder / "images" / f"{PAGE}.png")
 
 
 def _table(estimates: dict) -> str:
@@ -108,4 +110,4 @@ def _plot(sample: np.ndarray, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

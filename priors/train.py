@@ -4,23 +4,25 @@ One run is deterministic on one kind of machine. With --judge the held-out panor
 the model card are printed and written beside the weights.
 """
 
-import argparse
 import copy
 import json
 import os
 import time
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+import tyro
 from safetensors.torch import save_file
 from torch import Tensor
 
+from benchmarks.study import run
 from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import STOPS, LightNetwork, network_input
 
 from .families import LIT_ROOMS, Families
-from .judge import judge
+from .judge import DEVICE, judge
 from .panoramas import Pack, read_pack
 from .photos import Photos
 from .rooms import LitRooms
@@ -117,37 +119,48 @@ def fit_scale(network: LightNetwork, pack: Pack, chosen: np.ndarray, *, seed: in
     return float(torch.cat(parts).quantile(0.683))
 
 
-def main() -> None:
-    """Train, judge if asked to, and write the weights."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("pack", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--begin", type=Path, help="go on from these weights")
-    parser.add_argument("--rate", type=float, default=RATE, help="largest learning rate")
-    parser.add_argument("--judge", action="store_true", help="leave out the held-out panoramas and judge on them")
-    parser.add_argument("--deviation-scale", type=float, default=1.0, help="of a judged run, for one on all panoramas")
-    args = parser.parse_args()
+def main(
+    pack: Path,
+    /,
+    out: Path,
+    steps: int = STEPS,
+    seed: int = 0,
+    device: str = DEVICE,
+    begin: Path | None = None,
+    rate: float = RATE,
+    judged: Annotated[bool, tyro.conf.arg(name="judge")] = False,
+    deviation_scale: float = 1.0,
+) -> None:
+    """Train, judge if asked to, and write the weights.
+
+    Args:
+        pack: the panoramas, see priors.pack.
+        out: file of the weights.
+        steps: of the training.
+        seed: of all random numbers.
+        device: cpu or cuda:N.
+        begin: go on from these weights.
+        rate: largest learning rate.
+        judged: leave out the held-out panoramas and judge on them.
+        deviation_scale: of a judged run, for one on all panoramas.
+    """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=True)
-    pack = read_pack(args.pack)
-    chosen = np.flatnonzero(~pack.held_out) if args.judge else np.arange(len(pack.panoramas))
-    options = {name: getattr(args, name) for name in ("steps", "seed", "device", "begin", "rate")}
-    network = train(pack, chosen, **options).eval()
-    scale, unseen = args.deviation_scale, np.flatnonzero(pack.held_out)
-    if args.judge:
+    packed = read_pack(pack)
+    chosen = np.flatnonzero(~packed.held_out) if judged else np.arange(len(packed.panoramas))
+    network = train(packed, chosen, steps=steps, seed=seed, device=device, begin=begin, rate=rate).eval()
+    scale, unseen = deviation_scale, np.flatnonzero(packed.held_out)
+    if judged:
         # Halves: on one the deviations are scaled, on the other all is judged.
-        scale = fit_scale(network, pack, unseen[::2], seed=1, device=args.device)
+        scale = fit_scale(network, packed, unseen[::2], seed=1, device=device)
     tensors = {name: value.detach().half().cpu().contiguous() for name, value in network.state_dict().items()}
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    save_file(tensors, args.out, {"deviation_scale": f"{scale:.4f}"})
-    if args.judge:
-        figures = judge(network, scale, pack, unseen, chosen, seed=2, device=args.device)
-        args.out.with_suffix(".json").write_text(json.dumps(figures))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_file(tensors, out, {"deviation_scale": f"{scale:.4f}"})
+    if judged:
+        figures = judge(network, scale, packed, unseen, chosen, seed=2, device=device)
+        out.with_suffix(".json").write_text(json.dumps(figures))
         print(json.dumps(figures))
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,0 +1,44 @@
+"""Run a study as a program: its main() takes the command line, its docstring is the help."""
+
+import logging
+import sys
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from sehdr_warp.arguments import MARKERS
+from sehdr_warp.cli import run_program
+from sehdr_warp.files import write_json
+
+from .results import finish
+
+
+def run(main: Callable[..., Any]) -> None:
+    """Call main() with the words of the command line and exit; a user's error is one line.
+
+    The arguments before `/` stand without a flag, the others are flags.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    program = f"python -m {sys.modules['__main__'].__spec__.name}"  # pyright: ignore[reportOptionalMemberAccess]
+    run_program(lambda words: tyro.cli(main, prog=program, args=words, config=MARKERS), sys.argv[1:], program)
+
+
+def add_rows(result: dict, json: Path, measure: Callable[[Any], dict], jobs: Iterable[Any], at_once: int) -> None:
+    """Add the row that measure() returns for each job, in processes of their own, then write and print the result.
+
+    Args:
+        result: gets the rows.
+        json: file of the result, which is written after each row, so that rows outlive an interruption.
+        measure: can be pickled.
+        jobs: arguments of measure().
+        at_once: processes.
+    """
+    with ProcessPoolExecutor(at_once, get_context("spawn")) as workers:
+        for row in workers.map(measure, jobs):
+            result["rows"].append(row)
+            write_json(json, result, overwrite=True)
+    finish(result, json, overwrite=True)

@@ -1,0 +1,43 @@
+"""Studies of benchmarks/ and priors/ as programs."""
+
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from benchmarks.study import run
+from sehdr_warp.errors import SehdrError
+
+ROOT = Path(__file__).parents[2]
+STUDIES = sorted(
+    f"{path.parent.name}.{path.stem}"
+    for folder in ("benchmarks", "priors")
+    for path in (ROOT / folder).glob("*.py")
+    if re.search(r"^    run\(\w+\)$", path.read_text(), re.MULTILINE)
+)
+
+
+def ended(monkeypatch, main, *words):
+    monkeypatch.setattr(sys, "argv", ["study.py", *words])
+    with pytest.raises(SystemExit) as caught:
+        run(main)
+    return caught.value.code
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_help_describes_every_option_and_does_nothing_else(name, monkeypatch, capsys):
+    module = import_module(name)
+    assert ended(monkeypatch, getattr(module, "main", None) or module.write_survey, "--help") == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert text.startswith("usage: python -m")
+    assert not re.search(r"(PATH|INT|STR|FLOAT|\]) \((default|required)", text), "an option has no text"
+
+
+def test_an_error_of_a_study_is_one_line(monkeypatch, capsys):
+    def main(name: str, /) -> None:
+        raise SehdrError(f"{name}: is not there; name another")
+
+    assert ended(monkeypatch, main, "x") == 1
+    assert re.fullmatch(r"python -m \S+: x: is not there; name another\n", capsys.readouterr().err)
