@@ -1,6 +1,8 @@
 """Command-line parsing with tyro, one-line usage errors, and lists of numbers."""
 
+import ast
 import dataclasses
+import functools
 import inspect
 import io
 import itertools
@@ -8,6 +10,7 @@ import math
 import os
 import re
 import shutil
+import textwrap
 import typing
 from collections.abc import Iterator
 from contextlib import redirect_stderr, suppress
@@ -44,7 +47,7 @@ def parse(options: type[Options], words: list[str], program: str) -> Options:
     """
     if shutil.get_terminal_size().columns < MIN_COLUMNS:
         os.environ["COLUMNS"] = str(MIN_COLUMNS)
-    _hide_empty_defaults(options)
+    _mend_help(options)
     long_groups = {name: hint for name, hint in _hints(options).items() if typing.is_typeddict(_unwrap(hint))}
     if long_groups and "--help-all" in words:
         words = ["--help"]
@@ -129,18 +132,35 @@ def positional(options: typing.Any) -> list[str]:
     return [name for name, hint in _hints(options).items() if tyro.conf.Positional in getattr(hint, "__metadata__", ())]
 
 
-def _hide_empty_defaults(options: type) -> None:
-    """Leave `(default: None)` and `(default: False)`, which say nothing, out of the help of options."""
+def _mend_help(options: type) -> None:
+    """Join the lines of each option's help, and leave out `(default: None)` and `(default: False)`.
+
+    tyro breaks the help where the source does, and again where the terminal ends.
+    """
     for field in dataclasses.fields(options) if dataclasses.is_dataclass(options) else ():
         owner = next(kind for kind in options.__mro__ if field.name in inspect.get_annotations(kind))
         hint = owner.__annotations__[field.name]
         for part in (hint, *typing.get_args(_unwrap(hint))):
             if dataclasses.is_dataclass(_unwrap(part)):
-                _hide_empty_defaults(_unwrap(part))
-        marks = getattr(hint, "__metadata__", ())
-        if field.default in (None, False, (), "") and not any(hasattr(mark, "help_behavior_hint") for mark in marks):
-            without_default = tyro.conf.arg(help_behavior_hint="")
-            owner.__annotations__[field.name] = typing.Annotated[hint, without_default]
+                _mend_help(_unwrap(part))
+        if any(hasattr(mark, "help_behavior_hint") for mark in getattr(hint, "__metadata__", ())):
+            continue
+        empty = field.default in (None, False, (), "")
+        config = tyro.conf.arg(help=_field_texts(owner).get(field.name), help_behavior_hint="" if empty else None)
+        owner.__annotations__[field.name] = typing.Annotated[hint, config]
+
+
+@functools.cache
+def _field_texts(options: type) -> dict[str, str]:
+    """Return the docstrings of a dataclass's fields, each as one line."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(options))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    texts = {}
+    for field, text in itertools.pairwise(body.body):
+        match field, text:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(value))):
+                texts[name] = " ".join(value.split())
+    return texts
 
 
 def _invalid_choice(match: re.Match) -> str:

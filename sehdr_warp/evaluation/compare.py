@@ -156,9 +156,10 @@ def format_table(result: dict) -> str:
     names = list(result["protocol"]) if any(figures["views"] for figures in result["protocol"].values()) else []
     rows += [_row(f"HDR mu-law {name}", result["protocol"][name], "_mu") for name in names]
     rows += [_row(f"HDR PU21 {name}", result["pu21"][name]) for name in names]
-    regions = [["region of the photo", "share", "LDR", *names]]
+    ldr = [] if "folder" in result else ["LDR"]
+    regions = [["region of the photo", "share", *ldr, *names]]
     for region, figures in result["regions"].items():
-        values = [figures["psnr_ldr"], *(figures["psnr_mu"][name] for name in names)]
+        values = [figures["psnr_ldr"]] * len(ldr) + [figures["psnr_mu"][name] for name in names]
         regions.append([region, f"{figures['fraction']:.1%}", *(format_figure(value, 2) for value in values)])
     count, split = len(result["views"]), {"train": "training"}.get(result["split"], result["split"])
     lines = [f"{result['scene']}: {count} {split} view{'s' * (count != 1)}, {origin}", "", *columns(rows)]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sehdr_warp as sw
+from sehdr_warp.cli import main
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table, format_table
 from sehdr_warp.evaluation.evaluate import evaluate
@@ -88,7 +89,14 @@ def test_a_folder_scores_as_a_run_that_renders_it(tmp_path, logged):
     assert ours["missing"] == ours["extra"] == []
     json.dumps(ours, allow_nan=False)
     table = format_table(ours)
-    assert str(folder) in table and "LDR   " not in table.split("region")[0]
+    assert str(folder) in table and "LDR" not in table
+
+
+def test_pictures_without_truth_are_no_run(tmp_path, capsys):
+    folder = write_pictures(tmp_path / "out", {2: 1.0})
+    with pytest.raises(SystemExit):
+        main(["eval", str(folder)])
+    assert "out: holds EXR pictures; add --truth" in capsys.readouterr().err
 
 
 def test_missing_and_extra_files_are_said(tmp_path, logged):
