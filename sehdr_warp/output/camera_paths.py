@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from ..errors import SehdrError
+from ..errors import SehdrError, did_you_mean
 from ..scene import Camera
 from ..scene.gravity import looks_down, up_direction
+from ..subsets import first_names
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -37,6 +38,16 @@ def evenly(items: Sequence[Item], count: int) -> list[Item]:
 def training_cameras(run: "RenderableScene") -> list[Camera]:
     """Return the training cameras of a scene."""
     return [entry.camera for entry in run.cameras if entry.split == "train"]
+
+
+def camera_named(run: "RenderableScene", name: str) -> Camera:
+    """Return the camera of a view; raise SehdrError if the scene has none of this name."""
+    cameras = {entry.name: entry.camera for entry in run.cameras}
+    if name not in cameras:
+        some = first_names(list(cameras), 5)
+        hint = did_you_mean(name, cameras) or "; see scene.json of the run"
+        raise SehdrError(f"view {name!r} is not one of the scene's ({some}){hint}")
+    return cameras[name]
 
 
 def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:

@@ -68,7 +68,7 @@ def opening_of(comparison: Comparison, exposure_time: float, gain: float = 1.0) 
         return Opening(0, "Photo and scene", f"View {comparison.name}, of which the photo clips next to nothing.")
     stops = darker_stops([comparison], exposure_time, gain)
     darker = f"{-stops} stop{'s' * (stops < -1)} darker"
-    lead = f"View {comparison.name}, {darker}. What the photo clipped stays flat grey."
+    lead = f"View {comparison.name}, {darker}. What the photo clipped stays flat."
     return Opening(stops, "Light above white", lead)
 
 

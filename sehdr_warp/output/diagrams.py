@@ -42,9 +42,12 @@ def training_svg(metrics: Sequence[Mapping]) -> Markup:
         y = place(0, decibels)[1]
         grid = '<path d="M40 {:.1f}H660" stroke="{}"/><text x="0" y="{:.1f}">{} dB</text>'
         elements.append(markup(grid, y, LINE, y + 4, decibels))
+    digits = 0 if longest >= 20 else 1
     for seconds in np.linspace(0, longest, 5):
         x, anchor = place(seconds, low)[0], "middle" if 0 < seconds < longest else "start" if not seconds else "end"
-        elements.append(markup('<text x="{:.1f}" y="272" text-anchor="{}">{:.0f} s</text>', x, anchor, seconds))
+        elements.append(
+            markup('<text x="{:.1f}" y="272" text-anchor="{}">{} s</text>', x, anchor, f"{seconds:.{digits}f}")
+        )
     for color, (title, line) in zip(COLORS, lines.items()):
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in line))
         x, y = place(*line[-1])

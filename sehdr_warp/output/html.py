@@ -46,6 +46,11 @@ def data_block(packed: str, **attributes: str) -> Markup:
     return markup('<script type="text/plain"{}>{}</script>', extra, packed)
 
 
+def with_code(text: str) -> Markup:
+    """Return text whose `commands` between backticks are marked as code."""
+    return join(markup("<code>{}</code>", part) if index % 2 else part for index, part in enumerate(text.split("`")))
+
+
 def page_file(name: str) -> str:
     """Return the text of a file in the folder `page`."""
     return Path(__file__).parent.joinpath("page", name).read_text(encoding="utf-8")

@@ -10,9 +10,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, SehdrError, did_you_mean
+from ..errors import InputError, SehdrError
 from ..files import read_json, write_json
 from ..runs.values import LIGHT_UNIT_FILE
+from .camera_paths import camera_named
 from .images import as_array
 from .tonemap import LUMINANCE
 
@@ -92,14 +93,13 @@ def meter(
     Raises:
         SehdrError: For a view or place that is not there, or values that cannot be.
     """
-    entry = next((entry for entry in run.cameras if entry.name == view), None)
-    if entry is None:
-        raise SehdrError(f"view {view!r} is not in {run.path}{did_you_mean(view, [each.name for each in run.cameras])}")
+    camera, (x, y) = camera_named(run, view), pixel
     if (luminance is None) == (illuminance is None):
         raise SehdrError("a reading is one of luminance, in cd/m^2, and illuminance, in lux")
+    if luminance is not None and reflectance != GREY_CARD:
+        raise SehdrError("a reflectance is that of a surface whose illuminance was read; a luminance needs none")
     if not 0 < reflectance <= 1:
         raise SehdrError(f"reflectance {reflectance:g} is not above 0 and at most 1; a grey card has {GREY_CARD}")
-    camera, (x, y) = entry.camera, pixel
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         size = f"{camera.width} x {camera.height}"
         raise SehdrError(f"pixel {x:g},{y:g} is outside of view {view}, which has {size} pixels in this run")

@@ -155,7 +155,7 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
     if not lights:
         return "no lights: nothing that the photos clipped gives light"
     transform = transform or WorldTransform.identity()
-    lines = [f"  share  shape  {'radiance' if unit is None else 'cd / m^2':>10}  at least  stops   place, size"]
+    lines = [f"  share  shape  {'radiance' if unit is None else 'cd/m^2':>10}  at least  stops   place, size"]
     for light in lights:
         sides = light.shape.size[: 2 if light.shape.kind == "rect" else 1]
         size = " x ".join(f"{transform.scale * side:.3g}" for side in sides)

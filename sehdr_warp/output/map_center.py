@@ -7,8 +7,7 @@ import numpy as np
 
 from ..errors import SehdrError
 from ..scene import Camera
-from ..subsets import first_names
-from .camera_paths import common_focus
+from .camera_paths import camera_named, common_focus
 from .world_transform import WorldTransform
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ def find_center(
     if isinstance(at, str) and at == "center":
         center = map_center(photos)
     else:
-        center = MapCenter(_point(at, {entry.name: entry.camera for entry in run.cameras}, transform), 0.0)
+        center = MapCenter(_point(run, at, transform), 0.0)
     if beyond is not None:
         return center._replace(beyond=beyond / transform.scale)
     if center.beyond:
@@ -67,14 +66,10 @@ def find_center(
     return center
 
 
-def _point(at: str | tuple[float, float, float], cameras: dict[str, Camera], transform: WorldTransform) -> np.ndarray:
+def _point(run: "RenderableScene", at: str | tuple[float, float, float], transform: WorldTransform) -> np.ndarray:
     """Return the point [3] that `at` names, in the scene's coordinates; its numbers are in those of the transform."""
     if isinstance(at, str) and at.startswith("camera:"):
-        name = at.partition(":")[2]
-        if name not in cameras:
-            some = first_names(list(cameras), 5)
-            raise SehdrError(f"camera {name!r} is not one of the scene's ({some}); see scene.json of the run")
-        return cameras[name].position
+        return camera_named(run, at.partition(":")[2]).position
     return transform.inverse().points(_numbers(at))
 
 

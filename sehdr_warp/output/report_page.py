@@ -15,7 +15,7 @@ from ..scene.exposure import shutter
 from ..scene.lens import area_average
 from .comparison import Comparison, opening_of
 from .diagrams import camera_map, training_svg
-from .html import EMPTY, duration, join, markup, page_file, whole_page
+from .html import EMPTY, duration, join, markup, page_file, whole_page, with_code
 from .light_pictures import (
     SPLIT,
     dial,
@@ -126,7 +126,7 @@ def _header(run: "Run", scene: Scene, opening: Markup) -> Markup:
     }
     items = join(markup("<li>{}<b>{}</b></li>", name, value) for name, value in facts.items() if value is not None)
     # A response that was guessed is named when the photos are read again, so that only the training noted its doubt.
-    notes = join(markup("<li>{}</li>", note) for note in dict.fromkeys((*run.notes(), *scene.notes)))
+    notes = join(markup("<li>{}</li>", with_code(note)) for note in dict.fromkeys((*run.notes(), *scene.notes)))
     device = summary.get("device")
     return markup(
         '<header>\n<p class="quiet">sehdr-warp report</p>\n<h1>{}</h1>\n<p class="quiet">{}</p>\n'

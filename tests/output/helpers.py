@@ -73,7 +73,7 @@ class AnalyticRun:
         return {"device": "abacus"}
 
     def notes(self):
-        return ["a note of the training"]
+        return ["a note of `the training`"]
 
     def decisions(self):
         return []

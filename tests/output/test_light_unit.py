@@ -95,7 +95,7 @@ def test_lights_are_in_candelas(lit, tmp_path):
     lights_file = json.loads((tmp_path / "lights.json").read_text())
     assert lights_file["units"] == "cd/m^2, linear Rec.709"
     assert lights_file["lights"][0]["radiance"] == pytest.approx([8 * unit, 4 * unit, 2 * unit])
-    assert "cd / m^2" in lights_table(LIGHTS, unit) and "radiance" in lights_table(LIGHTS)
+    assert "cd/m^2" in lights_table(LIGHTS, unit) and "radiance" in lights_table(LIGHTS)
     write_lights(lit, tmp_path / "lights.usda", axes="scene")
     assert f"float inputs:intensity = {unit!r}\n        asset inputs:texture" in (tmp_path / "lights.usda").read_text()
 
@@ -125,10 +125,11 @@ def test_a_clipped_place_is_named(run, caplog):
 @pytest.mark.parametrize(
     "options, problem",
     [
-        ({"view": "r_9", "luminance": 5.0}, "did you mean r_"),
+        ({"view": "r_9", "luminance": 5.0}, r"'r_9' is not one of the scene's \(r_0, r_1.*did you mean r_"),
         ({"pixel": (400, 2), "luminance": 5.0}, "outside of view r_0, which has 32 x 24 pixels"),
         ({"luminance": 5.0, "illuminance": 5.0}, "one of luminance"),
         ({}, "one of luminance"),
+        ({"luminance": 5.0, "reflectance": 0.5}, "a reflectance is that of a surface whose illuminance"),
         ({"luminance": -5.0}, "not a positive number"),
         ({"luminance": math.nan}, "not a positive number"),
         ({"illuminance": 5.0, "reflectance": 18.0}, "reflectance 18"),

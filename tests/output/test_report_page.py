@@ -21,6 +21,7 @@ from PIL import Image
 
 from sehdr_warp import output
 from sehdr_warp.output.comparison import Comparison, darker_stops, opening_of
+from sehdr_warp.output.diagrams import training_svg
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report import write_report
 from sehdr_warp.output.tonemap import display_gain
@@ -75,7 +76,7 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     assert len(text) < 5e6
     expected = ["Light above white", "Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
     assert headings(text) == [*expected, "What was left out, and why", "Figures", "Error against time", "Cameras"]
-    assert "<li>a note of the training</li>" in text
+    assert "<li>a note of <code>the training</code></li>" in text
     assert text.index("<h2>Light above white") < text.index('class="facts"') < text.index("<h2>Photo, scene, truth")
     for checked in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
         assert checked in text
@@ -233,10 +234,15 @@ def test_the_opening_shows_what_photos_clip_as_grey():
     assert darker_stops([thumbnail], 0.5) == -2
     assert darker_stops([thumbnail], 0.5, gain=8.0) == -5
     assert darker_stops([thumbnail], 1e-9) == -1 and darker_stops([thumbnail], 1e9) == -8
-    assert opening_of(thumbnail, 0.5).lead == "View v, 2 stops darker. What the photo clipped stays flat grey."
+    assert opening_of(thumbnail, 0.5).lead == "View v, 2 stops darker. What the photo clipped stays flat."
 
 
 def test_a_photo_that_clips_nothing_is_opened_as_it_was_taken():
     flat = np.full((4, 4, 3), 0.5)
     opening = opening_of(Comparison("v", flat, flat, flat), 0.5)
     assert (opening.stops, opening.title) == (0, "Photo and scene") and "next to nothing" in opening.lead
+
+
+def test_times_of_a_short_training_are_at_their_places():
+    chart = training_svg([{"psnr_ldr": 20.0 + time, "seconds": time} for time in (1.0, 10.0)])
+    assert re.findall(r">([\d.]+ s)<", chart) == ["0.0 s", "2.5 s", "5.0 s", "7.5 s", "10.0 s"]
