@@ -155,9 +155,9 @@ def find_nonfinite(
 
 
 @wp.func
-def index_in_turn(k: int, turn: int, turns: int) -> int:
+def index_in_turn(k: int, turn: int, update_interval: int) -> int:
     """Return the index of the k-th number that is updated in a turn; numbers take turns in blocks of SH_BLOCK."""
-    return k + (k // wp.static(SH_BLOCK) * (turns - 1) + turn) * wp.static(SH_BLOCK)
+    return k + (k // wp.static(SH_BLOCK) * (update_interval - 1) + turn) * wp.static(SH_BLOCK)
 
 
 @cache
@@ -165,8 +165,8 @@ def harmonics_adam_kernel(count: int):
     """Return update_by_adam() for coefficients of harmonics [3 N count] whose gradients are not stored.
 
     They are computed as by harmonics.coefficient_backward_kernel(). Blocks of SH_BLOCK coefficients are updated in
-    `turns` turns. Launched over `stride` threads: a thread takes VALUES_PER_THREAD coefficients, `stride` apart, and
-    requests the memory of all before it waits for any.
+    `update_interval` turns. Launched over `stride` threads: a thread takes VALUES_PER_THREAD coefficients, `stride`
+    apart, and requests the memory of all before it waits for any.
     """
     numbers, whole_numbers = vector(VALUES_PER_THREAD, wp.float32), vector(VALUES_PER_THREAD, wp.int32)
 
@@ -174,7 +174,7 @@ def harmonics_adam_kernel(count: int):
     def update_harmonics_by_adam(
         range_start: int,
         basis: wp.array3d(dtype=wp.float32), grad_colors: wp.array3d(dtype=wp.float32), start: int, stride: int,
-        turns: int,
+        update_interval: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
         active_count: wp.array(dtype=wp.int32),
         first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
@@ -182,9 +182,9 @@ def harmonics_adam_kernel(count: int):
         second_moments: wp.array(dtype=wp.float32),
     ):
         thread = range_start + wp.tid()
-        turn = int(step[0]) % turns
+        turn = int(step[0]) % update_interval
         final = active_values(parameters, active_count, wp.static(3 * count)) - 1
-        if skipped[0] == 0.0 and index_in_turn(thread, turn, turns) <= final:
+        if skipped[0] == 0.0 and index_in_turn(thread, turn, update_interval) <= final:
             owners = whole_numbers()
             orders = whole_numbers()
             channels = whole_numbers()
@@ -193,7 +193,7 @@ def harmonics_adam_kernel(count: int):
             squares = numbers()
             values = numbers()
             for k in range(wp.static(VALUES_PER_THREAD)):
-                i = wp.min(index_in_turn(thread + k * stride, turn, turns), final)
+                i = wp.min(index_in_turn(thread + k * stride, turn, update_interval), final)
                 means[k] = first_moments[i]
                 squares[k] = second_moments[i]
                 values[k] = parameters[i]
@@ -207,13 +207,13 @@ def harmonics_adam_kernel(count: int):
                     basis_value = basis[view, wp.min(orders[k], basis_count - 1), owners[k]]
                     grad_color = grad_colors[view, owners[k], channels[k]]
                     gradients[k] += wp.where(orders[k] < basis_count, basis_value, 0.0) * grad_color
-            turn_count = wp.ceil(step[0] / float(turns))
+            turn_count = wp.ceil(step[0] / float(update_interval))
             length = rate[0] / bias_correction(first_decay_log, turn_count)
             enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, turn_count))
             for k in range(wp.static(VALUES_PER_THREAD)):
                 mean = means[k] + first_gain * (gradients[k] - means[k])
                 square = squares[k] + second_gain * (gradients[k] * gradients[k] - squares[k])
-                i = index_in_turn(thread + k * stride, turn, turns)
+                i = index_in_turn(thread + k * stride, turn, update_interval)
                 if i <= final:
                     first_moments[i] = mean
                     second_moments[i] = square

@@ -86,9 +86,9 @@ class Adam:
                 steps_with_gradient.append(AdamStep(values, gradient, first, second, step, group["lr"], width))
             elif harmonics is not None:
                 start = FIRST_HARMONIC[group["name"]]
-                turns = self.sh_update_interval if start else 1
+                interval = self.sh_update_interval if start else 1
                 arguments = values, start, harmonics, first, second, step, flags.skipped
-                harmonics_adam_step(*arguments, rate=group["lr"], turns=turns, **options)
+                harmonics_adam_step(*arguments, rate=group["lr"], update_interval=interval, **options)
         adam_steps(steps_with_gradient, flags.skipped, **options)
 
     def _with_gradient(self, *, factored: bool) -> list[tuple[dict, Tensor]]:

@@ -52,23 +52,23 @@ class CodeScale:
             a code; -inf or inf for a bound that does not exist. Values increase with the code.
         mu: Images are exposures x, and compared as log(1 + mu x / white) / log(1 + mu); 0 compares them as they are.
         white: Exposure that photos show as white.
-        wide: The table in which bright codes are intervals; None if there are no such codes.
+        interval_table: The table in which bright codes are intervals; None if there are no such codes.
     """
 
     table: Tensor
     mu: float = 0.0
     white: float = 1.0
-    wide: Tensor | None = None
+    interval_table: Tensor | None = None
 
     @property
     def compares_exposures(self) -> bool:
         """True if images are exposures; False if they are encoded values."""
         return self.mu > 0
 
-    def widen(self) -> None:
+    def use_intervals(self) -> None:
         """Treat bright codes as intervals from now on; in place, so that captured CUDA graphs do too."""
-        if self.wide is not None:
-            self.table.copy_(self.wide)
+        if self.interval_table is not None:
+            self.table.copy_(self.interval_table)
 
 
 def code_residual(image: Tensor, codes: Tensor, scale: CodeScale, index: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -179,12 +179,12 @@ def harmonics_adam_step(
     betas: tuple[float, float],
     epsilon: float,
     active_count: Tensor | None = None,
-    turns: int = 1,
+    update_interval: int = 1,
 ) -> None:
     """Do adam_steps() for coefficients of harmonics [N, K, 3] from number `start` on.
 
-    Their gradients are multiplied out as they are used. turns: parts of the coefficients that are updated in turn, one
-    at each call; `step` tells whose turn it is and how many it had.
+    Their gradients are multiplied out as they are used. update_interval: parts of the coefficients that are updated in
+    turn, one at each call; `step` tells whose turn it is and how many it had.
     """
     if not parameter.numel():
         return
@@ -192,10 +192,10 @@ def harmonics_adam_step(
     values = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
     in_turn = parameter.numel()
-    if turns > 1:
-        in_turn = -(-in_turn // (kernels.SH_BLOCK * turns)) * kernels.SH_BLOCK
+    if update_interval > 1:
+        in_turn = -(-in_turn // (kernels.SH_BLOCK * update_interval)) * kernels.SH_BLOCK
     stride = -(-in_turn // kernels.VALUES_PER_THREAD)
-    arguments = gradients.basis, gradients.grad_colors, start, stride, turns, *options, *values
+    arguments = gradients.basis, gradients.grad_colors, start, stride, update_interval, *options, *values
     launch(kernel, stride, *arguments)
 
 

@@ -92,6 +92,10 @@ class RunWriter(RunFolder):
         self.refuse_links()
         remove_stale(self.config_file)
         if not self.path.exists() or self._is_empty():
+            place = next(place for place in (self.path, *self.path.absolute().parents) if place.exists())
+            if not os.access(place, os.W_OK):
+                problem = f"cannot be written, because {place} is read-only or belongs to others"
+                raise InputError(self.path, problem, "choose another folder for the run")
             return False
         if not resume and not overwrite:
             raise InputError(self.path, "exists and is not empty", "choose another, or use --resume or --overwrite")

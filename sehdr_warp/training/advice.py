@@ -58,7 +58,9 @@ def advice(
         gain = points[-1].psnr - max(earlier, default=points[0].psnr)
         if gain > STILL_RISING:
             command = f"sehdr-warp train --resume --out {run} --iterations {2 * iterations}"
-            lines.append(f"held-out photos still gained {gain:.1f} dB at the end; more steps help: {command}")
+            lines.append(
+                f"held-out photos gained {gain:.1f} dB in the last third of the steps; more steps help: {command}"
+            )
         elif best := best_if_overfitted(points):
             lines.append(
                 f"held-out photos were {best.psnr - points[-1].psnr:.1f} dB better at iteration {best.iteration}: "

@@ -21,7 +21,7 @@ from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
-from ..runs.open import load_scene_and_log_notes
+from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
@@ -165,6 +165,7 @@ def _run_as_rank(words: list[str]) -> None:
 
 def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, on this rank."""
+    from ..response import Response
     from .machine import precompiling
     from .scene_facts import check_dataset_truth
 
@@ -175,6 +176,8 @@ def _train(args: Train, ranks=None) -> None:
     config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(machine.device) if ranks is None else ranks.device
     loading = _loading(config)
+    if resumed is not None:  # Its response need not be chosen again.
+        loading["response"] = response_for_loading(config, Response.from_dict(resumed.read_info()["response"]))
     check_dataset_truth(data, config)
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
@@ -271,7 +274,7 @@ def _in_blocks(args: Train) -> bool:
         return not options.plan_only
     if output.out is None or not is_in_blocks(output.out) or options.plan_only:
         if args.machine.slurm is not None:
-            raise UsageError("--slurm is of --blocks, whose blocks become SLURM jobs")
+            raise UsageError("--slurm needs --blocks, whose blocks become SLURM jobs")
         return False
     if output.overwrite:
         raise InputError(output.out, "holds a training in blocks", "choose another folder, or add --blocks")

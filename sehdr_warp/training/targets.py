@@ -67,8 +67,8 @@ def code_scale(
     16 bits too, keeps a response that never quite reaches white from being pulled up.
 
     If exposures are compared, a code stands for the middle of the interval of exposures that round to it. Near white
-    an interval may span stops. CodeScale.widen() makes all of it equally good, less the finest 8-bit step at its ends,
-    so that codes with finer intervals stay values.
+    an interval may span stops. CodeScale.use_intervals() makes all of it equally good, less the finest 8-bit step at
+    its ends, so that codes with finer intervals stay values.
 
     Args:
         largest: Largest code, 255 or 65535.
@@ -86,17 +86,17 @@ def code_scale(
     centers, between = to_scale(values), to_scale(values[:-1] + 0.5 / largest)
     if response is not None:
         centers[1:-1] = (between[1:] + between[:-1]) / 2
-    table, wide = torch.stack([centers, centers, centers], 1), None
+    table, intervals = torch.stack([centers, centers, centers], 1), None
     if clipping:
         table[0, 1], table[-1, 2] = -math.inf, math.inf
         table[0, 2], table[-1, 1] = to_scale(values.new_tensor([CODE / 2, 1 - CODE / 2]))
         if response is not None:
             finest = to_scale((torch.arange(255) + 0.5).double() / 255).diff().min()
             ends = torch.stack([between[:-1] + finest, between[1:] - finest], 1)
-            wide = table.clone()
-            wide[1:-1, 1:] = torch.where(ends[:, :1] < ends[:, 1:], ends, table[1:-1, 1:])
-            wide = wide.to(device, dtype)
-    return CodeScale(table.to(device, dtype), mu, white, wide)
+            intervals = table.clone()
+            intervals[1:-1, 1:] = torch.where(ends[:, :1] < ends[:, 1:], ends, table[1:-1, 1:])
+            intervals = intervals.to(device, dtype)
+    return CodeScale(table.to(device, dtype), mu, white, intervals)
 
 
 def mu_of_knee(response: Response) -> float:

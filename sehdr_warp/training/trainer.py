@@ -218,7 +218,7 @@ class Trainer:
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
         if self.iteration > INTERVALS_FROM * self.total:
-            self.views.widen_codes()
+            self.views.use_code_intervals()
         self._view_index = self.order.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)

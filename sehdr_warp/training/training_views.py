@@ -29,7 +29,7 @@ from .targets import PhotoSource, Target, TrainingView, ViewStack, select_view
 log = logging.getLogger(__name__)
 
 SLOTS = 3  # One is read, one is filled, and one may still be read by a step that has not finished
-SHARE = 0.4  # Largest fraction of the device's free memory for photos; stacking them takes as much again for a while
+MAX_MEMORY_PART = 0.4  # Of the device's free memory for photos; stacking them takes as much again for a while
 
 
 def first_wide_view(scene: Scene) -> View | None:
@@ -88,7 +88,8 @@ def make_view_source(source: PhotoSource, where: str, use_cuda_graph: bool) -> "
     device = torch.device(source.device)
     if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
         return source
-    if where in ("memory", "disk") or (where == "auto" and source.bytes > SHARE * torch.cuda.mem_get_info(device)[0]):
+    limit = MAX_MEMORY_PART * torch.cuda.mem_get_info(device)[0]
+    if where in ("memory", "disk") or (where == "auto" and source.bytes > limit):
         log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, device)
         try:
             return PhotoStream(source) if use_cuda_graph else source
@@ -235,7 +236,7 @@ class TrainingViews:
     def __init__(self, views: Sequence[View], field: RadianceField, config: Config, *, use_cuda_graph: bool):
         """Prepare the views of a field's normalized scene; steps are captured if use_cuda_graph."""
         self._views, self._field, self._config, self._use_cuda_graph = views, field, config, use_cuda_graph
-        self._widened = False
+        self._uses_intervals = False
 
     @cached_property
     def light_estimates(self) -> list[ClippedLight] | None:
@@ -250,11 +251,11 @@ class TrainingViews:
         estimates = self.light_estimates if compares_exposures(self._config.loss, self._field) else None
         return None if estimates is None else [estimate.log_light for estimate in estimates]
 
-    def widen_codes(self) -> None:
+    def use_code_intervals(self) -> None:
         """Turn bright codes into intervals, if they are not yet."""
-        if not self._widened:
-            self._widened = True
-            self._photos.scale.widen()
+        if not self._uses_intervals:
+            self._uses_intervals = True
+            self._photos.scale.use_intervals()
 
     @cached_property
     def source(self) -> Views:

@@ -141,7 +141,7 @@ def test_parts_of_the_coefficients_step_in_turn(device, count):
     never, changed = torch.zeros((), device=device), []
     for number in (1.0, 2.0, 3.0, 4.0):
         before, step = parts[0].clone(), torch.tensor(number, device=device)
-        harmonics_adam_step(parts[0], 1, gradients, *parts[1:], step, never, **options, turns=2)
+        harmonics_adam_step(parts[0], 1, gradients, *parts[1:], step, never, **options, update_interval=2)
         changed.append((parts[0] != before).view(-1))
     # Blocks take turns, whatever the number of Gaussians; two steps of each are those of all.
     second = torch.arange(count * 45, device=device) // 1024 % 2 == 1

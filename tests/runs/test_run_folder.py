@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -287,3 +288,10 @@ def test_names_that_are_no_text_are_refused_before_the_training(tmp_path, where)
     with pytest.raises(InputError, match="is a name that is not UTF-8 text; rename it"):
         create_trainer(scene, out, config, device="cpu", data=data)
     assert not [path for path in tmp_path.rglob("*") if path.name != ".lock"]
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_photos_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    with pytest.raises(InputError, match=f"cannot be written, because {tmp_path} is read-only"):
+        RunWriter(tmp_path / "runs" / "first").prepare(resume=False, overwrite=False)
+    assert not list(tmp_path.iterdir())

@@ -130,7 +130,7 @@ def test_light_anywhere_within_what_a_code_stands_for_is_as_good_once_it_is_an_i
         loss = ldr_loss(TrainRender(light, light, light, None, light), target, LossConfig(clipped_smoothness=0.0))
         (slopes,) = torch.autograd.grad(loss, light)
         assert (loss.item() < 1e-12) == wide and bool((slopes == 0).all()) == wide
-        target.scale.widen()
+        target.scale.use_intervals()
 
 
 def test_without_clipping_an_overshoot_costs():
@@ -155,7 +155,7 @@ def test_gradients_of_the_photo_loss(wide):
     generator = torch.Generator().manual_seed(4)
     target = target_of(torch.rand(4, 5, 3, generator=generator, dtype=torch.float64), response)
     if wide:
-        target.scale.widen()
+        target.scale.use_intervals()
     light = (torch.rand(4, 5, 3, generator=generator, dtype=torch.float64) + 0.1).requires_grad_()
 
     def loss(x):

@@ -14,11 +14,13 @@ from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
+from sehdr_warp.scene import response_choice
 from sehdr_warp.training.run_output import remove_unseen
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import TrainingState, load_state, state_of
 
+from ..refusals import call
 from .toy import VARIANTS, make_trainer, quick, toy_scene, without_truth
 
 
@@ -192,3 +194,11 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
     for use in (load_run, lambda path: train(scene, path, device="cpu", resume=True)):
         with pytest.raises(InputError, match="format = 1 is of sehdr-warp .* this one reads format 3; train again"):
             use(run.path)
+
+
+def test_a_resumed_training_takes_the_runs_response(tmp_path, monkeypatch):
+    words = ["train", "embedded", "--out", str(tmp_path / "run"), "--max-size", "32", "--device", "cpu"]
+    assert call(*words, "--iterations", "4") == 0
+    monkeypatch.setattr(response_choice, "_select_for_dataset", None)
+    assert call("train", "--resume", "--out", tmp_path / "run", "--device", "cpu", "--iterations", "6") == 0
+    assert load_run(tmp_path / "run").iterations == 6

@@ -71,6 +71,6 @@ def test_a_scale_has_black_at_0_and_white_at_1(device, deep):
             # Codes of the dark stand for more light than others, and not for that of the next.
             assert bool((least < most)[1:20].any()) == wide and bool((least < most)[1:20].all()) == wide
             assert bool((most[1:-2] < least[2:-1]).all())
-            scale.widen()
+            scale.use_intervals()
     worth, least, most = views_of((view,), device, clipping=False)[0].target.scale.table.unbind(1)
     assert torch.equal(least, worth) and torch.equal(most, worth)
