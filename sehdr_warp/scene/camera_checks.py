@@ -1,7 +1,6 @@
 """Checks of a set's cameras against each other, its points and its photos: what other tools often state wrongly."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,21 +17,14 @@ _MOST_POINTS, _MOST_CAMERAS = 2000, 64  # That are looked at
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # Between the axes of OpenGL (y up, z back) and OpenCV (y down, z ahead)
 
 
-class CheckedCameras(NamedTuple):
-    """Photos whose cameras can be used, and notes on all cameras."""
-
-    records: list[ImageRecord]
-    notes: list[str]
-
-
-def check_cameras(records: Sequence[ImageRecord], cloud: PointCloud) -> CheckedCameras:
-    """Leave out photos whose cameras are far from all others, and describe cameras that are probably stated wrongly.
+def check_cameras(records: Sequence[ImageRecord], cloud: PointCloud) -> tuple[list[ImageRecord], list[str]]:
+    """Return photos without those whose cameras are far from all others, and notes on cameras that seem to be wrong.
 
     One camera at a false place, as structure from motion leaves it at times, would make the scene a dot in its own
     unit, and training would fail.
     """
     near, notes = _without_far_cameras(records, cloud)
-    return CheckedCameras(near, [*notes, *_at_one_place(near), *_off_center(near), *_wrong_way(near, cloud)])
+    return near, [*notes, *_at_one_place(near), *_off_center(near), *_wrong_way(near, cloud)]
 
 
 def _at_one_place(records: Sequence[ImageRecord]) -> list[str]:

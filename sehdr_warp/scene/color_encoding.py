@@ -22,7 +22,7 @@ from .color_icc import IccTable, KnownColors, read_profile, xyz_to_rec709
 from .color_primaries import REC709, matrix_to_rec709, srgb_to_linear
 from .color_srgb_codes import encoded_in_bands
 from .heif import read_items
-from .images import PILLOW_ERRORS, EncodedImage, exif_of
+from .images import PILLOW_ERRORS, EncodedImage, exif_of, png_chunks
 
 _ADOBE_RGB = (0.640, 0.330, 0.210, 0.710, 0.150, 0.060, 0.3127, 0.3290)
 _ADOBE_GAMMA = 563 / 256
@@ -219,16 +219,12 @@ def _simplify(name: str, matrix: np.ndarray | None, curves: tuple[np.ndarray, ..
 
 def _png_cicp(path: Path) -> tuple[int, int, int] | None:
     """Return primaries, transfer and full range of a PNG's cICP chunk, which Pillow does not read."""
-    with path.open("rb") as file:
-        file.seek(8)
-        while len(head := file.read(8)) == 8:
-            length, kind = struct.unpack(">I4s", head)
-            if kind == b"cICP" and length == 4:
-                primaries, transfer, _, full = file.read(4)
-                return primaries, transfer, full
-            if kind in (b"IDAT", b"PLTE", b"IEND"):
-                return None
-            file.seek(length + 4, 1)
+    for kind, length, start in png_chunks(path):
+        if kind == b"cICP" and length == 4:
+            primaries, transfer, _, full = start.ljust(4, b"\0")
+            return primaries, transfer, full
+        if kind in (b"IDAT", b"PLTE", b"IEND"):
+            return None
     return None
 
 

@@ -18,13 +18,13 @@ _D50 = np.array([0.9642, 1.0, 0.8249])  # White of the profile connection space,
 _MOST_ENTRIES = 1 << 22  # Of a table, 128 to each side and three channels are 6 million numbers
 _AT_ONCE = 1 << 14  # Colors that are converted at a time, whose floats stay in the caches of a processor
 _EPSILON, _KAPPA = 216 / 24389, 24389 / 27
-_ReadCurve = Callable[[bytes], np.ndarray]
 _MOST_BYTES = 16 << 20  # Above any profile in use; printer tables have a few megabytes
 # Linear Rec.709 (sRGB, IEC 61966-2-1) from XYZ relative to D50, the connection space of ICC profiles.
 _REC709_FROM_D50 = np.array([
     [3.1338561, -1.6168667, -0.4906146], [-0.9787684, 1.9161415, 0.0334540], [0.0719453, -0.2289914, 1.4052427],
 ])  # fmt: skip
 _MOST_OF_NAME = 80  # Characters that lines show
+_PARAMETERS = (1, 3, 4, 5, 7)  # Of a `para` curve by its kind
 _SAMPLES = 65_536  # Of a curve that a formula describes: exact at all codes of 8 and 16 bits
 
 
@@ -117,7 +117,7 @@ def read_profile(data: bytes) -> IccProfile:
         # Of the relative colorimetric intent, or of the only one, as LittleCMS takes it.
         if (table := tags.get(b"A2B1") or tags.get(b"A2B0")) is not None and cicp is None:
             space = profile.connection_space.strip()
-            return IccProfile(name, colors, None, (), cicp, read_table(table, space, _curve))
+            return IccProfile(name, colors, None, (), cicp, _read_table(table, space))
         curves = tuple(_curve(tags[tag]) for tag in (b"rTRC", b"gTRC", b"bTRC")) if b"rTRC" in tags else ()
         to_xyz = np.eye(3)
         if curves:
@@ -161,7 +161,7 @@ def _curve(tag: bytes) -> np.ndarray:
     if tag[:4] != b"para":
         raise ValueError
     kind = struct.unpack_from(">H", tag, 8)[0]
-    count = (1, 3, 4, 5, 7)[kind]
+    count = _PARAMETERS[kind]
     g, a, b, c, d, e, f = np.pad(np.array(struct.unpack_from(f">{count}i", tag, 12)) / 65536, (0, 7 - count))
     if not g > 0 or (kind and a == 0):
         raise ValueError
@@ -201,13 +201,8 @@ class KnownColors:
         return self._light[numbers]
 
 
-def read_table(tag: bytes, space: str, read_curve: _ReadCurve) -> IccTable:
-    """Read a profile's A2B tag of three channels.
-
-    Args:
-        tag: the tag's bytes.
-        space: the profile connection space, "XYZ" or "Lab".
-        read_curve: returns samples of a `curv` or `para` tag.
+def _read_table(tag: bytes, space: str) -> IccTable:
+    """Read a profile's A2B tag of three channels; `space` is the profile connection space, "XYZ" or "Lab".
 
     Raises:
         ValueError, struct.error: if it is damaged, or of other than three channels.
@@ -217,7 +212,7 @@ def read_table(tag: bytes, space: str, read_curve: _ReadCurve) -> IccTable:
     if tag[:4] in (b"mft1", b"mft2"):
         return _of_lut(tag, space)
     if tag[:4] == b"mAB ":
-        return _of_stages(tag, space, read_curve)
+        return _of_stages(tag, space)
     raise ValueError
 
 
@@ -236,18 +231,22 @@ def _of_lut(tag: bytes, space: str) -> IccTable:
     return IccTable(tuple(first.reshape(3, -1)), entries, None, None, tuple(last.reshape(3, -1)), space_name)
 
 
-def _of_stages(tag: bytes, space: str, read_curve: _ReadCurve) -> IccTable:
+def _of_stages(tag: bytes, space: str) -> IccTable:
     """Read `mAB `: curves, table, curves, matrix, curves; places of 0 stand for stages that are missing."""
     output, matrix, middle, table, device = struct.unpack_from(">5I", tag, 12)
 
     def curves(at: int) -> tuple[np.ndarray, ...] | None:
         curves_of_stage = []
         for _ in range(3 if at else 0):
-            curves_of_stage.append(read_curve(tag[at:]))
-            at += -(-_curve_size(tag, at) // 4) * 4
+            curves_of_stage.append(_curve(tag[at:]))
+            if tag[at : at + 4] == b"para":
+                size = 12 + 4 * _PARAMETERS[struct.unpack_from(">H", tag, at + 8)[0]]
+            else:
+                size = 12 + 2 * struct.unpack_from(">I", tag, at + 8)[0]
+            at += -(-size // 4) * 4
         return tuple(curves_of_stage) or None
 
-    entries = None
+    entries = factors = None
     if table:
         grid, wide = tuple(tag[table : table + 3]), tag[table + 16] == 2
         count = 3 * int(np.prod(grid))
@@ -255,18 +254,10 @@ def _of_stages(tag: bytes, space: str, read_curve: _ReadCurve) -> IccTable:
             raise ValueError
         numbers = np.frombuffer(tag, ">u2" if wide else "u1", count, table + 20)
         entries = (numbers / (65535 if wide else 255)).reshape(*grid, 3)
-    factors = None
     if matrix:
         values = np.array(struct.unpack_from(">12i", tag, matrix)) / 65536
         factors = np.c_[values[:9].reshape(3, 3), values[9:]]
     return IccTable(curves(device) if table else None, entries, curves(middle), factors, curves(output), space)
-
-
-def _curve_size(tag: bytes, at: int) -> int:
-    """Return the bytes of a `curv` or `para` element."""
-    if tag[at : at + 4] == b"para":
-        return 12 + 4 * (1, 3, 4, 5, 7)[struct.unpack_from(">H", tag, at + 8)[0]]
-    return 12 + 2 * struct.unpack_from(">I", tag, at + 8)[0]
 
 
 def _through(curves: tuple[np.ndarray, ...] | None, values: np.ndarray) -> np.ndarray:

@@ -1,18 +1,48 @@
 """OpenEXR and Radiance pictures as photos: their values are light, at exposure times that make them middle grey."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
 from ..subsets import every_nth
-from .dataparser import reinhard_gamma
-from .hdr_files import read_hdr
+from .dataparser import ImageRecord, reinhard_gamma
+from .exposure import stated_times
+from .hdr_files import exr_exposure_time, read_hdr
 from .types import codes_of
 
 _MIDDLE_GREY = 0.18
 _MOST_JUDGED = 24
+
+
+def with_float_times(records: Sequence[ImageRecord], folder: Path) -> tuple[list[ImageRecord], bool, list[str]]:
+    """Return float images with the time each at which they are middle grey; results as of with_exposure_times().
+
+    Their values are divided by the times of the set or exposures.json, else by expTime of the headers. Times that the
+    user states count if the images' brightness follows them: a set of light may list those of photos. A float image is
+    its own truth.
+    """
+    averages = _log_averages([record.image for record in records])
+    stated, notes = stated_times(records, folder)
+    times = [exr_exposure_time(record.image) if time is None else time for record, time in zip(records, stated)]
+    known = [time for time in times if time is not None]
+    factors, meaning = [1.0] * len(records), "taken as light, at no exposure"
+    if len(known) == len(times) and max(known) >= min(known) * 1.001:
+        span, values = f"{min(known):g} to {max(known):g} s", np.array(list(averages.values()))
+        # Whether images become more alike if their values are divided by their times
+        if None in stated or np.std(values - np.log([known[index] for index in averages])) <= np.std(values):
+            factors = [time / known[0] for time in known]
+            meaning = f"light times {'expTime' if None in stated else 'the stated times'}, {span}"
+        else:
+            meaning = f"taken as light, because they do not follow the stated times, {span}"
+    grey = _MIDDLE_GREY / float(np.exp(np.mean(list(averages.values()))))
+    timed = [
+        replace(record, exposure_time=grey * factor, hdr=record.hdr or record.image, light_scale=1 / factor)
+        for record, factor in zip(records, factors, strict=True)
+    ]
+    return timed, True, [*notes, f"float images: their values are {meaning}"]
 
 
 def float_codes(radiance: np.ndarray, time: float) -> np.ndarray:
@@ -20,7 +50,13 @@ def float_codes(radiance: np.ndarray, time: float) -> np.ndarray:
     return codes_of(reinhard_gamma(radiance * time), 16)
 
 
-def log_averages(photos: Sequence[Path]) -> dict[int, float]:
+def tone_mapped(path: Path) -> np.ndarray:
+    """Return [H, W, 3] uint8 of a float image at its own exposure, for structure from motion."""
+    radiance = read_hdr(path)
+    return codes_of(reinhard_gamma(radiance * _MIDDLE_GREY / _log_average(radiance)), 8)
+
+
+def _log_averages(photos: Sequence[Path]) -> dict[int, float]:
     """Return the logarithm of the log-average of each float image of an even sample, by its index.
 
     Raises:
@@ -35,26 +71,6 @@ def log_averages(photos: Sequence[Path]) -> dict[int, float]:
     if not averages:
         raise problems[0]
     return averages
-
-
-def middle_grey_time(averages: Collection[float]) -> float:
-    """Return the exposure time at which images of these log_averages() are middle grey."""
-    return _MIDDLE_GREY / float(np.exp(np.mean(list(averages))))
-
-
-def follow_times(averages: Mapping[int, float], times: Sequence[float]) -> bool:
-    """Return whether images become more alike if their values are divided by their exposure times.
-
-    `averages` are log_averages(), `times` those of all images.
-    """
-    values = np.array(list(averages.values()))
-    return bool(np.std(values - np.log([times[index] for index in averages])) <= np.std(values))
-
-
-def tone_mapped(path: Path) -> np.ndarray:
-    """Return [H, W, 3] uint8 of a float image at its own exposure, for structure from motion."""
-    radiance = read_hdr(path)
-    return codes_of(reinhard_gamma(radiance * _MIDDLE_GREY / _log_average(radiance)), 8)
 
 
 def _log_average(radiance: np.ndarray) -> float:

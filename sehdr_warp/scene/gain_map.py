@@ -47,42 +47,41 @@ _APPLE_AUX = "urn:com:apple:photo:2020:aux:hdrgainmap"
 
 @dataclass(frozen=True)
 class GainMap:
-    """A gain map as its file stores it. Numbers are one for each color channel, [3] float64.
+    """A gain map as its file stores it.
 
     Attributes:
         encoded: [h, w, 1 or 3] float32 in [0, 1], of fewer pixels than the photo as a rule.
-        minimum: log2 of the gain that 0 stands for.
-        maximum: log2 of the gain that 1 stands for.
-        gamma: exponent of the encoding.
-        base_offset: added to the photo's light before it is multiplied.
-        alternate_offset: subtracted afterwards.
-        headroom: log2 of the brightest light that its pixels make of white, as a multiple of white. Metadata may state
-            more, such as what the encoder could have stored.
+        parameters: what they stand for.
         to_alternate: [3, 3] from the photo's primaries to those in which the gains apply; None if they are the photo's.
     """
 
     encoded: np.ndarray
-    minimum: np.ndarray
-    maximum: np.ndarray
-    gamma: np.ndarray
-    base_offset: np.ndarray
-    alternate_offset: np.ndarray
-    headroom: float
+    parameters: GainMapParameters
     to_alternate: np.ndarray | None = None
+
+    @property
+    def headroom(self) -> float:
+        """Log2 of the brightest light that its pixels make of white, as a multiple of white.
+
+        Metadata may state more, such as what the encoder could have stored.
+        """
+        largest = replace(self, encoded=self.encoded.max((0, 1), keepdims=True)).light(np.ones((1, 1, 3), np.float32))
+        return math.log2(max(float(largest.max()), 2.0**-MOST_STOPS))
 
     def light(self, base: np.ndarray) -> np.ndarray:
         """Return the light [H, W, 3] float32 of a photo whose own light [H, W, 3] is in [0, 1], 1 at white."""
+        stated = self.parameters
         guide = np.sqrt(base @ np.full(3, 1 / 3, np.float32))  # Even steps for the eye, about
         planes = [np.clip(_at_size_of(guide, plane), 0, 1) for plane in np.moveaxis(self.encoded, 2, 0)]
         if self.to_alternate is not None:
             base = base @ self.to_alternate.T.astype(np.float32)
         result = np.empty(base.shape, np.float32)
         for channel in range(3):
-            share = planes[min(channel, len(planes) - 1)] ** np.float32(1 / self.gamma[channel])
-            span = self.maximum[channel] - self.minimum[channel]
-            gain = np.exp2(np.float32(self.minimum[channel]) + np.float32(span) * share)
-            light = (base[..., channel] + np.float32(self.base_offset[channel])) * gain
-            result[..., channel] = light - np.float32(self.alternate_offset[channel])
+            share = planes[min(channel, len(planes) - 1)] ** np.float32(1 / stated.gamma[channel])
+            span = stated.maximum[channel] - stated.minimum[channel]
+            gain = np.exp2(np.float32(stated.minimum[channel]) + np.float32(span) * share)
+            light = (base[..., channel] + np.float32(stated.base_offset[channel])) * gain
+            result[..., channel] = light - np.float32(stated.alternate_offset[channel])
         if self.to_alternate is not None:
             result = result @ np.linalg.inv(self.to_alternate).T.astype(np.float32)
         return np.maximum(result, 0)
@@ -306,28 +305,12 @@ def _gain_map_of(
     """Return the gain map of parameters and pixels; None if the photo itself is the HDR rendition.
 
     `primaries` [3, 3] leads from the photo's to those of the alternate rendition, where the metadata may apply gains.
-    Raises ValueError for parameters that cannot be.
     """
     if parameters.base_is_hdr:
         return None
-    if parameters.apple_headroom is not None:
+    if parameters.is_apple:
         # light = base (1 + (headroom - 1) g), g decoded by Rec.709; as a gain map of stops.
         linear = np.where(encoded <= 0.08145, encoded / 4.5, ((encoded + 0.099) / 1.099) ** (1 / 0.45))
-        stops = math.log2(parameters.apple_headroom)
-        encoded = (np.log2(1 + (parameters.apple_headroom - 1) * linear) / stops).astype(np.float32)
-        parameters = GainMapParameters(maximum=(stops,), base_offset=(0.0,), alternate_offset=(0.0,), headroom=stops)
-    names = ("minimum", "maximum", "gamma", "base_offset", "alternate_offset")
-    numbers = {name: np.resize(np.array(getattr(parameters, name), np.float64), 3) for name in names}
-    if not all(np.isfinite(values).all() for values in numbers.values()):
-        raise ValueError("its parameters are not finite")
-    if not ((numbers["gamma"] > 0.01) & (numbers["gamma"] < 100)).all():
-        raise ValueError(f"gamma {numbers['gamma'].tolist()}")
-    low, high = numbers["minimum"], numbers["maximum"]
-    if not (low.min() >= -MOST_STOPS and (low <= high).all() and high.max() <= MOST_STOPS):
-        raise ValueError(f"gains from {low.tolist()} to {high.tolist()} stops")
-    if not max(np.abs(numbers["base_offset"]).max(), np.abs(numbers["alternate_offset"]).max()) <= 1:
-        raise ValueError("offsets above the light of white")
-    to_alternate = primaries if parameters.in_alternate_colors else None
-    gain_map = GainMap(encoded=encoded, headroom=0.0, to_alternate=to_alternate, **numbers)
-    largest = replace(gain_map, encoded=encoded.max((0, 1), keepdims=True)).light(np.ones((1, 1, 3), np.float32))
-    return replace(gain_map, headroom=math.log2(max(float(largest.max()), 2.0**-MOST_STOPS)))
+        stops = float(parameters.maximum[0])
+        encoded = (np.log2(1 + (2.0**stops - 1) * linear) / stops).astype(np.float32)
+    return GainMap(encoded, parameters, primaries if parameters.in_alternate_colors else None)

@@ -1,30 +1,62 @@
 """Read metadata of gain maps: Ultra HDR's XMP, ISO 21496-1's binary metadata, and Apple's maker note."""
 
 import io
+import math
 import struct
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from PIL import TiffImagePlugin
 
 from .xmp import xmp_values
 
 MOST_STOPS = 16.0  # Between white and the largest light; encoders state 1 to 6
+_NUMBERS = ("minimum", "maximum", "gamma", "base_offset", "alternate_offset")
 
 
 @dataclass(frozen=True)
 class GainMapParameters:
-    """Parameters that metadata state: lists of 1 or 3 numbers, by the names of GainMap; apple_headroom is linear."""
+    """Meaning of the pixels of a gain map. Numbers are given for one or three channels, and kept as [3] float64.
 
-    minimum: tuple[float, ...] = (0.0,)
-    maximum: tuple[float, ...] = (1.0,)
-    gamma: tuple[float, ...] = (1.0,)
-    base_offset: tuple[float, ...] = (1 / 64,)
-    alternate_offset: tuple[float, ...] = (1 / 64,)
-    headroom: float = 1.0
+    Attributes:
+        minimum: log2 of the gain that 0 stands for.
+        maximum: log2 of the gain that 1 stands for.
+        gamma: exponent of the encoding.
+        base_offset: added to the photo's light before it is multiplied.
+        alternate_offset: subtracted afterwards.
+        base_is_hdr: the photo itself is the HDR rendition, and gains lead to a darker one.
+        in_alternate_colors: gains apply in the primaries of the alternate rendition.
+        is_apple: the map is encoded by Rec.709's curve, and linear in gain; `maximum` is its headroom.
+
+    Raises:
+        ValueError: for numbers that cannot be, unless base_is_hdr.
+    """
+
+    minimum: Any = 0.0
+    maximum: Any = 1.0
+    gamma: Any = 1.0
+    base_offset: Any = 1 / 64
+    alternate_offset: Any = 1 / 64
     base_is_hdr: bool = False
     in_alternate_colors: bool = False
-    apple_headroom: float | None = None
+    is_apple: bool = False
+
+    def __post_init__(self):
+        """Make all numbers [3], and check them."""
+        for name in _NUMBERS:
+            object.__setattr__(self, name, np.resize(np.array(getattr(self, name), np.float64), 3))
+        if self.base_is_hdr:
+            return
+        if not all(np.isfinite(getattr(self, name)).all() for name in _NUMBERS):
+            raise ValueError("its parameters are not finite")
+        if not ((self.gamma > 0.01) & (self.gamma < 100)).all():
+            raise ValueError(f"gamma {self.gamma.tolist()}")
+        low, high = self.minimum, self.maximum
+        if not (low.min() >= -MOST_STOPS and (low <= high).all() and high.max() <= MOST_STOPS):
+            raise ValueError(f"gains from {low.tolist()} to {high.tolist()} stops")
+        if not np.abs([self.base_offset, self.alternate_offset]).max() <= 1:
+            raise ValueError("offsets above the light of white")
 
 
 def parameters_of_xmp(xmp: str) -> GainMapParameters:
@@ -43,7 +75,6 @@ def parameters_of_xmp(xmp: str) -> GainMapParameters:
         gamma=numbers("Gamma", 1.0),
         base_offset=numbers("OffsetSDR", 1 / 64),
         alternate_offset=numbers("OffsetHDR", 1 / 64),
-        headroom=numbers("HDRCapacityMax", 1.0)[0],
         base_is_hdr=[value.lower() for value in values("BaseRenditionIsHDR")[:1]] == ["true"],
     )
 
@@ -76,7 +107,7 @@ def parameters_of_iso(data: bytes) -> GainMapParameters:
     rows = [(take(True), take(True), take(False), take(True), take(True)) for _ in range(channels)]
     minimum, maximum, gamma, base_offset, alternate_offset = zip(*rows, strict=True)
     colors, is_hdr = not flags & 0x40, base > alternate
-    return GainMapParameters(minimum, maximum, gamma, base_offset, alternate_offset, alternate, is_hdr, colors)
+    return GainMapParameters(minimum, maximum, gamma, base_offset, alternate_offset, is_hdr, colors)
 
 
 def parameters_of_apple(xmp: str, exif: Any) -> GainMapParameters:
@@ -98,7 +129,7 @@ def parameters_of_apple(xmp: str, exif: Any) -> GainMapParameters:
         headroom = 2.0 ** max(stops, 0.0)
     if not 1 < headroom <= 2**MOST_STOPS:
         raise ValueError(f"headroom {headroom:g}")
-    return GainMapParameters(apple_headroom=headroom)
+    return GainMapParameters(maximum=math.log2(headroom), base_offset=0.0, alternate_offset=0.0, is_apple=True)
 
 
 def _apple_note(note: Any) -> dict[int, float]:

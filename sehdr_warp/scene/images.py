@@ -8,6 +8,7 @@ import re
 import struct
 import threading
 import zlib
+from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -193,23 +194,23 @@ def exif_of(image: Image.Image) -> Image.Exif:
     Raises:
         PILLOW_ERRORS: if it is damaged.
     """
-    if image.format == "PNG" and _has_text_behind_pixels(Path(image.filename)):  # pyright: ignore[reportAttributeAccessIssue]
-        return image.getexif()
+    if image.format == "PNG":
+        kinds = [kind for kind, *_ in png_chunks(Path(image.filename))]  # pyright: ignore[reportAttributeAccessIssue]
+        behind = kinds[kinds.index(b"IDAT") :] if b"IDAT" in kinds else []
+        if not {b"eXIf", b"tEXt", b"zTXt", b"iTXt"}.isdisjoint(behind):
+            return image.getexif()
     return Image.Image.getexif(image)
 
 
-def _has_text_behind_pixels(png: Path) -> bool:
-    """Return whether a PNG has a chunk that may hold EXIF behind its pixels."""
+def png_chunks(png: Path) -> Iterator[tuple[bytes, int, bytes]]:
+    """Yield the kind of each chunk of a PNG, the length of its data, and the first 4 bytes of these."""
     with png.open("rb") as file:
         file.seek(8)
-        behind = False
         while len(head := file.read(8)) == 8:
             length, kind = struct.unpack(">I4s", head)
-            behind |= kind == b"IDAT"
-            if behind and kind in (b"eXIf", b"tEXt", b"zTXt", b"iTXt"):
-                return True
-            file.seek(length + 4, 1)
-    return False
+            start = file.read(min(length, 4))
+            yield kind, length, start
+            file.seek(length - len(start) + 4, 1)
 
 
 def require_file(path: Path) -> None:

@@ -14,10 +14,9 @@ from ..subsets import first_names
 from .camera_checks import check_cameras
 from .colmap_model import find_model
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
-from .exposure import choose_exposure, exposures_note, stated_times, with_exposure_times
+from .exposure import choose_exposure, exposures_note, with_exposure_times
 from .file_names import image_folder, unique_names
-from .float_images import follow_times, log_averages, middle_grey_time
-from .hdr_files import exr_exposure_time
+from .float_images import with_float_times
 from .masks import assign_masks
 from .photos import usable_photos
 from .preprocess import preprocess
@@ -149,16 +148,18 @@ def parse_dataset(
     all_records = records
     records, exposure_notes = choose_exposure(records, exposure_index, folder)
     records, kind, photo_notes = usable_photos(records)
-    records, times_known, time_notes = _with_times(records, kind, folder)
+    with_times = with_float_times if kind == "float" else with_exposure_times
+    records, times_known, time_notes = with_times(records, folder)
     dataset = replace(dataset, kind=kind, records=tuple(records), folder=folder, times_known=times_known)
     if check is not None:
         check(dataset)
     unplaced: list[str] = []
     if records and records[0].lens is UNPLACED:
-        dataset, records, unplaced = place_photos(dataset, records, folder, kind, cache)
+        dataset, unplaced = place_photos(dataset, cache)
+        records = list(dataset.records)
         if unplaced:  # Their times are not to be told of, nor the others' relative to theirs.
             untimed = [replace(record, exposure_time=None, time_known=True) for record in records]
-            records, times_known, time_notes = _with_times(untimed, kind, folder)
+            records, times_known, time_notes = with_times(untimed, folder)
             dataset = replace(dataset, times_known=times_known)
     records, camera_notes = check_cameras(records, dataset.cloud)
     records, split_notes = _with_splits(records, dataset, holdout)
@@ -171,35 +172,6 @@ def parse_dataset(
     if not is_embedded(path) and dataset.format != "video":
         notes = (*notes, *unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]))
     return replace(dataset, records=tuple(records), notes=notes, name=name)
-
-
-def _with_times(records: list[ImageRecord], kind: str, folder: Path) -> tuple[list[ImageRecord], bool, list[str]]:
-    """Return the photos with an exposure time each, whether times are known, and notes.
-
-    Float images get the time at which they are middle grey. Their values are divided by the times of the set or
-    exposures.json, else by expTime of the headers. Times that the user states count if the images' brightness follows
-    them: a set of light may list those of photos.
-    """
-    if kind != "float":
-        return with_exposure_times(records, folder)
-    averages = log_averages([record.image for record in records])
-    stated, notes = stated_times(records, folder)
-    times = [exr_exposure_time(record.image) if time is None else time for record, time in zip(records, stated)]
-    known = [time for time in times if time is not None]
-    factors, meaning = [1.0] * len(records), "taken as light, at no exposure"
-    if len(known) == len(times) and max(known) >= min(known) * 1.001:
-        span = f"{min(known):g} to {max(known):g} s"
-        if None in stated or follow_times(averages, known):
-            factors = [time / known[0] for time in known]
-            meaning = f"light times {'expTime' if None in stated else 'the stated times'}, {span}"
-        else:
-            meaning = f"taken as light, because they do not follow the stated times, {span}"
-    grey = middle_grey_time(averages.values())
-    timed = [
-        replace(record, exposure_time=grey * factor, hdr=record.hdr or record.image, light_scale=1 / factor)
-        for record, factor in zip(records, factors, strict=True)
-    ]
-    return timed, True, [*notes, f"float images: their values are {meaning}"]
 
 
 def _folder(path: Path | str) -> Path:

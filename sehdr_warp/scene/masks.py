@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from ..subsets import first_names
 from .dataparser import UNPLACED, ImageRecord
 from .file_names import INVERTED_MASK, bases_of, fold_name, folders_named, lies_at, natural_key, without_mask_mark
 from .images import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
+from .lens import Lens
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
@@ -64,8 +64,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         mask = record.mask or next((file for file in candidates if file is not None), None)
         if mask is not None and record.mask is None:
             mask = resolve_inside(folder, mask.relative_to(folder).as_posix(), folder)
-        if mask is None and common is not None and _has_shape(common, record):
-            mask = common.file
+        if mask is None and common is not None and _has_shape(common[1], record.lens):
+            mask = common[0]
         mask_files.add(mask)
         masked.append(replace(record, mask=mask))
     notes = []
@@ -142,22 +142,8 @@ def mask_note(shares: Sequence[float | None], labeled: int = 0) -> list[str]:
     return lines
 
 
-class _CommonMask(NamedTuple):
-    """A mask of all photos of a set.
-
-    Attributes:
-        file: its path.
-        width: in pixels.
-        height: in pixels.
-    """
-
-    file: Path
-    width: int
-    height: int
-
-
-def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> _CommonMask | None:
-    """Return the mask of all photos, None if the data folder has none or holds photos itself."""
+def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> tuple[Path, tuple[int, int]] | None:
+    """Return the mask of all photos and its (width, height); None without one, or if the data folder holds photos."""
     if not folder.is_dir() or any(record.image.parent == folder for record in records):
         return None
     names = (f"{stem}{suffix}" for stem in _COMMON for suffix in LDR_SUFFIXES)
@@ -165,14 +151,12 @@ def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> _CommonMask | 
     if file is None:
         return None
     with open_image(resolve_inside(folder, file.name, folder), mask=True) as image:
-        return _CommonMask(file, *image.size)
+        return file, image.size
 
 
-def _has_shape(mask: _CommonMask, record: ImageRecord) -> bool:
-    """Return whether a mask has the shape of a photo, as far as that is known."""
-    lens = record.lens
-    differs = abs(mask.width * lens.height - mask.height * lens.width) > max(mask.width, mask.height)
-    return lens is UNPLACED or not differs
+def _has_shape(size: tuple[int, int], lens: Lens) -> bool:
+    """Return whether a size has the shape of a lens's photos, as far as that is known."""
+    return lens is UNPLACED or abs(size[0] * lens.height - size[1] * lens.width) <= max(size)
 
 
 def _photo_keys(record: ImageRecord, bases: Sequence[Path], shared: Counter) -> list[str]:

@@ -95,36 +95,22 @@ def fitted_lens(record: ImageRecord) -> tuple[Lens, bool]:
     raise InputError(record.image, problem, "use the images that the cameras were solved for")
 
 
-def unusable_notes(problems: Sequence[InputError], count: int) -> list[str]:
-    """Return a note on the photos, of `count`, that have a problem and cannot be used.
+def unusable_notes(problems: Sequence[InputError], count: int, *, truth: bool = False) -> list[str]:
+    """Return a note on the photos, of `count`, that have a problem and are left out; with `truth` on files of truth.
 
     Raises:
-        InputError: the first problem, if more than half of the photos or all but two have one.
+        InputError: the first problem, if more than half of them or all but two photos have one.
     """
-    if problems and count - len(problems) < min(FEWEST_PHOTOS, count):
-        raise problems[0]
-    return _left_out_note(problems, count, "photos")
-
-
-def truth_notes(problems: Sequence[InputError], count: int) -> list[str]:
-    """Return a note on the truth files, of `count`, that have a problem: their photos are used without truth.
-
-    Raises:
-        InputError: the first problem, if more than half of the files have one.
-    """
-    return _left_out_note(problems, count, "files of truth")
-
-
-def _left_out_note(problems: Sequence[InputError], count: int, files: str) -> list[str]:
     if not problems:
         return []
-    if 2 * len(problems) > count:
+    if 2 * len(problems) > count or (not truth and count - len(problems) < min(FEWEST_PHOTOS, count)):
         raise problems[0]
     # A mask may have the name of its photo, so its folder is named too.
     paths = [Path(error.path) for error in problems[:_MOST_NAMED]]
     names = [f"{p.parent.name}/" * (p.parent.name.lower() in MASK_FOLDERS) + p.name for p in paths]
     reasons = "; ".join(f"{name}: {error.problem}" for name, error in zip(names, problems))
     more = " ..." if len(problems) > _MOST_NAMED else ""
+    files = "files of truth" if truth else "photos"
     return [f"{len(problems)} of {count} {files} cannot be used and were left out ({reasons}{more})"]
 
 

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -27,7 +27,7 @@ from .lens import Lens, Undistortion, area_average
 from .masks import mask_note, read_mask
 from .photo_content import ContentCheck, unused_bits_note
 from .photo_storage import PhotoKeeper
-from .photos import fitted_lens, read_photo, truth_notes, unusable_notes
+from .photos import fitted_lens, read_photo, unusable_notes
 from .raw import linear_codes
 from .types import Scene, View, codes_of
 from .video_color import codes_in_rec709
@@ -79,7 +79,8 @@ def preprocess(
         else:
             views.append(keeper.store(view))
     truth_count = sum(record.hdr is not None for record in dataset.records)
-    damaged = unusable_notes(problems, len(names)) + truth_notes(preprocessor.unusable_truth, truth_count)
+    damaged = unusable_notes(problems, len(names))
+    damaged += unusable_notes(preprocessor.unusable_truth, truth_count, truth=True)
     content = ContentCheck()
     for view in [view for view in views if view.split == "train"] or views:
         content.add(view.codes, view.mask)
@@ -99,38 +100,27 @@ def preprocess(
 
 def read_codes(record: ImageRecord) -> EncodedImage:
     """Read a photo's codes, or compute them from HDR truth or light, before anything is undistorted or resized."""
-    stored = _read_stored(record, {}, oriented=False)
-    return stored.encoding.convert(stored.photo)
-
-
-class _StoredPhoto(NamedTuple):
-    """A photo whose codes are not converted to sRGB's yet.
-
-    Attributes:
-        photo: its codes.
-        encoding: of the codes.
-    """
-
-    photo: EncodedImage
-    encoding: ColorEncoding
+    photo, encoding = _read_stored(record, {}, oriented=False)
+    return encoding.convert(photo)
 
 
 def _read_stored(
     record: ImageRecord, problems: dict[Path, str], *, oriented: bool, masked: bool = False
-) -> _StoredPhoto:
-    """Read a photo; the problem of a damaged gain map goes to `problems`.
+) -> tuple[EncodedImage, ColorEncoding]:
+    """Return a photo before its codes are converted to sRGB's, and their encoding.
 
-    `masked` leaves float pictures without the black that their transparent parts lie over.
+    The problem of a damaged gain map goes to `problems`. `masked` leaves float pictures without the black that their
+    transparent parts lie over.
     """
     srgb, kind = ColorEncoding("sRGB"), kind_of(record.image)
     if record.derived:
         codes = codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8)
-        return _StoredPhoto(EncodedImage(codes, None), srgb)
+        return EncodedImage(codes, None), srgb
     if kind == "float":
         light = read_light(record.image)
         pixels = light.uncovered if masked else light.pixels
         codes = float_codes(pixels * record.light_scale, record.seconds)
-        return _StoredPhoto(EncodedImage(codes, light.coverage if masked else None), srgb)
+        return EncodedImage(codes, light.coverage if masked else None), srgb
     photo, encoding = read_photo(record.image, oriented=oriented), record.encoding or srgb
     if record.gain_map or (kind == "encoded" and not record.linear):
         gain_map = read_gain_map(record.image, oriented=oriented, problems=problems)
@@ -142,7 +132,7 @@ def _read_stored(
     elif record.linear and encoding.light is None:
         photo = EncodedImage(linear_codes(photo.pixels / photo.levels), photo.alpha)
         encoding = replace(encoding, curves=(), table=None)
-    return _StoredPhoto(photo, encoding)
+    return photo, encoding
 
 
 @dataclass(frozen=True)

@@ -82,20 +82,18 @@ def find_photos(folder: Path) -> DataparserOutputs:
     return DataparserOutputs("photos", tuple(records), notes=tuple(notes), mentioned=names)
 
 
-def place_photos(
-    dataset: DataparserOutputs, records: Sequence[ImageRecord], folder: Path, kind: str, cache: Path | str | None
-) -> tuple[DataparserOutputs, list[ImageRecord], list[str]]:
+def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[DataparserOutputs, list[str]]:
     """Find the cameras of bare photos, as find_photos() returned them, by structure from motion; see reconstruct().
 
     Returns:
-        The dataset with its points, the photos that could be placed, and the names of the others.
+        The dataset with its points and the photos that could be placed, and the names of the others.
 
     Raises:
         InputError: if the photos are an exposure stack, or of several cameras' sensors, or cannot be placed.
     """
-    photos = [record.image for record in records]
+    photos, folder = [record.image for record in dataset.records], dataset.folder
     _require_photos(photos, folder)
-    if kind == "raw":
+    if dataset.kind == "raw":
         color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
     try:
@@ -104,18 +102,15 @@ def place_photos(
         if poses := _foreign_poses(folder):
             raise InputError(error.path, error.problem, poses[0]) from None
         raise
-    cameras = {int(Path(image.name).stem): image for image in reconstruction.model.images}
-    result = [
-        replace(record, lens=image.lens, world_to_camera=image.world_to_camera)
-        for i, record in enumerate(records)
-        if (image := cameras.get(i)) is not None
-    ]
-    unplaced = [record.image.name for i, record in enumerate(records) if i not in cameras]
-    return (
-        replace(dataset, cloud=reconstruction.model.cloud, notes=(*dataset.notes, *reconstruction.notes(photos))),
-        result,
-        unplaced,
-    )
+    model, placed, unplaced = reconstruction.model, [], []
+    cameras = {int(Path(image.name).stem): image for image in model.images}
+    for i, record in enumerate(dataset.records):
+        if (image := cameras.get(i)) is None:
+            unplaced.append(record.image.name)
+        else:
+            placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera))
+    notes = (*dataset.notes, *reconstruction.notes(photos))
+    return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
 
 
 def _require_photos(photos: Sequence[Path], folder: Path, copies: int = 0) -> None:

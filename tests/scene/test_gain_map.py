@@ -13,6 +13,7 @@ from PIL import Image
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color_primaries import matrix_to_rec709
 from sehdr_warp.scene.gain_map import GainMap, light_of, read_gain_map
+from sehdr_warp.scene.gain_map_parameters import GainMapParameters
 from sehdr_warp.scene.images import read_ldr
 
 from .gain_map_files import iso_metadata, jpeg_bytes, write_heif_pair, write_jpeg_pair, xmp_segment
@@ -96,9 +97,8 @@ def test_a_small_gain_map_follows_the_edges_of_its_photo(factor):
     light[13:44, 16:47] = 40.0
     gain = np.log2(np.maximum(light, 1)).mean(2) / 6
     small = gain.reshape(60 // factor, factor, 60 // factor, factor).mean((1, 3)).astype(np.float32)
-    numbers = {name: np.full(3, value) for name, value in (("minimum", 0.0), ("maximum", 6.0), ("gamma", 1.0))}
-    offsets = {name: np.zeros(3) for name in ("base_offset", "alternate_offset")}
-    gain_map = GainMap(encoded=small[..., None], headroom=6.0, **numbers, **offsets)
+    parameters = GainMapParameters(maximum=6.0, base_offset=0.0, alternate_offset=0.0)
+    gain_map = GainMap(small[..., None], parameters)
     error = np.abs(np.log2(gain_map.light(np.minimum(light, 1)) / light))
     plain = np.asarray(Image.fromarray(small).resize((60, 60), Image.Resampling.BILINEAR))
     assert error.mean() < 0.5 * 6 * np.abs(plain - gain).mean() and error[20:37, 23:40].max() < 0.02
@@ -369,7 +369,7 @@ def test_values_as_elements_and_sequences(tmp_path):
     listed = "".join(f"<rdf:li>{value}</rdf:li>" for value in (1.0, 2.0, 3.0))
     inner = f"<hdrgm:GainMapMax><rdf:Seq>{listed}</rdf:Seq></hdrgm:GainMapMax><hdrgm:Gamma>2</hdrgm:Gamma>"
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [(0xFFE1, b"http://ns.adobe.com/xap/1.0/\0" + inner.encode())])
-    result = read_gain_map(tmp_path / "a.jpg")
+    result = read_gain_map(tmp_path / "a.jpg").parameters
     assert result.maximum.tolist() == [1, 2, 3] and result.gamma.tolist() == [2, 2, 2]
 
 

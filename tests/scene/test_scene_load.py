@@ -50,11 +50,11 @@ def test_exposures_of_photos_that_are_left_out_are_not_told_of(tmp_path, monkeyp
     assert "exposures differ: 1/100 to 4 s" in " ".join(placed.notes)
     photos = shutil.copytree(tmp_path / "model" / "images", tmp_path / "bare")
 
-    def place_all_but_the_last(dataset, records, *_):
+    def place_all_but_the_last(dataset, _):
         camera = placed.views[0].camera
         lens = Lens("PINHOLE", camera.width, camera.height, tuple(camera.intrinsics), photos)
-        records = [replace(r, lens=lens, world_to_camera=np.eye(4)) for r in records if r.view != "005"]
-        return dataset, records, ["005.jpg"]
+        records = (replace(r, lens=lens, world_to_camera=np.eye(4)) for r in dataset.records if r.view != "005")
+        return replace(dataset, records=tuple(records)), ["005.jpg"]
 
     monkeypatch.setattr("sehdr_warp.scene.load.place_photos", place_all_but_the_last)
     notes = " ".join(load(photos).notes)

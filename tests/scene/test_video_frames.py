@@ -50,9 +50,9 @@ def test_frames_are_kept_in_the_cache(tmp_path, caplog):
 
 @pytest.mark.parametrize("saturated", [False, True])
 def test_a_clip_within_rec709_is_converted_and_another_keeps_its_primaries(tmp_path, monkeypatch, saturated):
-    def place(dataset, records, folder, *_):
-        lens = Lens("SIMPLE_PINHOLE", 128, 96, (100.0, 64.0, 48.0), folder)
-        return dataset, [replace(record, lens=lens) for record in records], []
+    def place(dataset, _):
+        lens = Lens("SIMPLE_PINHOLE", 128, 96, (100.0, 64.0, 48.0), dataset.folder)
+        return replace(dataset, records=tuple(replace(record, lens=lens) for record in dataset.records)), []
 
     monkeypatch.setattr("sehdr_warp.scene.load.place_photos", place)
     response = response_by_name("colour:ITU-R BT.2100 HLG")
