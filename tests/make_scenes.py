@@ -1,6 +1,8 @@
 """Small real scenes for tests, written with the formats' own libraries."""
 
 import json
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,6 +42,14 @@ def pattern(width: int, height: int, seed: int = 0) -> np.ndarray:
     noise = np.random.default_rng(seed).random((height // 4 + 2, width // 4 + 2, 3))
     picture = Image.fromarray((noise * 255).astype(np.uint8)).resize((width, height), Image.Resampling.BICUBIC)
     return np.asarray(picture)
+
+
+def png_of(*chunks: tuple[bytes, bytes], head: bytes = b"\x89PNG\r\n\x1a\n") -> bytes:
+    """A PNG file of (kind, data) of its chunks; `head` is empty for chunks alone."""
+    parts = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+    return head + b"".join(parts)
 
 
 def write_colmap(

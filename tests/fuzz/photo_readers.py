@@ -21,9 +21,18 @@ from sehdr_warp.scene.video import codes, decode, open_clip
 from sehdr_warp.scene.video_frames import choose_frames
 from tests.make_scenes import pattern
 from tests.scene.clips import pan, write_clip
-from tests.scene.dng_files import area, gain_map, jpeg_tiles, longs, mosaic, opcodes, shorts, write_tagged_dng
+from tests.scene.dng_files import (
+    area,
+    gain_map,
+    jpeg_tiles,
+    longs,
+    mosaic,
+    opcodes,
+    shorts,
+    write_dng,
+    write_tagged_dng,
+)
 from tests.scene.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
-from tests.scene.raw_files import write_dng
 from tests.scene.test_color_encoding import icc_profile
 from tests.trial.test_sets import exif_of_place
 

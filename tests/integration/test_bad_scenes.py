@@ -13,7 +13,7 @@ from PIL.TiffImagePlugin import IFDRational
 from sehdr_warp import load_scene
 from sehdr_warp.scene.hdr_files import read_hdr
 
-from ..make_scenes import edited_json, write_blender, write_colmap
+from ..make_scenes import edited_json, png_of, write_blender, write_colmap
 from ..refusals import call, train_refused
 
 
@@ -23,15 +23,11 @@ def frames(tmp_path):
     return tmp_path / "data"
 
 
-def png_chunk(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-
 def png_bomb(width: int, height: int) -> bytes:
     """A PNG file of a few bytes that states a huge size."""
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     pixels = zlib.compress(b"\0" * 1000)
-    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IDAT", pixels) + png_chunk(b"IEND", b"")
+    return png_of((b"IHDR", header), (b"IDAT", pixels), (b"IEND", b""))
 
 
 # ---------------------------------------------------------------------------------------------------- data folders

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from .raw_files import TO_CAMERA
-
+TO_CAMERA = np.array([[0.9, -0.2, -0.1], [-0.4, 1.2, 0.2], [-0.1, 0.2, 0.6]])
+"""XYZ to the sensor's colors."""
 BAYER = np.array([[0, 1], [1, 2]])
 Tag = tuple[int, int, bytes]
 
@@ -48,11 +48,12 @@ def gain_map(
 
 
 def write_tagged_dng(
-    path: Path, stored: np.ndarray, tags: dict[int, Tag] | None = None, pattern=BAYER, pieces: list[bytes] | None = None
-) -> None:
+    path: Path, stored: np.ndarray, tags: dict[int, Tag | None] | None = None, pattern=BAYER,
+    pieces: list[bytes] | None = None,
+) -> None:  # fmt: skip
     """stored: [H, W] of a color filter or [H, W, 3] of linear raw; uint16 or float32. tags: beside or in place of the
-    usual ones: black level 0, white level 65535, the top left pixel first. pieces: compressed strips or tiles, in place
-    of the samples."""
+    usual ones: black level 0, white level 65535, the top left pixel first; None takes one away. pieces: compressed
+    strips or tiles, in place of the samples."""
     height, width = stored.shape[:2]
     samples = 1 if stored.ndim == 2 else stored.shape[2]
     pieces = [stored.astype(stored.dtype.newbyteorder("<")).tobytes()] if pieces is None else pieces
@@ -70,7 +71,7 @@ def write_tagged_dng(
         all_tags[33422] = 1, pattern.size, bytes(pattern.ravel().tolist())
     if stored.dtype.kind == "f":
         all_tags[339] = shorts(*[3] * samples)
-    all_tags |= tags or {}
+    all_tags = {tag: value for tag, value in (all_tags | (tags or {})).items() if value is not None}
     place_tag, length_tag = (324, 325) if 322 in all_tags else (273, 279)
     all_tags |= {place_tag: longs(*[0] * len(pieces)), length_tag: longs(*lengths)}
     start, blobs, entries = 8 + 2 + 12 * len(all_tags) + 4, b"", b""
@@ -82,6 +83,24 @@ def write_tagged_dng(
             value = struct.pack("<I", place)
         entries += struct.pack("<HHI", tag, kind, count) + value.ljust(4, b"\0")
     path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(all_tags)) + entries + bytes(4) + blobs + b"".join(pieces))
+
+
+def write_dng(
+    path: Path, light: np.ndarray, *, black=512, white=15000, balance=(0.5, 1.0, 0.7), seconds=1 / 60,
+    to_camera=TO_CAMERA, stated=None, maker: tuple[str, str] | None = None,
+) -> None:  # fmt: skip
+    """light: [H, W, 3] of even size in the sensor's colors, 1 at the white level, mosaiced as RGGB. balance: what a
+    neutral surface gives in each channel. to_camera: as TO_CAMERA. stated: the white level that the file states.
+    maker: make and model; the file then says nothing that only DNG says, as those of cameras do."""
+    stored = np.rint(black + np.clip(mosaic(light), 0, 1) * (white - black)).astype(np.uint16)
+    tags: dict[int, Tag | None] = {
+        33434: (5, 1, struct.pack("<II", round(seconds * 1e6), 10**6)), 50714: longs(black),
+        50717: longs(stated or white), 50721: rationals(*np.ravel(to_camera)), 50728: rationals(*balance),
+    }  # fmt: skip
+    if maker is not None:
+        make, model = ((2, len(name) + 1, name.encode() + b"\0") for name in maker)
+        tags |= {271: make, 272: model} | dict.fromkeys((50706, 50708, 50714, 50717, 50721, 50728, 50778))
+    write_tagged_dng(path, stored, tags)
 
 
 def mosaic(light: np.ndarray, pattern=BAYER) -> np.ndarray:

@@ -15,7 +15,7 @@ from sehdr_warp.scene.color_encoding import encoding_of, encoding_of_profile
 from sehdr_warp.scene.color_icc import xyz_to_rec709
 from sehdr_warp.scene.color_primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
 from sehdr_warp.scene.images import EncodedImage, open_image, read_ldr
-from tests.make_scenes import load, pattern, write_colmap
+from tests.make_scenes import load, pattern, png_of, write_colmap
 
 SPACES = {"sRGB": ("sRGB", None), "Display P3": ("Display P3", None), "Adobe RGB": ("Adobe RGB (1998)", 563 / 256),
           "ProPhoto": ("ProPhoto RGB", 1.8), "Rec.2020": ("ITU-R BT.2020", 2.4), "ACEScg": ("ACEScg", 2.2),
@@ -203,13 +203,8 @@ def png16(path, values, *chunks):
     """A 16-bit PNG of values in [0, 1] with chunks of color before the pixels."""
     codes = np.rint(values * 65535).astype(">u2")
     rows = b"".join(b"\0" + row.tobytes() for row in codes)
-
-    def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     head = struct.pack(">IIBBBBB", values.shape[1], values.shape[0], 16, 2, 0, 0, 0)
-    parts = [(b"IHDR", head), *chunks, (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts))
+    path.write_bytes(png_of((b"IHDR", head), *chunks, (b"IDAT", zlib.compress(rows)), (b"IEND", b"")))
 
 
 def _iccp(profile):

@@ -1,7 +1,6 @@
 """Photos whose pixels are not square are refused by name where structure from motion would find wrong lenses."""
 
 import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.photos import usable_photos
 from sehdr_warp.scene.read_photos import find_photos
-from tests.make_scenes import pattern
+from tests.make_scenes import pattern, png_of
 
 
 def write(path: Path, aspect: tuple[int, int], seed: int) -> None:
@@ -23,9 +22,8 @@ def write(path: Path, aspect: tuple[int, int], seed: int) -> None:
         OpenEXR.File(header, {"RGB": pixels.astype(np.float32)}).write(str(path))
     elif path.suffix == ".png":
         Image.fromarray(pixels).save(path)
-        chunk = b"pHYs" + struct.pack(">IIB", *aspect, 0)
         data = path.read_bytes()
-        path.write_bytes(data[:33] + struct.pack(">I", 9) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:])
+        path.write_bytes(data[:33] + png_of((b"pHYs", struct.pack(">IIB", *aspect, 0)), head=b"") + data[33:])
     else:
         Image.fromarray(pixels).save(path, dpi=aspect)
         data = bytearray(path.read_bytes())

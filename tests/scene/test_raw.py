@@ -24,7 +24,7 @@ from sehdr_warp.training.plan import make_plan
 from ..make_scenes import edited_json, write_colmap
 from ..output.helpers import camera
 from ..splats.test_splat_files import gaussians
-from .raw_files import TO_CAMERA, write_dng
+from .dng_files import TO_CAMERA, write_dng
 
 BALANCE = np.array([0.5, 1.0, 0.7])
 

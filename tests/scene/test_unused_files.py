@@ -160,23 +160,6 @@ def test_photos_that_are_listed_twice_count_once(tmp_path):
     assert said(scene, "more than once") == ["2 photos are listed more than once, and counted once: r_1.png, r_2.png"]
 
 
-@pytest.mark.parametrize("pose", [None, [[0, 0, 0, 0]] * 4, "nan"])
-def test_a_frame_without_a_usable_pose_is_left_out_and_named(tmp_path, pose):
-    write_blender(tmp_path)
-    with edited_json(tmp_path / "transforms.json") as values:
-        matrix = values["frames"][2]["transform_matrix"]
-        values["frames"][2]["transform_matrix"] = np.full_like(matrix, np.nan).tolist() if pose == "nan" else pose
-    scene = load(tmp_path, holdout=0)
-    assert len(scene.views) == 5 and said(
-        scene, "1 of 6 photos cannot be used and were left out (transforms.json: pose"
-    )
-    for frame in values["frames"][:4]:
-        frame["transform_matrix"] = None
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
-    with pytest.raises(InputError, match="pose of './images/r_0' is not a finite 4 x 4 matrix"):
-        load(tmp_path)
-
-
 @pytest.mark.parametrize("sides, problem", [((1, 1, -1), "mirrors the scene"), ((2, 2, 1), r"stretch \[2.0, 2.0, 1.0")])
 def test_poses_that_are_no_rotations_are_refused(tmp_path, sides, problem):
     write_blender(tmp_path)

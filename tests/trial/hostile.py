@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.own_files import LIST
-from tests.make_scenes import pattern
+from tests.make_scenes import pattern, png_of
 
 from .harness import call, files_in
 
@@ -114,18 +114,9 @@ def gif_named(path: Path) -> None:
 
 
 def png(path: Path, *chunks: tuple[bytes, bytes], size=(24, 16)) -> None:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     rows = zlib.compress((b"\0" + bytes(24 * 3)) * 16)
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0))
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + head
-        + b"".join(chunk(*each) for each in chunks)
-        + chunk(b"IDAT", rows)
-        + chunk(b"IEND", b"")
-    )
+    head = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)
+    path.write_bytes(png_of((b"IHDR", head), *chunks, (b"IDAT", rows), (b"IEND", b"")))
 
 
 REFUSED, EITHER = (1, 2), (0, 1)
