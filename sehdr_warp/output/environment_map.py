@@ -116,7 +116,7 @@ def write_environment_map(
     _judge(run, place, photos, rendered.alpha, rendered.distance, weight)
     added = np.zeros_like(rendered.hdr)
     if inpaint:
-        directions = (latlong if layout == "latlong" else cube)(size) @ transform.rotation
+        directions = map_directions(size, layout) @ transform.rotation
         light = inpainted_light(rendered.hdr, rendered.alpha, directions, weight)
         added = (1 - rendered.alpha[..., None]) * light
     shares = light_shares(rendered.hdr, added, rendered.clipped, weight, run.response.white / run.base_time)
@@ -220,7 +220,7 @@ def render_map(
     bands = []
     for start in range(0, rows, step):
         band = slice(start * finer, min(rows, start + step) * finer)
-        rays = (latlong if layout == "latlong" else cube)(size * finer, band) @ to_scene
+        rays = map_directions(size * finer, layout, band) @ to_scene
         bands.append(_averaged_map(run.render_directions(position, rays, **options), finer))
 
     def join_parts(name: str) -> Any:
@@ -259,6 +259,11 @@ def envmap(layout: str) -> Any:
     import OpenEXR
 
     return OpenEXR.Envmap.ENVMAP_LATLONG if layout == "latlong" else OpenEXR.Envmap.ENVMAP_CUBE
+
+
+def map_directions(size: int, layout: str, rows: slice = slice(None)) -> np.ndarray:
+    """Return [H, size, 3] unit directions of the pixel centers of a map, or of some of its rows."""
+    return (latlong if layout == "latlong" else cube)(size, rows)
 
 
 def latlong(size: int, rows: slice = slice(None)) -> np.ndarray:

@@ -5,6 +5,7 @@ NumPy alone is loaded here; USD needs the extra `usd`.
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -137,6 +138,8 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
         problem = f"holds {color_model} colors, and these are {gaussians.color_model}"
         raise InputError(path, problem, "choose another suffix, or let export change the colors")
     gaussians.require_finite(path)
+    # Text of a NumPy scalar is not that of a number.
+    gaussians = replace(gaussians, base_time=float(gaussians.base_time))
     if gaussians.means.dtype == np.float64:
         far = float(np.abs(gaussians.means).max())
         log.warning(

@@ -95,14 +95,14 @@ class GaussianArrays:
 
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         rotation = matrix[:3, :3] / scale
-        turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.roll(self.unit_quaternions, -1, axis=1))
+        turned = Rotation.from_matrix(rotation) * Rotation.from_quat(self.unit_quaternions, scalar_first=True)
         before = np.eye(4) if self.world_matrix is None else self.world_matrix
         log_scales = (self.log_scales + np.log(scale)).astype(np.float32)
         return replace(
             self,
             means=rounded_means(self.means.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3], log_scales),
             log_scales=log_scales,
-            quaternions=np.roll(turned.as_quat(), 1, axis=1).astype(np.float32),
+            quaternions=turned.as_quat(scalar_first=True).astype(np.float32),
             harmonics=rotate_harmonics(self.harmonics, rotation),
             world_matrix=matrix @ before,
         )

@@ -12,6 +12,8 @@ from .arrays import HARMONIC_0, GaussianArrays, degree_of
 from .packing import from_smallest_three, logits, morton_order, smallest_three
 
 SUFFIX = ".compressed.ply"
+MIP = "SplatRenderMode: mip"
+"""Comment of Gaussians that were trained with opacity compensation."""
 _CHUNK = 256
 _LIMITS = ("x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b")
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -62,13 +64,16 @@ def write_compressed_ply(path: Path, gaussians: GaussianArrays, overwrite: bool)
         for i, column in enumerate(bytes_.T):
             higher[f"f_rest_{i}"] = column
         elements.append(PlyElement.describe(higher, "sh"))
-    comments = ["sehdr:color_model display", f"sehdr:base_exposure_time {gaussians.base_time!r}"]
-    comments += ["SplatRenderMode: mip"] * gaussians.antialiased
-    if gaussians.world_matrix is not None:
-        matrix = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
-        comments.append(f"sehdr:world_matrix {matrix}")
     with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
-        PlyData(elements, byte_order="<", comments=comments).write(file)
+        PlyData(elements, byte_order="<", comments=header_comments(gaussians)).write(file)
+
+
+def header_comments(gaussians: GaussianArrays) -> list[str]:
+    """Return the comments of a PLY header that state what its properties do not."""
+    facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(gaussians.base_time)}
+    if gaussians.world_matrix is not None:
+        facts["world_matrix"] = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
+    return [*(f"sehdr:{name} {value}" for name, value in facts.items()), *[MIP] * gaussians.antialiased]
 
 
 def unpack_ply(elements: Any, path: Path) -> dict[str, np.ndarray]:

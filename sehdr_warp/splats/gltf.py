@@ -47,7 +47,8 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         kind = next(name for name, width in _WIDTHS.items() if width == values.shape[1])
         accessors.append({"bufferView": index, "componentType": _FLOAT, "count": len(values), "type": kind})
         offset += len(blob)
-    accessors[0] |= {name: getattr(gaussians.means, name)(axis=0).tolist() for name in ("min", "max")}
+    means = gaussians.means.astype(np.float32)  # The limits are those of the stored numbers.
+    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     extension = {"kernel": "ellipse", "colorSpace": _SPACE}
     extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     primitive = {

@@ -8,7 +8,6 @@ So are 8-bit colors in place of f_dc (red, green, blue), as nerfstudio writes th
 """
 
 import io
-import json
 import logging
 import re
 from pathlib import Path
@@ -29,10 +28,9 @@ from .arrays import (
     read_matrix,
     warn_of_compensation,
 )
-from .compressed_ply import unpack_ply
+from .compressed_ply import MIP, header_comments, unpack_ply
 
 log = logging.getLogger(__name__)
-_MIP = "SplatRenderMode: mip"
 _FLAT = np.log(1e-6)  # Third log size of 2D Gaussian Splatting's files, which have two; as SuperSplat reads them
 _DAMAGED = "copy or export the file again"
 _COLOR_MODELS = ("display", "log", "linear")
@@ -62,13 +60,9 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     table = np.empty(gaussians.count, [(name, "<f4") for name, _ in columns])
     for name, values in columns:
         table[name] = values
-    facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(float(gaussians.base_time))}
-    if gaussians.world_matrix is not None:
-        facts["world_matrix"] = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
-    comments = [f"sehdr:{name} {value}" for name, value in facts.items()]
-    comments += [_MIP] * gaussians.antialiased
+    vertices = PlyElement.describe(table, "vertex")
     with atomic_path(path, overwrite) as temporary, temporary.open("wb") as file:
-        PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
+        PlyData([vertices], byte_order="<", comments=header_comments(gaussians)).write(file)
 
 
 def read_ply(path: Path) -> GaussianArrays:
@@ -84,10 +78,8 @@ def read_ply(path: Path) -> GaussianArrays:
         vertex = read["vertex"]
         names = {each.name for each in vertex.properties}
         if "packed_position" in names:
-            facts = _facts(read.comments, path)
-            arguments: dict[str, Any] = {**unpack_ply(read, path), "color_model": "display"}
-            shared = {"base_time": facts.base_time, "world_matrix": facts.world_matrix}
-            return GaussianArrays(**arguments, **shared, antialiased=facts.antialiased)
+            facts = _facts(read.comments, path)._replace(color_model="display")
+            return GaussianArrays(**unpack_ply(read, path), **facts._asdict())
         flat = "scale_2" not in names and {"scale_0", "scale_1", "rot_3"} <= names
         rgb = not names & {"f_dc_0", "f_dc_1", "f_dc_2"} and all(_is_byte(vertex, name) for name in _RGB)
         present = names | ({"scale_2"} if flat else set()) | (set(_GROUPS[-1].split()) if rgb else set())
@@ -125,18 +117,8 @@ def read_ply(path: Path) -> GaussianArrays:
         log.info("%s: its 3D smoothing filter (filter_3D) is fused into sizes and opacities", path)
     higher = higher.reshape(len(means), 3, len(rest) // 3).swapaxes(1, 2)
     harmonics = np.concatenate([constant[:, None], higher], axis=1)
-    facts = _facts(read.comments, path)
-    return GaussianArrays(
-        means=means,
-        log_scales=log_scales,
-        quaternions=quaternions,
-        opacity_logits=opacity[:, 0],
-        harmonics=harmonics,
-        color_model=facts.color_model,
-        base_time=facts.base_time,
-        world_matrix=facts.world_matrix,
-        antialiased=facts.antialiased,
-    )
+    arrays = means, log_scales, quaternions, opacity[:, 0], harmonics
+    return GaussianArrays(*arrays, **_facts(read.comments, path)._asdict())
 
 
 def _read(path: Path):
@@ -211,12 +193,12 @@ def _start(path: Path) -> bytes:
 
 
 class _Facts(NamedTuple):
-    """Values that the header states in comments of this package."""
+    """Fields of GaussianArrays that the header states in comments."""
 
     color_model: str
     base_time: float
     world_matrix: np.ndarray | None
-    antialiased: bool = False
+    antialiased: bool
 
 
 def _facts(comments: list[str], path: Path) -> _Facts:
@@ -233,5 +215,5 @@ def _facts(comments: list[str], path: Path) -> _Facts:
             path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a time of {SHORTEST_TIME} to {LONGEST_TIME} s"
         )
     antialiased = any(re.fullmatch(r"SplatRenderMode:\s*mip", line.strip(), re.IGNORECASE) for line in comments)
-    warn_of_compensation(path, antialiased, _MIP)
+    warn_of_compensation(path, antialiased, MIP)
     return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path), antialiased)

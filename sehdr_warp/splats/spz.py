@@ -8,6 +8,7 @@ import gzip
 import logging
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -113,8 +114,7 @@ def read_spz(path: Path) -> GaussianArrays:
     warn_of_compensation(path, gaussians.antialiased, "its header says antialiased")
     if flags & _EXTENDED:
         log.warning("%s: its extensions are not read; one of them may state other axes than SPZ's", path)
-    turned = gaussians.transformed(np.linalg.inv(_TO_FILE))
-    return GaussianArrays(**{**vars(turned), "world_matrix": None})
+    return replace(gaussians.transformed(np.linalg.inv(_TO_FILE)), world_matrix=None)
 
 
 def _zstandard_streams(path: Path, data: bytes, streams: int, sizes: list[int]) -> bytes:

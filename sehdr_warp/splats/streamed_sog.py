@@ -124,5 +124,5 @@ def _half_sizes(gaussians: GaussianArrays) -> np.ndarray:
     """Return half the size [N, 3] of the boxes around the Gaussians, float64."""
     from scipy.spatial.transform import Rotation
 
-    turns = Rotation.from_quat(np.roll(gaussians.unit_quaternions, -1, axis=1)).as_matrix()
+    turns = Rotation.from_quat(gaussians.unit_quaternions, scalar_first=True).as_matrix()
     return DEVIATIONS * np.sqrt(np.einsum("nij,nj->ni", turns**2, np.exp(2.0 * gaussians.log_scales)))

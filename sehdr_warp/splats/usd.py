@@ -86,7 +86,8 @@ def _write_stage(path: Path, gaussians: GaussianArrays) -> None:
     harmonics[:, 0] -= _BIAS
     splat.CreatePositionsAttr(_array("Vec3fArray", gaussians.means))
     splat.CreateScalesAttr(_array("Vec3fArray", np.exp(gaussians.log_scales)))
-    splat.CreateOrientationsAttr(_quaternions(gaussians.unit_quaternions))
+    quaternions = np.roll(gaussians.unit_quaternions, -1, axis=1)  # The real part is last.
+    splat.CreateOrientationsAttr(_array("QuatfArray", quaternions))
     splat.CreateOpacitiesAttr(_array("FloatArray", gaussians.opacities))
     splat.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.degree)
     radiance = splat.CreateRadianceSphericalHarmonicsCoefficientsAttr(_array("Vec3fArray", harmonics.reshape(-1, 3)))
@@ -166,11 +167,6 @@ def _value(attribute: Any) -> Any:
 
 def _array(kind: str, values: np.ndarray):
     return getattr(pxr("Vt"), kind).FromNumpy(np.ascontiguousarray(values, np.float32))
-
-
-def _quaternions(values: np.ndarray):
-    """Return quaternions in OpenUSD's order, with the real part last."""
-    return _array("QuatfArray", np.roll(values, -1, axis=1))
 
 
 def _extent(gaussians: GaussianArrays) -> np.ndarray:

@@ -58,8 +58,9 @@ def test_positions_stay_precise_in_map_coordinates():
 
 
 def test_a_base_time_of_numpy_is_read_again(tmp_path):
-    write_gaussians(tmp_path / "a.ply", replace(gaussians(), base_time=np.float64(0.01)))
-    assert read_gaussians(tmp_path / "a.ply").base_time == 0.01
+    for name in ("a.ply", "a.compressed.ply", "a.sog", "a.glb"):
+        write_gaussians(tmp_path / name, replace(gaussians(color_model="display"), base_time=np.float32(0.5)))
+        assert read_gaussians(tmp_path / name).base_time == 0.5
 
 
 def test_ply_has_the_names_and_order_of_the_reference_release(tmp_path):
