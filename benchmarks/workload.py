@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sehdr_warp.kernels.blend_cuda import BLOCKS_PER_TILE
 from sehdr_warp.kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
-from sehdr_warp.rasterizer.block_blending import blend_blocks, pad_features
+from sehdr_warp.rasterizer.block_blending import blend_on_cuda
 from sehdr_warp.rasterizer.projection import RasterInputs, project_to_camera
 from sehdr_warp.rasterizer.render_options import RenderOptions
 from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_intersections, pack_splats
@@ -48,7 +48,8 @@ def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) ->
     lists = build_tile_lists(packed, offsets, depths, extents, width, height, keep_emit_order=False)
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     image, transmittance = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
-    last_contributor = blend_blocks(pad_features(features), lists, packed, image, transmittance, ALPHA_THRESHOLD)
+    blended = blend_on_cuda(features, lists, packed, image, transmittance, ALPHA_THRESHOLD, deterministic=False)
+    last_contributor = blended.last_contributor
     columns, rows = lists.grid
     beyond = 0, columns * TILE_SIZE - width, 0, rows * TILE_SIZE - height
     last_contributor = torch.nn.functional.pad(last_contributor.view(height, width), beyond)
@@ -62,5 +63,5 @@ def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) ->
     touched = (
         lists.subtile_masks[intersections, None].int() >> torch.arange(BLOCKS_PER_TILE, device=last_contributor.device)
     ) & 1
-    blended = touched.bool() & (places[:, None] < last_contributor[tiles])
-    return Workload(lists.intersection_count, int(blended.sum()))
+    pairs = touched.bool() & (places[:, None] < last_contributor[tiles])
+    return Workload(lists.intersection_count, int(pairs.sum()))

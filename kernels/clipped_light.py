@@ -133,7 +133,7 @@ def clipped_light_kernel(dtype):
 
 @cache
 def clipped_light_patch_kernel(dtype, code):
-    """Both of the above in one launch on CUDA, over patches_of() x BLOCK_DIM threads (patches.py)."""
+    """Return both of the above as one kernel for CUDA, launched over patches_of() x BLOCK_DIM threads (patches.py)."""
     real = dtype
     vec3, around = vector(3, dtype), vector(ROWS + 2 * REACH, dtype)
     functions = patch_functions(REACH)

@@ -38,7 +38,7 @@ WRITE_QUAD = """
 
 @cache
 def geometry(dtype) -> SimpleNamespace:
-    """Scalar, vector and matrix types and the functions below for one scalar type (wp.float32 or wp.float64)."""
+    """Return types and the functions below for one scalar type (wp.float32 or wp.float64)."""
     real = dtype
     vec3, vec4, mat33 = vector(3, dtype), vector(4, dtype), matrix(3, 3, dtype)
 

@@ -16,7 +16,7 @@ TURNS = ROWS * COLUMNS * CHANNELS // BLOCK_DIM  # In which threads take the valu
 
 
 def patches_of(height: int, width: int, channels: int) -> int:
-    """Patches that an image takes."""
+    """Return how many patches cover an image."""
     return -(-height // ROWS) * -(-width // COLUMNS) * -(-channels // CHANNELS)
 
 

@@ -27,7 +27,7 @@ BLOCK_TILES = 8
 
 @cache
 def projection_kernel(dtype, antialiased: bool):
-    """Gaussians to what blend reads of them.
+    """Return the kernel that projects Gaussians to caps of the unit sphere, as blend reads them.
 
     footprint: variance in square radians that a training pixel added. smoothing: variance beyond it, for pixels that
     are larger; it keeps a Gaussian's energy by lowering its opacity, as the footprint does where antialiased.

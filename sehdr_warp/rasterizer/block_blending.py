@@ -28,12 +28,13 @@ def blend_on_cuda(
     keeps_padded: let the backward pass read the padded features of this call, as on_fixed_memory() needs.
     """
     padded = pad_features(features) if packed.padded is None else packed.padded
-    last_contributor = blend_blocks(padded, lists, packed, image, transmittance, alpha_threshold)
+    kernel, arguments = _forward(padded, lists, packed, image, transmittance, alpha_threshold)
+    launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
     # Padded features take more memory. The backward pass pads those of many Gaussians again.
     features = padded if keeps_padded or len(features) <= MAX_SINGLE_SORT else features
     packed = packed._replace(padded=None)
     return BlockBackward(
-        features, image.shape[-1], lists, packed, transmittance, last_contributor, alpha_threshold, deterministic
+        features, image.shape[-1], lists, packed, transmittance, arguments[-1], alpha_threshold, deterministic
     )
 
 
@@ -47,7 +48,7 @@ class BlockBackward:
         lists: that were blended.
         packed: Gaussians that were blended.
         transmittance: [H, W], the result.
-        last_contributor: of blend_blocks().
+        last_contributor: [H W] int32, 1 + the index of a pixel's last Gaussian in its tile's list, or 0.
         alpha_threshold: contributions with a smaller alpha were left out.
         deterministic: sum in a fixed order.
     """
@@ -142,29 +143,17 @@ class FixedBackward(NamedTuple):
     gradients: Tensor
 
 
-def blend_blocks(
-    padded: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
-) -> Tensor:
-    """Fill image [H, W, C] and transmittance [H, W] from pad_features(); return the last Gaussian of each pixel.
-
-    That is [H W] int32, 1 + its index in the tile's list, or 0.
-    """
-    kernel, arguments = _forward(padded, lists, packed, image, transmittance, alpha_threshold)
-    launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
-    return arguments[-1]
-
-
 def fixed_blend_blocks(
     padded: Tensor, lists: TileLists, packed: PackedSplats, image: Tensor, transmittance: Tensor, alpha_threshold: float
 ) -> FixedLaunch:
-    """Return the launch of blend_blocks(), whose tensors stay where they are but for image and transmittance."""
+    """Return the launch of blend_on_cuda(), whose tensors stay where they are but for image and transmittance."""
     kernel, arguments = _forward(padded, lists, packed, image, transmittance, alpha_threshold)
     threads = block_threads(lists, blend_cuda.BLOCKS_PER_TILE)
     return fixed_launch(kernel, threads, *arguments, whole=(image, transmittance), block_dim=blend_cuda.BLOCK_DIM)
 
 
 def _forward(padded, lists, packed, image, transmittance, alpha_threshold) -> tuple[Any, tuple[Any, ...]]:
-    """Return the forward kernel and its arguments, of which the last is the last Gaussian of each pixel."""
+    """Return the forward kernel and its arguments, of which the last is BlockBackward.last_contributor."""
     kernel = blend_cuda.forward_kernel(warp_scalar(padded.dtype), image.shape[2], padded.device.type == "cuda")
     last_contributor = torch.empty(transmittance.numel(), dtype=torch.int32, device=padded.device)
     inputs = _inputs(padded, lists, packed, transmittance, alpha_threshold)

@@ -62,7 +62,7 @@ class CodeScale:
 
     @property
     def compares_exposures(self) -> bool:
-        """True if images are exposures; False if they are encoded values."""
+        """Return whether images are exposures, in place of encoded values."""
         return self.mu > 0
 
     def use_intervals(self) -> None:

@@ -145,30 +145,17 @@ def compiled_rasterize(
     if background is not None:
         tensors.append(background)
     options = RenderOptions(width, height, **others)
-    results = list(_rasterize_op(_as_float(*tensors), *options))
+    results = _rasterize_op(_as_float(*tensors), *options)
     image, transmittance, means2d, depths, extents = results[:5]
-    overflow = needed = None
-    if options.max_intersections is not None:
-        overflow, needed = results[-2:]
-    return Rendering(
-        image=image,
-        transmittance=transmittance,
-        means2d=means2d,
-        depths=depths,
-        extents=extents,
-        intersection_count=cameras * (options.max_intersections or 0),
-        overflow=overflow,
-        needed_intersections=needed,
-        depth=results[5] if options.depth else None,
-    )
-
-
-_DIRECTION_OPTIONS = "focal_length", "pixel_angle", "antialiased", "near_plane", "alpha_threshold"
+    depth = results[5] if options.depth else None
+    overflow, needed = (None, None) if options.max_intersections is None else results[-2:]
+    count = cameras * (options.max_intersections or 0)
+    return Rendering(image, transmittance, means2d, depths, extents, count, overflow, needed, depth)
 
 
 def _run_directions(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
-    arguments, options = tensors, dict(zip(_DIRECTION_OPTIONS, values, strict=True))
-    return list(rasterize_directions(*arguments, **options))
+    arguments, names = tensors, ("focal_length", "pixel_angle", "antialiased", "near_plane", "alpha_threshold")
+    return list(rasterize_directions(*arguments, **dict(zip(names, values, strict=True))))
 
 
 _directions_op = register_custom_op(
@@ -232,20 +219,10 @@ _ssim_map_op = register_custom_op(
 )
 
 
-def compiled_ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Do what ssim() does, as a custom operator."""
-    return _ssim_op(_as_float(a, b))[0]
-
-
-def compiled_ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """Do what ssim_map() does, as a custom operator."""
-    return _ssim_map_op(_as_float(a, b))[0]
-
-
 register_compiled(
     rasterize=compiled_rasterize,
     rasterize_directions=compiled_directions,
     spherical_harmonics=compiled_harmonics,
-    ssim=compiled_ssim,
-    ssim_map=compiled_ssim_map,
+    ssim=lambda a, b: _ssim_op(_as_float(a, b))[0],
+    ssim_map=lambda a, b: _ssim_map_op(_as_float(a, b))[0],
 )

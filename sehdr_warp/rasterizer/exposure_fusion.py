@@ -22,7 +22,7 @@ def fuse_exposures(
     *,
     scale: float,
 ) -> Tensor:
-    """[M, 3]: scale times the encoded brackets [P, M, 3], weighted by the softmax over P of MLP(gamma, encoded) gamma.
+    """Return [M, 3]: brackets [P, M, 3] summed over P with weights softmax(MLP(gamma, encoded) gamma), times scale.
 
     gamma = exp(-d^2 / 2), d = (encoded - 0.5) / exp(log_sigma), with log_sigma [3] and d held within their limits. The
     perceptrons, one a channel: inner [3, 2, H], inner_bias [3, 1, H], ReLU, outer [3, H, 1], outer_bias [3, 1, 1].
@@ -45,7 +45,7 @@ def fuse_exposures(
 
 
 def fusion_weights(encoded, log_sigma, inner, inner_bias, outer, outer_bias) -> Tensor:
-    """[P, M, 3] the weights in fuse_exposures(), which sum to 1 over P, by torch's own operations."""
+    """Return the weights [P, M, 3] in fuse_exposures(), which sum to 1 over P, by torch's own operations."""
     deviation = (encoded - 0.5) / log_sigma.clamp(-MAX_LOG_SIGMA, MAX_LOG_SIGMA).exp()
     exposedness = (-0.5 * deviation.clamp(-MAX_DEVIATION, MAX_DEVIATION).square()).exp()
     # One product for each channel and bracket: the weights' gradients are sums over many points, which a GPU makes in

@@ -95,7 +95,7 @@ class HarmonicsGradients:
 
     @cached_property
     def basis(self) -> Tensor:
-        """[V, (degree + 1)^2, N] the harmonics towards each mean, as the means are at the first call."""
+        """Return the harmonics towards each mean, [V, (degree + 1)^2, N], as the means are at the first call."""
         means = self.means.detach()
         basis = means.new_empty(len(self.positions), (self.degree + 1) ** 2, len(means))
         kernel = basis_kernel(warp_scalar(means.dtype), self.degree)

@@ -11,7 +11,7 @@ from .warp_launch.launching import launch
 
 
 def interpolate(table: Tensor, low: float, step: float, positions: Tensor) -> Tensor:
-    """[N, C] values at positions [N, C] of C functions given at equal steps (Catmull and Rom 1974).
+    """Return values [N, C] at positions [N, C] of C functions tabulated at equal steps (Catmull and Rom 1974).
 
     table: [nodes + 2, C], column c holding function c at low - step, low, low + step ...; nodes from 2. Below `low` a
     function is constant, above its last node but one a straight line. Differentiable once with respect to table and

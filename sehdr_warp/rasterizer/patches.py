@@ -21,7 +21,7 @@ def launch_patches(kernel: Any, image: Tensor, *arguments: Any) -> None:
 
 
 def new_terms(image: Tensor) -> Tensor:
-    """Room for what total() sums: a term for each patch of an image [H, W, C], or for each value of it."""
+    """Return memory for what total() sums: a term for each patch of an image [H, W, C], or for each of its values."""
     return image.new_empty(patches_of(*image.shape)) if in_patches(image.device) else torch.empty_like(image)
 
 

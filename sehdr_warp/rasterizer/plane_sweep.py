@@ -33,7 +33,7 @@ class PhotoSet:
 
     @staticmethod
     def of(photos: Sequence[np.ndarray], cameras: Sequence, neighbors: np.ndarray, device: torch.device | str):
-        """photos: uint8 [H, W, 3]; cameras: scene.Camera, of the photos' sizes; neighbors: [V, K] of -1 and indices."""
+        """Return the set of photos, uint8 [H, W, 3], with a scene.Camera each and neighbors [V, K], -1 for none."""
         poses = np.stack([camera.world_to_camera for camera in cameras])
         back = np.stack([camera.camera_to_world for camera in cameras])
         starts = np.cumsum([0, *(photo.shape[0] * photo.shape[1] for photo in photos)])
@@ -71,10 +71,10 @@ def matching_costs(photos: PhotoSet, pixels: Tensor, depths: Tensor) -> Tensor:
 def trusted_depths(
     costs: Tensor, planes: Tensor, *, worst: float, margin: tuple[float, float], few: int, widest: float
 ) -> Tensor:
-    """[N] depths by costs [N, D] of planes [D], D >= 3, farthest first; 0 where none is to be trusted.
+    """Return depths [N] by costs [N, D] of planes [D], D >= 3, farthest first; 0 if none is to be trusted.
 
-    A depth is, where the least cost is below worst, and costs below margin[0] times it plus margin[1] are those of
-    fewer than `few` planes, or of depths within a factor of `widest`.
+    A depth is trusted if the least cost is below worst, and if costs below margin[0] times it plus margin[1] are those
+    of fewer than `few` planes, or of depths within a factor of `widest`.
     """
     depths = torch.empty(len(costs), device=costs.device)
     launch(plane_sweep.trust_depths, len(costs), costs, planes, worst, *margin, few, widest, depths)

@@ -84,7 +84,7 @@ def launch_projection(
     Does what bridge.differentiable() would, at half of its host time.
 
     Args:
-        kernel: takes inputs, parameters, the last output of the forward pass (None within it), and outputs.
+        kernel: takes inputs, parameters, for the adjoint the last output of the forward pass (else None), and outputs.
         inputs: four tensors with a row for each Gaussian, then those that all share (the camera); contiguous.
         parameters: that are not tensors.
         outputs: with a row for each Gaussian. The last one is 0 if a Gaussian is culled, and not differentiable.

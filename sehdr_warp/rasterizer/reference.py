@@ -25,7 +25,7 @@ def project_reference(
     means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near_plane, eps2d,
     alpha_threshold, antialiased,
 ):
-    """projection.project in torch: means2d, conics, depths, opacities and extents (0 where culled)."""
+    """Return means2d, conics, depths, opacities and extents (0 if culled) of project_to_camera(), by torch."""
     fx, fy, cx, cy = intrinsics
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     center = means @ rotation.T + translation
@@ -73,7 +73,7 @@ def blend_reference(
     means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold,
     transmittance_min=TRANSMITTANCE_MIN,
 ):
-    """Front-to-back blending in torch: image [H, W, C] and the transmittance left [H, W]."""
+    """Blend front to back by torch; return image [H, W, C] and the transmittance left [H, W]."""
     order = torch.where(extents[:, 0] > 0, depths, math.inf).argsort(stable=True)
     order = order[: int((extents[:, 0] > 0).sum())]
     low, high = means2d[order] - extents[order], means2d[order] + extents[order]
@@ -106,7 +106,7 @@ def rasterize_reference(
     *, near_plane=NEAR_PLANE, eps2d=EPS2D, alpha_threshold=ALPHA_THRESHOLD, antialiased=False,
     transmittance_min=TRANSMITTANCE_MIN,
 ) -> Rendering:
-    """rasterize() in plain torch, for float64 truth and for comparison; same arguments, same result.
+    """Do what rasterize() does by torch alone, for float64 truth and for comparison.
 
     transmittance_min: a pixel is finished before its transmittance would fall to this value; 0 never stops.
     """

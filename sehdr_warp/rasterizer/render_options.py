@@ -40,4 +40,6 @@ class RenderOptions(NamedTuple):
         check_render_options(self.near_plane, self.alpha_threshold, **flags)
         width = integer("width", self.width, 1, MAX_SIDE)
         height = integer("height", self.height, 1, MAX_SIDE)
+        if width * height >= 1 << 31:  # Kernels number pixels in int32.
+            raise ValueError(f"an image of {width} x {height} has 2^31 pixels or more; render parts of it")
         return self._replace(width=width, height=height, max_intersections=limit)

@@ -19,7 +19,7 @@ STEPS_PER_THREAD = 1024  # Smallest share of such steps that is worth handing to
 
 @partial(torch_operation, compiles=True)
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, data range 1.
+    """Return the mean structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, data range 1.
 
     Beyond the border both images count as zero and every pixel is averaged, as in 3DGS's loss.
 

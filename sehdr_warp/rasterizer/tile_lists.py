@@ -52,7 +52,7 @@ class TileGrid(NamedTuple):
 
     @property
     def tiles(self) -> int:
-        """All tiles. Unused intersections have this number for their tile."""
+        """Return the number of tiles, which unused intersections have for their tile."""
         return self.columns * self.rows
 
 
@@ -130,12 +130,12 @@ class TileLists:
 
     @property
     def grid(self) -> TileGrid:
-        """Tiles of the image."""
+        """Return the tiles of the image."""
         return tile_grid(self.width, self.height)
 
     @property
     def intersection_count(self) -> int:
-        """Intersections that memory was allocated for: all there are, or max_intersections."""
+        """Return how many intersections memory was allocated for: all there are, or max_intersections."""
         return self.gaussians.shape[0]
 
 
@@ -358,9 +358,9 @@ def _count_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order) -> S
     starts = (by_tile.cumsum(0) - by_tile).int().view(grid.tiles + 1, chunks).t().contiguous()
     tile_ranges = torch.stack([starts[0, :-1], starts[0, 1:]], 1)
     ordered = torch.empty_like(gaussians)
-    emit_indices = torch.empty(length if keep_emit_order else 0, dtype=torch.int32, device=tiles.device)
+    emit_indices = torch.empty_like(gaussians) if keep_emit_order else None
     launch(kernels.place_intersections, chunks, tiles, gaussians, size, starts, ordered, emit_indices, ranges=spans)
-    return SortedIntersections(tile_ranges, ordered, None, emit_indices if keep_emit_order else None)
+    return SortedIntersections(tile_ranges, ordered, None, emit_indices)
 
 
 def find_tile_ranges(
@@ -368,18 +368,15 @@ def find_tile_ranges(
 ) -> tuple[Tensor, Tensor | None]:
     """Return the tile_ranges [tiles, 2] and subtile_masks [M] of sorted intersections, as TileLists has them.
 
-    Both numbers of an empty range are equal. subtile_masks are None without packed Gaussians. keys: of
-    emit_intersections(), sorted.
+    Both numbers of an empty range are equal. subtile_masks are None without packed Gaussians, as for the caps of
+    rasterize_directions(). keys: of emit_intersections(), sorted.
     """
     tile_ranges = (torch.empty if len(keys) else torch.zeros)(grid.tiles, 2, dtype=torch.int32, device=keys.device)
-    subtile_masks = torch.empty(0 if packed is None else len(keys), dtype=torch.uint8, device=keys.device)
+    subtile_masks = None if packed is None else torch.empty(len(keys), dtype=torch.uint8, device=keys.device)
     if len(keys):
         key_type = (wp.int64, kernels.DEPTH_BITS) if keys.dtype == torch.int64 else (wp.int32, 0)
-        if packed is None:
-            means_opacities = conics_cutoffs = torch.empty(0, 4, device=keys.device)
-        else:
-            means_opacities, conics_cutoffs = packed.means_opacities, packed.conics_cutoffs
-        kernel = kernels.tile_ranges_kernel(warp_scalar(means_opacities.dtype), *key_type)
-        inputs = keys, gaussians, means_opacities, conics_cutoffs, grid.columns, grid.tiles
-        launch(kernel, len(keys), *inputs, tile_ranges.view(-1), subtile_masks)
-    return tile_ranges, None if packed is None else subtile_masks
+        scalar = wp.float32 if packed is None else warp_scalar(packed.means_opacities.dtype)
+        ellipses = (None, None) if packed is None else packed[:2]
+        inputs = keys, gaussians, *ellipses, grid.columns, grid.tiles
+        launch(kernels.tile_ranges_kernel(scalar, *key_type), len(keys), *inputs, tile_ranges.view(-1), subtile_masks)
+    return tile_ranges, subtile_masks

@@ -119,6 +119,11 @@ def test_misfits_of_a_picture_of_the_sphere_are_named(name, value, kind, message
         rasterize_directions(*tensors, **arguments | {name: value})
 
 
+def test_an_image_of_too_many_pixels_is_named():
+    with pytest.raises(ValueError, match="an image of 65536 x 32768 has 2\\^31 pixels or more; render parts of it"):
+        rasterize(**arguments(width=lambda _: 1 << 16, height=lambda _: 1 << 15))
+
+
 def test_a_device_without_kernels_is_named():
     args = {name: t.to("meta") if isinstance(t, torch.Tensor) else t for name, t in arguments().items()}
     with pytest.raises(ValueError, match="means is on meta, expected the CPU or a CUDA device"):
