@@ -254,6 +254,7 @@ def test_chroma_lies_where_the_stream_states_it(tmp_path, place):
         stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p10le"
         stream.options = {"x265-params": f"log-level=none:lossless=1:chromaloc={place}"}
         frame = av.VideoFrame(64, 64, "yuv420p10le")
+        frame.pts = 0
         for index, plane in enumerate(frame.planes):
             rows, columns = np.mgrid[: plane.height, : plane.line_size // 2]
             values = np.full(rows.shape, 502) if index == 0 else 400 + 6 * (columns if index == 1 else rows)
