@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from sehdr_warp.arguments import parse_numbers, parse_pairs, require_positive
+from sehdr_warp.arguments import parse_numbers, parse_pairs
+from sehdr_warp.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,6 +233,13 @@ def run_benchmark(options: Benchmarks) -> None:
     if benchmark.json is not None:
         write_json(benchmark.json, result, benchmark.overwrite)
     benchmark.report(result)
+
+
+def require_positive(flag: str, value: int) -> int:
+    """Return the value of a flag; raise InputError if it is not above 0."""
+    if not value > 0:
+        raise InputError(f"{flag} {value}", "not positive", "give a number above 0")
+    return value
 
 
 def _sizes(text: str) -> list:

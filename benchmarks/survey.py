@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.parallel import prefetch_map
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, codes_of, look_at
+from sehdr_warp.synth.expose import write_points
 
 from .study import run
 
@@ -139,21 +139,10 @@ def write_survey(
     camera = cameras[0]
     subset = np.random.default_rng(seed).permutation(len(points))[: 40 * views]
     colors = codes_of(field.response.encode(np.exp(log_exposures[subset])), 8) / 255
-    _write_points(folder / "points.ply", points[subset], colors)
+    write_points(folder / "points.ply", points[subset], colors)
     lens = {"w": camera.width, "h": camera.height, "cx": camera.cx, "cy": camera.cy}
     lens |= {"fl_x": camera.fx, "fl_y": camera.fy}
     (folder / "transforms.json").write_text(json.dumps({**lens, "ply_file_path": "points.ply", "frames": frames}))
-
-
-def _write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write a point cloud as COLMAP and nerfstudio do."""
-    types = [*((name, "f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
-    vertices = np.empty(len(points), types)
-    for axis, name in enumerate("xyz"):
-        vertices[name] = points[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = np.rint(colors[:, channel] * 255)
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
 
 
 if __name__ == "__main__":

@@ -239,14 +239,3 @@ def parse_pairs(flag: str, text: str | None) -> dict[str, str] | None:
         example = f"write for example {flag}=partition=gpu"
         raise InputError(f"{flag} {text}", "not NAME=VALUE separated by commas", example)
     return pairs
-
-
-def require_positive(flag: str, value):
-    """Return the value of a flag if it is above 0.
-
-    Raises:
-        InputError: if it is not.
-    """
-    if not value > 0:
-        raise InputError(f"{flag} {value}", "not positive", "give a number above 0")
-    return value

@@ -26,6 +26,7 @@ from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationVa
 from ..scene import Scene, View
 from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.normalization import Normalization, normalization_of
+from ..subsets import every_nth
 from ..training.compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from ..training.initialization import base_time, check_views, match_points, response_for_training
 from ..training.matching import LARGEST_SIDE
@@ -299,8 +300,7 @@ def _places(scene: Scene, response: Response, device: torch.device) -> np.ndarra
         if len(scene.points) == 0:
             return np.stack([view.camera.position for view in scene.train_views])
         return scene.points
-    views = scene.train_views[:: -(-len(scene.train_views) // MOST_MATCHED)]
-    part = replace(scene, views=views)
+    part = replace(scene, views=every_nth(scene.train_views, MOST_MATCHED))
     return match_points(part, MATCHED, response=response, device=device)[0]
 
 

@@ -17,6 +17,7 @@ from scipy import sparse
 from ..errors import InputError
 from ..scene import Camera
 from ..scene.photos import FEWEST_PHOTOS
+from ..subsets import every_nth
 
 MARGIN = 0.1  # Enlargement of a core for the choice of its photos, as a fraction of its extent, on each side
 LEAST_PART = 0.15  # A block trains on photos of which its enlarged core fills at least this part
@@ -115,7 +116,7 @@ class ShownPlaces:
         for camera in cameras:
             weights = weights_of(camera, points)
             inside = np.flatnonzero(weights)
-            inside = inside[:: -(-len(inside) // MOST_OF_PHOTO) or 1]
+            inside = every_nth(inside, MOST_OF_PHOTO)
             columns.append(inside.astype(np.int32))
             values.append((weights[inside] / max(weights[inside].sum(), 1e-300)).astype(np.float32))
         ends = np.cumsum([0, *map(len, columns)])
@@ -131,7 +132,7 @@ class ShownPlaces:
 def thin_out(points: np.ndarray, photos: int) -> np.ndarray:
     """Return every nth of points [P, 3], as many as describe a number of photos."""
     most = min(max(FEWEST_PLACES, PLACES_PER_PHOTO * photos), MOST_PLACES)
-    return points[:: -(-len(points) // most) or 1]
+    return every_nth(points, most)
 
 
 def divide(name: str, cameras: Sequence[Camera], points: np.ndarray, count: int) -> Division:
@@ -146,7 +147,11 @@ def divide(name: str, cameras: Sequence[Camera], points: np.ndarray, count: int)
     Raises:
         InputError: If a block would have too few photos, or nearly all of them.
     """
-    _check_enough(name, len(cameras), count)
+    if len(cameras) < count * LEAST_PHOTOS:
+        most = len(cameras) // LEAST_PHOTOS
+        problem = f"{len(cameras)} training photos are too few for {count} blocks of at least {LEAST_PHOTOS}"
+        remedy = f"use --blocks {most} at most" if most > 1 else "train without --blocks"
+        raise InputError(name, problem, remedy)
     return _divide(name, ShownPlaces.of(cameras, points), count)
 
 
@@ -159,15 +164,6 @@ def largest_count(name: str, cameras: Sequence[Camera], points: np.ndarray, most
         except InputError:
             continue
     return None
-
-
-def _check_enough(name: str, photos: int, count: int) -> None:
-    """Raise InputError if there are too few photos for a number of blocks."""
-    if photos < count * LEAST_PHOTOS:
-        most = photos // LEAST_PHOTOS
-        problem = f"{photos} training photos are too few for {count} blocks of at least {LEAST_PHOTOS}"
-        remedy = f"use --blocks {most} at most" if most > 1 else "train without --blocks"
-        raise InputError(name, problem, remedy)
 
 
 def _divide(name: str, coverage: ShownPlaces, count: int) -> Division:

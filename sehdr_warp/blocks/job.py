@@ -13,6 +13,7 @@ from ..errors import SehdrError, as_user_error
 from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.run_folder import RunFolder
 from ..scene import Scene
+from ..subsets import every_nth
 from ..training.launch import installed_versions
 from .block_plan import BlockPlan
 from .division import weights_of
@@ -29,12 +30,10 @@ class BlockResult(NamedTuple):
     """Result of the training of a block.
 
     Attributes:
-        index: Number of the block.
         error: One line, if the training cannot be done; None if it is done.
         node: Name of the machine that it ran on.
     """
 
-    index: int
     error: str | None
     node: str
 
@@ -85,8 +84,8 @@ def train_block(
         message = as_user_error(error)
         if message is None:
             raise
-        return BlockResult(index, str(message), platform.node())
-    return BlockResult(index, None, platform.node())
+        return BlockResult(str(message), platform.node())
+    return BlockResult(None, platform.node())
 
 
 def _train(
@@ -122,7 +121,7 @@ def shared_scene(plan: BlockPlan, index: int, scene: Scene) -> Scene:
     chosen_by = scene.chosen_by if scene.light_known else (options.method, tuple(map(str, options.candidates)))
     views = tuple(replace(view, exposure_time=plan.exposure_times[view.name]) for view in scene.views)
     most = MOST_POINTS * plan.config.densification.cap_max
-    points = np.arange(len(scene.points))[:: -(-len(scene.points) // most) or 1]
+    points = every_nth(np.arange(len(scene.points)), most)
     positions = scene.points[points]
     counts = np.zeros(len(points), np.int64)
     for view in scene.train_views:

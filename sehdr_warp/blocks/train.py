@@ -16,6 +16,7 @@ from ..runs.run import Run, load_run
 from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter
 from ..runs.values import LoadArguments
+from ..subsets import every_nth
 from .block_plan import FILE, BlockPlan, make_block_plan
 from .job import FOLDER, folder_of, is_finished
 from .jobs import run_blocks
@@ -151,7 +152,7 @@ def _continue(out: Path, data: LoadArguments, config: Config, count: int | None)
 def _measure(run: Run, plan: BlockPlan, photo_storage: str) -> SeamErrors | None:
     """Return the errors of the merged run on held-out photos; None if there are none."""
     names = [entry.name for entry in run.cameras if entry.split == "test" and entry.camera.is_pinhole]
-    names = names[:: -(-len(names) // MOST_VIEWS) or 1]
+    names = every_nth(names, MOST_VIEWS)
     if not names:
         return None
     response = response_for_loading(plan.config, plan.response)

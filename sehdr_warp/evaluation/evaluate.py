@@ -3,9 +3,10 @@
 import logging
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,48 +39,39 @@ class Doubt(NamedTuple):
     """Radiance that the photo shows as black."""
 
 
-class Predictions(Protocol):
-    """Predictions for the views of a scene."""
+@dataclass(frozen=True)
+class Predictions:
+    """Predictions for the views of a scene.
 
+    Attributes:
+        hdr: Returns the radiance of a view, [H, W, 3].
+        facts: Plain values for the result.
+        ldr: Returns the simulated photo of a view, [H, W, 3] in [0, 1]; None if there is none.
+        confidence: Returns how reliable the prediction for a view is; None if that is not known.
+    """
+
+    hdr: Callable[[View], Tensor]
     facts: dict[str, Any]
-    """Plain values for the result."""
-
-    def hdr(self, view: View) -> Tensor:
-        """Return the radiance, [H, W, 3]."""
-        ...
-
-    def ldr(self, view: View) -> Tensor | None:
-        """Return the simulated photo, [H, W, 3] in [0, 1]; None if there is none."""
-        ...
-
-    def confidence(self, view: View) -> Doubt | None:
-        """Return how reliable the prediction is; None if that is not known."""
-        ...
+    ldr: Callable[[View], Tensor | None] = lambda view: None
+    confidence: Callable[[View], Doubt | None] = lambda view: None
 
 
-class RunPredictions:
-    """The predictions of a trained run."""
+def _run_predictions(run: "Run") -> Predictions:
+    """Return the predictions of a trained run."""
 
-    def __init__(self, run: "Run"):
-        """Take a Run."""
-        self.run = run
-        self.facts = {"train_seconds": run.train_seconds, "gaussians": run.gaussian_count, "iterations": run.iterations}
-
-    def hdr(self, view: View) -> Tensor:
-        """Return the radiance, [H, W, 3]."""
-        return self.run.render(view.camera).hdr
-
-    def ldr(self, view: View) -> Tensor | None:
-        """Return the simulated photo, [H, W, 3] in [0, 1]."""
-        return self.run.render_ldr(view.camera, view.exposure_time)
-
-    def confidence(self, view: View) -> Doubt | None:
-        """Return how reliable the prediction is; None if the run's confidence was not measured."""
-        confidence = self.run.render_confidence(view.camera)
+    def confidence(view: View) -> Doubt | None:
+        confidence = run.render_confidence(view.camera)
         if confidence is None:
             return None
-        black = self.run.response.decode(torch.full((1, 3), DARKEST_CODE, device=confidence.device))
+        black = run.response.decode(torch.full((1, 3), DARKEST_CODE, device=confidence.device))
         return Doubt(confidence, float(black.mean()) / view.exposure_time)
+
+    return Predictions(
+        hdr=lambda view: run.render(view.camera).hdr,
+        facts={"train_seconds": run.train_seconds, "gaussians": run.gaussian_count, "iterations": run.iterations},
+        ldr=lambda view: run.render_ldr(view.camera, view.exposure_time),
+        confidence=confidence,
+    )
 
 
 @torch.no_grad()
@@ -104,7 +96,7 @@ def evaluate(run: "Run", scene: Scene, *, lpips_weights: Path | str | None = Non
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    return Evaluation(RunPredictions(run), run.normalize_photos(scene), run.device, lpips_weights).result()
+    return Evaluation(_run_predictions(run), run.normalize_photos(scene), run.device, lpips_weights).result()
 
 
 class Evaluation:

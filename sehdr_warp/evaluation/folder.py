@@ -5,34 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from ..errors import InputError
 from ..output.images import safe_names
-from ..scene import Scene, View
+from ..scene import Scene
 from ..scene.hdr_files import read_hdr
 from ..subsets import first_names
-from .evaluate import Evaluation
+from .evaluate import Evaluation, Predictions
 
 log = logging.getLogger(__name__)
-
-
-class FolderPredictions:
-    """The pictures of a folder as predictions, see evaluate.Predictions."""
-
-    def __init__(self, folder: Path, files: dict[str, Path]):
-        """Take the EXR files of a folder by the names of their views."""
-        self.files, self.facts = files, {"folder": str(folder)}
-
-    def hdr(self, view: View) -> Tensor:
-        """Return the radiance in the view's file, [H, W, 3]."""
-        return torch.from_numpy(read_hdr(self.files[view.name]).copy())
-
-    def ldr(self, view: View) -> None:
-        """Return None, because a folder of radiance has no simulated photos."""
-
-    def confidence(self, view: View) -> None:
-        """Return None, because a folder of radiance does not say how reliable it is."""
 
 
 @torch.no_grad()
@@ -72,6 +53,9 @@ def evaluate_folder(folder: Path | str, truth: Scene, *, lpips_weights: Path | s
         if which:
             log.warning("%d %s: %s", len(which), what, first_names(which, 5))
     training = [view for view in truth.train_views if view.name in pictures and view.hdr is not None]
-    evaluation = Evaluation(FolderPredictions(folder, pictures), truth, "cpu", lpips_weights, views, training or views)
+    predictions = Predictions(
+        lambda view: torch.from_numpy(read_hdr(pictures[view.name]).copy()), {"folder": str(folder)}
+    )
+    evaluation = Evaluation(predictions, truth, "cpu", lpips_weights, views, training or views)
     scale_from = "train" if training else "scored"
     return evaluation.result() | {"missing": missing, "extra": extra, "scale_from": scale_from}

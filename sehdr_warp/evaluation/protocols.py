@@ -15,6 +15,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from ..subsets import every_nth
 from .metrics import maximum, mu_law, psnr, region_masks
 
 PROTOCOLS = ("gt-max", "self-max", "aligned")
@@ -94,7 +95,7 @@ def fit_scale(views: Iterable[tuple[Tensor, Tensor, Tensor | None, Tensor | None
 def log_ratios(prediction: Tensor, truth: Tensor, pixels: Tensor) -> Tensor:
     """Return log(truth / prediction), [K], of at most VOTES_PER_VIEW evenly spaced values."""
     ratios = (truth[pixels] / prediction[pixels]).log()
-    return ratios[:: max(1, -(-len(ratios) // VOTES_PER_VIEW))].cpu()
+    return every_nth(ratios, VOTES_PER_VIEW).cpu()
 
 
 def median_factor(votes: list[Tensor]) -> float | None:

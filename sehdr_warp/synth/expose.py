@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..files import atomic_folder, atomic_path, write_json
 from ..output.exr import write_exr
 from ..scene import Camera, Scene, View, codes_of
+from ..subsets import every_nth
 from .glare import add_glare
 
 _MOST_SAMPLES, _STEPS_PER_STOP = 200_000, 16
@@ -116,7 +117,7 @@ def ladder_of(name: str, images: Sequence[np.ndarray], encode: Callable, count: 
         InputError: with the name, if all is black.
     """
     radiance = np.concatenate([image.ravel() for image in images])
-    radiance = radiance[:: -(-len(radiance) // _MOST_SAMPLES)].astype(np.float64)
+    radiance = every_nth(radiance, _MOST_SAMPLES).astype(np.float64)
     lit = radiance[radiance > 0]
     if not len(lit):
         raise InputError(name, "the truth of the training views is black", "render it with light")
@@ -240,7 +241,7 @@ def write_tables(folder: Path, views: Sequence[RadianceView], times: Sequence[fl
             write_json(folder / f"transforms_{split}.json", head, overwrite=True)
             write_json(folder / f"exposure_{split}.json", exposures, overwrite=True)
     if points is not None:
-        _write_points(folder / "points3d.ply", *points)
+        write_points(folder / "points3d.ply", *points)
 
 
 def _view_angle(views: Sequence[RadianceView]) -> float:
@@ -254,7 +255,8 @@ def _view_angle(views: Sequence[RadianceView]) -> float:
     return angles.pop()
 
 
-def _write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    """Write points [P, 3] and their colors [P, 3] in [0, 1] as PLY, as COLMAP and nerfstudio do."""
     from plyfile import PlyData, PlyElement
 
     kinds = [(axis, "f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]

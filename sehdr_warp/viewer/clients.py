@@ -1,13 +1,12 @@
-"""Clients of requests, the paths that they ask for, refused requests, and scenes as a client's save renders them."""
+"""The paths that clients ask for, refused requests, and scenes as a client's save renders them."""
 
 import ipaddress
 import re
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
 
-from .connections import Connection, Connections
+from .connections import Connection
 from .frames import ViewerScene
 
 
@@ -18,26 +17,6 @@ class Refusal(Exception):
         """Set the status and the line."""
         self.status = status
         super().__init__(line)
-
-
-class Client:
-    """Client of a request, with what the request may know of its connection."""
-
-    def __init__(self, connections: Connections, connection: Connection):
-        """Set the connection and those beside it."""
-        self._connections, self._connection = connections, connection
-
-    def is_closed(self) -> bool:
-        """Return whether the client no longer waits for the answer."""
-        return self._connection.is_closed()
-
-    def reserve(self, size: int) -> None:
-        """Wait for room for an answer of so many bytes; see Connections.reserve."""
-        self._connections.reserve(self._connection, size)
-
-    def asking(self) -> AbstractContextManager[None]:
-        """Return a context in which the request is received; see Connection.asking."""
-        return self._connection.asking()
 
 
 def own_path(path: str) -> str:
@@ -61,7 +40,9 @@ class SavedRun:
         client: Whom the save is for.
     """
 
-    def __init__(self, on_renderer: Callable[[Client, Callable[[], Any], int], Any], run: ViewerScene, client: Client):
+    def __init__(
+        self, on_renderer: Callable[[Connection, Callable[[], Any], int], Any], run: ViewerScene, client: Connection
+    ):
         """Set the run, and what calls a function on the renderer, see Viewer.on_renderer."""
         self._on_renderer, self._run, self.client = on_renderer, run, client
 

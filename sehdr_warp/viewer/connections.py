@@ -46,9 +46,14 @@ class BusyError(SehdrError):
 class Connection:
     """One connection: what it does, since when, and how many bytes of answers it holds."""
 
-    def __init__(self, client: socket.socket):
-        """Wrap the socket of a client."""
-        self.socket = client
+    def __init__(self, client: socket.socket, others: "Connections"):
+        """Wrap the socket of a client.
+
+        Args:
+            client: The socket.
+            others: All open connections of the server.
+        """
+        self.socket, self._others = client, others
         self.answering = self.sending = self.receiving = self.closed = False
         self.since, self.reserved_bytes = time.monotonic(), 0
 
@@ -57,6 +62,10 @@ class Connection:
         self.closed = True
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
+
+    def reserve(self, size: int) -> None:
+        """Wait for room for an answer of so many bytes; see Connections.reserve."""
+        self._others.reserve(self, size)
 
     def is_closed(self) -> bool:
         """Return whether the client has closed the connection."""
@@ -117,7 +126,7 @@ class Connections:
                     return False
                 del self._open[idle.socket]
                 idle.close()
-            self._open[client] = Connection(client)
+            self._open[client] = Connection(client, self)
             return True
 
     def remove(self, client: socket.socket) -> None:

@@ -131,10 +131,6 @@ class ViewerScene:
         self.visible_count = None if edits is None and not merged else count
         self._edits = edits
 
-    def turned(self) -> None:
-        """Tell pages that up or scale have changed."""
-        self.version += 1
-
     def __getattr__(self, name: str):
         """Return an attribute of the run."""
         return getattr(self.run, name)
@@ -154,16 +150,15 @@ class ViewerScene:
         with self.lock.rendering():
             return self.run.render_confidence(camera)
 
-    def frame(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> memoryview:
+    def frame_parts(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> Iterator[memoryview | None]:
         """Render a camera as half floats, row by row.
 
         The planes are [H, W, 4] exposure at the base time and confidence (1 in a draft, or if unknown), [H, W] depth,
         and with `clipped` [H, W] the share of clipped values.
-        """
-        return next(part for part in self.frame_parts(camera, draft=draft, clipped=clipped) if part is not None)
 
-    def frame_parts(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> Iterator[memoryview | None]:
-        """Make a frame in parts, between which other pictures can be made: yield None, and the frame at the end."""
+        Yields:
+            None between parts of the work, where other pictures can be made, and the frame at the end.
+        """
         run, shares, size = self.run, self.clipped if clipped else None, (camera.height, camera.width)
         with torch.no_grad():
             rendered = self.render(camera)
@@ -237,7 +232,7 @@ def camera_of(values: dict) -> Camera:
 
 
 def frame_bytes(camera: Camera, clipped: bool) -> int:
-    """Return the size of a frame in bytes; see ViewerScene.frame."""
+    """Return the size of a frame in bytes; see ViewerScene.frame_parts."""
     return 2 * (6 if clipped else 5) * camera.width * camera.height
 
 

@@ -63,17 +63,10 @@ class LiveTraining(ViewerScene):
         """Render between two steps."""
         return self._between_steps(lambda: self.run.render(camera))
 
-    def frame(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> memoryview:
-        """Render between two steps; see ViewerScene.frame."""
-        return self._between_steps(lambda: self._frame(camera, draft=draft, clipped=clipped))
-
-    def _frame(self, camera: Camera, **options: bool) -> memoryview:
-        """Render a frame in the training's thread."""
-        return [*super().frame_parts(camera, **options)][-1]  # pyright: ignore[reportReturnType]
-
     def frame_parts(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> Iterator[memoryview]:
-        """Yield a frame in one part, since the training goes on between two."""
-        yield self.frame(camera, draft=draft, clipped=clipped)
+        """Yield a frame in one part between two steps, since the training goes on between two parts."""
+        parts = super().frame_parts(camera, draft=draft, clipped=clipped)
+        yield self._between_steps(lambda: [*parts][-1])
 
     def _between_steps(self, make: Callable[[], Any]) -> Any:
         """Call `make` in the training's thread and return its result; other threads wait for it."""

@@ -28,7 +28,7 @@ from ..output.images import quantize
 from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
-from .clients import Client, Refusal, SavedRun, is_local, own_path
+from .clients import Refusal, SavedRun, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, orient
 from .frames import ViewerScene, camera_file, camera_of, frame_bytes
@@ -79,7 +79,7 @@ class Viewer:
             "/viewer.js": ("text/javascript", page.joinpath("viewer.js").read_text(encoding="utf-8")),
         }
 
-    def get(self, path: str, client: Client) -> tuple[str, bytes]:
+    def get(self, path: str, client: Connection) -> tuple[str, bytes]:
         """Answer a GET: content type and content; raise Refusal."""
         if path in self.files:
             kind, text = self.files[path]
@@ -97,7 +97,7 @@ class Viewer:
             return "image/png", self._photo(path.removeprefix("/photo/"), client)
         raise Refusal(404, "no such page")
 
-    def post(self, path: str, request: dict, client: Client) -> tuple[str, bytes | memoryview]:
+    def post(self, path: str, request: dict, client: Connection) -> tuple[str, bytes | memoryview]:
         """Answer a POST: content type and content; raise Refusal, or the error of a bad request."""
         if path == "/training" and self.training is not None:
             self.training.control(str(request["do"]))
@@ -118,7 +118,7 @@ class Viewer:
                 self.on_renderer(client, partial(run.edit, edits, merged))
             else:
                 self.on_renderer(client, partial(orient, run, request))
-            run.turned()
+            run.version += 1  # Pages read up and scale again.
             return "application/json", json.dumps(run.facts()).encode()
         if path in ("/lights", "/gain") and self.training is None:
             run = self._run(request)
@@ -146,7 +146,7 @@ class Viewer:
             if lock.acquire(timeout=_SAVE_END):
                 lock.release()
 
-    def on_renderer(self, client: Client, make: Callable[[], Any], pixels: int = 0) -> Any:
+    def on_renderer(self, client: Connection, make: Callable[[], Any], pixels: int = 0) -> Any:
         """Return what `make` returns on the thread of the renderer, unless its client has gone by then.
 
         pixels: Of the picture, by which others go first.
@@ -177,7 +177,7 @@ class Viewer:
         with self._reading:
             return list(self._photos(index).values())
 
-    def _photo(self, name: str, client: Client) -> bytes:
+    def _photo(self, name: str, client: Connection) -> bytes:
         """Return the photo of a run and a view by their indices, as PNG."""
         run, _, view = name.partition("/")
         if not (run.isascii() and view.isascii() and run.isdigit() and view.isdigit() and len(name) < 20):
@@ -321,7 +321,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         self._answer(lambda path, client: self.server.viewer.post(path, self._body(client), client))
 
-    def _body(self, client: Client) -> dict:
+    def _body(self, client: Connection) -> dict:
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit() and int(length) <= MOST_BODY):
             self.close_connection = True
@@ -337,7 +337,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise Refusal(400, "a request is an object")
         return values
 
-    def _answer(self, find: Callable[[str, Client], tuple[str, bytes | memoryview]]) -> None:
+    def _answer(self, find: Callable[[str, Connection], tuple[str, bytes | memoryview]]) -> None:
         connections = self.server.connections
         try:
             connection = connections.of(self.connection)
@@ -345,7 +345,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             return
         with connections.answering(connection):
-            answer = self._result_of(partial(find, own_path(self.path), Client(connections, connection)))
+            answer = self._result_of(partial(find, own_path(self.path), connection))
             self._send(connection, *answer)
 
     def _result_of(self, find: Callable[[], tuple[str, bytes | memoryview]]) -> tuple[int, str, bytes | memoryview]:

@@ -231,7 +231,7 @@ def test_what_a_training_writes_meanwhile_is_shown(tmp_path, logged):
             os.utime(file, (1, 1))
         watch.look()
         assert "keeps what it has read" in logged[-1] and scene_shown.version == 1
-    assert scene_shown.frame(camera(8, 8)).nbytes == 8 * 8 * 5 * 2
+    assert [*scene_shown.frame_parts(camera(8, 8))][-1].nbytes == 8 * 8 * 5 * 2
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
