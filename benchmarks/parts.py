@@ -56,7 +56,7 @@ class Work:
         harmonics: numbers of a Gaussian's harmonics.
         channels: features that are blended.
         pairs: pairs of a Gaussian and a tile.
-        pairs: pairs of a Gaussian and a warp that blends it.
+        warp_pairs: pairs of a Gaussian and a warp that blends it.
         pixels: of the image.
     """
 

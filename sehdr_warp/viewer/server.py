@@ -55,7 +55,10 @@ class Viewer:
     """Runs that the server shows, and its answers to a page."""
 
     def __init__(
-        self, runs: Sequence[ViewerScene], photos: Callable[[int], dict[str, Any]] | None = None, training: Any = None
+        self,
+        runs: Sequence[ViewerScene],
+        photos: Callable[[int], dict[str, Any]] = lambda index: {},
+        training: Any = None,
     ):
         """Set what is shown.
 
@@ -172,8 +175,6 @@ class Viewer:
 
     def _photos_of(self, index: int) -> list[Any]:
         """Return the photos of a run; raise SehdrError if they are gone."""
-        if self._photos is None:
-            raise SehdrError("the photos, whose masks these would be, are not here")
         with self._reading:
             return list(self._photos(index).values())
 
@@ -183,7 +184,7 @@ class Viewer:
         if not (run.isascii() and view.isascii() and run.isdigit() and view.isdigit() and len(name) < 20):
             raise Refusal(404, "no such photo")
         entries = self._run({"run": run}).cameras
-        if self._photos is None or int(view) >= len(entries):
+        if int(view) >= len(entries):
             raise Refusal(404, "no such photo")
         with self._reading:  # One at a time, because pictures of a large photo take much memory on the way.
             photo = self._photos(int(run)).get(entries[int(view)].name)
