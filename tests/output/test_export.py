@@ -15,7 +15,7 @@ from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras
-from sehdr_warp.splats import read_gaussians, write_gaussians
+from sehdr_warp.splats import read_gaussians
 
 from ..splats.test_other_tools import write_ply
 from ..splats.test_splat_files import LOSSY_SUFFIXES, gaussians
@@ -156,11 +156,6 @@ def test_unusable_requests(tmp_path, run):
         with pytest.raises(SehdrError, match=words):
             export(run, tmp_path / name, **options)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_files_hold_one_color_model(tmp_path):
-    with pytest.raises(InputError, match="holds display colors, and these are log"):
-        write_gaussians(tmp_path / "a.glb", gaussians())
 
 
 @pytest.mark.parametrize("suffix", LOSSY_SUFFIXES)

@@ -170,8 +170,8 @@ def test_version_4_without_its_library_is_named(tmp_path, monkeypatch):
         read_gaussians(tmp_path / "a.spz")
 
 
-def test_linear_colors_are_refused(tmp_path):
-    for suffix in LOSSY_SUFFIXES:
+def test_files_hold_one_color_model(tmp_path):
+    for suffix in (*LOSSY_SUFFIXES, ".glb"):
         assert check_suffix(f"x{suffix.upper()}") == suffix
         with pytest.raises(InputError, match="holds display colors, and these are linear"):
             write_gaussians(tmp_path / f"a{suffix}", gaussians(color_model="linear"))

@@ -14,18 +14,10 @@ from plyfile import PlyData, PlyElement
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, write_gaussians
-from sehdr_warp.splats.arrays import HARMONIC_0, GaussianArrays
+from sehdr_warp.splats.arrays import HARMONIC_0
 
 from .ply_names import DEGREE_0_NAMES
-
-
-def arrays(count=5, degree=1, color_model="display"):
-    rng = np.random.default_rng(count)
-    normal = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    return GaussianArrays(
-        normal(count, 3), normal(count, 3) - 2, normal(count, 4), normal(count), normal(count, (degree + 1) ** 2, 3),
-        color_model, 1.0,
-    )  # fmt: skip
+from .test_splat_files import gaussians, rewrite
 
 
 def write_ply(path, comments=(), **more):
@@ -41,8 +33,10 @@ def write_ply(path, comments=(), **more):
     return path
 
 
-def test_the_smoothing_filter_is_fused(tmp_path):
+def test_the_smoothing_filter_is_fused(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     read = read_gaussians(write_ply(tmp_path / "a.ply", filter_3D=0.01))
+    assert "a.ply: its 3D smoothing filter (filter_3D) is fused" in caplog.text
     sizes = np.array([0.002, 0.02, 0.001])
     wide = np.hypot(sizes, 0.01)
     np.testing.assert_allclose(np.exp(read.log_scales), [wide] * 3, rtol=1e-5)
@@ -102,7 +96,7 @@ def test_colors_of_eight_bits(tmp_path):
 
 def test_extensions_of_spz_are_named(tmp_path, caplog):
     """One of them states other axes; spz issue 84 and pull request 82."""
-    write_gaussians(tmp_path / "a.spz", arrays())
+    write_gaussians(tmp_path / "a.spz", gaussians(5, 1, "display"))
     data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
     data[14] |= 2  # A flag says that extensions lie behind the Gaussians.
     extension = struct.pack("<III", 0xADBE0003, 4, 5)
@@ -112,7 +106,7 @@ def test_extensions_of_spz_are_named(tmp_path, caplog):
 
 
 def test_sog_in_pieces_and_in_a_folder(tmp_path):
-    write_gaussians(tmp_path / "a.sog", arrays(300))
+    write_gaussians(tmp_path / "a.sog", gaussians(300, 1, "display"))
     with zipfile.ZipFile(tmp_path / "a.sog") as packed, zipfile.ZipFile(tmp_path / "b.sog", "w") as other:
         for name in packed.namelist():
             other.writestr(f"scene/{name}", packed.read(name))
@@ -123,7 +117,7 @@ def test_sog_in_pieces_and_in_a_folder(tmp_path):
 
 
 def test_harmonics_beyond_degree_3_are_named(tmp_path):
-    write_gaussians(tmp_path / "a.spz", arrays())
+    write_gaussians(tmp_path / "a.spz", gaussians(5, 1, "display"))
     data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
     data[12] = 4
     (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
@@ -136,27 +130,13 @@ def test_comments_in_any_encoding(tmp_path):
     assert read.count == 3 and read.antialiased
 
 
-def rewrite(path, change):
-    """A .glb with its description changed."""
-    data = path.read_bytes()
-    (length,) = struct.unpack_from("<I", data, 12)
-    described = json.loads(data[20 : 20 + length])
-    change(described)
-    text = json.dumps(described).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    head = struct.pack("<5I", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
-    path.write_bytes(head + text + rest)
-    return path
-
-
 def test_logarithms_in_gltf_are_read_as_such(tmp_path, caplog):
     """SplatTransform wrote them until June 2026 (its pull request 268); the extension forbids negative sizes."""
-    write_gaussians(tmp_path / "a.glb", arrays())
-    before = read_gaussians(tmp_path / "a.glb")
+    written = gaussians(5, 1, "display")
+    write_gaussians(tmp_path / "a.glb", written)
     data = (tmp_path / "a.glb").read_bytes()
-    linear, stored = np.exp(before.log_scales).astype("<f4"), before.log_scales.astype("<f4")
-    assert stored.min() < 0
+    linear, stored = np.exp(written.log_scales), written.log_scales
+    assert stored.min() < 0 and linear.tobytes() in data
     (tmp_path / "b.glb").write_bytes(data.replace(linear.tobytes(), stored.tobytes()))
     np.testing.assert_array_equal(read_gaussians(tmp_path / "b.glb").log_scales, stored)
     assert "b.glb: its SCALE has negative numbers and is read as logarithms" in caplog.text
@@ -164,7 +144,7 @@ def test_logarithms_in_gltf_are_read_as_such(tmp_path, caplog):
 
 def test_opacities_and_sizes_in_place_of_logits_and_logarithms_are_named(tmp_path, caplog):
     """pixelSplat issue 115, GPS-Gaussian issue 46, mesh2splat pull request 21."""
-    splats = arrays(100)
+    splats = gaussians(100, 1, "display")
     write_gaussians(tmp_path / "right.ply", splats)
     write_gaussians(tmp_path / "opacity.ply", replace(splats, opacity_logits=splats.opacities))
     write_gaussians(tmp_path / "size.ply", replace(splats, log_scales=np.exp(splats.log_scales)))
@@ -176,7 +156,7 @@ def test_opacities_and_sizes_in_place_of_logits_and_logarithms_are_named(tmp_pat
 
 
 def test_compressed_primitives_are_named(tmp_path):
-    write_gaussians(tmp_path / "a.glb", arrays())
+    write_gaussians(tmp_path / "a.glb", gaussians(5, 1, "display"))
 
     def compress(described):
         extension = described["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
@@ -188,7 +168,7 @@ def test_compressed_primitives_are_named(tmp_path):
 
 
 def test_identity_nodes_cameras_and_lights_do_not_matter(tmp_path):
-    write_gaussians(tmp_path / "a.glb", arrays())
+    write_gaussians(tmp_path / "a.glb", gaussians(5, 1, "display"))
     expected = read_gaussians(tmp_path / "a.glb")
 
     def change(described):
@@ -204,7 +184,7 @@ def test_identity_nodes_cameras_and_lights_do_not_matter(tmp_path):
 
 
 def test_transforms_of_nodes_move_gaussians(tmp_path):
-    write_gaussians(tmp_path / "a.glb", arrays())
+    write_gaussians(tmp_path / "a.glb", gaussians(5, 1, "display"))
     before = read_gaussians(tmp_path / "a.glb")
 
     def change(described):
@@ -230,7 +210,7 @@ def test_transforms_of_nodes_move_gaussians(tmp_path):
 
 
 def test_several_primitives_are_one_scene(tmp_path):
-    write_gaussians(tmp_path / "a.glb", arrays(degree=2))
+    write_gaussians(tmp_path / "a.glb", gaussians(5, 2, "display"))
     before = read_gaussians(tmp_path / "a.glb")
 
     def change(described):
@@ -250,7 +230,7 @@ def test_several_primitives_are_one_scene(tmp_path):
 
 def test_values_of_openusd_at_times_alone(tmp_path):
     pytest.importorskip("pxr")
-    write_gaussians(tmp_path / "a.usda", arrays(color_model="linear"))
+    write_gaussians(tmp_path / "a.usda", gaussians(5, 1, "linear"))
     text = (tmp_path / "a.usda").read_text()
     sampled = re.sub(
         r"(point3f\[\] positions) = (\[.*?\])", r"\1.timeSamples = { 3: \2, 5: [(0, 0, 0)] }", text, flags=re.DOTALL
@@ -263,7 +243,7 @@ def test_values_of_openusd_at_times_alone(tmp_path):
 @pytest.mark.parametrize("value", [" = (1, 2, 3)", ".timeSamples = { 1: (1, 2, 3), 5: (0, 0, 0) }"])
 def test_transforms_of_openusd_are_named(tmp_path, value):
     pytest.importorskip("pxr")
-    write_gaussians(tmp_path / "a.usda", arrays(color_model="linear"))
+    write_gaussians(tmp_path / "a.usda", gaussians(5, 1, "linear"))
     text = (tmp_path / "a.usda").read_text()
     moved = (
         f'double3 xformOp:translate{value}\nuniform token[] xformOpOrder = ["xformOp:translate"]\npoint3f[] positions'
@@ -271,9 +251,3 @@ def test_transforms_of_openusd_are_named(tmp_path, value):
     (tmp_path / "b.usda").write_text(text.replace("point3f[] positions", moved, 1))
     with pytest.raises(InputError, match="moved by a transform"):
         read_gaussians(tmp_path / "b.usda")
-
-
-def test_the_filter_is_told(tmp_path, caplog):
-    with caplog.at_level(logging.INFO):
-        read_gaussians(write_ply(tmp_path / "a.ply", filter_3D=0.01))
-    assert "filter_3D" in caplog.text

@@ -130,21 +130,31 @@ def test_glb_is_laid_out_as_the_extension_says(tmp_path):
     assert all({"min", "max"} <= set(described["accessors"][i]) for i in [primitive["attributes"]["POSITION"]])
 
 
+def rewrite(path, change, more=b""):
+    """Change the description of a .glb, and put more behind its binary data."""
+    data = path.read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    described, binary = json.loads(data[20 : 20 + length]), data[28 + length :] + more
+    change(described)
+    text = json.dumps(described).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<5I", 0x46546C67, 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
+    path.write_bytes(head + text + struct.pack("<2I", len(binary), 0x4E4942) + binary)
+    return path
+
+
 def test_glb_of_normalized_integers_and_strides_is_read(tmp_path):
     """As other writers quantize."""
     write_gaussians(tmp_path / "a.glb", gaussians(2, 0, "display"))
-    data = (tmp_path / "a.glb").read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    described, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
-    opacity = described["meshes"][0]["primitives"][0]["attributes"]["KHR_gaussian_splatting:OPACITY"]
-    described["accessors"][opacity] |= {"componentType": 5121, "normalized": True}
-    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": 8, "byteStride": 4}
-    described["bufferViews"][described["accessors"][opacity]["bufferView"]] = view
-    text, binary = json.dumps(described).encode(), binary + bytes([51, 0, 0, 0, 204, 0, 0, 0])
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<5I", 0x46546C67, 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
-    (tmp_path / "b.glb").write_bytes(head + text + struct.pack("<2I", len(binary), 0x4E4942) + binary)
-    np.testing.assert_allclose(read_gaussians(tmp_path / "b.glb").opacities, [0.2, 0.8], rtol=1e-6)
+
+    def quantize(described):
+        opacity = described["meshes"][0]["primitives"][0]["attributes"]["KHR_gaussian_splatting:OPACITY"]
+        described["accessors"][opacity] |= {"componentType": 5121, "normalized": True}
+        view = {"buffer": 0, "byteOffset": described["buffers"][0]["byteLength"], "byteLength": 8, "byteStride": 4}
+        described["bufferViews"][described["accessors"][opacity]["bufferView"]] = view
+
+    rewrite(tmp_path / "a.glb", quantize, bytes([51, 0, 0, 0, 204, 0, 0, 0]))
+    np.testing.assert_allclose(read_gaussians(tmp_path / "a.glb").opacities, [0.2, 0.8], rtol=1e-6)
 
 
 def test_ply_of_others(tmp_path, shared, logged):
@@ -191,17 +201,14 @@ BAD = {
 )
 def test_glb_that_says_what_is_not_read_is_refused(tmp_path, place, value, words):
     write_gaussians(tmp_path / "a.glb", gaussians(degree=0, color_model="display"))
-    data = (tmp_path / "a.glb").read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    tree = at = json.loads(data[20 : 20 + length])
-    for key in place[:-1]:
-        at = at[key]
-    at[place[-1]] = value
-    text = json.dumps(tree).encode()
-    head = struct.pack("<5I", 0x46546C67, 2, 0, len(text), 0x4E4F534A)
-    (tmp_path / "b.glb").write_bytes(head + text + data[20 + length :])
+
+    def put(described):
+        for key in place[:-1]:
+            described = described[key]
+        described[place[-1]] = value
+
     with pytest.raises(InputError, match=words):
-        read_gaussians(tmp_path / "b.glb")
+        read_gaussians(rewrite(tmp_path / "a.glb", put))
 
 
 def test_ply_larger_than_the_memory_is_refused_unread(tmp_path, monkeypatch):
