@@ -91,7 +91,7 @@ def time_ranks(size: Size, count: int, device_type: str, repetitions: int) -> di
 def _rank(rank: int, count: int, folder: Path, size: Size, device_type: str, repetitions: int) -> None:
     os.environ |= {"WORLD_SIZE": str(count), "SEHDR_RANKS": str(folder / "meeting")}
     device = device_of_rank(rank, device_type)
-    with join_ranks(RankInfo.on_one_node(rank, count), device) if count > 1 else nullcontext() as ranks:
+    with join_ranks(RankInfo(rank, count, rank, count), device) if count > 1 else nullcontext() as ranks:
         timing = _time_steps(ranks, size, device, repetitions)
         if not rank:
             write_json(folder / "timing.json", timing)

@@ -11,6 +11,7 @@ from sehdr_warp.model.color_models import EXPOSURE_FLOOR
 from sehdr_warp.model.fusion import NeuralExposureFusion
 from sehdr_warp.model.renders import TrainRender
 from sehdr_warp.rasterizer import ssim
+from sehdr_warp.rasterizer.exposure_fusion import fusion_weights
 from sehdr_warp.rasterizer.photo_loss import ClippedWeights, clipped_light_energy
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response.table import TabulatedResponse
@@ -75,7 +76,7 @@ def _zero_radiance(device):
     """Start from a black photo, and fuse log 0 = -infinity."""
     logs = torch.tensor([[-math.inf] * 3, [-200.0] * 3, [math.log(EXPOSURE_FLOOR)] * 3], device=device)
     fusion = _Fusion(0.2).to(device)
-    yield count("not finite in fusion", not_finite(fusion.exact(logs), fusion(logs)))
+    yield count("not finite in fusion", not_finite(fusion(logs), NeuralExposureFusion.forward(fusion, logs)))
     decoded = torch.cat([response_by_name(name).decode(torch.zeros(1, device=device)) for name in CURVES])
     yield count("not finite in the start's logarithm", not_finite(decoded.clamp_min(EXPOSURE_FLOOR).log()))
 
@@ -83,11 +84,13 @@ def _zero_radiance(device):
 class _Fusion(NeuralExposureFusion):
     """The fusion by its equations, without the table."""
 
-    forward = NeuralExposureFusion.exact
-
     def __init__(self, sigma: float):
         super().__init__(response_by_name("srgb"), BRACKETS, 1.0, width=16)
         torch.nn.init.constant_(self.log_sigma, math.log(sigma))
+
+    def forward(self, log_base):
+        encoded = self._encode(log_base)
+        return self.radiance_scale * (fusion_weights(encoded, *self._learned_tensors()) * encoded).sum(dim=0)
 
 
 def _fusion_results(sigma: float, gain: float, device):

@@ -107,8 +107,9 @@ def _opacity_reset(device):
     trainer = _trainer(device)
     before = _losses(trainer, STEPS // 2)[-1]
     with torch.no_grad():
-        trainer.field.gaussians.opacity_logits.clamp_(max=math.log(0.01 / 0.99))
-        trainer.field.gaussians.forget("opacity_logits", slice(None), trainer.optimizer)
+        gaussians = trainer.field.gaussians
+        lowered = gaussians.opacity_logits.clamp(max=math.log(0.01 / 0.99))
+        gaussians.overwrite({"opacity_logits": lowered}, trainer.optimizer)
     losses = _losses(trainer, 60)
     yield count("steps skipped", trainer.skipped_steps)
     yield count("numbers of the state not finite", _state_not_finite(trainer))

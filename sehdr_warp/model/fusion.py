@@ -13,12 +13,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from ..errors import SehdrError
 from ..rasterizer.cuda_graphs import is_capturing
-from ..rasterizer.exposure_fusion import fuse_exposures, fusion_weights
+from ..rasterizer.exposure_fusion import fuse_exposures
 from ..rasterizer.interpolation import interpolate
 from ..response.curve import Response
-from .exposure import bracket_log_radiance, exposure_times
+from .exposure import bracket_log_radiance
 
 # The table spans, for every bracket, exposures from where the encoded value is this far above black (a four-hundredth
 # of an 8-bit code) to this many octaves above white, where only the response's extension is left: a line in the log.
@@ -34,19 +33,16 @@ class NeuralExposureFusion(nn.Module):
     2 -> width -> 1 with ReLU between and no function at the end.
 
     forward() applies the equations to NODES values of the log radiance, with Catmull-Rom interpolation between them,
-    constant below and linear above; exact() applies them to every Gaussian. Parameters: log_sigma [3]; weights and
-    biases, one stack over the three channels per layer.
+    constant below and linear above. Parameters: log_sigma [3]; weights and biases, one stack over the three channels
+    per layer.
 
     Args:
         response: The curve f, with its extension beyond the clip point.
-        times: Exposure times of the n brackets, seconds.
+        times: Exposure times of the n brackets, seconds, as from exposure_times().
         base_time: Exposure time dt_1 of the photos, seconds.
         radiance_scale: Factor on the fused value, which is at most 1; > 0.
         seed: Seed of the MLPs' start values.
         width: Hidden units of each MLP, as in HDR-GS's tone mapper.
-
-    Raises:
-        SehdrError: If a time or the scale is not positive.
     """
 
     def __init__(
@@ -61,11 +57,7 @@ class NeuralExposureFusion(nn.Module):
     ):
         """Create the fusion with seeded MLPs; arguments as in the class."""
         super().__init__()
-        if not (math.isfinite(radiance_scale) and radiance_scale > 0):
-            raise SehdrError(f"fusion: radiance_scale = {radiance_scale!r} is not positive")
-        self.response = response
-        self.times = exposure_times(base_time, [f"{float(time)!r}s" for time in times])
-        (self.base_time,) = exposure_times(base_time, ("base",))
+        self.response, self.times, self.base_time = response, tuple(times), base_time
         self.radiance_scale = radiance_scale
         self.log_sigma = nn.Parameter(torch.full((3,), math.log(START_SIGMA)))
         self.weights, self.biases = _channel_layers([2, width, 1], seed)
@@ -81,16 +73,6 @@ class NeuralExposureFusion(nn.Module):
             self._encoded_at_nodes(log_base, step), *self._learned_tensors(), scale=self.radiance_scale
         )
         return interpolate(table, self._low, step, log_base)
-
-    def exact(self, log_base: Tensor) -> Tensor:
-        """Return the same as forward(), without the table."""
-        weights, encoded = self.fusion_weights(log_base)
-        return self.radiance_scale * (weights * encoded).sum(dim=0)
-
-    def fusion_weights(self, log_base: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the weights w and the encoded brackets f(c^{l_p}), each [n, N, 3], of log c^{l_1} [N, 3]."""
-        encoded = self._encode(log_base)
-        return fusion_weights(encoded, *self._learned_tensors()), encoded
 
     def _encode(self, log_base):
         """Return the encoded brackets [n, N, 3] of log_base [N, 3]."""

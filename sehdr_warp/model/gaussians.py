@@ -218,22 +218,13 @@ class Gaussians(nn.Module):
             more = count - self.count
             self.append({name: old.new_zeros(more, *old.shape[1:]) for name, old in self.tensors().items()}, optimizer)
 
-    def overwrite(
-        self, rows: dict[str, Tensor], index: Tensor | None = None, optimizer: Optimizer | None = None
-    ) -> None:
-        """Write values of some parameters in place, at an index or mask [N] or everywhere.
-
-        The optimizer state is zeroed there.
-        """
-        where = slice(None) if index is None else index
-        for name, values in rows.items():
-            getattr(self, name).detach()[where] = values
-            self.forget(name, where, optimizer)
-
-    def forget(self, name: str, where, optimizer: Optimizer | None) -> None:
-        """Zero a parameter's optimizer state at an index, mask or slice."""
-        for state in moments_of(optimizer, getattr(self, name)).values():
-            state[where] = 0
+    def overwrite(self, values: dict[str, Tensor], optimizer: Optimizer | None = None) -> None:
+        """Write values of some parameters in place, and zero their optimizer state."""
+        for name, new in values.items():
+            parameter = getattr(self, name)
+            parameter.detach().copy_(new)
+            for moment in moments_of(optimizer, parameter).values():
+                moment.zero_()
 
     def _replace(self, name: str, change: Callable[[Tensor, bool], Tensor], optimizer: Optimizer | None) -> None:
         """Replace a parameter and its moments by change(tensor, whether it is a moment).

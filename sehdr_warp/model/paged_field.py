@@ -158,14 +158,10 @@ class PagedField(RadianceField):
         self._pages.move_to_end(key)
         return self._pages[key]
 
-    def _slice(self, key: tuple[int, int]) -> slice:
-        """Return the rows of a cell at a level of detail."""
-        cell, level = key
-        return slice(cell * CELL, min((cell + 1) * CELL, self.gaussians.count), LEVEL_STEP if level else 1)
-
     def _rows(self, levels: list[tuple[int, int]]) -> Tensor:
-        """Return the indices of the rows of some cells."""
-        parts = [torch.arange(part.start, part.stop, part.step) for part in map(self._slice, levels)]
+        """Return the indices of the rows of some cells, of the first of each group at a lower level."""
+        steps = {cell: LEVEL_STEP if level else 1 for cell, level in levels}
+        parts = [torch.arange(k * CELL, min((k + 1) * CELL, self.gaussians.count), step) for k, step in steps.items()]
         return torch.cat(parts) if parts else torch.zeros(1, dtype=torch.int64)
 
     def _empty(self) -> dict[str, Tensor]:

@@ -71,10 +71,6 @@ class LightPrior:
         """
         self.network, self.deviation_scale = network.eval(), deviation_scale
 
-    def size(self, height: int, width: int) -> tuple[int, int]:
-        """Return the size of an estimate of a photo, `coarse_size`."""
-        return coarse_size(height, width)
-
     @torch.no_grad()
     def estimate(self, exposure: Tensor, clipped: Tensor) -> LightEstimate:
         """Estimate the light of a photo's clipped values.
@@ -96,10 +92,6 @@ class LightPrior:
 
 class Prior(Protocol):
     """An estimator of clipped light: LightPrior, or another for photos of cameras that are not pinholes."""
-
-    def size(self, height: int, width: int) -> tuple[int, int]:
-        """Return the size of an estimate of a photo."""
-        ...
 
     def estimate(self, exposure: Tensor, clipped: Tensor) -> LightEstimate:
         """Estimate the light of a photo's clipped values, as LightPrior does."""

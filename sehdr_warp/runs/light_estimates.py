@@ -67,7 +67,7 @@ def light_estimates(
             wide = wide if wide is not None and wide.fits(view.camera) else WidePrior(prior, view.camera)
             seeing = wide
         if not bool(mask.any()):
-            size = (coarse_size if seeing is None else seeing.size)(*mask.shape[:2])
+            size = (seeing.size if isinstance(seeing, WidePrior) else coarse_size)(*mask.shape[:2])
             nothing = torch.zeros(*size, 6, dtype=torch.float16)
             result.append(ClippedLight(nothing, nothing[..., 3:]))
             continue

@@ -48,11 +48,6 @@ class RankInfo:
     node: int = 0
     nodes: int = 1
 
-    @staticmethod
-    def on_one_node(rank: int, count: int) -> "RankInfo":
-        """Return the info of a rank if all are on this machine."""
-        return RankInfo(rank, count, rank, count)
-
     @property
     def several_nodes(self) -> bool:
         """True if the processes are on several nodes."""

@@ -108,17 +108,12 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
 
 
 def is_large(scene: Scene) -> bool:
-    """Return whether photos show so little of a scene that many steps pass before a Gaussian is seen again."""
-    return share_in_view(scene) < LARGE_SCENE
+    """Return whether photos show so little of a scene that many steps pass before a Gaussian is seen again.
 
-
-def share_in_view(scene: Scene, seed: int = 0) -> float:
-    """Return the mean fraction of a scene's sparse points that a training photo contains, occlusion not considered.
-
-    With fewer than FEWEST_POINTS points, places along the cameras' rays count. `seed` is that of the sample.
+    The figure is the mean fraction of the probes that a training photo contains, occlusion not considered.
     """
     views = perspective_views(scene.train_views)
-    return float(_in_view(views, _probes(scene, views, seed)[0]).mean())
+    return float(_in_view(views, _probes(scene, views, 0)[0]).mean()) < LARGE_SCENE
 
 
 def _probes(scene: Scene, views: tuple[View, ...], seed: int) -> tuple[np.ndarray, np.ndarray]:

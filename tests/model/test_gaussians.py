@@ -85,7 +85,7 @@ def test_reserved_rows_keep_gaussians_where_they_are_and_change_nothing_else():
     for change in (
         lambda g, o: g.keep_only(torch.tensor([5, 1, 2, 7, 0, 3]), o),
         lambda g, o: g.append(g.rows(torch.tensor([0, 4, 4])), o),
-        lambda g, o: g.overwrite({"opacity_logits": torch.tensor([7.0])}, torch.tensor([8]), o),
+        lambda g, o: g.overwrite({"opacity_logits": torch.full((9,), 7.0)}, o),
         lambda g, o: g.keep_only(torch.arange(9) < 7, o),
         lambda g, o: g.resize(10, o),
     ):
@@ -111,14 +111,13 @@ def test_reserved_rows_keep_gaussians_where_they_are_and_change_nothing_else():
     assert roomy.reallocations > moves and roomy.row_count == roomy.count == 12
 
 
-def test_overwrite_forgets_where_it_wrote():
+def test_overwrite_forgets_what_it_wrote():
     gaussians = Gaussians.from_points(grid(2), torch.rand(8, 3), 0)
     optimizer = adam(gaussians)
-    mask = torch.arange(8) < 2
-    gaussians.overwrite({"opacity_logits": torch.tensor([7.0, 8.0])}, mask, optimizer)
-    assert gaussians.opacity_logits.detach()[:2].tolist() == [7.0, 8.0]
-    moments = optimizer.state[gaussians.opacity_logits]["exp_avg"]
-    assert not moments[:2].any() and moments[2:].all()
+    gaussians.overwrite({"opacity_logits": torch.arange(8.0)}, optimizer)
+    assert gaussians.opacity_logits.tolist() == list(range(8))
+    moments = (optimizer.state[getattr(gaussians, name)]["exp_avg"] for name in ("opacity_logits", "means"))
+    assert [bool(moment.any()) for moment in moments] == [False, True]
 
 
 def test_shapes_that_do_not_fit_are_refused():

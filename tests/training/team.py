@@ -22,7 +22,7 @@ def _rank(rank: int, work, folder: Path, arguments: tuple) -> None:
     from sehdr_warp.training.ranks import join_ranks
 
     os.environ |= {"WORLD_SIZE": str(RANKS), "SEHDR_RANKS": str(folder / "meeting"), "SEHDR_RANK_TIMEOUT": "60"}
-    with join_ranks(RankInfo.on_one_node(rank, RANKS), torch.device("cpu")) as ranks:
+    with join_ranks(RankInfo(rank, RANKS, rank, RANKS), torch.device("cpu")) as ranks:
         work(ranks, folder, *arguments)
 
 

@@ -169,7 +169,7 @@ def test_ports_that_cannot_be_are_refused(monkeypatch, port):
     monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
     monkeypatch.setenv("MASTER_PORT", port)
     with pytest.raises(SehdrError, match="is not a port from 1 to 65535"):
-        open_store(RankInfo.on_one_node(0, 2), 1.0)
+        open_store(RankInfo(0, 2, 0, 2), 1.0)
 
 
 @pytest.mark.parametrize("seconds", ["nan", "-1", "x", "inf"])

@@ -159,7 +159,7 @@ class AdcStrategy(Strategy):
         """Lower all opacities to at most twice prune_opacity."""
         opacity = 2 * self.prune_opacity
         logits = gaussians.opacity_logits.clamp_max(math.log(opacity / (1 - opacity)))
-        gaussians.overwrite({"opacity_logits": logits}, optimizer=optimizer)
+        gaussians.overwrite({"opacity_logits": logits}, optimizer)
 
     def state_dict(self, count: int) -> dict[str, Tensor]:
         """Return the gradient statistics of `count` Gaussians; photo_count is named as in earlier checkpoints."""
