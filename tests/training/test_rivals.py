@@ -24,10 +24,6 @@ from .recorded import train_on_gpu
 from .toy import VARIANTS, make_trainer, quick, without_truth
 
 
-def trainer_of(scene, config):
-    return make_trainer(scene, config)
-
-
 def test_presets_are_what_their_methods_say():
     gs, truth, with_truth = (load_config(name) for name in ("hdr-gs", "truth", "hdr-gs-truth"))
     assert (gs.model.radiance, gs.model.tone_map, gs.response.name) == ("log", "gaussian", "learned")
@@ -63,7 +59,7 @@ def test_the_hdr_loss_compares_in_the_mu_law():
 def test_weights_mix_photos_and_truth(scene):
     photo = TrainRender(images(0) / 4, images(1), images(1), None)
     target = target_of(images(2) / 4, images(3))
-    field = trainer_of(scene, quick()).field
+    field = make_trainer(scene, quick()).field
 
     def loss(**weights):
         return float(data_loss(field, photo, target, LossConfig(clipping=False, **weights), 4.0))
@@ -78,7 +74,7 @@ def test_weights_mix_photos_and_truth(scene):
 def test_photos_of_no_weight_teach_nothing(scene):
     views = tuple(dataclasses.replace(view, codes=view.codes[::-1].copy()) for view in scene.views)
     config = quick("truth", **{"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0})
-    trainers = [trainer_of(scene, config), trainer_of(dataclasses.replace(scene, views=views), config)]
+    trainers = [make_trainer(scene, config), make_trainer(dataclasses.replace(scene, views=views), config)]
     for trainer in trainers:
         for _ in range(5):
             trainer.step()
@@ -98,15 +94,15 @@ def test_a_scene_without_truth_is_refused_by_name_and_field(scene, tmp_path, pre
 
 def test_truth_in_some_views_is_enough_where_photos_count(scene):
     some = without_truth(scene, "v_1")
-    trainer = trainer_of(some, quick("hdr-gs-truth"))
+    trainer = make_trainer(some, quick("hdr-gs-truth"))
     for _ in range(7):
         trainer.step()
     assert trainer.skipped_steps == 0
     with pytest.raises(InputError, match="view v_1 lacks the HDR truth"):
-        trainer_of(some, quick("truth"))
+        make_trainer(some, quick("truth"))
     black = tuple(dataclasses.replace(view, hdr=np.zeros_like(view.hdr)) for view in scene.views)
     with pytest.raises(InputError, match="black in every training view"):
-        trainer_of(dataclasses.replace(scene, views=black), quick("truth"))
+        make_trainer(dataclasses.replace(scene, views=black), quick("truth"))
 
 
 def test_the_largest_truth_is_that_of_training_views_where_they_count(scene):

@@ -300,14 +300,6 @@ def test_a_loop_that_is_left_after_the_last_step_ends_as_one_that_is_not(scene, 
     assert trainer.run.summary()["finished"] and trainer.run.field.confidence is not None
 
 
-def test_the_last_score_is_that_of_the_saved_gaussians(scene, tmp_path):
-    run = train(scene, tmp_path / "run", quick(), device="cpu")
-    last = [line for line in run.metrics() if line["iteration"] == run.iterations]
-    assert len(last) == 1 and last[0]["gaussians"] == run.gaussian_count
-    scores = evaluate_views(run.field, scene.test_views, run.degree)
-    assert last[0]["psnr_ldr"] == pytest.approx(scores["psnr_ldr"], abs=1e-3)
-
-
 @pytest.mark.parametrize("config", ["demo", {"schedule.iterations": 3, "response.name": "srgb"}, 7])
 def test_a_config_may_be_a_name_or_fields(scene, tmp_path, config):
     if config == 7:
