@@ -49,7 +49,7 @@ def code_residual_kernel(dtype, code, mu_law: bool):
             x = value * mu_over_white
             value = per_log * log1p(x)
             slope = per_log * mu_over_white / (real(1.0) + x)
-        # What is not a number is in no branch, and stays, as does what is beside a code that stands for one value.
+        # NaN takes no branch and stays. So do values beside a code that stands for one value.
         if row[1] < row[2]:
             if value < row[1]:
                 value = row[0] + (value - row[1])

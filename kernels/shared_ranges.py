@@ -2,7 +2,7 @@
 
 Work names a CPU kernel and its packed parameters, which begin with `range_start`, and the ranges that are to be done.
 Each thread of the team keeps parameters of its own and takes the next range until none is left. The team is OpenMP's,
-as torch has loaded it; without one whoever calls is a team of one, and callers may come together.
+as torch has loaded it. Without OpenMP, each calling thread is a team of one, and several may call at the same time.
 """
 
 import ctypes

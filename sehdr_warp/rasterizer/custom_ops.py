@@ -1,7 +1,7 @@
 """Public operations within torch.compile and torch.export: custom operators of torch, with the shapes of their results.
 
-Nothing here runs outside of a compiler. The backward pass of an operator renders once more, because an operator's
-results are tensors alone.
+Importing this module registers the operators; calls reach them only inside a compiler. The backward pass of an operator
+renders once more, because an operator's results are tensors alone.
 """
 
 from collections.abc import Callable, Sequence

@@ -61,6 +61,8 @@ def photo_loss(
 
 
 class _PhotoLoss(torch.autograd.Function):
+    """The forward pass also computes the gradient; the backward pass multiplies it by that of the loss."""
+
     @staticmethod
     def forward(ctx, image, codes, scale, index, weights, clipped, estimates):
         image = image.detach().contiguous()

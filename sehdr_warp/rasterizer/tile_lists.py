@@ -249,6 +249,7 @@ def build_tile_lists(
     tile_ranges, gaussians, subtile_masks, emit_indices = lists_by_tile(
         keys, gaussians, length, packed, grid, keep_emit_order
     )
+    # Copies, because order and total are views that would keep larger buffers.
     emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
     return TileLists(tile_ranges, gaussians, subtile_masks, emit_order, width, height, overflow, total.clone())
 

@@ -99,9 +99,9 @@ def _without_autocast(function: Callable[..., T], args: tuple, kwargs: dict) -> 
 def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
     """Let what differentiates a gradient raise RuntimeError, and a batch of gradients NotImplementedError.
 
-    torch.autograd.function.once_differentiable() lets a gradient pass that came from a constant, as that of a sum does:
-    what a loss adds by it would then be missing from the second derivative in silence. This one also refuses gradients
-    by what the node has saved of its inputs.
+    torch.autograd.function.once_differentiable() raises nothing if the upstream gradient is a constant, as below a sum:
+    the second derivative would then silently lack this node's part. This one also refuses derivatives by the inputs
+    that the node has saved.
     """
 
     @wraps(backward)

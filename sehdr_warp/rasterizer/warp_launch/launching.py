@@ -37,14 +37,15 @@ def launch(
     """Launch a kernel or its adjoint over `dim` threads, without a tape and without a synchronization.
 
     A kernel whose first parameter is `range_start` adds it to its thread index and writes nothing that another index
-    writes. On the CPU such a kernel runs in parallel over ranges of indices.
+    writes. On the CPU such a kernel runs in parallel over ranges of indices: PackedLaunch.launch_ranges() calls
+    threads.run_ranges(), whose kernel share_ranges hands them to threads.
 
     Args:
         kernel: a Warp kernel.
         dim: number of threads.
         *arguments: the kernel's arguments (without `range_start`), with tensors of one device in the place of arrays. A
             vector or matrix type takes up the last one or two dimensions. A tensor with more dimensions than the
-            kernel's array is passed flattened. None is an array that the kernel tests for.
+            kernel's array is passed flattened. None passes a null array, which the kernel tests for.
         gradients: for each argument its gradient or None. If given, the adjoint is launched: it reads the gradients of
             the kernel's outputs and adds to those of its inputs.
         ranges: [K + 1] int32, where ranges of indices begin and where the last one ends; by default even ones.
