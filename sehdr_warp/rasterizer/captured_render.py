@@ -14,7 +14,7 @@ from ..kernels.caller_memory import write_last
 from ..kernels.project import projection_kernel
 from .block_blending import BlockBackward, blend_on_cuda, fixed_blend_blocks
 from .caller_memory import CallerMemory
-from .captured_backward import CapturedBackward, GradientLayout
+from .captured_backward import CapturedBackward, GradientLayout, GradientMemory
 from .cuda_graphs import CudaGraphRunner
 from .projection import ProjectedGaussians, RasterInputs, project_to_camera, projection_parameters
 from .render_options import MAX_INTERSECTIONS, RenderOptions
@@ -50,13 +50,13 @@ class ReplayResult(NamedTuple):
         image: [H, W, C].
         transmittance: [H, W].
         others: means2d, depths and extents; extents alone if the graph begins with 2D Gaussians.
-        gradients: zeros like GradientLayout.like; None if the backward pass allocates them.
+        gradients: for the backward pass; None if that allocates them.
     """
 
     image: Tensor
     transmittance: Tensor
     others: Sequence[Tensor]
-    gradients: Tensor | None
+    gradients: GradientMemory | None
 
 
 class CapturedRender:
@@ -82,6 +82,7 @@ class CapturedRender:
     ) -> None:
         """Launch the render once, then capture it."""
         self._options, self._projects = options, len(tensors) == RASTERIZE_TENSORS
+        self._are_contiguous = all(tensor.is_contiguous() for tensor in tensors)
         many = len(tensors[0]) > MAX_COPIED_GAUSSIANS
         self._copies = differentiable or options.depth or not self._projects or not many
         self._inputs = [tensor.detach().contiguous() for tensor in tensors]
@@ -193,12 +194,17 @@ class CapturedRender:
         if not self._copies:
             return self._launch(tensors)
         new = self._results[: len(self._results) - len(outputs)]
-        results = [*map(torch.empty_like, new), *outputs]
-        gradients = None if self._gradients is None else torch.empty_like(self._gradients)
-        inputs = [tensor.contiguous() for tensor in tensors]  # Copies must live until the graph is launched.
-        self._callers.set(inputs, results, gradients)
+        image, transmittance, *others = *map(torch.empty_like, new), *outputs
+        zeros = None if self._gradients is None else torch.empty_like(self._gradients)
+        # Copies must live until the graph is launched.
+        inputs = tensors if self._are_contiguous else [tensor.contiguous() for tensor in tensors]
+        self._callers.set(inputs, (image, transmittance, *others), zeros)
         self._runner.replay()
-        return ReplayResult(results[0], results[1], results[2:], gradients)
+        if zeros is None or self.backward is None:
+            return ReplayResult(image, transmittance, others, None)
+        return ReplayResult(
+            image, transmittance, others, self.backward.allocate(zeros)
+        )  # Views, while the GPU renders.
 
     def _launch(self, tensors: Sequence[Tensor]) -> ReplayResult:
         """Do what replay() does without copies of the features and of the image."""

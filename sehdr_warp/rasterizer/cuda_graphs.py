@@ -68,9 +68,8 @@ def without_replays() -> Iterator[None]:
         _replays_are_off.reset(token)
 
 
-def replays_are_off() -> bool:
-    """Return whether this is within without_replays()."""
-    return _replays_are_off.get()
+replays_are_off: Callable[[], bool] = _replays_are_off.get
+"""Return whether this is within without_replays()."""
 
 
 _idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}

@@ -18,11 +18,11 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import count
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch._C._dynamo.guards import TensorGuards
 
 from .blending import BlendResult
 from .captured_backward import GradientMemory
@@ -42,9 +42,6 @@ MAX_LARGE_GRAPHS = 1  # The same with more than MAX_SINGLE_SORT Gaussians, whose
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
 MAX_GAUSSIANS = 1 << 21
 
-_properties = attrgetter("shape", "dtype", "device")
-_properties_with_gradients = attrgetter("shape", "dtype", "device", "requires_grad", "is_leaf")
-
 
 def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
     """Return the CUDA graphs of calls like this one; None if there are none yet, or the call cannot be captured.
@@ -52,13 +49,18 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
     tensors, options: as their user passed them. If calls like this one are known, they were checked before.
     """
     try:
-        # 640.0 equals 640, and is refused where arguments are checked.
-        if not on_gpu(tensors[0]) or type(options.width) is not int or type(options.height) is not int:
-            return None
-        pool = _pools.get(_signature(tensors, options))
-    except (AttributeError, TypeError, RuntimeError):
+        pool = _known_pool(tensors, options)
+    except (
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ):  # Options that cannot be compared, as arrays, or other threads' pools.
         return None
-    if pool is None or replays_are_off() or is_capturing(tensors[0].device):
+    # 640.0 equals 640, and is refused where arguments are checked.
+    if pool is None or type(options.width) is not int or type(options.height) is not int:
+        return None
+    # is_capturing() with less host time: the name of a device is a new string.
+    if replays_are_off() or (tensors[0].is_cuda and torch._C._cuda_isCurrentStreamCapturing()):
         return None
     pool.last_use = next(_uses)
     return pool
@@ -79,25 +81,49 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     fits = 0 < len(first) <= MAX_GAUSSIANS and options.width * options.height <= MAX_PIXELS
     if not fits or is_capturing(first.device):
         return None
-    differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    max_graphs = MAX_GRAPHS if len(first) <= MAX_SINGLE_SORT else MAX_LARGE_GRAPHS
     with _lock:
-        pool = _pools.setdefault(_signature(tensors, options), GraphPool(differentiable, max_graphs))
+        pool = _known_pool(tensors, options)
+        if pool is None:
+            differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+            pool = GraphPool(differentiable, MAX_GRAPHS if len(first) <= MAX_SINGLE_SORT else MAX_LARGE_GRAPHS)
+            _pools[CallPattern(tensors, options)] = pool
         pool.last_use = next(_uses)
         while len(_pools) > MAX_POOLS:
-            del _pools[min(_pools, key=lambda key: _pools[key].last_use)]
+            del _pools[min(_pools, key=lambda pattern: _pools[pattern].last_use)]
     return pool
+
+
+def _known_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
+    for pattern, pool in _pools.items():
+        if pattern.matches(tensors, options):
+            return pool
+    return None
+
+
+class CallPattern:
+    """What the calls of one pool share: options, stream, grad mode; and layout and requires_grad of each tensor."""
+
+    def __init__(self, tensors: Sequence[Tensor], options: RenderOptions) -> None:
+        """Note the properties of a call that can be captured."""
+        self._device, self._options, self._count = tensors[0].device, options, len(tensors)
+        self._grad_mode, self._stream = torch.is_grad_enabled(), stream_handle(tensors[0].device)
+        # Compares type, shape, strides, dtype, device and requires_grad of all tensors in a quarter of Python's time.
+        self._guards = TensorGuards(*tensors, dynamic_dims_sizes=None, dynamic_dims_strides=None)
+
+    def matches(self, tensors: Sequence[Any], options: RenderOptions) -> bool:
+        """Return whether a call has them."""
+        return (
+            options == self._options
+            and len(tensors) == self._count
+            and self._guards.check(*tensors)
+            and torch.is_grad_enabled() == self._grad_mode
+            and stream_handle(self._device) == self._stream
+        )
 
 
 def on_gpu(tensor: Tensor) -> bool:
     """Return whether CUDA graphs can render it; tests without a GPU replace this function."""
     return tensor.is_cuda
-
-
-def _signature(tensors: Sequence[Tensor], options: RenderOptions) -> tuple[Any, ...]:
-    """Return the properties that the calls of one pool share."""
-    properties = _properties_with_gradients if torch.is_grad_enabled() else _properties
-    return options, stream_handle(tensors[0].device), properties, *map(properties, tensors)
 
 
 class ReplayedRender(NamedTuple):
@@ -139,25 +165,21 @@ class GraphInUse:
 
     def render(self, tensors: Sequence[Tensor]) -> ReplayedRender:
         """Render from the seven tensors of rasterize()."""
-        blended, (means2d, depths, extents) = self._replay(tensors, ())
-        if self._graph.backward is None:
+        backward = self._graph.backward
+        image, transmittance, (means2d, depths, extents), self._prepared = self._graph.replay(tensors)
+        blended = BlendResult(image, transmittance, self.blend_backward)
+        if backward is None:
             return ReplayedRender(self, blended, means2d, depths, extents, None)
-        conics_opacities = self._graph.backward.conics_opacities
-        assert conics_opacities is not None, "the CUDA graph begins with 2D Gaussians"
-        outputs, gaussians = (means2d, conics_opacities.detach(), depths, extents), without_features(tensors)
-        outputs = with_projection_gradient(outputs, gaussians, self.project_backward)
+        assert backward.conics_opacities is not None, "the CUDA graph begins with 2D Gaussians"
+        outputs = means2d, backward.conics_opacities.detach(), depths, extents
+        outputs = with_projection_gradient(outputs, without_features(tensors), self.project_backward)
         means2d, conics_opacities, depths, extents = outputs
         return ReplayedRender(self, blended, means2d, depths, extents, conics_opacities)
 
     def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> BlendResult:
         """Render from flatten() of RasterInputs; write the extents that are left, see pack_splats()."""
-        return self._replay(tensors, (extents,))[0]
-
-    def _replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor]) -> tuple[BlendResult, Sequence[Tensor]]:
-        image, transmittance, others, gradients = self._graph.replay(tensors, outputs)
-        if gradients is not None and self._graph.backward is not None:  # Views are made while the GPU renders.
-            self._prepared = self._graph.backward.allocate(gradients)
-        return BlendResult(image, transmittance, self.blend_backward), others
+        image, transmittance, _, self._prepared = self._graph.replay(tensors, (extents,))
+        return BlendResult(image, transmittance, self.blend_backward)
 
     def count_intersections(self) -> int | None:
         """Wait until the GPU has counted the intersections; return how many there are.
@@ -196,7 +218,7 @@ class GraphInUse:
 
 @dataclass
 class GraphPool:
-    """The CUDA graphs of calls with one signature.
+    """The CUDA graphs of calls with one CallPattern.
 
     Attributes:
         differentiable: whether the calls need backward passes.
@@ -248,7 +270,7 @@ class GraphPool:
 
 
 _lock = threading.Lock()
-_pools: dict[tuple[Any, ...], GraphPool] = {}
+_pools: dict[CallPattern, GraphPool] = {}
 _uses = count(1)
 
 

@@ -154,7 +154,7 @@ def rasterize(
         check_opacities(opacities)
         check_cameras(world_to_camera, intrinsics)
         options = options.checked(means.device)
-    with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
+    try:
         if world_to_camera.ndim == 2:
             begun = _begin(tensors, options, pool or get_or_create_pool(tensors, options))
             rendering = _finish(begun, begun.means2d, tensors, options)
@@ -164,6 +164,9 @@ def rasterize(
             behind = background[:, None, None] if background.ndim == 2 else background
             rendering.image = rendering.image + rendering.transmittance[..., None] * behind
         return rendering
+    except (RuntimeError, MemoryError):
+        with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
+            raise
 
 
 def check_shapes(
