@@ -37,15 +37,11 @@ class GradientMemory:
             emptied when they are returned, because torch takes a leaf's gradient without a copy only if nothing else
             refers to it.
         of_gaussians: by the projection's inputs, None where not needed.
-        features: address of a copy of the features' gradient that is contiguous; None if there is none.
-        of_projection: addresses of the gradients by conics, opacities and the inputs of the projection that need one.
     """
 
     zeros: Tensor
     of_splats: Sequence[Tensor]
     of_gaussians: Sequence[Tensor | None]
-    features: int | None
-    of_projection: Sequence[int]
 
 
 class GradientLayout:
@@ -110,43 +106,38 @@ class CapturedBackward:
         """Pack the launches."""
         self._layout, self.conics_opacities = layout, layout.like if gaussians else None
         self._blend, rows = blend.on_fixed_memory()
-        self._device, self._number_size = rows.device, rows.element_size()
+        self._stream = warp_stream(rows.device)  # Torch differentiates on the stream of the forward pass.
         self._of_splats = [layout.means2d, layout.features]
         if layout.copies_features:
             copy = rows.new_empty(layout.features.shape)
             kernel = copy_features_kernel(warp_scalar(rows.dtype))
             self._copy_features = fixed_launch(kernel, copy.shape, rows, copy, whole=(rows, copy))
+            self._features_offset = layout.features.begin * rows.element_size()
         if gaussians:
-            self._of_projection = [layout.conics, layout.opacities, *filter(None, layout.gaussians)]
+            of_projection = layout.conics, layout.opacities, *filter(None, layout.gaussians)
+            self._projection_offsets = [view.begin * rows.element_size() for view in of_projection]
             self._project = _fixed_projection_backward(gaussians, layout, options, projected, rows)
         else:
             self._of_splats += layout.conics, layout.opacities
-            self._of_projection = []
 
     def allocate(self, zeros: Tensor | None = None) -> GradientMemory:
         """Return memory for one backward pass.
 
         zeros: like GradientLayout.like, which the render's replay wrote; by default new ones.
         """
-        layout, size = self._layout, self._number_size
         if zeros is None:
-            zeros = torch.zeros_like(layout.like)
-        begin = zeros.data_ptr()
-        return GradientMemory(
-            zeros,
-            [zeros.as_strided(*view) for view in self._of_splats],
-            [None if view is None else zeros.as_strided(*view) for view in layout.gaussians],
-            begin + size * layout.features.begin if layout.copies_features else None,
-            [begin + size * view.begin for view in self._of_projection],
-        )
+            zeros = torch.zeros_like(self._layout.like)
+        of_splats = [zeros.as_strided(*view) for view in self._of_splats]
+        of_gaussians = [None if view is None else zeros.as_strided(*view) for view in self._layout.gaussians]
+        return GradientMemory(zeros, of_splats, of_gaussians)
 
     def blend(self, memory: GradientMemory, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
         """Return the gradients by means2d, features, and conics and opacities, as one or each."""
-        stream, rows = warp_stream(self._device), memory.zeros.data_ptr()
+        rows = memory.zeros.data_ptr()
         transmittance = 0 if grad_transmittance is None else grad_transmittance.data_ptr()
-        self._blend.launch((), (grad_image.data_ptr(), transmittance, rows), stream)
-        if memory.features is not None:
-            self._copy_features.launch((), (rows, memory.features), stream)
+        self._blend.launch((), (grad_image.data_ptr(), transmittance, rows), self._stream)
+        if self._layout.copies_features:
+            self._copy_features.launch((), (rows, rows + self._features_offset), self._stream)
         gradients, memory.of_splats = memory.of_splats, ()
         return gradients if self.conics_opacities is None else (*gradients, memory.zeros)
 
@@ -157,7 +148,9 @@ class CapturedBackward:
 
         memory: of the blend's backward pass, or if the image has no gradient, a new one.
         """
-        self._project.launch((grad_means2d, grad_depths), memory.of_projection, warp_stream(self._device))
+        begin = memory.zeros.data_ptr()
+        addresses = [begin + offset for offset in self._projection_offsets]
+        self._project.launch((grad_means2d, grad_depths), addresses, self._stream)
         return memory.of_gaussians
 
 

@@ -328,6 +328,20 @@ def test_only_calls_whose_arguments_were_checked_are_known():
             rasterize(*wrong)
 
 
+def test_tensors_that_are_not_contiguous_are_read_by_their_strides():
+    scene = scene_of()
+    truth = launched(*scene.arguments).image
+    cotangent = random_like(truth, 1)
+    expected = torch.autograd.grad(truth, scene.tensors[:5], cotangent)
+    for layout in (lambda t: t, lambda t: torch.stack([t, -t], -1)[..., 0], lambda t: t.t().contiguous().t()):
+        for _ in range(CALLS):
+            leaves = [layout(tensor.detach()).requires_grad_() for tensor in scene.tensors[:5]]
+            image = rasterize(*leaves, *scene.arguments[5:]).image
+        assert_alike([image], [truth])
+        assert_alike(torch.autograd.grad(image, leaves, cotangent), expected)
+    assert len(graph_cache._pools) == 3 and all(pool.captured for pool in graph_cache._pools.values())
+
+
 def test_sizes_that_equal_those_of_known_calls_are_checked_as_well():
     scene = scene_of(count=5)
     *tensors, width, height = scene.arguments
