@@ -36,7 +36,7 @@ from .warp_launch.launching import stream_handle
 LOG = logging.getLogger(__name__)
 
 WARMUP_CALLS = 4  # Launched calls of a pool before one is captured: a capture takes the time of some twenty of them.
-MAX_POOLS = 3  # Pools of CUDA graphs, by sizes, options and required gradients of calls, the most recent ones.
+MAX_POOLS = 3  # Pools of CUDA graphs, one for each CallPattern, the most recent ones.
 MAX_GRAPHS = 4  # CUDA graphs of a pool: each holds a render until its backward pass.
 MAX_LARGE_GRAPHS = 1  # The same with more than MAX_SINGLE_SORT Gaussians, whose memory is hundreds of megabytes.
 MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
@@ -50,11 +50,7 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
     """
     try:
         pool = _known_pool(tensors, options)
-    except (
-        TypeError,
-        ValueError,
-        RuntimeError,
-    ):  # Options that cannot be compared, as arrays, or other threads' pools.
+    except (TypeError, RuntimeError):  # Arrays among the options, or another thread made a pool meanwhile.
         return None
     # 640.0 equals 640, and is refused where arguments are checked.
     if pool is None or type(options.width) is not int or type(options.height) is not int:
@@ -106,6 +102,7 @@ class CallPattern:
     def __init__(self, tensors: Sequence[Tensor], options: RenderOptions) -> None:
         """Note the properties of a call that can be captured."""
         self._device, self._options, self._count = tensors[0].device, options, len(tensors)
+        self._hash = hash(options)
         self._grad_mode, self._stream = torch.is_grad_enabled(), stream_handle(tensors[0].device)
         # Compares type, shape, strides, dtype, device and requires_grad of all tensors in a quarter of Python's time.
         self._guards = TensorGuards(*tensors, dynamic_dims_sizes=None, dynamic_dims_strides=None)
@@ -113,7 +110,8 @@ class CallPattern:
     def matches(self, tensors: Sequence[Any], options: RenderOptions) -> bool:
         """Return whether a call has them."""
         return (
-            options == self._options
+            hash(options) == self._hash  # Tensors of equal values are no options.
+            and options == self._options
             and len(tensors) == self._count
             and self._guards.check(*tensors)
             and torch.is_grad_enabled() == self._grad_mode

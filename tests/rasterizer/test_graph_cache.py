@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from sehdr_warp.compat.gsplat import rasterization
+from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.rasterizer import block_blending, captured_backward, captured_render, graph_cache, rasterize, tile_lists
@@ -342,7 +343,7 @@ def test_tensors_that_are_not_contiguous_are_read_by_their_strides():
     assert len(graph_cache._pools) == 3 and all(pool.captured for pool in graph_cache._pools.values())
 
 
-def test_sizes_that_equal_those_of_known_calls_are_checked_as_well():
+def test_options_that_equal_those_of_known_calls_are_checked_as_well():
     scene = scene_of(count=5)
     *tensors, width, height = scene.arguments
     for _ in range(CALLS):
@@ -350,6 +351,9 @@ def test_sizes_that_equal_those_of_known_calls_are_checked_as_well():
     for wrong in ((float(width), height), (width, float(height))):
         with pytest.raises(TypeError, match="expected a whole number"):
             rasterize(*tensors, *wrong)
+    for eps2d in (torch.tensor(EPS2D, dtype=torch.float64), np.array([EPS2D])):
+        with pytest.raises(TypeError, match="expected a number"):
+            rasterize(*tensors, width, height, eps2d=eps2d)
     assert rasterize(*tensors, np.int64(width), height).image.shape[:2] == (height, width)
 
 
