@@ -157,6 +157,7 @@ class FixedLaunch:
         self._packed, self._row_slots = packed, self._slots[: len(rows)]
         self._on_stream = _on_stream(packed.command) if packed.command.device.is_cuda else None
         self._values = [value for value in values if not any(value is tensor for tensor in (*rows, *whole))]
+        self._addresses: Sequence[int] = ()
         self._lock = threading.Lock()  # A retained graph may be differentiated by several threads.
 
     def launch(self, rows: Sequence[Tensor | None], addresses: Sequence[int], stream: wp.Stream | None) -> None:
@@ -167,12 +168,13 @@ class FixedLaunch:
             for slot, tensor in zip(self._row_slots, rows, strict=True):
                 if tensor is not None and (step := tensor.stride(0)) != slot.step:
                     slot.step, slot.strides[0] = step, step * slot.size
-            # A loop without calls: torch runs backward passes on a thread whose caches hold none of this.
-            for slot, address in zip(self._slots, addresses, strict=True):
-                slot.array.data = address
-                if slot.is_empty is not (address == 0):
-                    slot.is_empty = address == 0
-                    slot.shape[0] = 0 if slot.is_empty else slot.length
+            if addresses != self._addresses:  # Torch mostly allocates where it did for the last call.
+                for slot, address in zip(self._slots, addresses, strict=True):
+                    slot.array.data = address
+                    if slot.is_empty is not (address == 0):
+                        slot.is_empty = address == 0
+                        slot.shape[0] = 0 if slot.is_empty else slot.length
+                self._addresses = addresses
             # Of a launch that failed, Warp's own launch raises the error.
             if self._on_stream is None or stream is None or self._on_stream(stream.cuda_stream, None):
                 self._packed.run(stream)
