@@ -200,11 +200,9 @@ class CapturedRender:
         inputs = tensors if self._are_contiguous else [tensor.contiguous() for tensor in tensors]
         self._callers.set(inputs, (image, transmittance, *others), zeros)
         self._runner.replay()
-        if zeros is None or self.backward is None:
-            return ReplayResult(image, transmittance, others, None)
-        return ReplayResult(
-            image, transmittance, others, self.backward.allocate(zeros)
-        )  # Views, while the GPU renders.
+        # Views of the gradients are made while the GPU renders.
+        gradients = None if zeros is None or self.backward is None else self.backward.allocate(zeros)
+        return ReplayResult(image, transmittance, others, gradients)
 
     def _launch(self, tensors: Sequence[Tensor]) -> ReplayResult:
         """Do what replay() does without copies of the features and of the image."""

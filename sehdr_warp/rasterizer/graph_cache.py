@@ -97,10 +97,10 @@ def _known_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | 
 
 
 class CallPattern:
-    """What the calls of one pool share: options, stream, grad mode; and layout and requires_grad of each tensor."""
+    """Properties that all calls of a pool have: options, stream, grad mode; of each tensor layout and requires_grad."""
 
     def __init__(self, tensors: Sequence[Tensor], options: RenderOptions) -> None:
-        """Note the properties of a call that can be captured."""
+        """Note those of a call that can be captured."""
         self._device, self._options, self._count = tensors[0].device, options, len(tensors)
         self._hash = hash(options)
         self._grad_mode, self._stream = torch.is_grad_enabled(), stream_handle(tensors[0].device)
