@@ -119,7 +119,7 @@ def write_environment_map(
         directions = map_directions(size, layout) @ transform.rotation
         light = inpainted_light(rendered.hdr, rendered.alpha, directions, weight)
         added = (1 - rendered.alpha[..., None]) * light
-    shares = light_shares(rendered.hdr, added, rendered.clipped, weight, run.response.white / run.base_time)
+    shares = light_shares(rendered.hdr, added, rendered.clipped, rendered.certain, weight)
     coverage = 100 * weight[rendered.alpha > COVERED].sum() / weight.sum()
     rest = "" if inpaint or coverage > _WHOLE else "; the rest is black, --inpaint fills it with the light around it"
     log.info("%s: %.0f %% of all directions seen%s", path.name, coverage, rest)
@@ -179,6 +179,7 @@ class RenderedMap:
         distance: [H, W] mean distance of what is seen, 0 where nothing is.
         confidence: [H, W] mean of what is seen; None if it was not measured.
         clipped: [H, W] share of clipped light; None without shares.
+        certain: [H, W] clipped light up to the photos' white, mean of channels; None without shares.
     """
 
     hdr: np.ndarray
@@ -186,6 +187,7 @@ class RenderedMap:
     distance: np.ndarray
     confidence: np.ndarray | None
     clipped: np.ndarray | None
+    certain: np.ndarray | None
 
 
 def render_map(
@@ -221,7 +223,8 @@ def render_map(
     for start in range(0, rows, step):
         band = slice(start * finer, min(rows, start + step) * finer)
         rays = map_directions(size * finer, layout, band) @ to_scene
-        bands.append(_averaged_map(run.render_directions(position, rays, **options), finer))
+        white = run.response.white / run.base_time
+        bands.append(_averaged_map(run.render_directions(position, rays, **options), finer, white))
 
     def join_parts(name: str) -> Any:
         parts = [getattr(band, name) for band in bands]
@@ -230,8 +233,8 @@ def render_map(
     return RenderedMap(*(join_parts(field.name) for field in fields(RenderedMap)))
 
 
-def _averaged_map(rendered: Any, finer: int) -> RenderedMap:
-    """Return a render along directions as pixels of `finer` x `finer` of its own."""
+def _averaged_map(rendered: Any, finer: int, white: float) -> RenderedMap:
+    """Return a render along directions as pixels of `finer` x `finer` of its own; `white`: radiance of white."""
 
     def average(values: np.ndarray) -> np.ndarray:
         height, width, *channels = values.shape
@@ -245,12 +248,14 @@ def _averaged_map(rendered: Any, finer: int) -> RenderedMap:
 
     hdr, alpha, distance = (as_array(values) for values in (rendered.hdr, rendered.alpha, rendered.distance))
     coverage, light = alpha * (distance > 0), np.maximum(hdr.mean(2), 0)
+    clipped = None if rendered.clipped is None else as_array(rendered.clipped)
     return RenderedMap(
         average(hdr),
         average(alpha),
         weighted_mean(distance, coverage),
         None if rendered.confidence is None else weighted_mean(rendered.confidence, coverage),
-        None if rendered.clipped is None else weighted_mean(rendered.clipped, light),
+        None if clipped is None else weighted_mean(clipped, light),
+        None if clipped is None else average(clipped * np.minimum(light, white)),
     )
 
 

@@ -46,7 +46,11 @@ class LightShares:
 
 
 def light_shares(
-    radiance: np.ndarray, inpainted: np.ndarray, clipped: np.ndarray | None, weight: np.ndarray, white: float
+    radiance: np.ndarray,
+    inpainted: np.ndarray,
+    clipped: np.ndarray | None,
+    certain: np.ndarray | None,
+    weight: np.ndarray,
 ) -> LightShares:
     """Return the shares of an environment map's light.
 
@@ -54,12 +58,12 @@ def light_shares(
         radiance: [H, W, 3] of the scene, without what was filled in.
         inpainted: [H, W, 3] that was filled in.
         clipped: [H, W] in [0, 1], the share of a direction's light that photos clipped; None if it is not known.
+        certain: [H, W] clipped light up to the photos' white, mean of channels; None if it is not known.
         weight: [H, W] solid angle of each pixel, up to scale.
-        white: radiance that the photos show as white.
     """
     light, added = (np.maximum(image, 0).mean(2) * weight for image in (radiance, inpainted))
     unsure = np.zeros_like(light) if clipped is None else light * clipped
-    bound = np.minimum(unsure, weight * white * (0 if clipped is None else clipped))
+    bound = np.zeros_like(light) if certain is None else np.minimum(certain * weight, unsure)
     total = max(float(light.sum() + added.sum()), np.finfo(np.float64).tiny)
     parts = (light - unsure).sum(), bound.sum(), (unsure - bound).sum(), added.sum()
     return LightShares(*(float(part) / total for part in parts), clipped_known=clipped is not None)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
@@ -288,3 +289,17 @@ def test_bands_make_the_same_map(run, layout, monkeypatch):
     for name in ("hdr", "alpha", "distance"):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-5, atol=1e-6)
     assert whole.hdr.max() > 1
+
+
+def test_shares_of_light_do_not_depend_on_the_size_of_the_map(tmp_path):
+    """A coarse pixel holds a lamp and the dark beside it, whose mean may lie below the photos' white."""
+    cameras = tuple(Entry(str(i), "train", camera(position=(0.1 * i, 0, 0), target=(0, 0, 9))) for i in range(3))
+    run = Splats(tmp_path / "run", field_of(lamps(0.1)), cameras)
+    run.clipped_share = lambda: torch.ones(6)
+    shares = []
+    for size in (32, 512):
+        write_environment_map(run, tmp_path / f"{size}.exr", size=size, at=(0, 0, 0), axes="scene")
+        shares.append(json.loads(read(tmp_path / f"{size}.exr")[2]["sehdr:lightShares"]))
+    assert shares[1]["estimated"] > 0.1
+    for name in ("measured", "bound", "estimated"):
+        assert shares[0][name] == pytest.approx(shares[1][name], abs=0.06)
