@@ -246,7 +246,7 @@ class RunWriter(RunFolder):
         self._check_lock()
         final = self.checkpoints / f"iteration_{values['iteration']:08d}"
         try:
-            self.checkpoint_hash = read_checkpoint(final).values["sha256"]
+            self.checkpoint_hash = read_checkpoint(final).values["sha256"]  # It is there and sound.
         except InputError:
             self._hashes = self._hashes or self.hashes()
             data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})

@@ -205,7 +205,8 @@ def _train(args: Train, ranks=None) -> None:
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
         with serve_training(trainer, str(output.out)) if output.view else nullcontext(trainer) as steps:
-            run_with_progress(steps, trainer.total)  # Iterating the trainer trains.
+            # Iterating the trainer trains; serve_training() answers browsers between its steps.
+            run_with_progress(steps, trainer.total)
     photos = len(trainer.scene.train_views)
     typed = configs.named_fields(args.fields) | {"response": args.scene.response, "preset": args.training.preset}
     options = options_of_run(trainer.run) if output.resume else typed | {"seed": args.training.seed}
