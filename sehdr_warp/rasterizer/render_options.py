@@ -1,6 +1,6 @@
 """The options of a rendered image, and their ranges."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -10,6 +10,14 @@ from .cuda_graphs import is_capturing
 
 MAX_INTERSECTIONS = 2**31 - 1  # They are counted in int32.
 MAX_SIDE = 1 << 20  # Of an image, in pixels.
+
+
+def image_size(width: Any, height: Any) -> tuple[int, int]:
+    """Return the sides of an image as plain integers; raise TypeError or ValueError for sizes out of range."""
+    width, height = integer("width", width, 1, MAX_SIDE), integer("height", height, 1, MAX_SIDE)
+    if width * height >= 1 << 31:  # Kernels number pixels in int32.
+        raise ValueError(f"an image of {width} x {height} has 2^31 pixels or more; render parts of it")
+    return width, height
 
 
 class RenderOptions(NamedTuple):
@@ -38,8 +46,5 @@ class RenderOptions(NamedTuple):
         real("eps2d", self.eps2d, is_not_negative, "a number from 0")
         flags = {"antialiased": self.antialiased, "depth": self.depth, "deterministic": self.deterministic}
         check_render_options(self.near_plane, self.alpha_threshold, **flags)
-        width = integer("width", self.width, 1, MAX_SIDE)
-        height = integer("height", self.height, 1, MAX_SIDE)
-        if width * height >= 1 << 31:  # Kernels number pixels in int32.
-            raise ValueError(f"an image of {width} x {height} has 2^31 pixels or more; render parts of it")
+        width, height = image_size(self.width, self.height)
         return self._replace(width=width, height=height, max_intersections=limit)

@@ -6,9 +6,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ...rasterizer.checks import check_tensors, integer, is_not_negative, real
+from ...rasterizer.checks import check_tensors, is_not_negative, real
 from ...rasterizer.projection import FRUSTUM_MARGIN, ProjectedGaussians, project_to_camera
-from ...rasterizer.render_options import ALPHA_THRESHOLD, MAX_SIDE, RenderOptions
+from ...rasterizer.render_options import ALPHA_THRESHOLD, RenderOptions, image_size
 from .inputs import View, split_views
 from .splats import JoinedSplats
 
@@ -48,7 +48,7 @@ class ProjectionOptions(NamedTuple):
         for name in ("near_plane", "far_plane", "radius_clip"):
             real(name, getattr(self, name), lambda number: not math.isnan(number), "a number")
         real("eps2d", self.eps2d, is_not_negative, "a number from 0")
-        width, height = integer("width", self.width, 1, MAX_SIDE), integer("height", self.height, 1, MAX_SIDE)
+        width, height = image_size(self.width, self.height)
         return self._replace(width=width, height=height)
 
 
@@ -175,8 +175,8 @@ def quat_scale_to_covar_preci(
     Args:
         quats: [..., 4] (w, x, y, z), of any length.
         scales: [..., 3].
-        compute_covar: whether covariances are wanted.
-        compute_preci: whether their inverses are.
+        compute_covar: whether to return covariances, else None.
+        compute_preci: whether to return their inverses, else None.
         triu: whether to return the six numbers of the upper triangle, [..., 6], in place of [..., 3, 3].
 
     Raises:

@@ -99,6 +99,7 @@ def test_projections_of_batches_are_those_of_each_scene(packed, device):
         ({"scales": torch.ones(3, 3)}, r"scales has shape \[3, 3\], expected \[N, 3\]"),
         ({"opacities": torch.ones(3)}, r"opacities has shape \[3\], expected \[N\]"),
         ({"width": 0}, "width 0 is not in 1.."),
+        ({"width": 1 << 16, "height": 1 << 15}, "2\\^31 pixels or more"),
         ({"height": 31.5}, "height is 31.5, expected a whole number"),
         ({"eps2d": -1.0}, "eps2d -1.0 is not a number from 0"),
     ],
