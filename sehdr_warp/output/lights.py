@@ -4,7 +4,7 @@ import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -62,7 +62,7 @@ _DOME = """    def DomeLight "Rest"
         custom float sehdr:inpaintedShare = {inpainted}
         color3f inputs:color = (1, 1, 1)
         float inputs:intensity = {intensity}
-        asset inputs:texture:file = @./{file}@
+        asset inputs:texture:file = {asset}
         token inputs:texture:format = "latlong"
     }}"""
 
@@ -135,7 +135,12 @@ def write_lights(
     rows = [_describe(f"light_{index}", light, transform, factor) for index, light in enumerate(lights)]
     if center is not None:
         inpainted = _write_rest(run, rest, lights, transform, center, unseen, overwrite)
-        text = usd_lights(rows, run.scene_name, DomeMap(rest.name, factor, inpainted), units, transform)
+        mark = "@@@" if "@" in rest.name else "@"  # USD's quotes of a path
+        asset = f"{mark}./{rest.name}{mark}"
+        dome = _DOME.format(asset=asset, intensity=repr(float(factor)), inpainted=repr(inpainted))
+        matrix = ", ".join(_tuple(row) for row in transform.matrix.T)  # USD's matrices act on row vectors.
+        names = {"scene": json.dumps(run.scene_name), "units": json.dumps(units)}
+        text = _STAGE.format(**names, matrix=matrix, lights="\n".join([*map(_usd, rows), dome]))
     else:
         facts = {**provenance(run), "units": units, "axes": axes, "world_matrix": transform.matrix.tolist()}
         text = json.dumps({**facts, "lights": rows}, indent=1)
@@ -165,36 +170,6 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
         figures = " ".join(f"{value:9.3g}" for value in radiances)
         lines.append(f"{100 * light.share:5.1f} %  {light.shape.kind:6} {figures}  {sure}   ({place}), {size}")
     return "\n".join(lines)
-
-
-class DomeMap(NamedTuple):
-    """The map of a DomeLight.
-
-    Attributes:
-        file: Name of the file, beside the stage.
-        intensity: Factor of its values.
-        inpainted: Share, 0 to 1, of its light that is filled in, because no photo shows where it comes from.
-    """
-
-    file: str
-    intensity: float
-    inpainted: float
-
-
-def usd_lights(rows: Sequence[dict], scene: str, dome: DomeMap, units: str, transform: WorldTransform) -> str:
-    """Return the text of a stage of lights and a dome.
-
-    Args:
-        rows: Lights as _describe() returns them.
-        scene: Name of the scene.
-        dome: Map of everything else.
-        units: Of light, in words.
-        transform: From the scene's coordinates to those of the file.
-    """
-    rest = _DOME.format(file=dome.file, intensity=repr(float(dome.intensity)), inpainted=repr(float(dome.inpainted)))
-    matrix = ", ".join(_tuple(row) for row in transform.matrix.T)  # USD's matrices act on row vectors.
-    lights = "\n".join([*(_usd(row) for row in rows), rest])
-    return _STAGE.format(scene=json.dumps(scene), units=json.dumps(units), matrix=matrix, lights=lights)
 
 
 def _describe(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:

@@ -85,15 +85,12 @@ def _joined_gaussians(scenes: Sequence[RenderableScene], moves: Sequence[WorldTr
         names.add("log")  # Codes of different responses or primaries have light alone in common.
     color_model = names.pop() if len(names) == 1 else "log"
     time = scenes[0].base_time if color_model == "display" else None
-    pairs = zip(scenes, moves, strict=True)
-    return join_gaussians([_gaussians_in(color_model, scene, move, time) for scene, move in pairs])
-
-
-def _gaussians_in(color_model: str, scene: RenderableScene, move: WorldTransform, time: float | None) -> GaussianArrays:
-    """Return the moved Gaussians of a scene in a color model; `time`: exposure of display colors, seconds."""
-    positions = np.array([camera.position for camera in training_cameras(scene)]).reshape(-1, 3)
-    gaussians = gaussians_of(scene.field, color_model, positions, time, scene.color_matrix)
-    return gaussians if move.is_identity else gaussians.transformed(move.matrix)
+    parts = []
+    for scene, move in zip(scenes, moves, strict=True):
+        positions = np.array([camera.position for camera in training_cameras(scene)]).reshape(-1, 3)
+        gaussians = gaussians_of(scene.field, color_model, positions, time, scene.color_matrix)
+        parts.append(gaussians if move.is_identity else gaussians.transformed(move.matrix))
+    return join_gaussians(parts)
 
 
 def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:

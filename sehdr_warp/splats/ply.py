@@ -11,7 +11,7 @@ import io
 import logging
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -81,7 +81,8 @@ def read_ply(path: Path) -> GaussianArrays:
             facts = _facts(read.comments, path)._replace(color_model="display")
             return GaussianArrays(**unpack_ply(read, path), **facts._asdict())
         flat = "scale_2" not in names and {"scale_0", "scale_1", "rot_3"} <= names
-        rgb = not names & {"f_dc_0", "f_dc_1", "f_dc_2"} and all(_is_byte(vertex, name) for name in _RGB)
+        bytes_ = {each.name for each in vertex.properties if each.val_dtype == "u1"}
+        rgb = not names & {"f_dc_0", "f_dc_1", "f_dc_2"} and bytes_.issuperset(_RGB)
         present = names | ({"scale_2"} if flat else set()) | (set(_GROUPS[-1].split()) if rgb else set())
         missing = [name for group in _GROUPS for name in group.split() if name not in present]
         if missing:
@@ -155,10 +156,6 @@ def _smooth(log_scales: np.ndarray, logits: np.ndarray, smoothing: np.ndarray) -
     with np.errstate(divide="ignore"):
         opacities = ratio / (1 + np.exp(-logits.astype(np.float64)))
         return (0.5 * np.log(wide)).astype(np.float32), np.log(opacities / (1 - opacities)).astype(np.float32)
-
-
-def _is_byte(vertex: Any, name: str) -> bool:
-    return any(each.name == name and each.val_dtype == "u1" for each in vertex.properties)
 
 
 def _check_header(path: Path) -> None:

@@ -77,8 +77,9 @@ def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
     write_lights(run, tmp_path / "lights.usda", axes="scene", unseen="black")
     image = read_hdr(tmp_path / "lights_rest.exr")
     run.find_lights = list
-    write_lights(run, tmp_path / "none.usda", axes="scene", unseen="black")
-    whole = read_hdr(tmp_path / "none_rest.exr")
+    write_lights(run, tmp_path / "a@b.usda", axes="scene", unseen="black")
+    assert "= @@@./a@b_rest.exr@@@\n" in (tmp_path / "a@b.usda").read_text(), "paths with @ have their own quotes"
+    whole = read_hdr(tmp_path / "a@b_rest.exr")
     directions = latlong(1024)
     for index, axis in enumerate(np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]):
         place = np.unravel_index(np.argmax(directions @ axis), directions.shape[:2])
