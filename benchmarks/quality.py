@@ -20,6 +20,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from benchmarks.irradiance import LIGHT, irradiance_errors, read_light_maps, store_light
+from sehdr_warp.blocks.jobs import MONTH, slurm_executor
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.metrics import REGIONS
@@ -35,7 +36,6 @@ from sehdr_warp.training.train import train
 from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
-MONTH = 30 * 24 * 60  # Minutes, the longest that a worker may take
 FORMAT = 7  # Of a job and of its result; others are run again.
 RESULT, FAILURE = "result.json", "failure.json"
 TESTS, FIRST_TEST = 16, 100
@@ -258,17 +258,15 @@ def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpip
         raise SehdrError(f"{problem}; pip install submitit, or take --jobs 1") from None
     gpus = torch.cuda.device_count() if device == "cuda" and slurm is None else 0
     shared = -(-at_once // gpus) if gpus else at_once if slurm is None else 1
-    workers = []
-    for index in range(at_once):
-        if slurm is None:
-            executor = submitit.LocalExecutor(folder=out / "logs")
-            parameters = {"gpus_per_node": 1, "visible_gpus": [index % gpus]} if gpus else {}
-        else:
-            executor = submitit.AutoExecutor(folder=out / "logs", cluster="slurm")
-            parameters = {"name": "sehdr-warp"} | ({"gpus_per_node": 1} if device == "cuda" else {})
-            parameters |= {key if key == "timeout_min" else f"slurm_{key}": value for key, value in slurm.items()}
-        executor.update_parameters(**{"timeout_min": MONTH} | parameters)
-        workers.append(executor.submit(work, jobs, out.absolute(), device, shared, lpips))
+    logs = out / "logs"
+    if slurm is None:
+        executors = [submitit.LocalExecutor(folder=logs) for _ in range(at_once)]
+        for index, executor in enumerate(executors):
+            on_gpu = {"gpus_per_node": 1, "visible_gpus": [index % gpus]} if gpus else {}
+            executor.update_parameters(timeout_min=MONTH, **on_gpu)
+    else:
+        executors = [slurm_executor(logs, slurm, gpu=device == "cuda")] * at_once
+    workers = [executor.submit(work, jobs, out.absolute(), device, shared, lpips) for executor in executors]
     try:
         for worker in workers:
             worker.wait()

@@ -67,7 +67,9 @@ def run_blocks(
     slots = min(gpus, len(queue.waiting)) if slurm is None else len(queue.waiting)
     on_cpu = slurm_device == "cpu" if slurm is not None else device.type == "cpu"
     executors = (
-        _executors(out, device, slots) if slurm is None else [_slurm_executor(out, slurm, gpu=not on_cpu)] * slots
+        _executors(out, device, slots)
+        if slurm is None
+        else [slurm_executor(_logs_folder(out), slurm, gpu=not on_cpu)] * slots
     )
     arguments = ("cpu" if on_cpu else None), photo_storage, installed_versions()
     # Jobs that run beside each other on this machine share its processors.
@@ -204,13 +206,19 @@ def _executors(out: Path, device: torch.device, slots: int) -> list[Any]:
     return executors
 
 
-def _slurm_executor(out: Path, options: Mapping[str, str], *, gpu: bool) -> Any:
-    """Return submitit's executor for SLURM; raise SehdrError if SLURM is missing or does not know an option."""
+def slurm_executor(logs: Path, options: Mapping[str, str], *, gpu: bool) -> Any:
+    """Return submitit's executor for SLURM; raise SehdrError if SLURM is missing or does not know an option.
+
+    Args:
+        logs: Folder of logs and pickled values.
+        options: Parameters of SLURM jobs, `time` in minutes.
+        gpu: Whether a job takes a GPU.
+    """
     submitit = _submitit()
     from .slurm_states import job_watcher
 
     try:
-        executor = submitit.AutoExecutor(folder=_logs_folder(out), cluster="slurm")
+        executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
         executor.update_parameters(name="sehdr-warp", **_slurm_parameters(options, gpu=gpu))
     except (RuntimeError, ValueError, NameError, TypeError, AssertionError) as error:
         problem = (str(error).splitlines() or [type(error).__name__])[0].partition(". Valid")[0]
