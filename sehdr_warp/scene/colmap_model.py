@@ -3,11 +3,8 @@
 import logging
 import os
 import struct
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +12,6 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_bytes, read_lines
-from ..parallel import preserve_signals
 from .dataparser import NO_POINTS, PointCloud, pose_from_quaternion
 from .file_names import is_system_file
 from .lens import CAMERA_MODELS, Lens
@@ -355,46 +351,3 @@ def _point(line: str) -> tuple:
 def _points_text(path: Path) -> PointCloud:
     table = np.array([*_records(path, "a point with x, y, z and colors in 0..255", _point)], np.float64).reshape(-1, 6)
     return _checked_points(table[:, :3], table[:, 3:] / 255, path)
-
-
-@contextmanager
-def counted_rows(database: Path, table: str, show: Callable[[int], None]) -> Iterator[None]:
-    """Call show() with the rows of a table of COLMAP's database every half second while the block writes to it.
-
-    Another process reads them: two copies of SQLite in one process, COLMAP's and Python's, break each other's locks.
-    """
-    with preserve_signals():
-        import pycolmap
-    words = (sys.executable, "-I", "-S", "-c", COUNT_ROWS, database.resolve().as_uri(), table)
-    with ExitStack() as stack:
-        stack.enter_context(pycolmap.Database.open(database))  # COLMAP waits for no lock; no later open needs one.
-        try:
-            counter = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        except OSError:  # As where no more processes may be started: the work goes on without.
-            yield
-            return
-
-        def read() -> None:
-            for line in counter.stdout or ():
-                show(int(line))
-
-        reader = threading.Thread(target=read, name="sehdr-warp counts", daemon=True)
-        stack.enter_context(counter)
-        reader.start()
-        try:
-            yield
-        finally:
-            counter.kill()
-            reader.join()
-
-
-COUNT_ROWS = """
-import contextlib, sqlite3, sys, time
-(place, table), count = sys.argv[1:], 0
-while True:
-    with contextlib.suppress(sqlite3.Error):
-        with contextlib.closing(sqlite3.connect(place + "?mode=ro", uri=True, timeout=0.1)) as database:
-            count = database.execute("SELECT COUNT(*) FROM " + table).fetchone()[0]
-    print(count, flush=True)  # Even without news: it fails, and ends this process, if nobody reads any more.
-    time.sleep(0.5)
-"""

@@ -67,6 +67,11 @@ class ImageRecord:
         assert self.exposure_time is not None
         return self.exposure_time
 
+    @property
+    def is_own_truth(self) -> bool:
+        """True for a float image, and for a photo that is derived: `image` is the file of truth."""
+        return self.hdr == self.image
+
 
 UNPLACED = Lens("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5), Path("photos without cameras"))
 """The lens of photos before structure from motion."""

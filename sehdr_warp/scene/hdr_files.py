@@ -21,7 +21,7 @@ from .images import DAMAGED, check_size, kind_by_content, remedy_for_kind, requi
 _MOST_PIXELS_PER_BYTE = 4096
 _REMEDY = "export the image again"
 _MAX_HEADER_BYTES = 1 << 16
-_COLOR_NAMES = "RGB", "rgb", "XYZ", "YYY", "VVV"
+_COLOR_NAMES = "RGB", "rgb", "XYZ", "YYY", "VVV"  # Y alone is grey; with RY and BY it is luminance beside chroma
 _PICTURE_LAYERS = "rgba", "rgb", "combined", "beauty", "image", "c", "color"  # Of Blender, Arnold, V-Ray, Nuke, ...
 _XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 _RADIANCE = (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.333, 0.333)
@@ -83,7 +83,7 @@ def is_without_colors(path: Path) -> bool:
             endings = {ending for part in file.parts for ending in _channel_endings(part)}
     except InputError:
         return False
-    return bool(endings) and not any(set(names) <= endings for names in _COLOR_NAMES)
+    return bool(endings) and not _has_colors(endings)
 
 
 def read_hdr(path: Path) -> np.ndarray:
@@ -109,8 +109,9 @@ def read_light(path: Path) -> Light:
         pixels, primaries = _read_radiance(path)
     else:
         channels, header = read_exr_channels(path)
+        channels = _picture_layer(channels, path)
         pixels, primaries = _exr_colors(channels, header, path)
-        coverage = _coverage(channels, header, path)
+        coverage = _coverage(channels, header)
     bad = ~np.isfinite(pixels)
     if bad.any():
         row, column, channel = (int(i) for i in np.argwhere(bad)[0])
@@ -125,11 +126,10 @@ def read_light(path: Path) -> Light:
     return Light(pixels, coverage)
 
 
-def _coverage(channels: Mapping[str, np.ndarray], header: Mapping[str, Any], path: Path) -> np.ndarray | None:
+def _coverage(channels: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> np.ndarray | None:
     """Return [H, W] float32 in [0, 1]: alpha, 0 outside of the data window; None if all is covered, or nothing."""
-    names = channels if {"Y", "RY", "BY"} <= set(channels) else _picture_layer(channels, path)
     shape = next(iter(channels.values())).shape
-    alpha = np.clip(np.nan_to_num(names["A"]), 0, 1) if "A" in names else np.ones(shape, np.float32)
+    alpha = np.clip(np.nan_to_num(channels["A"]), 0, 1) if "A" in channels else np.ones(shape, np.float32)
     origin = header["displayWindow"][0]
     low, high = (corner - origin for corner in header["dataWindow"])
     inside = np.zeros(shape, bool)
@@ -148,9 +148,8 @@ def _exr_colors(
     encoding = encoding_of_interop_id(str(header.get("colorInteropID", "")))
     if encoding.chromaticities is not None:
         primaries = encoding.chromaticities
-    if {"Y", "RY", "BY"} <= set(channels):
+    if set(channels) >= {"Y", "RY", "BY"}:
         return _from_luminance(channels, primaries, path), primaries
-    channels = _picture_layer(channels, path)
     names = next((names for names in _COLOR_NAMES if set(names) <= set(channels)), None)
     if names is None:
         problem = f"has the channels {sorted(channels)[:8]}, not R, G, B"
@@ -167,7 +166,7 @@ def _picture_layer(channels: Mapping[str, np.ndarray], path: Path) -> Mapping[st
     Raises:
         InputError: if several layers have colors and their names do not say which is the picture.
     """
-    if any(set(names) <= set(channels) for names in _COLOR_NAMES):
+    if _has_colors(set(channels)):
         return channels
     layers: dict[str, dict[str, np.ndarray]] = {}
     for name, values in channels.items():
@@ -234,6 +233,10 @@ def read_exr_channels(path: Path) -> tuple[dict[str, np.ndarray], dict]:
     return channels, header
 
 
+def _has_colors(channels: set[str]) -> bool:
+    return any(set(names) <= channels for names in _COLOR_NAMES)
+
+
 def _channel_endings(part: Any) -> set[str]:
     """Return the names of a part's channels without their layers; also if its header alone was read."""
     names = (str(channel.name) for channel in part.header.get("channels", ()))
@@ -247,11 +250,7 @@ def _colored_part(file: Any) -> int:
     named as the picture, else the first.
     """
     endings = [_channel_endings(part) for part in file.parts]
-    colored = [
-        number
-        for number, own in enumerate(endings)
-        if any(set(names) <= own for names in _COLOR_NAMES) or {"Y", "RY", "BY"} <= own
-    ]
+    colored = [number for number, own in enumerate(endings) if _has_colors(own)]
     names = {number: str(file.parts[number].header.get("name", "")) for number in colored}
     pictures = [number for number in colored if names[number].rpartition(".")[2].lower() in _PICTURE_LAYERS]
     return next(iter(pictures or colored), 0)

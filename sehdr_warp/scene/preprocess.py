@@ -191,7 +191,7 @@ class _Preprocessor:
         resample = self._resampler(record, lens)
         camera = resample.camera
         hdr = self._truth(record, lens, resample)
-        if hdr is not None and record.hdr == record.image:
+        if hdr is not None and record.is_own_truth:
             hdr *= np.float32(record.light_scale)
         time, split = record.seconds, record.split or "train"
         stored = None if record.mask is None else _fitted_mask(record.mask, lens, oriented, self.labeled_masks)
@@ -238,7 +238,7 @@ class _Preprocessor:
         try:
             return resample(_read_truth(record.hdr, lens, resample.camera, resample.undistortion is not None))
         except InputError as error:
-            if record.derived or record.hdr == record.image:
+            if record.is_own_truth:
                 raise
             self.unusable_truth.append(error)
             return None

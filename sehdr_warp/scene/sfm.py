@@ -26,10 +26,11 @@ from ..parallel import preserve_signals, run_interruptibly
 from ..progress import Stage, stage, track_progress
 from ..subsets import first_names
 from .cached_folder import cached_folder
-from .colmap_model import SparseModel, counted_rows, read_model
+from .colmap_model import SparseModel, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from .photos import read_photo, unusable_notes
 from .sfm_pairs import likely_pairs, pairs_with
+from .sfm_progress import counted_rows
 
 _log = logging.getLogger("sehdr_warp.scene")
 
@@ -38,7 +39,7 @@ MAX_SIDE = 1200
 SEED = 0
 FEWEST_SHARED = 60  # Points of a photo with fewer shared ones place it badly; sound photos have hundreds
 MOST_ERROR = 1.0  # Pixels; sound sets have 0.2 to 0.8
-_VERSION = 3
+_VERSION = 4
 # Up to so many photos every pair is matched; in larger sets those that are likely to share points, and in still larger
 # ones each photo is matched with its neighbors by name.
 EXHAUSTIVE_LIMIT, COMPARED_LIMIT = 30, 150
@@ -122,28 +123,16 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
         again = partial(_match_missing, database, names) if rule else None
         model = run_mapper(database, work, len(photos), photos[0].parent, before_again=again)
         model.write_binary(result)
-        (result / "sizes.json").write_text(json.dumps(sizes))
+        placed = [model.images[i] for i in model.reg_image_ids()]
+        weak = sorted(int(Path(image.name).stem) for image in placed if image.num_points3D < FEWEST_SHARED)
+        facts = {"sizes": sizes, "error": float(model.compute_mean_reprojection_error()), "weak": weak}
+        (result / "facts.json").write_text(json.dumps(facts))
 
     folder = solved_folder(cache, key, solve)
-    model = read_model(folder)
-    sizes = json.loads((folder / "sizes.json").read_text())
-    error, weak = _placement(folder)
-    images = (replace(image, lens=image.lens.resized(*sizes[int(Path(image.name).stem)])) for image in model.images)
-    return Reconstruction(SparseModel(tuple(images), model.cloud), error, weak)
-
-
-def _placement(folder: Path) -> tuple[float, tuple[int, ...]]:
-    """Return the mean reprojection error of a result of ours, and the indices of photos with few shared points."""
-    import pycolmap
-
-    with quiet_colmap():
-        reconstruction = pycolmap.Reconstruction(str(folder))
-        shared = {
-            int(Path(reconstruction.images[i].name).stem): reconstruction.images[i].num_points3D
-            for i in reconstruction.reg_image_ids()
-        }
-        error = float(reconstruction.compute_mean_reprojection_error())
-    return error, tuple(sorted(index for index, count in shared.items() if count < FEWEST_SHARED))
+    model, facts = read_model(folder), json.loads((folder / "facts.json").read_text())
+    sizes = [facts["sizes"][int(Path(image.name).stem)] for image in model.images]
+    images = [replace(image, lens=image.lens.resized(*size)) for image, size in zip(model.images, sizes, strict=True)]
+    return Reconstruction(SparseModel(tuple(images), model.cloud), facts["error"], tuple(facts["weak"]))
 
 
 def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Path], None]) -> Path:

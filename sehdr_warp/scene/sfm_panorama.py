@@ -14,7 +14,7 @@ from PIL import Image
 from ..errors import InputError
 from ..parallel import run_interruptibly
 from ..progress import stage, track_progress
-from .colmap_model import ModelImage, SparseModel, counted_rows, read_points
+from .colmap_model import ModelImage, SparseModel, read_points
 from .dataparser import PointCloud
 from .images import kind_of, open_image
 from .lens import Lens
@@ -31,6 +31,7 @@ from .sfm import (
     run_mapper,
     solved_folder,
 )
+from .sfm_progress import counted_rows
 from .types import View, encoded_values
 from .wide_camera import FACE_ANGLE, face_rotations, faces_of
 from .xmp import xmp_of, xmp_values

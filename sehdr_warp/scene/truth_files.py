@@ -60,7 +60,7 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
             hdr = None if hdr is not None and is_without_colors(hdr) else hdr
         result.append(replace(record, hdr=hdr))
     in_use, notes = {record.hdr for record in result}, []
-    result = [record for record in result if record.hdr == record.image or record.image not in in_use]
+    result = [record for record in result if record.is_own_truth or record.image not in in_use]
     for place in places:
         others = sorted(file.relative_to(place).as_posix() for file in files[place].values() if file not in in_use)
         if others:

@@ -6,8 +6,8 @@ import time
 
 import pycolmap
 
-from sehdr_warp.scene import colmap_model
-from sehdr_warp.scene.colmap_model import COUNT_ROWS, counted_rows
+from sehdr_warp.scene import sfm_progress
+from sehdr_warp.scene.sfm_progress import COUNT_ROWS, counted_rows
 
 
 def test_rows_are_counted_while_they_are_written(tmp_path):
@@ -25,7 +25,7 @@ def test_rows_are_counted_while_they_are_written(tmp_path):
 
 def test_colmap_opens_its_database_while_rows_are_counted(tmp_path, monkeypatch):
     """COLMAP waits for no lock: a training failed where a count came in between."""
-    monkeypatch.setattr(colmap_model, "COUNT_ROWS", COUNT_ROWS.replace("time.sleep(0.5)", ""))
+    monkeypatch.setattr(sfm_progress, "COUNT_ROWS", COUNT_ROWS.replace("time.sleep(0.5)", ""))
     with counted_rows(tmp_path / "database.db", "keypoints", lambda count: None):
         for _ in range(300):
             with pycolmap.Database.open(tmp_path / "database.db"):
