@@ -222,6 +222,7 @@ def _up_from_gps(views: Sequence[View]) -> UpDirection | None:
     if len(gps_places) < max(_GPS_PHOTOS, len(views) // 2):
         return None
     places, cameras = (np.array(each) for each in zip(*gps_places, strict=True))
+    places[:, 1] = np.unwrap(places[:, 1], period=360)  # Across the 180th meridian
     middle = places.mean(axis=0)
     east = np.radians(places[:, 1] - middle[1]) * math.cos(math.radians(middle[0])) * _EARTH
     local = np.stack([east, np.radians(places[:, 0] - middle[0]) * _EARTH, places[:, 2] - middle[2]], axis=1)

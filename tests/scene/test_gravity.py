@@ -40,7 +40,7 @@ def test_lines_leave_what_poses_know(name):
     assert up.source == "lines" and degrees(up.direction) < 1.2
 
 
-def flight(folder, noise=0.0, south=False):
+def flight(folder, noise=0.0, south=False, longitude=-16.0):
     """Photos straight down with one heading, 40 m above the ground, in a world of 7 m a unit that lies askew."""
     random = np.random.default_rng(1)
     turn = Rotation.from_euler("xyz", [40, 70, 110], degrees=True).as_matrix()
@@ -52,7 +52,8 @@ def flight(folder, noise=0.0, south=False):
         pose[:3, :3] = pose[:3, :3] @ turn.T
         place = place + random.normal(0, noise, 3)
         exif, meters = Image.Exif(), 6_371_000 * np.pi / 180
-        angles = (-48.0 if south else 48.0) + place[1] / meters, -16.0 + place[0] / meters / np.cos(np.radians(48))
+        east = longitude + place[0] / meters / np.cos(np.radians(48))
+        angles = (-48.0 if south else 48.0) + place[1] / meters, (east + 180) % 360 - 180
         table = exif.get_ifd(0x8825)
         for tag, angle, names in ((1, angles[0], "NS"), (3, angles[1], "EW")):
             table[tag], size = names[int(angle < 0)], abs(angle)
@@ -65,9 +66,10 @@ def flight(folder, noise=0.0, south=False):
     return scene(views), turn @ UP
 
 
-@pytest.mark.parametrize("south", [False, True])
-def test_places_in_exif_tell_up_and_the_unit(tmp_path, south):
-    photos, truth = flight(tmp_path, noise=0.2, south=south)
+@pytest.mark.parametrize("south, longitude", [(False, -16.0), (True, -16.0), (True, 179.9997)])
+def test_places_in_exif_tell_up_and_the_unit(tmp_path, south, longitude):
+    """The last flight crosses the 180th meridian."""
+    photos, truth = flight(tmp_path, noise=0.2, south=south, longitude=longitude)
     assert degrees(up_direction([view.camera for view in photos.views]), truth) > 20
     up = find_up(photos)
     assert up.source == "gps" and degrees(up.direction, truth) < 1 and up.unit == pytest.approx(7, rel=0.02)
