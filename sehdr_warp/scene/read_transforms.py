@@ -109,7 +109,7 @@ class _Frames:
         self.photos |= images
         for name, frame in frames:
             fields = values | frame
-            self.unread |= {key for key in _UNREAD if np.any(fields.get(key))}
+            self.unread |= {key for key in _UNREAD if _is_set(fields.get(key))}
             for name_of_field in itertools.chain(*_VARYING.values()):
                 self.varying.setdefault(name_of_field, set()).add(repr(fields.get(name_of_field)))
             image = images[name]
@@ -155,6 +155,11 @@ class _Frames:
                 values = f"{len(self.varying[name])} values"
                 notes.append(f"frames differ in {name} ({values}), which is not read: {consequence}")
         return notes
+
+
+def _is_set(value: Any) -> bool:
+    """Return whether a value of JSON, or one in its lists, is neither 0 nor empty."""
+    return any(map(_is_set, value)) if isinstance(value, list) else bool(value)
 
 
 def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
@@ -255,7 +260,7 @@ def frame_pose(frame: dict, path: Path, name: str, *, mitsuba: bool = False) -> 
     """
     matrix = _matrix(frame.get("transform_matrix"))
     matrix = matrix.reshape(4, 4) if matrix.shape == (16,) else matrix
-    if mitsuba and matrix.ndim == 2:
+    if mitsuba and matrix.shape[1:] == (4,):
         matrix[:3, (0, 2)] *= -1
     return pose_from_opengl(matrix, path, name)
 

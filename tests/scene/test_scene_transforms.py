@@ -159,11 +159,11 @@ def test_names_of_web_addresses(tmp_path):
 
 
 def test_fields_that_are_not_read_are_named(tmp_path):
-    write_blender(tmp_path, 3, fisheye_crop_radius=12, rolling_shutter=[0, 0, 0, 0])
+    write_blender(tmp_path, 3, fisheye_crop_radius=12, rolling_shutter=[0, 0, 0, 0], mask_color=[[0], [0, 2]])
     frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     _edit(tmp_path, frames=[frame | {"time": i / 2, "depth_file_path": "d.png"} for i, frame in enumerate(frames)])
     notes = read_transforms(tmp_path).notes
-    assert "fields of the frames that are not read: depth_file_path, fisheye_crop_radius" in notes
+    assert "fields of the frames that are not read: depth_file_path, fisheye_crop_radius, mask_color" in notes
     assert "frames differ in time (3 values), which is not read: what moves is not modeled" in notes
     assert not any("frames differ in iso" in note for note in notes)
     _edit(tmp_path, frames=[frame | {"iso": 100 * (i + 1)} for i, frame in enumerate(frames)])
@@ -181,6 +181,10 @@ def test_fields_that_are_not_read_are_named(tmp_path):
         ({"camera_model": "EQUIRECTANGULAR"}, "equirectangular photos are 40 x 30"),
         ({"fl_x": -5.0}, "not positive"),
         ({"w": 30, "h": 40}, "image is 40 x 30, its camera 30 x 40"),
+        (
+            {"from_mitsuba": True, "frames": [{"file_path": "images/r_0", "transform_matrix": [[1]]}]},
+            "not a finite 4 x 4 matrix",
+        ),
     ],
 )
 def test_bad_transforms_are_refused(tmp_path, fields, message):
