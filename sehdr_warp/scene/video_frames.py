@@ -3,10 +3,8 @@
 import json
 import logging
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -64,20 +62,21 @@ def choose_frames(clip: Clip) -> FrameChoice:
     reference: np.ndarray | None = None
     before = 0.0  # Movement up to the reference
     total = 0
-    for number, frame in _counted_frames(decode(clip)):
-        total = number + 1
-        if number % stride:
-            continue
-        small = grey(frame, _SHARPNESS_WIDTH)
-        tiny = grey(frame, _MOVEMENT_WIDTH)
-        # From a reference some pixels back: a slow camera moves by less than a pixel between frames.
-        reference = tiny if reference is None else reference
-        step = frame_shift(reference, tiny)
-        moved.append(max(before + step, moved[-1] if moved else 0.0))
-        if step * tiny.shape[1] >= _LEAST_STEP:
-            reference, before = tiny, moved[-1]
-        numbers.append(number)
-        sharp.append(sharpness(small))
+    with stage("looking at frames", 0, _log) as progress:  # A clip does not state reliably how many it has.
+        for number, frame in decode(clip):
+            total = number + 1
+            progress.update(total)
+            if number % stride:
+                continue
+            tiny = grey(frame, _MOVEMENT_WIDTH)
+            # From a reference some pixels back: a slow camera moves by less than a pixel between frames.
+            reference = tiny if reference is None else reference
+            step = frame_shift(reference, tiny)
+            moved.append(max(before + step, moved[-1] if moved else 0.0))
+            if step * tiny.shape[1] >= _LEAST_STEP:
+                reference, before = tiny, moved[-1]
+            numbers.append(number)
+            sharp.append(sharpness(grey(frame, _SHARPNESS_WIDTH)))
     if len(numbers) < 3:
         raise InputError(clip.path, f"holds {total} frames that can be decoded", "give a longer clip")
     movement = moved[-1]
@@ -126,14 +125,6 @@ def _subpixel_offset(peak: np.ndarray, pixel: np.ndarray, axis: int) -> float:
     before, center, after = line[:3]
     bend = 2 * center - before - after
     return float(np.clip((after - before) / (2 * bend), -0.5, 0.5)) if bend > 0 else 0.0
-
-
-def _counted_frames(frames: Iterable[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
-    """Yield numbered frames as a stage; a clip does not state reliably how many it has."""
-    with stage("looking at frames", 0, _log) as progress:
-        for number, frame in frames:
-            yield number, frame
-            progress.update(number + 1)
 
 
 def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
