@@ -31,15 +31,21 @@ DENSE = 300.0  # Gaussians over the square root of the photos' pixels, from whic
 
 
 @dataclass(frozen=True)
-class RelocationSlots:
-    """Rows to fill in a refinement: those of the dead Gaussians, then the new ones.
+class Refinement:
+    """A refinement under way. It fills slots: the rows of the dead Gaussians, then the new ones.
 
     Attributes:
-        of_row: [N] int32 with the new rows, slot of each row in that order; negative for rows that stay.
+        gaussians: As in Strategy.refine(), with the new rows.
+        optimizer: As in Strategy.refine().
+        generator: As in Strategy.refine().
+        slot_of_row: [N] int32, negative for rows that stay.
         changed: [N] bool, rows whose optimizer state is to be reset, see reset_moments().
     """
 
-    of_row: Tensor
+    gaussians: Gaussians
+    optimizer: Optimizer | None
+    generator: torch.Generator
+    slot_of_row: Tensor
     changed: Tensor
 
 
@@ -105,15 +111,14 @@ class McmcStrategy(Strategy):
         dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
         slot_of_row, dead_count = number_slots(dead, added)
         gaussians.resize(count + added, optimizer)
-        slots = RelocationSlots(slot_of_row, torch.zeros_like(slot_of_row, dtype=torch.bool))
-        seeded = self.fill_proposals(gaussians, slots, dead_count, added, count, propose)
-        weights = opacities.masked_fill(dead, 0)
-        self.relocate(gaussians, optimizer, slots, weights, seeded, dead_count, count, generator)
+        changed = torch.zeros_like(slot_of_row, dtype=torch.bool)
+        refinement = Refinement(gaussians, optimizer, generator, slot_of_row, changed)
+        seeded = self.fill_proposals(refinement, dead_count, added, propose)
+        self.relocate(refinement, opacities.masked_fill(dead, 0), seeded, dead_count, count)
         if added > 0:
-            first, last = torch.maximum(dead_count, seeded), dead_count + added
-            self.sample_add(gaussians, optimizer, slots, first, last, added, generator)
+            self.sample_add(refinement, torch.maximum(dead_count, seeded), dead_count + added, added)
         left = SECOND_MOMENT_LEFT_WHERE_DENSE if self.dense else SECOND_MOMENT_LEFT
-        reset_moments(gaussians, optimizer, slots.changed, left)
+        reset_moments(gaussians, optimizer, changed, left)
         return added > 0
 
     def next_count(self, iteration: int, count: int) -> int:
@@ -127,40 +132,22 @@ class McmcStrategy(Strategy):
             growth = max(growth, min((self.cap_max / count) ** (1 / remaining) - 1, MAX_GROWTH))
         return max(count, min(self.cap_max, math.ceil((1 + growth) * count)))
 
-    def fill_proposals(
-        self,
-        gaussians: Gaussians,
-        slots: RelocationSlots,
-        dead_count: Tensor,
-        added: int,
-        count: int,
-        propose: Propose | None,
-    ) -> Tensor:
+    def fill_proposals(self, refinement: Refinement, dead_count: Tensor, added: int, propose: Propose | None) -> Tensor:
         """Fill the first slots with seeded Gaussians; return their number, int64 []."""
         fraction, none = self.options.seed_fraction, torch.zeros_like(dead_count)
         if propose is None or not fraction:
             return none
         number = (fraction * (dead_count + added).double()).long()
-        bound = host_bound(number, int(fraction * (count + added)))
+        bound = host_bound(number, int(fraction * refinement.gaussians.count))
         if not bound:
             return none
         rows, seeded = propose(number, bound)
-        values = list(gaussians.tensors().values())
+        values = list(refinement.gaussians.tensors().values())
         rows = [rows[name] for name in PARAMETER_NAMES]
-        copy_rows(values, rows, slots.of_row, none, seeded, changed=slots.changed)
+        copy_rows(values, rows, refinement.slot_of_row, none, seeded, changed=refinement.changed)
         return seeded
 
-    def relocate(
-        self,
-        gaussians: Gaussians,
-        optimizer: Optimizer | None,
-        slots: RelocationSlots,
-        weights: Tensor,
-        first: Tensor,
-        last: Tensor,
-        bound: int,
-        generator: torch.Generator,
-    ) -> None:
+    def relocate(self, refinement: Refinement, weights: Tensor, first: Tensor, last: Tensor, bound: int) -> None:
         """Fill the slots [first, last), at most `bound`, none if first > last, with Gaussians sampled by weights [N].
 
         The copies and their source share opacity and size so that the image stays (3DGS-MCMC, equation 9).
@@ -168,31 +155,23 @@ class McmcStrategy(Strategy):
         bound = host_bound((last - first).clamp_min(0), bound)
         if not bound:
             return
-        sampled = sample_rows(weights, bound, generator)
-        copies = count_copies(sampled, first, last, slots.changed)
+        gaussians = refinement.gaussians
+        sampled = sample_rows(weights, bound, refinement.generator)
+        copies = count_copies(sampled, first, last, refinement.changed)
         logits, log_scales = gaussians.opacity_logits.detach(), gaussians.log_scales.detach()
         share_opacities(logits, log_scales, copies, least=self.prune_opacity)
         values, changed = list(gaussians.tensors().values()), None
         if self.dense:
-            states = [moments_of(optimizer, parameter) for parameter in gaussians.parameters()]
+            states = [moments_of(refinement.optimizer, parameter) for parameter in gaussians.parameters()]
             values += [state["exp_avg_sq"] for state in states if state]
-            changed = slots.changed
+            changed = refinement.changed
         # Elsewhere, as in the authors' code, copies keep the Adam state of their row, and only their sources lose it.
-        copy_rows(values, values, slots.of_row, first, last, samples=sampled, changed=changed)
+        copy_rows(values, values, refinement.slot_of_row, first, last, samples=sampled, changed=changed)
 
-    def sample_add(
-        self,
-        gaussians: Gaussians,
-        optimizer: Optimizer | None,
-        slots: RelocationSlots,
-        first: Tensor,
-        last: Tensor,
-        bound: int,
-        generator: torch.Generator,
-    ) -> None:
+    def sample_add(self, refinement: Refinement, first: Tensor, last: Tensor, bound: int) -> None:
         """Fill the slots [first, last) of new Gaussians, at most `bound`, as relocate(), sampled by opacity."""
-        weights = gaussians.opacities().masked_fill_(slots.of_row >= first, 0)
-        self.relocate(gaussians, optimizer, slots, weights, first, last, bound, generator)
+        weights = refinement.gaussians.opacities().masked_fill_(refinement.slot_of_row >= first, 0)
+        self.relocate(refinement, weights, first, last, bound)
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
