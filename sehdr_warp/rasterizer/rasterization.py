@@ -124,7 +124,7 @@ def rasterize(
         height: of the image, pixels.
         near_plane: least depth of a Gaussian's center, in scene units; > 0.
         eps2d: variance in square pixels added to each 2D Gaussian; >= 0.
-        alpha_threshold: contributions with a smaller alpha are left out; in (0, 1).
+        alpha_threshold: contributions with a smaller alpha are left out; between 1e-37 and 1.
         antialiased: lower opacities so that the variance of eps2d keeps a Gaussian's energy (Mip-Splatting).
             rasterize_directions() and compat.gsplat differentiate this factor, rasterize() does not.
         background: [C] color behind the Gaussians, or with B cameras [B, C].
