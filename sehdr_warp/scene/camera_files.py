@@ -152,7 +152,7 @@ def _of_colmap(folder: Path) -> list[tuple[str, Camera]]:
     source = find_model(folder)
     if source is None:
         raise InputError(folder, "holds no COLMAP model", "give cameras.bin or .txt and its kin, or a camera file")
-    model = read_model(source)
+    model = read_model(source, points=False)
     if model.unusable:
         raise model.unusable[0]
     images = sorted(model.images, key=lambda image: natural_key(image.name))

@@ -127,8 +127,8 @@ def _image_count(model: Path) -> int:
         return 0
 
 
-def read_model(folder: Path) -> SparseModel:
-    """Read cameras, images and (if present) points3D of a folder, binary files before text files.
+def read_model(folder: Path, *, points: bool = True) -> SparseModel:
+    """Read cameras, images and (if present, and unless `points` is False) points3D, binary files before text files.
 
     Raises:
         InputError: if a file is missing, empty, damaged or truncated, or holds impossible values.
@@ -157,7 +157,7 @@ def read_model(folder: Path) -> SparseModel:
             images[name] = error
     usable = tuple(image for image in images.values() if isinstance(image, ModelImage))
     unusable = tuple(error for error in images.values() if isinstance(error, InputError))
-    return SparseModel(usable, read_points(folder), unusable)
+    return SparseModel(usable, read_points(folder) if points else NO_POINTS, unusable)
 
 
 def _model_files(folder: Path) -> tuple[Path, Path]:

@@ -30,7 +30,7 @@ def model_fits(folder: Path, model: Path) -> bool:
     """Return whether a model is one of a set: it lies where COLMAP puts it, or photos of its names are there."""
     if model == find_model(folder) or model == folder:
         return True
-    names = [image.name for image in read_model(model).images[:LOOKED_FOR]]
+    names = [image.name for image in read_model(model, points=False).images[:LOOKED_FOR]]
     places = [place for place in (image_folder(folder), _folder_of(names, folder)) if place is not None]
     return any(find_image(place, name, model) for place in places for name in names)
 
