@@ -48,6 +48,7 @@ _CHECKED = 3  # Held-out views that the mesh's depth is compared in
 # near a vertex so many are asked, because the nearest one may be small.
 _REACH, _CLEAR, _NEAREST = 2.0, 1.5, 8
 _LEVEL = 1.0  # Degrees to which a floor counts as level
+_COARSE = 0.1  # Voxels by which rounded coordinates may move a vertex without a warning
 _CLOSE = 0.03  # Relative difference of depth that counts as agreement
 
 
@@ -141,6 +142,11 @@ def write_proxy_mesh(
             with writing_usd(path):
                 _write_usd(temporary, mesh, transform, run)
     log.info("%s: %d triangles, voxels of %.3g", path.name, len(mesh.faces), mesh.voxel)
+    far = float(np.abs(mesh.vertices).max())
+    step = far * 1e-6 if path.suffix.lower() == ".obj" else float(np.spacing(np.float32(far)))  # OBJ has six digits.
+    if step > _COARSE * mesh.voxel:
+        text = "%s: coordinates up to %.4g are too large for its numbers, which move vertices by about %.2g; %s"
+        log.warning(text, path.name, far, step, "use --axes upright, which puts the scene at the origin")
     if mesh.ground is not None:
         log.info("%s", _ground_line(mesh.ground, transform))
     _log_agreement(mesh, run, transform)

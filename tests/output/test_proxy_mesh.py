@@ -209,6 +209,19 @@ def test_bad_requests_are_one_line(name, options, message, tmp_path):
     assert not (tmp_path / name).exists()
 
 
+@pytest.mark.parametrize("name", ["a.obj", "a.usdc"])
+def test_map_coordinates_that_a_mesh_cannot_hold_are_named(name, tmp_path, logged):
+    if name == "a.usdc":
+        pytest.importorskip("pxr")
+    run = BallOnFloor()
+    run.world_matrix = np.eye(4)
+    run.world_matrix[1, 3] = -5.4e6  # From the photos' coordinates to the scene's
+    write_proxy_mesh(run, tmp_path / name, resolution=24)
+    assert not any("too large for its numbers" in line for line in logged)
+    write_proxy_mesh(run, tmp_path / name, resolution=24, axes="scene", overwrite=True)
+    assert any(f"{name}: coordinates up to 5.4e+06 are too large for its numbers" in line for line in logged)
+
+
 def test_a_scene_without_cameras_is_refused():
     run = BallOnFloor()
     run.cameras = []
