@@ -3,6 +3,7 @@
 import re
 import sys
 from importlib import import_module
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,8 @@ STUDIES = sorted(
 
 def ended(monkeypatch, main, *words):
     monkeypatch.setattr(sys, "argv", ["study.py", *words])
+    # As `python -m` states it; processes of pytest-xdist have None.
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", ModuleSpec("benchmarks.study", None))
     with pytest.raises(SystemExit) as caught:
         run(main)
     return caught.value.code
