@@ -81,7 +81,7 @@ def run_evaluate(options: Evaluate) -> None:
 
     if options.pictures.truth is None:
         _refuse_unused(options.pictures, PictureOptions(), "needs --truth, the set to compare pictures with")
-        if any(options.run.glob("*.exr")):
+        if any(options.run.glob("*.exr")) and not (options.run / "run.json").is_file():
             raise UsageError(f"{options.run}: holds EXR pictures; add --truth, the set to compare them with")
     else:
         _refuse_unused(options.scene, RunOptions(), "belongs to runs; pictures with --truth do not take it")

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import sehdr_warp as sw
-from sehdr_warp.cli import main
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table, format_table
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.output.exr import write_exr
 from sehdr_warp.runs.config import Config
 
+from ..refusals import call
 from .test_evaluate import VIEWS, radiance, run, scene, view
 
 
@@ -94,9 +94,11 @@ def test_a_folder_scores_as_a_run_that_renders_it(tmp_path, logged):
 
 def test_pictures_without_truth_are_no_run(tmp_path, capsys):
     folder = write_pictures(tmp_path / "out", {2: 1.0})
-    with pytest.raises(SystemExit):
-        main(["eval", str(folder)])
+    assert call("eval", folder) == 2
     assert "out: holds EXR pictures; add --truth" in capsys.readouterr().err
+    (folder / "run.json").touch()  # A run in which somebody keeps a map
+    assert call("eval", folder) == 1
+    assert "out: is not a run (no config.json)" in capsys.readouterr().err
 
 
 def test_missing_and_extra_files_are_said(tmp_path, logged):
