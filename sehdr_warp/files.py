@@ -241,9 +241,10 @@ def check_absent(path: Path | str, overwrite: bool = False, *, folder: bool = Fa
     """
     path = Path(path)
     require_text(path)
+    for parent in path.parents:
+        if parent.exists() and not parent.is_dir():
+            raise InputError(parent, "is a file, not a folder", "choose another place")
     parent = next(parent for parent in path.absolute().parents if parent.exists())
-    if not parent.is_dir():
-        raise InputError(parent, "is a file, or in one, and not a folder", "choose another place")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise SehdrError(f"{path}: cannot be written (nothing may be made in {parent}); choose another folder")
     if not (path.exists() or path.is_symlink()):
