@@ -10,6 +10,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from benchmarks.study import run
+from sehdr_warp.errors import UsageError
 
 
 def average(weights: dict[Path, float], out: Path) -> None:
@@ -32,6 +33,8 @@ def main(out: Path, weights: tuple[str, ...], /) -> None:
         out: the file to write.
         weights: FILE=SHARE of each; shares are divided by their sum.
     """
+    if not weights:
+        raise UsageError("no weights; name some as FILE=SHARE")
     pairs = [each.rpartition("=") for each in weights]
     average({Path(path): float(share) for path, _, share in pairs}, out)
 

@@ -1,9 +1,11 @@
 """Averages of weights files."""
 
+import pytest
 import torch
 from safetensors.torch import save_file
 
-from priors.average import average
+from priors.average import average, main
+from sehdr_warp.errors import UsageError
 from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import LightNetwork
 
@@ -19,3 +21,9 @@ def test_weights_and_deviation_scales_are_averaged_by_share(tmp_path):
     first, second = (network.out.weight.half().float() for network in networks)
     assert abs(mean.deviation_scale - 0.7) < 1e-4
     assert torch.allclose(mean.network.out.weight, 0.75 * first + 0.25 * second, atol=1e-3)
+
+
+def test_an_average_of_nothing_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="no weights; name some as FILE=SHARE"):
+        main(tmp_path / "mean", ())
+    assert not any(tmp_path.iterdir())
