@@ -165,7 +165,7 @@ class Choice:
 
 
 def choices(whole: Workload, divided: Workload, blocks: int, memory: float | None, gpus: int = 1) -> list[Choice]:
-    """Return ways to train a set on GPUs: on one, on several, in blocks.
+    """Return ways to train a set on GPUs: on one, on `gpus`, on several that need SAVES times less, in blocks.
 
     Args:
         whole: Size of one training.
@@ -176,6 +176,9 @@ def choices(whole: Workload, divided: Workload, blocks: int, memory: float | Non
     """
     costs = {f"{count} GPU" + "s" * (count > 1): training_cost(whole, count) for count in sorted({1, 2, 4, 8, gpus})}
     costs["8 nodes of 8 GPUs"] = training_cost(whole, 64, 8)
+    alone = costs["1 GPU"].seconds
+    listed = "1 GPU", f"{gpus} GPUs"
+    costs = {name: cost for name, cost in costs.items() if name in listed or alone > SAVES * cost.seconds}
     for count in sorted({1, gpus, min(blocks, 8)}) if blocks > 1 else ():
         costs[f"{blocks} blocks on {count} GPU" + "s" * (count > 1)] = block_cost(divided, blocks, count)
     return [Choice(name, cost, memory is None or cost.gpu_bytes <= memory) for name, cost in costs.items()]

@@ -93,6 +93,14 @@ def test_recommendations():
     assert not fits["1 GPU"] and fits["65 blocks on 1 GPU"]
 
 
+def test_gpus_that_gain_nothing_are_not_listed_unless_they_are_named():
+    quick = Workload(20, 1e4, 3e4, 2000)
+    assert [choice.name for choice in choices(quick, quick, 1, None)] == ["1 GPU"]
+    assert [choice.name for choice in choices(quick, quick, 1, None, 4)] == ["1 GPU", "4 GPUs"]
+    long = replace(quick, pixels=2e6, gaussians=1e6, iterations=30_000)
+    assert len(choices(long, long, 1, None)) == 5
+
+
 def test_durations():
     assert [format_duration(value) for value in (5, 119, 130, 3600 * 3, 86400 * 30)] == [
         "5 s",
