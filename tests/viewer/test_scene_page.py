@@ -139,6 +139,8 @@ def test_two_fingers_come_nearer_and_one_turns(run, tmp_path):
     file = write_scene_page(run, tmp_path / "scene.html")
     with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200, has_touch=True) as page:
         page.wait_for_selector(FULL)
+        hint, panel = (page.locator(f"#{name}").bounding_box() for name in ("hint", "panel"))
+        assert hint["x"] >= 0 and hint["x"] + hint["width"] <= 240 and hint["y"] + hint["height"] < panel["y"]
         ahead, pivot = page.evaluate("[camera.ahead, camera.pivot]")
         pinch(page, [(100, 80), (120, 80)], [(90, 80), (130, 80)])
         until = "ahead => Math.abs(camera.ahead / ahead - 0.5) < 1e-6"
