@@ -66,7 +66,8 @@ class Export:
     """Further runs or files in the same coordinates, which the file holds as well."""
     file: SplatFileOptions = SplatFileOptions()
     cameras: bool = False
-    """Also write <name>.cameras.json beside it, in the form of the reference release of 3D Gaussian Splatting."""
+    """Also write the cameras beside it (scene.ply.cameras.json), in the form of the reference release of 3D Gaussian
+    Splatting."""
     overwrite: bool = False
     """Replace files that exist."""
     device: str | None = None
