@@ -288,12 +288,12 @@ def test_transforms(frames, capfd, case):
     assert "transforms.json" in train_refused(capfd, frames)
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None, "stretched", "mirrored"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None, "stretched", "mirrored", "no axis"])
 def test_a_frame_without_a_place_is_left_out(frames, value):
     with edited_json(frames / "transforms.json") as values:
         matrix = values["frames"][2]["transform_matrix"]
-        if value in ("stretched", "mirrored"):
-            factors = (2, 1, 1) if value == "stretched" else (-1, 1, 1)
+        if value in ("stretched", "mirrored", "no axis"):
+            factors = {"stretched": (2, 1, 1), "mirrored": (-1, 1, 1), "no axis": (float("nan"), 1, 1)}[value]
             values["frames"][2]["transform_matrix"] = [[*np.multiply(row[:3], factors), row[3]] for row in matrix]
         else:
             matrix[0][3] = value

@@ -92,11 +92,12 @@ def test_masks_of_instant_ngp_are_not_bare_photos(tmp_path):
 def test_masks_of_photos_in_folders_of_same_names(tmp_path):
     write_colmap(tmp_path, name="cam{0}/0000.png")
     write_mask(tmp_path / "masks" / "cam1" / "0000.png")
+    write_mask(tmp_path / "masks" / "cam2" / "0000.png.png")
     scene = load(tmp_path, holdout=0)
-    assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
+    assert shares(scene) == [1.0, 0.5, 0.5, 1.0, 1.0, 1.0]
     write_mask(tmp_path / "masks" / "0000.png")  # It could be any camera's.
     scene = load(tmp_path, holdout=0)
-    assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
+    assert shares(scene) == [1.0, 0.5, 0.5, 1.0, 1.0, 1.0]
     assert "masks/ holds 1 file that fits no photo: 0000.png; name each like its photo" in masks_said(scene)[0]
 
 
