@@ -98,11 +98,7 @@ def to_scene(gaussians: GaussianArrays, normalization: Normalization) -> Gaussia
 
 
 def _transform(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> GaussianArrays:
-    """Return Gaussians at other means [N, 3] float64, with sizes multiplied by exp(log_scale).
-
-    Positions stay float64 if float32 would move them by more than a thousandth of the median size, as in UTM
-    coordinates.
-    """
+    """Return Gaussians at other means [N, 3] float64, with sizes multiplied by exp(log_scale)."""
     sizes = (gaussians.log_scales.astype(np.float64) + log_scale).astype(np.float32)
     return replace(gaussians, means=rounded_means(means, sizes), log_scales=sizes)
 

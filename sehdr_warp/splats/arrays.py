@@ -22,7 +22,7 @@ SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
 _MOST_LOGIT = 20.0
 # Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.
 _MOST_LOG_SCALE = 20.0
-COARSE = 1e-3  # Of the median size of Gaussians: larger errors of float32 positions keep them in float64
+_COARSE = 1e-3  # Of the size of Gaussians: larger errors of float32 positions keep them in float64
 
 
 @dataclass(frozen=True)
@@ -165,10 +165,13 @@ def join_gaussians(parts: Sequence[GaussianArrays]) -> GaussianArrays:
 
 
 def rounded_means(means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
-    """Return means [N, 3] float64 as float32, unless that moves one by more than COARSE of the median size."""
+    """Return means [N, 3] float64 as float32, unless that moves a tenth of them by a thousandth of their size.
+
+    Of a scene near the origin, float32 moves what is far away most, but what is far away is large.
+    """
     rounded = means.astype(np.float32)
-    moved = np.abs(rounded - means).max(initial=0.0)
-    return means if len(means) and moved > COARSE * float(np.exp(np.median(log_scales))) else rounded
+    moved = np.abs(rounded - means).max(axis=1) / np.exp(log_scales.mean(axis=1))
+    return means if len(means) and np.percentile(moved, 90) > _COARSE else rounded
 
 
 def degree_of(coefficients: float, path: Path) -> int:

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import SUFFIXES, GaussianArrays, path_is_lossy, read_gaussians, write_gaussians
+from sehdr_warp.splats.arrays import join_gaussians
 
 LOSSY_SUFFIXES = [suffix for suffix in SUFFIXES if path_is_lossy(f"a{suffix}")]
 ARRAYS = ("means", "log_scales", "opacity_logits", "harmonics", "unit_quaternions")
@@ -55,6 +57,17 @@ def test_positions_stay_precise_in_map_coordinates():
     far = near.transformed(matrix)
     np.testing.assert_allclose(far.means - moved, near.means, atol=1e-8)
     assert near.transformed(np.eye(4)).means.dtype == np.float32
+
+
+def test_a_far_sky_does_not_make_the_positions_of_a_scene_coarse(tmp_path, logged):
+    """float32 moves Gaussians of the sky by 0.01 of the others' size, and by 1e-5 of their own."""
+    near, matrix = gaussians(), np.eye(4)
+    near = replace(near, log_scales=np.full((50, 3), np.log(0.005), np.float32))
+    sky = replace(near, means=400 * near.means, log_scales=np.full((50, 3), np.log(4), np.float32))
+    matrix[:3, :3] = Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix()
+    turned = join_gaussians([*[near] * 12, sky]).transformed(matrix)
+    write_gaussians(tmp_path / "a.ply", turned)
+    assert turned.means.dtype == np.float32 and not any("too large for the float32" in line for line in logged)
 
 
 def test_a_base_time_of_numpy_is_read_again(tmp_path):
