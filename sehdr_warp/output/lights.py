@@ -139,8 +139,9 @@ def write_lights(
         asset = f"{mark}./{rest.name}{mark}"
         dome = _DOME.format(asset=asset, intensity=repr(float(factor)), inpainted=repr(inpainted))
         matrix = ", ".join(_tuple(row) for row in transform.matrix.T)  # USD's matrices act on row vectors.
-        names = {"scene": json.dumps(run.scene_name), "units": json.dumps(units)}
-        text = _STAGE.format(**names, matrix=matrix, lights="\n".join([*map(_usd, rows), dome]))
+        scene = json.dumps(run.scene_name, ensure_ascii=False)  # OpenUSD reads \u00e9 as u00e9.
+        lines = "\n".join([*map(_usd, rows), dome])
+        text = _STAGE.format(scene=scene, units=json.dumps(units), matrix=matrix, lights=lines)
     else:
         facts = {**provenance(run), "units": units, "axes": axes, "world_matrix": transform.matrix.tolist()}
         text = json.dumps({**facts, "lights": rows}, indent=1)

@@ -50,9 +50,11 @@ def test_usd_lights_stand_and_shine_as_the_scene_s(tmp_path, run):
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom, UsdLux
 
+    run.scene_name = 'Café "1"'
     files = write_lights(run, tmp_path / "lights.usda", axes="scene")
     assert files == [tmp_path / "lights.usda", tmp_path / "lights_rest.exr"]
     stage = Usd.Stage.Open(str(files[0]))
+    assert stage.GetRootLayer().customLayerData["sehdr:scene"] == run.scene_name
     panel = UsdLux.RectLight(stage.GetPrimAtPath("/Lights/light_0"))
     ball = UsdLux.SphereLight(stage.GetPrimAtPath("/Lights/light_1"))
     color = np.array(panel.GetColorAttr().Get()) * panel.GetIntensityAttr().Get()
