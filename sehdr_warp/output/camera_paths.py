@@ -44,7 +44,7 @@ def camera_named(run: "RenderableScene", name: str) -> Camera:
     """Return the camera of a view; raise SehdrError if the scene has none of this name."""
     cameras = {entry.name: entry.camera for entry in run.cameras}
     if name not in cameras:
-        some = first_names(list(cameras), 5)
+        some = first_names(list(cameras), 5) or "none"
         hint = did_you_mean(name, cameras) or "; see scene.json of the run"
         raise SehdrError(f"view {name!r} is not one of the scene's ({some}){hint}")
     return cameras[name]

@@ -93,6 +93,8 @@ def export(
     kind = kind or ("hdr" if file_model == "linear" else "ldr")
     _check(path, kind, file_model, exposure_time, degree)
     check_new_file(path, cameras=cameras, overwrite=overwrite)  # Before minutes of fitting
+    if cameras and not any(entry.camera.is_pinhole for entry in run.cameras):
+        raise SehdrError(f"{run.path}: has no cameras, or none that is a pinhole, to write; leave --cameras out")
     for_edits, to_file = _file_coordinates(run, path, axes, up, scale)
     seconds = run.base_time if exposure_time is None else float(exposure_time)
     # Colors that are converted to Rec.709 are encoded by sRGB, at the exposure that shows middle grey as the photos do.

@@ -141,6 +141,10 @@ def test_panoramas_are_not_among_the_pinholes_beside_a_file(tmp_path, run, logge
     export(run, tmp_path / "a.ply", cameras=True)
     assert [name for name, _ in load_cameras(tmp_path / "a.ply.cameras.json")] == ["0", "1", "2"]
     assert any("a.ply.cameras.json: without around" in line for line in logged)
+    run.cameras = run.cameras[-1:]
+    with pytest.raises(SehdrError, match="none that is a pinhole, to write"):
+        export(run, tmp_path / "b.ply", cameras=True)
+    assert not (tmp_path / "b.ply").exists()
 
 
 def test_unusable_requests(tmp_path, run):
