@@ -98,8 +98,10 @@ def camera_file_of(path: Path) -> Path:
 
 def cameras_beside(path: Path) -> Path | None:
     """Return the file beside a file of Gaussians that holds cameras in its coordinates; None if there is none."""
-    # A PLY's cameras were once named without .ply. Other files of that stem have other axes than they.
-    once = [path.with_name(f"{path.stem}.cameras.json")] * (path.suffix.lower() == ".ply")
+    suffix = path.suffix.lower()
+    # Once their name lacked the suffix. Files of one stem may differ in axes: then they count as those of the PLY.
+    is_alone = not any(path.with_name(path.stem + other).exists() for other in SUFFIXES if other != suffix)
+    once = [path.with_name(f"{path.stem}.cameras.json")] * (suffix == ".ply" or is_alone)
     files = (camera_file_of(path), *once, path.with_name("cameras.json"))
     return next((file for file in files if file.is_file()), None)
 
