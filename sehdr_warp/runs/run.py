@@ -228,13 +228,7 @@ class Run(RenderableScene):
     """
 
     def __init__(
-        self,
-        folder: RunFolder,
-        config: Config,
-        field: RadianceField,
-        info: dict,
-        values: dict,
-        clipped: Tensor | None = None,
+        self, folder: RunFolder, config: Config, field: RadianceField, info: dict, values: dict, clipped: Tensor | None
     ):
         """Wrap the parts of a run; load_run() reads them."""
         self.folder, self.path = folder, folder.path
@@ -290,8 +284,12 @@ class Run(RenderableScene):
         estimates = light_estimates(views, response, self.config.loss, self.device)
         certainties = None if estimates is None else [estimate.certainty for estimate in estimates]
         evidence = gather_evidence(self.field, views, degree=self.degree, truth=truth, certainties=certainties)
-        self.field.confidence, self._clipped = evidence.confidence(), evidence.clipped
+        self.set_evidence(evidence)
         return evidence
+
+    def set_evidence(self, evidence: Evidence) -> None:
+        """Set confidence and clipped fractions from the evidence of the training photos, in this object alone."""
+        self.field.confidence, self._clipped = evidence.confidence(), evidence.clipped
 
 
 def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:

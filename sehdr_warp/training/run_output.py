@@ -138,7 +138,7 @@ class RunOutput:
             return
         run = self.load_run(trainer.device)
         evidence = evidence or run.measure_confidence(trainer.scene)
-        run.field.confidence = evidence.confidence()
+        run.set_evidence(evidence)
         write_confidence(self.folder, evidence, run.checkpoint_hash)
         if not self._is_block:
             self._report_residuals(run, trainer)

@@ -297,7 +297,9 @@ def test_a_loop_that_is_left_after_the_last_step_ends_as_one_that_is_not(scene, 
     for progress in trainer:
         if progress.iteration == progress.total:
             break
-    assert trainer.run.summary()["finished"] and trainer.run.field.confidence is not None
+    run, saved = trainer.run, load_run(tmp_path / "run")
+    assert run.summary()["finished"] and run.field.confidence is not None
+    assert torch.equal(run.clipped_share(), saved.clipped_share()), "lights are found in a run as it was trained"
 
 
 @pytest.mark.parametrize("config", ["demo", {"schedule.iterations": 3, "response.name": "srgb"}, 7])
