@@ -89,7 +89,10 @@ def option_words(options: Mapping[str, Any]) -> list[str]:
 
 def options_of_run(run: Run) -> dict[str, str]:
     """Return the fields that a run was started with: what differs from the default and was not planned."""
-    planned = {name for decision in run.decisions() for name in decision["fields"]} - set(run.config.plan.keep)
+    decisions = run.decisions()
+    planned = {name for decision in decisions for name in decision["fields"]} - set(run.config.plan.keep)
+    if decisions:
+        planned.add("plan.enabled")  # A plan that was made is turned off in the run's config.
     options = {}
     for name, item in config_fields():
         value = attrgetter(name)(run.config)

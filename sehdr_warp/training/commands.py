@@ -171,13 +171,13 @@ def _train(args: Train, ranks=None) -> None:
 
     output, machine = args.output, args.machine
     # What can be refused is refused before the photos are read, which may take minutes.
-    resumed = _prepare_folder(output)
-    data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
-    config = _config(args, None if resumed is None else resumed.read_config())
+    run = _prepare_folder(output)
+    data = _load_arguments(args, None if run is None else run.read_info()["data"])
+    config = _config(args, None if run is None else run.read_config())
     device = pick_device(machine.device) if ranks is None else ranks.device
     loading = _loading(config)
-    if resumed is not None:  # Its response need not be chosen again.
-        loading["response"] = response_for_loading(config, Response.from_dict(resumed.read_info()["response"]))
+    if run is not None:  # Its response need not be chosen again; create_trainer() refuses another --response.
+        loading["response"] = response_for_loading(run.read_config(), Response.from_dict(run.read_info()["response"]))
     check_dataset_truth(data, config)
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:

@@ -126,8 +126,7 @@ class RunOutput:
         self.checkpoint(trainer, last=True)
         if trainer.ranks is not None:
             trainer.ranks.shutdown()
-        if trainer.iteration > trainer.first_iteration or not self.folder.summary_file.exists():
-            self._write_summary(trainer)
+        self._write_summary(trainer)
         if self._writer is not None:
             self._writer.close()
         if not complete:
@@ -144,10 +143,11 @@ class RunOutput:
             self._report_residuals(run, trainer)
 
     def _write_summary(self, trainer: Trainer) -> None:
-        """Write summary.json: times, memory and counts."""
-        summary = {
-            "iteration": trainer.iteration,
-            "finished": trainer.iteration >= trainer.total,
+        """Write summary.json: times, memory and counts; one of this iteration stays if no step was taken."""
+        progress = {"iteration": trainer.iteration, "finished": trainer.iteration >= trainer.total}
+        if trainer.iteration == trainer.first_iteration and progress.items() <= self.folder.read_summary().items():
+            return
+        summary = progress | {
             "train_seconds": round(trainer.seconds, 3),
             "gaussians": trainer.field.gaussians.count,
             "skipped_steps": trainer.skipped_steps,

@@ -49,6 +49,9 @@ def test_a_resumed_training_is_repeated_with_the_fields_of_its_run(tmp_path):
     again = load_config("default", {name: value_of(name, text) for name, text in options.items()})
     assert (again.seed, again.loss.ssim_weight) == (7, 0.3)
     assert again.densification.strategy == run.config.densification.strategy == "adc", "the preset's fields are stated"
+    config = load_config("default", {"schedule.iterations": 2, "plan.keep": ("schedule.iterations",)})
+    planned = train(toy_scene(), tmp_path / "planned", config, device="cpu")
+    assert planned.decisions() and "plan.enabled" not in options_of_run(planned), "the command plans as the run did"
 
 
 def test_a_training_that_is_too_short_blames_nothing_that_moved():

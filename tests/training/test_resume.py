@@ -196,6 +196,25 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
             use(run.path)
 
 
+def test_resume_refuses_another_response(tmp_path, capsys):
+    words = ["train", "embedded", "--out", str(tmp_path / "run"), "--max-size", "32", "--device", "cpu"]
+    assert call(*words, "--iterations", "1", "--response", "learned") == 0
+    assert call("train", "--resume", "--out", tmp_path / "run", "--device", "cpu", "--response", "srgb") == 1
+    assert "response.name = 'learned', but 'srgb' was asked for" in capsys.readouterr().err
+
+
+def test_a_summary_is_of_the_last_checkpoint(scene, tmp_path):
+    config = quick(**{"schedule.iterations": 4})
+    run = train(scene, tmp_path / "run", config, device="cpu")
+    before = run.summary()
+    run.folder.summary_file.write_text(json.dumps(before | {"iteration": 2, "finished": False}))  # Of a killed session.
+    assert train(scene, run.path, device="cpu", resume=True).summary()["finished"]
+    longer = override_config(config, {"schedule.iterations": 8})
+    trainer = create_trainer(scene, run.path, longer, device="cpu", resume=True)
+    trainer.stop()
+    assert not trainer.train().summary()["finished"]
+
+
 def test_a_resumed_training_takes_the_runs_response(tmp_path, monkeypatch):
     words = ["train", "embedded", "--out", str(tmp_path / "run"), "--max-size", "32", "--device", "cpu"]
     assert call(*words, "--iterations", "4") == 0
