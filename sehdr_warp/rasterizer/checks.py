@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -96,17 +97,18 @@ def is_not_negative(number: float) -> bool:
     return 0.0 <= number < math.inf
 
 
-def check_render_options(near_plane: Any, alpha_threshold: Any, **flags: Any) -> None:
-    """Raise TypeError or ValueError for options of a render that are of another type or out of range.
+def boolean(name: str, value: Any) -> bool:
+    """Return Python's or NumPy's bool as Python's; raise TypeError for another type."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} is {value!r:.60}, expected True or False")
+    return bool(value)
 
-    flags: by name, options that are True or False.
-    """
+
+def check_render_options(near_plane: Any, alpha_threshold: Any) -> None:
+    """Raise TypeError or ValueError for options of a render that are of another type or out of range."""
     real("near_plane", near_plane, is_positive, "a positive number")
     # A float32 below 1e-37 is less exact than others, and soon 0.
     real("alpha_threshold", alpha_threshold, lambda number: 1e-37 < number < 1.0, "between 1e-37 and 1")
-    for name, flag in flags.items():
-        if not isinstance(flag, bool):
-            raise TypeError(f"{name} is {flag!r:.60}, expected True or False")
 
 
 def check_opacities(opacities: Tensor) -> None:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
-from .checks import check_render_options, integer, is_not_negative, real
+from .checks import boolean, check_render_options, integer, is_not_negative, real
 from .cuda_graphs import is_capturing
 
 MAX_INTERSECTIONS = 2**31 - 1  # They are counted in int32.
@@ -34,7 +34,7 @@ class RenderOptions(NamedTuple):
     deterministic: bool = False
 
     def checked(self, device: torch.device) -> "RenderOptions":
-        """Return the options with sizes as plain integers; raise TypeError or ValueError for values out of range."""
+        """Return the options as Python's types; raise TypeError or ValueError for values out of range."""
         limit = self.max_intersections
         if limit is not None:
             limit = integer("max_intersections", limit, 1, MAX_INTERSECTIONS)
@@ -44,7 +44,7 @@ class RenderOptions(NamedTuple):
                 "give max_intersections"
             )
         real("eps2d", self.eps2d, is_not_negative, "a number from 0")
-        flags = {"antialiased": self.antialiased, "depth": self.depth, "deterministic": self.deterministic}
-        check_render_options(self.near_plane, self.alpha_threshold, **flags)
+        check_render_options(self.near_plane, self.alpha_threshold)
+        flags = {name: boolean(name, getattr(self, name)) for name in ("antialiased", "depth", "deterministic")}
         width, height = image_size(self.width, self.height)
-        return self._replace(width=width, height=height, max_intersections=limit)
+        return self._replace(width=width, height=height, max_intersections=limit, **flags)

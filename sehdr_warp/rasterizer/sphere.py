@@ -11,6 +11,7 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
 from .checks import (
+    boolean,
     check_directions,
     check_opacities,
     check_position,
@@ -88,7 +89,8 @@ def rasterize_directions(
     check_position(position)
     real("focal_length", focal_length, is_positive, "a positive number")
     real("pixel_angle", pixel_angle, is_not_negative, "a number from 0")
-    check_render_options(near_plane, alpha_threshold, antialiased=antialiased)
+    check_render_options(near_plane, alpha_threshold)
+    antialiased = boolean("antialiased", antialiased)
     height, width = directions.shape[:2]
     if not height * width:
         raise ValueError(f"directions has shape {list(directions.shape)}, expected [H, W, 3] with at least one pixel")

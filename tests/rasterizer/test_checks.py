@@ -75,7 +75,7 @@ def with_nan_and_logits(opacities):
         ("eps2d", lambda _: torch.tensor(0.3), TypeError, r"eps2d is tensor\(0.3000\), expected a number"),
         ("alpha_threshold", lambda _: 1e-50, ValueError, "alpha_threshold 1e-50 is not between 1e-37 and 1"),
         ("antialiased", lambda _: "no", TypeError, "antialiased is 'no', expected True or False"),
-        ("depth", lambda _: np.bool_(1), TypeError, "depth is .*True_?, expected True or False"),
+        ("depth", lambda _: 1, TypeError, "depth is 1, expected True or False"),
     ],
 )
 def test_misfits_of_a_render_are_named(name, change, kind, message):
@@ -130,8 +130,12 @@ def test_a_device_without_kernels_is_named():
         rasterize(**args)
 
 
-def test_whole_numbers_of_numpy_are_sizes():
-    assert rasterize(**arguments(width=np.int64)).image.shape == (50, 70, 3)
+def test_numbers_and_bools_of_numpy_are_options():
+    flags = {name: lambda _: np.bool_(1) for name in ("antialiased", "depth", "deterministic")}
+    rendering = rasterize(**arguments(width=np.int64, **flags))
+    assert rendering.image.shape == (50, 70, 3) and rendering.depth is not None
+    truth = rasterize(**arguments(antialiased=lambda _: True, depth=lambda _: True))
+    assert torch.equal(rendering.image, truth.image)
 
 
 @pytest.mark.parametrize(
