@@ -77,6 +77,8 @@ def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "Gr
     fits = 0 < len(first) <= MAX_GAUSSIANS and options.width * options.height <= MAX_PIXELS
     if not fits or is_capturing(first.device):
         return None
+    if len({*map(id, tensors)}) < len(tensors):  # TensorGuards tells nothing of a tensor that is passed twice.
+        tensors = [tensor.view_as(tensor) for tensor in tensors]
     with _lock:
         pool = _known_pool(tensors, options)
         if pool is None:
@@ -97,7 +99,7 @@ def _known_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | 
 
 
 class CallPattern:
-    """Properties that all calls of a pool have: options, stream, grad mode; of each tensor layout and requires_grad."""
+    """Properties that all calls of a pool have: options, stream, grad mode, and each tensor's, but for its values."""
 
     def __init__(self, tensors: Sequence[Tensor], options: RenderOptions) -> None:
         """Note those of a call that can be captured."""

@@ -343,6 +343,21 @@ def test_tensors_that_are_not_contiguous_are_read_by_their_strides():
     assert len(graph_cache._pools) == 3 and all(pool.captured for pool in graph_cache._pools.values())
 
 
+def test_a_tensor_may_be_passed_twice():
+    scene = scene_of()
+    means, log_scales, quaternions, opacities, _, *others = scene.arguments
+    arguments = means, log_scales, quaternions, opacities, means, *others
+    truth = launched(*arguments).image
+    cotangent = random_like(truth, 1)
+    [expected] = torch.autograd.grad(truth, [means], cotangent)
+    for _ in range(CALLS):
+        image = rasterize(*arguments).image
+    assert_alike([image], [truth])
+    assert_alike(torch.autograd.grad(image, [means], cotangent), [expected])
+    [pool] = graph_cache._pools.values()
+    assert pool.captured
+
+
 def test_options_that_equal_those_of_known_calls_are_checked_as_well():
     scene = scene_of(count=5)
     *tensors, width, height = scene.arguments
@@ -354,7 +369,7 @@ def test_options_that_equal_those_of_known_calls_are_checked_as_well():
     for eps2d in (torch.tensor(EPS2D, dtype=torch.float64), np.array([EPS2D])):
         with pytest.raises(TypeError, match="expected a number"):
             rasterize(*tensors, width, height, eps2d=eps2d)
-    assert rasterize(*tensors, np.int64(width), height).image.shape[:2] == (height, width)
+    assert rasterize(*tensors, np.int64(width), height, depth=np.bool_(0)).image.shape[:2] == (height, width)
 
 
 def test_a_count_is_waited_for_while_other_threads_run_and_missed_if_the_gpu_is_idle():
