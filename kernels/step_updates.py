@@ -130,7 +130,7 @@ def update_by_adam(
 
 @wp.func
 def is_finite(values: _floats, index: int) -> bool:
-    """Return whether a number is finite and its square, which Adam's second moment takes; true beyond the end."""
+    """Return whether a number and its square, which Adam's second moment takes, are finite; true beyond the end."""
     finite = bool(True)
     if index < values.shape[0]:
         finite = wp.isfinite(values[index] * values[index])

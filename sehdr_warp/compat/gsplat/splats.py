@@ -94,6 +94,10 @@ class Meta(dict[str, Any]):
         """Return a plain dictionary of all values and another's."""
         return dict(self) | other
 
+    def __reduce__(self) -> Any:
+        """Pickle and copy as a plain dictionary, which is read without this package."""
+        return dict, (dict(self),)
+
 
 def make_meta(splats: JoinedSplats, shape: tuple[int, ...], size: tuple[int, int], tile_size: int) -> dict[str, Any]:
     """Return gsplat's `meta` for views with axes `shape` and images of `size` (width, height)."""

@@ -1,5 +1,6 @@
 """The third result of gsplat's rasterization(): packed rows, intersections, and copies of it."""
 
+import copy
 import pickle
 
 import pytest
@@ -55,14 +56,14 @@ def test_intersections_are_made_when_they_are_read(device):
 
 @pytest.mark.parametrize(
     "read",
-    [dict, lambda info: {**info}, lambda info: info.copy(), lambda info: info | {}, lambda info: {} | info],
-    ids=["dict", "unpacked", "copy", "or", "or of another"],
+    [dict, lambda info: {**info}, lambda info: info.copy(), copy.copy, lambda info: info | {}, lambda info: {} | info],
+    ids=["dict", "unpacked", "method", "copy", "or", "or of another"],
 )
 def test_copies_of_meta_hold_values(read):
     leaves, place = scene()
     _, _, info = rasterization(*leaves, **place._asdict())
     copied = read(info)
-    assert list(copied) == list(info)
+    assert type(copied) is dict and list(copied) == list(info)
     assert not any(callable(dict.get(copied, key)) for key in copied)
     assert torch.equal(info.pop("isect_ids"), copied["isect_ids"]) and "isect_ids" not in info
     with pytest.raises(KeyError):
