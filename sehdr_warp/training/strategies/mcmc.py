@@ -205,11 +205,10 @@ def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tens
     """Clear Adam's first moments of the rows marked in `which` [N] bool; of their second moments `left` is kept.
 
     These are the sources of copies, whose state the authors clear; relocated copies keep that of their row, and new
-    rows have none. Adam then moves a source, and a new row, by 3 to 6
-    times its rate for about 50 steps. That parts the two, but where Gaussians are small beside such a step, the
-    rendering collapses. If all of the second moments stay, sources and copies part too slowly. So a tenth stays. In
-    large and dense scenes, where Gaussians are small and their next photo comes late, more stays, and copies take over
-    their source's second moments, too.
+    rows have none. Adam then moves a source, and a new row, by 3 to 6 times its rate for about 50 steps. That parts the
+    two, but where Gaussians are small beside such a step, the rendering collapses. If all of the second moments stay,
+    sources and copies part too slowly. So a tenth stays. In large and dense scenes, where Gaussians are small and their
+    next photo comes late, more stays, and copies take over their source's second moments, too.
     """
     states = [moments_of(optimizer, parameter) for parameter in gaussians.parameters()]
     for name, factor in (("exp_avg", 0.0), ("exp_avg_sq", left)):
