@@ -9,7 +9,7 @@ import json
 import os
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 import torch
@@ -96,7 +96,8 @@ def train(
         photos = batches.pop()
         for group in optimizer.param_groups:
             group["lr"] = rate * min(1.0, (step + 1) / WARM_UP) * (0.5 + 0.5 * np.cos(np.pi * step / steps))
-        loss = pixel_loss(*network(network_input(photos.exposure, photos.clipped)), photos)
+        mean, deviation = network(network_input(photos.exposure, photos.clipped))
+        loss = pixel_loss(mean, deviation, photos)
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -105,7 +106,7 @@ def train(
         if step % 200 == 0:
             seconds = round(time.perf_counter() - started, 1)
             print(json.dumps({"step": step, "loss": round(float(loss.detach()), 4), "seconds": seconds}), flush=True)
-    return average.module
+    return cast(LightNetwork, average.module)
 
 
 def fit_scale(network: LightNetwork, pack: Pack, chosen: np.ndarray, *, seed: int, device: str) -> float:
