@@ -27,7 +27,7 @@ class Command(NamedTuple):
     run: str
     """Function that takes the options."""
     takes_argv: bool = False
-    """Whether the function also takes the words of the command line."""
+    """True if the function also takes the words of the command line."""
 
 
 COMMANDS = {

@@ -109,7 +109,7 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
             unplaced.append(record.image.name)
         else:
             placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera))
-    notes = (*dataset.notes, *reconstruction.notes(photos))
+    notes = dataset.notes + reconstruction.notes(photos)
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
 
 

@@ -223,8 +223,8 @@ class PhotoStream:
 
 
 Views = ViewStack | PhotoStream | Sequence[TrainingView]
-"""What steps select views from: a ViewStack if all photos are on a GPU, a PhotoStream if they are streamed to it, a
-PhotoSource on a CPU; a PhotoSource or a list on a GPU without CUDA graphs."""
+"""Source that steps select views from: a ViewStack if all photos are on a GPU, a PhotoStream if they are streamed to
+it, a PhotoSource on a CPU; a PhotoSource or a list on a GPU without CUDA graphs."""
 
 
 class TrainingViews:

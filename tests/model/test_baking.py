@@ -93,8 +93,8 @@ def test_refinement_brings_display_colors_to_the_pictures(device):
     positions = np.stack([each.position for each in cameras])
     baked = gaussians_of(field, "display", positions)
     refined = refine(baked, field.render_ldr, cameras, steps=60)
-    shown = (field_of(each).to(device).render_ldr for each in (baked, refined))
-    before, after = (agreement(each, field.render_ldr, cameras) for each in shown)
+    renderers = (field_of(each).to(device).render_ldr for each in (baked, refined))
+    before, after = (agreement(each, field.render_ldr, cameras) for each in renderers)
     assert after > before + 6
     np.testing.assert_array_equal(refined.means, start.means)
     assert refine(baked, field.render_ldr, []) is baked

@@ -337,7 +337,8 @@ def test_tensors_that_are_not_contiguous_are_read_by_their_strides():
     for layout in (lambda t: t, lambda t: torch.stack([t, -t], -1)[..., 0], lambda t: t.t().contiguous().t()):
         for _ in range(CALLS):
             leaves = [layout(tensor.detach()).requires_grad_() for tensor in scene.tensors[:5]]
-            image = rasterize(*leaves, *scene.arguments[5:]).image
+            arguments = [*leaves, *scene.arguments[5:]]
+            image = rasterize(*arguments).image
         assert_alike([image], [truth])
         assert_alike(torch.autograd.grad(image, leaves, cotangent), expected)
     assert len(graph_cache._pools) == 3 and all(pool.captured for pool in graph_cache._pools.values())
