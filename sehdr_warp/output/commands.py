@@ -221,8 +221,9 @@ def run_meter(args: Meter) -> None:
 
     run = open_run(args.run, args.device)
     if args.view is None:
-        if flags := [flag for flag in ("pixel", "luminance", "illuminance") if getattr(args, flag) is not None]:
-            raise UsageError(f"--{flags[0]}: needs the view of the reading; name it with --view")
+        of_readings = "--pixel", "--luminance", "--illuminance", "--reflectance"
+        if flags := [flag for flag in changed_flags(args) if flag in of_readings]:
+            raise UsageError(f"{flags[0]}: needs the view of the reading; name it with --view")
         print(read_light_unit(run) or "no unit is kept: radiance is relative")
         return
     if args.pixel is None:
@@ -242,7 +243,8 @@ def run_lights(args: Lights) -> None:
     from .world_transform import world_transform
 
     if args.out is None:
-        if flags := [flag for flag in changed_flags(args) if flag in ("--reference-white", "--at", "--beyond")]:
+        of_files = "--reference-white", "--at", "--beyond", "--unseen"
+        if flags := [flag for flag in changed_flags(args) if flag in of_files]:
             raise UsageError(f"{', '.join(flags)}: set for a file, which --out names")
         run = open_run(args.run, args.device)
         transform = world_transform(run, **vars(args.world))
@@ -264,7 +266,7 @@ def run_environment_map(args: EnvironmentMap) -> None:
     check_place(args.at)
     from .environment_map import check_map, write_environment_map
 
-    check_map(args.out, args.size, args.layout, args.world.axes, args.beyond)
+    check_map(args.out, args.size, args.layout, args.world.axes, args.beyond, args.pixel)
     options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
     print(write_environment_map(open_scene(args.run, args.device), args.out, **options, **vars(args.world)))
 

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from ..runs.run import RenderableScene
 
 _GREY = 0.3  # Display light at which what photos clip is shown
-_CLIPPED, _LEAST_CLIPPED = 0.99, 0.002  # Encoded value that counts as clipped; share of a photo that shows light above
+_CLIPPED, _BRIGHTER = 0.99, 4 / 3  # Encoded value that counts as clipped; factor that counts as brighter
+_LEAST_BRIGHTER = 0.002  # Share of a picture that shows light above white
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,11 @@ class Comparison:
     confidence: np.ndarray | None = None
     new: np.ndarray | None = None
 
+    @property
+    def light_above_white(self) -> float:
+        """Share of the values that the photo clips, and that the scene shows brighter than all of the photo's light."""
+        return float(((self.photo > _CLIPPED) & (self.hdr > _BRIGHTER * self.from_photo.max())).mean())
+
 
 def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: float = 1.0) -> int:
     """Return the stops, from -8 to -1, at which pictures show best what photo and scene hold above white.
@@ -60,12 +66,13 @@ class Opening(NamedTuple):
 
 
 def opening_of(comparison: Comparison, exposure_time: float, gain: float = 1.0) -> Opening:
-    """Return how a report opens: as dark as tells what the photo clips, or as it was taken if it clips next to nothing.
+    """Return how a report opens: as dark as shows the light above white, or as the photo was taken if there is none.
 
     Arguments as in darker_stops().
     """
-    if float((comparison.photo > _CLIPPED).mean()) < _LEAST_CLIPPED:
-        return Opening(0, "Photo and scene", f"View {comparison.name}, of which the photo clips next to nothing.")
+    if comparison.light_above_white < _LEAST_BRIGHTER:
+        lead = f"View {comparison.name}, in which the scene shows next to no light above the photo's white."
+        return Opening(0, "Photo and scene", lead)
     stops = darker_stops([comparison], exposure_time, gain)
     darker = f"{-stops} stop{'s' * (stops < -1)} darker"
     lead = f"View {comparison.name}, {darker}. What the photo clipped stays flat."

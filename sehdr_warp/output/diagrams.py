@@ -35,12 +35,12 @@ def training_svg(metrics: Sequence[Mapping]) -> Markup:
     high = low + 5 * step
 
     def place(seconds: float, decibels: float) -> tuple[float, float]:
-        return 40 + 620 * seconds / longest, 250 - 225 * (decibels - low) / (high - low)
+        return 40 + 440 * seconds / longest, 250 - 215 * (decibels - low) / (high - low)
 
     elements = []
     for decibels in range(low, high + 1, step):
         y = place(0, decibels)[1]
-        grid = '<path d="M40 {:.1f}H660" stroke="{}"/><text x="0" y="{:.1f}">{} dB</text>'
+        grid = '<path d="M40 {:.1f}H480" stroke="{}"/><text x="0" y="{:.1f}">{} dB</text>'
         elements.append(markup(grid, y, LINE, y + 4, decibels))
     digits = 0 if longest >= 20 else 1
     for seconds in np.linspace(0, longest, 5):
@@ -48,15 +48,15 @@ def training_svg(metrics: Sequence[Mapping]) -> Markup:
         elements.append(
             markup('<text x="{:.1f}" y="272" text-anchor="{}">{} s</text>', x, anchor, f"{seconds:.{digits}f}")
         )
-    for color, (title, line) in zip(COLORS, lines.items()):
+    for left, color, (title, line) in zip((40, 200), COLORS, lines.items()):
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in line))
-        x, y = place(*line[-1])
         elements.append(markup('<polyline points="{}" fill="none" stroke="{}" stroke-width="2"/>', path, color))
         dot = '<circle cx="{:.1f}" cy="{:.1f}" r="2.5" fill="{}"/>'
         elements += [markup(dot, *place(*point), color) for point in line]
-        label = '<text x="{:.1f}" y="{:.1f}" style="fill:{}">{}: {:.1f} dB</text>'
-        elements.append(markup(label, x + 12, y + 4, color, title, line[-1][1]))
-    return _svg(860, 280, "Held-out PSNR against training time", elements)
+        elements.append(
+            markup('<text x="{}" y="14" style="fill:{}">{}: {:.1f} dB</text>', left, color, title, line[-1][1])
+        )
+    return _svg(484, 280, "Held-out PSNR against training time", elements)
 
 
 def camera_map(run: "RenderableScene", tone_map: Any, names: Sequence[str] = ()) -> Markup:
@@ -111,7 +111,7 @@ def camera_map(run: "RenderableScene", tone_map: Any, names: Sequence[str] = ())
             style = "fill:var(--ink);stroke:var(--ground);stroke-width:3px;paint-order:stroke"
             label = '<text x="{:.1f}" y="{:.1f}" style="{}">{}</text>'
             elements.append(markup(label, at[0] + 7, at[1] - 6, style, entry.name))
-    return markup('<div class="map">{}</div>', _svg(round(width), round(height), "Cameras from above", elements))
+    return _svg(round(width), round(height), "Cameras from above", elements)
 
 
 def _visible_points(cameras: Sequence[Camera], run: "RenderableScene", up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,5 +149,5 @@ def _ground(at: np.ndarray, colors: np.ndarray, width: int, height: int) -> Mark
 
 
 def _svg(width: int, height: int, title: str, parts: Sequence[Markup]) -> Markup:
-    template = '<svg viewBox="0 0 {} {}" role="img" aria-label="{}">\n{}\n</svg>'
+    template = '<svg class="diagram" viewBox="0 0 {} {}" role="img" aria-label="{}">\n{}\n</svg>'
     return markup(template, width, height, title, join(parts, "\n"))

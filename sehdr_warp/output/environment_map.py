@@ -101,7 +101,7 @@ def write_environment_map(
         InputError: If the file exists or a pixel is not finite.
     """
     path = Path(path)
-    check_map(path, size, layout, axes, beyond)
+    check_map(path, size, layout, axes, beyond, pixel)
     color_space(colorspace)
     transform = world_transform(run, axes, up=up, scale=scale)
     exposure = exposure_of_white(run, reference_white)
@@ -128,7 +128,7 @@ def write_environment_map(
     luminance = luminance_of_one(run)
     if path.suffix.lower() == ".hdr":
         absolute = 1.0 if luminance is None else EFFICACY / luminance
-        write_radiance(path, hdr, exposure=exposure * absolute, overwrite=overwrite)
+        write_radiance(path, hdr, exposure=exposure * absolute, colorspace=colorspace, overwrite=overwrite)
         return path
     beyond = center.beyond * transform.scale if beyond is None else beyond
     facts = {
@@ -156,10 +156,12 @@ def write_environment_map(
     return path
 
 
-def check_map(path: Path, size: int, layout: str, axes: str, beyond: float | None) -> None:
+def check_map(path: Path, size: int, layout: str, axes: str, beyond: float | None, pixel: str) -> None:
     """Raise the errors of write_environment_map() about options that need no scene."""
     if path.suffix.lower() not in SUFFIXES:
         raise SehdrError(f"{path}: an environment map is one of {', '.join(SUFFIXES)}; choose a suffix")
+    if path.suffix.lower() == ".hdr" and pixel != "half":
+        raise SehdrError(f"{path}: pixel {pixel} is a type of .exr; leave it out, or write .exr")
     for name, value, allowed in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):
         if value not in allowed:
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")

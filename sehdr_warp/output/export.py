@@ -29,6 +29,7 @@ from ..splats import (
     write_gaussians,
 )
 from ..subsets import every_nth, first_names
+from .brackets import remove_earlier
 from .camera_paths import training_cameras
 from .splat_edits import SplatEdits, most_visible, without_strays
 from .tonemap import display_gain
@@ -82,7 +83,7 @@ def export(
         up: As in world_transform.
         scale: As in world_transform.
         edits: What the file leaves out; by default Gaussians too faint to be drawn.
-        overwrite: Replace files that exist.
+        overwrite: Replace files that exist, and without `cameras` remove those that an earlier export wrote beside.
 
     Raises:
         SehdrError: For options that do not fit, or edits that leave nothing.
@@ -112,6 +113,8 @@ def export(
     write_gaussians(path, written, overwrite=overwrite)
     if cameras:
         _write_cameras(camera_file_of(path), run, to_file, overwrite)
+    elif overwrite:  # Cameras of an earlier export would count as these Gaussians'.
+        remove_earlier(path.parent, [camera_file_of(path).name])
     meaning = f"display colors of {shutter(seconds)}" if kind == "ldr" else "scene-linear radiance"
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, written.count, written.degree, meaning)
     if edits.shows_part:

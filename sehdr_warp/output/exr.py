@@ -212,13 +212,21 @@ def _camera_attributes(camera: Camera) -> dict[str, Any]:
     }
 
 
-def write_radiance(path: Path | str, image: np.ndarray, *, exposure: float = 1.0, overwrite: bool = False) -> None:
+def write_radiance(
+    path: Path | str,
+    image: np.ndarray,
+    *,
+    exposure: float = 1.0,
+    colorspace: str = "rec709",
+    overwrite: bool = False,
+) -> None:
     """Write [H, W, 3] linear RGB as Radiance HDR; negative values become 0 and channels share an 8-bit exponent.
 
     Args:
         path: The file.
         image: The picture.
         exposure: Factor that radiance was multiplied by, written as EXPOSURE.
+        colorspace: Primaries of the picture, written as PRIMARIES unless they are Rec.709's, which programs expect.
         overwrite: Replace a file that exists.
 
     Raises:
@@ -233,7 +241,9 @@ def write_radiance(path: Path | str, image: np.ndarray, *, exposure: float = 1.0
         [np.floor(image * scale[..., None]), (exponent + 128)[..., None] * (scale > 0)[..., None]], 2
     )
     height, width = largest.shape
-    exposure_line = "" if exposure == 1 else f"EXPOSURE={exposure:.9g}\n"
-    head = f"#?RADIANCE\nSOFTWARE=sehdr-warp\n{exposure_line}FORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n"
+    lines = "" if exposure == 1 else f"EXPOSURE={exposure:.9g}\n"
+    if color_space(colorspace).name != "rec709":
+        lines += f"PRIMARIES={' '.join(f'{value:.6g}' for value in chromaticities(colorspace))}\n"
+    head = f"#?RADIANCE\nSOFTWARE=sehdr-warp\n{lines}FORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n"
     with atomic_path(path, overwrite) as temporary:
         temporary.write_bytes(head.encode() + codes.astype(np.uint8).tobytes())

@@ -116,8 +116,8 @@ def write_lights(
     files = [path] if suffix == ".json" else [path, rest]
     for file in files:
         check_absent(file, overwrite)
-    if suffix == ".json" and (at, beyond) != ("center", None):
-        raise SehdrError(f"{path}: a place is that of the dome's map, which .json has not; write .usda")
+    if suffix == ".json" and (at, beyond, unseen) != ("center", None, "inpaint"):
+        raise SehdrError(f"{path}: at, beyond and unseen are of the dome's map, which .json has not; write .usda")
     transform = world_transform(run, axes, up=up, scale=scale)
     center = None if suffix == ".json" else find_center(run, training_cameras(run), at, beyond, transform)
     exposure_of_white(run, reference_white)  # Before minutes of looking for lights

@@ -55,7 +55,7 @@ def write_report(
     `report.html`: one page without a network: figures, what was left out and why, photo, scene and truth as Ultra HDR,
     brackets with an exposure dial, lights, confidence, unexplained regions, error against time, cameras. For papers:
     `comparison.png`: photo; photo, HDR scene and truth (if known) some stops darker; a new view. `stops.png`: the view
-    with the most clipped light from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
+    with the most light above white from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
     `training.png`: held-out error against training time; absent for a run without evaluations. A scene without test
     views shows training views, and captions say so.
 
@@ -84,7 +84,7 @@ def write_report(
         raise SehdrError("the scene has no views to report on; check its splits")
     views = evenly(candidates, max(view_count, 1))
     comparisons = [compare(run, view, scene.views) for _, view in track_progress("comparing views", views, log)]
-    brightest = max(comparisons, key=lambda comparison: float((comparison.photo > 0.99).mean()))
+    brightest = max(comparisons, key=lambda comparison: comparison.light_above_white)
     time = views[0].exposure_time
     compared = comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out)
     figures = [compared, stops_figure(brightest, time)] + [training_chart({scene.name: [metrics]})] * charted

@@ -57,7 +57,7 @@ def report_page(
         run: The trained run.
         scene: What it was trained on.
         comparisons: Views to show.
-        brightest: The view with the most clipped light, for the brackets.
+        brightest: The view with the most light above white, for the opening and the brackets.
         held_out: Whether the views were not trained on.
         evaluation: Result of evaluate(), for the table of held-out views.
         lights: The lights of the scene, as from run.find_lights().
@@ -74,9 +74,7 @@ def report_page(
         _plan(run.decisions()),
         _table(evaluation, held_out),
         _section(
-            "Error against time",
-            "Of all held-out photos, while it was trained.",
-            _figure(_wide(training_svg(run.metrics()))),
+            "Error against time", "Of all held-out photos, while it was trained.", _figure(training_svg(run.metrics()))
         ),
         _map(run, comparisons),
         _footer(run, held_out),
@@ -98,11 +96,6 @@ def _figure(body: Markup, caption: str = "") -> Markup:
 
 def _views(figures: Sequence[Markup]) -> Markup:
     return markup('<div class="views">{}</div>', join(figures))
-
-
-def _wide(body: Markup) -> Markup:
-    """Wrap what a narrow window should scroll sideways rather than shrink."""
-    return markup('<div class="wide">{}</div>', body) if body else EMPTY
 
 
 def _header(run: "Run", scene: Scene, opening: Markup) -> Markup:
@@ -176,7 +169,7 @@ def _opening(comparison: Comparison, time: float, gain: float) -> Markup:
         picture = jpeg(expose(small, stops, scale=time * gain))
         caption = f"{name} at {stops_text(stops)}"
         figures.append(_figure(img(picture, caption, (small.shape[1], small.shape[0])), caption))
-    return _section(title, lead, markup('<div class="views">{}</div>', join(figures)))
+    return _section(title, lead, _views(figures))
 
 
 def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:
@@ -194,9 +187,7 @@ def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:
         f"View {comparison.name}, re-exposed from {shutter(time)} (0 EV) and shown as a plain display does. "
         "What the photo clipped stays flat; the scene keeps its light."
     )
-    body = _figure(dial(lights, time, gain, "Scene")) + _figure(
-        _wide(markup('<div class="strip">{}</div>', join(cells)))
-    )
+    body = _figure(dial(lights, time, gain, "Scene")) + _figure(markup('<div class="strip">{}</div>', join(cells)))
     return _section("Brackets", lead, body)
 
 

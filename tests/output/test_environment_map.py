@@ -81,10 +81,10 @@ def test_a_map_has_openexrs_orientation(tmp_path, run):
 
 @pytest.mark.parametrize("suffix", [".exr", ".hdr"])
 def test_white_is_an_exposure_that_the_file_states(tmp_path, run, suffix):
+    pixel = {"pixel": "float"} if suffix == ".exr" else {}
     for name, white in (("plain", None), ("exposed", 4.0)):
-        write_environment_map(
-            run, tmp_path / f"{name}{suffix}", at=(0, 0, 0), size=64, reference_white=white, pixel="float"
-        )
+        path = tmp_path / f"{name}{suffix}"
+        write_environment_map(run, path, at=(0, 0, 0), size=64, reference_white=white, **pixel)
     if suffix == ".hdr":
         radiance, again = (read_hdr(tmp_path / f"{name}.hdr") for name in ("plain", "exposed"))
         head = (tmp_path / "exposed.hdr").read_bytes()[:100].decode("latin-1")
@@ -164,6 +164,15 @@ def test_radiance_files_keep_seven_bits(tmp_path):
     assert (np.abs(read_back - image) <= image.max(2, keepdims=True) / 128).all()
     with pytest.raises(InputError, match="not finite"):
         write_radiance(tmp_path / "b.hdr", np.full((2, 2, 3), np.nan))
+
+
+def test_radiance_files_state_their_primaries(tmp_path, run):
+    for space in ("rec709", "acescg"):
+        write_environment_map(run, tmp_path / f"{space}.hdr", at=(0, 0, 0), size=32, axes="scene", colorspace=space)
+    plain, converted = (read_hdr(tmp_path / f"{space}.hdr") for space in ("rec709", "acescg"))
+    np.testing.assert_allclose(converted, plain, atol=0.02 * plain.max())
+    with pytest.raises(SehdrError, match=r"leave it out, or write \.exr"):
+        write_environment_map(run, tmp_path / "a.hdr", pixel="float")
 
 
 def test_unseen_directions_are_inpainted_on_request(tmp_path, run, logged):

@@ -103,6 +103,11 @@ def test_cameras_beside_are_read_again(tmp_path, run):
     with pytest.raises(InputError, match=r"cameras.json: exists already"):
         export(run, tmp_path / "b.ply", cameras=True)
     assert not (tmp_path / "b.ply").exists()
+    export(run, tmp_path / "a.ply", overwrite=True)
+    assert not (tmp_path / "a.ply.cameras.json").exists(), "these cameras would see other coordinates"
+    (tmp_path / "a.ply.cameras.json").write_text("mine")
+    export(run, tmp_path / "a.ply", overwrite=True)
+    assert (tmp_path / "a.ply.cameras.json").read_text() == "mine"
 
 
 def test_cameras_are_of_one_file_and_not_of_another_with_its_stem(tmp_path, run):

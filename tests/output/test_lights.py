@@ -119,6 +119,8 @@ def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
         write_lights(run, tmp_path / "lights.json", **place)
     with pytest.raises(UsageError, match="--at, --beyond: set for a file"):
         run_lights(Lights(run=run.path, at="0,0,1", beyond=1.0))
+    with pytest.raises(UsageError, match="--unseen: set for a file"):
+        run_lights(Lights(run=run.path, unseen="black"))
 
 
 def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):

@@ -28,7 +28,7 @@ from sehdr_warp.output.tonemap import display_gain
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.response import response_by_name
 
-from ..viewer.browser import browser
+from ..viewer.browser import browser, page_of
 from .helpers import AnalyticRun
 from .test_lights import LIGHTS
 from .test_report import make
@@ -240,9 +240,24 @@ def test_the_opening_shows_what_photos_clip_as_grey():
 def test_a_photo_that_clips_nothing_is_opened_as_it_was_taken():
     flat = np.full((4, 4, 3), 0.5)
     opening = opening_of(Comparison("v", flat, flat, flat), 0.5)
-    assert (opening.stops, opening.title) == (0, "Photo and scene") and "next to nothing" in opening.lead
+    assert (opening.stops, opening.title) == (0, "Photo and scene") and "next to no light" in opening.lead
+
+
+def test_a_scene_without_light_above_white_is_not_opened_dark():
+    white, flat = np.ones((4, 4, 3)), np.full((4, 4, 3), 2.0)
+    assert opening_of(Comparison("v", white, flat, flat), 0.5).title == "Photo and scene"
+    steep = flat * [[[1.0, 1.0, 0.01]]]  # Of a code just below white, which a steep response decodes to far less
+    assert opening_of(Comparison("v", white, steep, flat), 0.5).title == "Photo and scene"
 
 
 def test_times_of_a_short_training_are_at_their_places():
     chart = training_svg([{"psnr_ldr": 20.0 + time, "seconds": time} for time in (1.0, 10.0)])
     assert re.findall(r">([\d.]+ s)<", chart) == ["0.0 s", "2.5 s", "5.0 s", "7.5 s", "10.0 s"]
+
+
+def test_a_phone_sees_the_whole_chart_and_all_brackets(tmp_path):
+    (tmp_path / "report.html").write_text(page(tmp_path))
+    with browser() as chromium, page_of(chromium, (tmp_path / "report.html").as_uri(), width=390) as phone:
+        for content in (".diagram text", ".strip img"):
+            ends = phone.locator(content).evaluate_all("all => all.map(each => each.getBoundingClientRect().right)")
+            assert ends and max(ends) <= 390, content
