@@ -283,7 +283,7 @@ class BracketWriter:
         pixels = [linear * exposure.time for exposure in options.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
         pixel = stored_pixel_type(pixels, options.pixel)
-        # write_multipart_exr() gets the raised type alone, so the header says why.
+        # write_multipart_exr() sees one exposure, so it cannot tell why the type is another one.
         reason = {"sehdr:pixelType": PAST_HALF} if pixel != options.pixel else {}
         if reason:
             log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)

@@ -34,9 +34,9 @@ COVERED = 0.5  # Alpha above which a direction counts as covered
 _LEAST_COVERED = 0.1  # Covered share of all directions below which a warning names the point
 _NEAR = 0.02  # Spread of the cameras: surfaces that near in most directions mean that the point is inside something
 _LARGEST = 1 << 15  # Pixels across
-_WHOLE = 99.5  # Per cent of all directions that count as all
-_FINEST = {"latlong": 4096, "cube": 1024}  # Most pixels across that are rendered for a map that is smaller
-_MOST_PIXELS = 1 << 21  # Of those, at once
+_WHOLE = 99.5  # Covered per cent from which nothing is said of the rest
+_FINEST = {"latlong": 4096, "cube": 1024}  # Smaller maps are averaged from renders of at most so many pixels across
+_MOST_PIXELS = 1 << 21  # Pixels that are rendered at once
 _COARSE, _DARKEST = 128, 1e-9  # Inpainting: columns of the coarse map, and the least light
 # The nearest axes of a cube's faces in OpenEXR's order (+X -X +Y -Y +Z -Z): to the right, down, and out.
 _FACES = np.array(

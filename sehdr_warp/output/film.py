@@ -60,23 +60,23 @@ _X265_SMALL, _X265_SMALLEST_SIDE = ":aq-mode=0:no-cutree=1", 64
 _MASTER = (
     "hdr-opt=1:master-display=G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)L(10000000,50):max-cll=1000,400"
 )
-TRANSFERS = {
-    "sdr": Transfer("libx264", "yuv420p", {"crf": "16", "preset": "medium"}, 1, 1, 1),
-    "hlg": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": _X265}, 9, 18, 9),
-    "hdr10": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": f"{_X265}:{_MASTER}"}, 9, 16, 9),
-}
 LOG_CURVES = {
     "logc3": ("ARRI LogC3", "ARRI Wide Gamut 3"),
     "slog3": ("S-Log3", "S-Gamut3.Cine"),
     "acescct": ("ACEScct", "ACEScg"),
 }
 """Curve and primaries of each logarithm, as colour-science names them. H.273 has no code points for them."""
+TRANSFERS = {
+    "sdr": Transfer("libx264", "yuv420p", {"crf": "16", "preset": "medium"}, 1, 1, 1),
+    "hlg": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": _X265}, 9, 18, 9),
+    "hdr10": Transfer("libx265", "yuv420p10le", {"crf": "18", "x265-params": f"{_X265}:{_MASTER}"}, 9, 16, 9),
+    **dict.fromkeys(LOG_CURVES, Transfer("prores_ks", "yuv444p10le", {"profile": "4444"}, 2, 2, 1)),
+}
 _FASTSTART = (".mp4", ".mov", ".m4v")
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".avi": "avi", ".ts": "mpegts"}
 """FFmpeg's formats by suffix: those of one file. Others write further files beside it, whoever owns their names."""
 _SLOWEST, _FASTEST = 0.1, 1000.0
 """Frames a second."""
-TRANSFERS |= dict.fromkeys(LOG_CURVES, Transfer("prores_ks", "yuv444p10le", {"profile": "4444"}, 2, 2, 1))
 
 
 def write_film(

@@ -31,6 +31,7 @@ def film_size(photos: Sequence[Camera]) -> tuple[int, int]:
 
 
 _VIEWS, _SIZE = 12, 96  # Renders that the subject is found on; longest side of these and of the checks for obstacles
+_NEAR, _BLOCKED = 0.3, 10  # A view is blocked if this per cent of its middle is nearer than this part of the distance
 _REACH = 0.7  # Surfaces within this part of the cameras' distance from the focus are the subject
 _EXTENT = 90  # Percentile of their distances from the focus that the picture holds
 
@@ -78,10 +79,10 @@ def default_path(run: "RenderableScene", count: int, up: str | Sequence[float] |
     return frame_subject(run, [film_camera(camera, photos) for camera in path], photos)
 
 
-_OPENINGS, _WITNESSES = 16, 32  # Photos among which an opening view is chosen, and those that may show what it shows
-_SEVERAL = 3  # Photos that show a point which an opening view should show
-# Parts of the picture that an opening view may show less if it is nearer to the middle of the photos by their extent,
-# if it looks as most of them do by a right angle, and if it holds the whole subject instead of nothing of it.
+_OPENINGS, _WITNESSES = 16, 32  # Photos whose views may be the opening one, and photos that these are compared with
+_SEVERAL = 3  # Photos that must show a point for it to count as shown
+# Weights of an opening view beside the share of its picture that several photos show: minus the distance to the middle
+# of the photos over their extent, plus the cosine to their mean axis, plus the part of the subject that it holds.
 _ASIDE, _TURNED, _WHOLE = 0.4, 0.4, 0.8
 
 
@@ -164,9 +165,6 @@ def _view_from_outside(run: "RenderableScene") -> Camera:
     return camera
 
 
-_NEAR, _BLOCKED = 0.3, 10  # A view is blocked if this per cent of its middle is nearer than this part of the distance
-
-
 def _nearest_depth(run: "RenderableScene", camera: Camera) -> float:
     """Return the depth than which a tenth of the middle of a camera's picture is nearer; infinity if it is empty."""
     small = camera.within(_SIZE)
@@ -198,10 +196,14 @@ def _opening_of(
     if focus is None or radius is None:
         return camera
     present = camera.height / 2 / camera.fy
-    needed = math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
     most = _MOST_ZOOM * present if around else max(photo.height / 2 / photo.fy, present)
-    zoom = present / max(min(needed, most), _CLOSER * present)
+    zoom = present / max(min(_subject_tangent(radius, distance), most), _CLOSER * present)
     return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
+
+
+def _subject_tangent(radius: float, distance: float) -> float:
+    """Return the tangent of half the field of view that holds a sphere with _MARGIN, at most that of _WIDEST."""
+    return math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
 
 
 def _visible_share(run: "RenderableScene", camera: Camera, witnesses: Sequence[Camera]) -> float:
@@ -232,11 +234,9 @@ def frame_subject(run: "RenderableScene", path: Sequence[Camera], photos: Sequen
     around = surround(photos, focus)
     most = _MOST_ZOOM * present if around else max(photo, present)
     farthest = np.percentile([np.linalg.norm(each.position - focus) for each in photos], 50 if around else 75)
-    needed = _MARGIN * radius / math.sin(math.atan(most))
-    cleared = _far_enough(cleared, focus, min(needed, float(farthest)))
+    cleared = _far_enough(cleared, focus, min(_MARGIN * radius / math.sin(math.atan(most)), float(farthest)))
     distance = min(float(np.linalg.norm(camera.position - focus)) for camera in cleared)
-    needed = math.tan(min(math.asin(min(_MARGIN * radius / distance, 1.0)), _WIDEST / 2))
-    zoom = present / min(max(present, needed), most)
+    zoom = present / min(max(present, _subject_tangent(radius, distance)), most)
     return [replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom) for camera in cleared]
 
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from datetime import datetime
 from fractions import Fraction
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ _EXIF_IFD, _EXPOSURE_TIME, _EXPOSURE_BIAS, _SOFTWARE, _DATE = 0x8769, 0x829A, 0x
 EXIF_TIME = "%Y:%m:%d %H:%M:%S"
 # Separators, what Windows forbids, and control characters.
 _FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
-_LONGEST = 120
+_LONGEST = 120  # Bytes of a name, which get prefixes and suffixes; most file systems take 255
 
 
 def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
@@ -75,14 +76,12 @@ def safe_names(names: Sequence[str]) -> list[str]:
     Letters that some system forbids become `_`, leading dots are dropped, names are cut at 120 bytes, and repeated
     names get a number.
     """
-    cleaned = [_FORBIDDEN.sub("_", name).strip().lstrip(".").rstrip(". ") for name in names]
-    # The file system's limit counts bytes, and prefixes and suffixes still come.
-    cleaned = [name.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore") or "view" for name in cleaned]
-    reserved, used_names, result = {name.casefold() for name in cleaned}, set(), []
+    cleaned = [_FORBIDDEN.sub("_", name).strip().lstrip(".").encode("utf-8")[:_LONGEST] for name in names]
+    cleaned = [name.decode("utf-8", "ignore").rstrip(". ") or "view" for name in cleaned]
+    wanted, result = {name.casefold() for name in cleaned}, {}
     for name in cleaned:
-        candidate, number = name, 2
-        while candidate.casefold() in used_names or (number > 2 and candidate.casefold() in reserved):
-            candidate, number = f"{name}_{number}", number + 1
-        used_names.add(candidate.casefold())
-        result.append(candidate)
-    return result
+        numbered = (f"{name}_{number}" for number in count(2))
+        free = (each for each in numbered if (low := each.casefold()) not in wanted and low not in result)
+        unique = next(free) if name.casefold() in result else name
+        result[unique.casefold()] = unique
+    return [*result.values()]

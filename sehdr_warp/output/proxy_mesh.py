@@ -33,7 +33,7 @@ from .depth_fusion import (
 )
 from .splat_edits import Box, Sphere, read_region
 from .tonemap import encode_srgb
-from .world_transform import WorldTransform, world_transform
+from .world_transform import WorldTransform, scene_up, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -47,6 +47,7 @@ _CHECKED = 3  # Held-out views that the mesh's depth is compared in
 # Triangles nearer to a Gaussian of a light than so many standard deviations and voxels are left out. Of the Gaussians
 # near a vertex so many are asked, because the nearest one may be small.
 _REACH, _CLEAR, _NEAREST = 2.0, 1.5, 8
+_UPRIGHT = np.cos(np.radians(20))  # Cosine between +Y of the file and up with which a level part is a floor
 _LEVEL = 1.0  # Degrees to which a floor counts as level
 _COARSE = 0.1  # Voxels by which rounded coordinates may move a vertex without a warning
 _CLOSE = 0.03  # Relative difference of depth that counts as agreement
@@ -111,8 +112,8 @@ def write_proxy_mesh(
 
     Lights that write_lights() would write are left out, because the mesh would block them.
 
-    An OpenUSD file holds `/World/Proxy` with radiance as displayColor and, if a floor was found, a level plane
-    `/World/Ground`. An OBJ file holds both as objects, with display colors.
+    An OpenUSD file holds `/World/Proxy` with radiance as displayColor and, if +Y is up and a floor was found, a level
+    plane `/World/Ground`. An OBJ file holds both as objects, with display colors.
 
     Args:
         run: A trained run, with training cameras.
@@ -193,7 +194,8 @@ def proxy_mesh(
     colors = nearest_values(radiance, vertices / voxel)
     vertices, faces, colors = _large_parts(vertices + low, faces, colors)
     places = np.array([view.camera.position for view in views])
-    ground = find_ground(vertices, faces, places, longest)
+    stands = (transform.rotation @ scene_up(run))[1] > _UPRIGHT
+    ground = find_ground(vertices, faces, places, longest) if stands else None
     return ProxyMesh(vertices.astype(np.float32), faces.astype(np.int32), colors.astype(np.float32), longest, ground)
 
 
@@ -319,7 +321,7 @@ def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "Ren
     colors = encode_srgb(np.clip(mesh.radiance * run.base_time, 0, 1))
     with path.open("w", encoding="utf-8") as file:
         world_matrix = json.dumps(transform.matrix.tolist())
-        file.write(f"# sehdr-warp proxy mesh, +Y up\n# sehdr:world_matrix {world_matrix}\no Proxy\n")
+        file.write(f"# sehdr-warp proxy mesh\n# sehdr:world_matrix {world_matrix}\no Proxy\n")
         np.savetxt(file, np.hstack([mesh.vertices, colors]), "v %.6g %.6g %.6g %.4f %.4f %.4f")
         np.savetxt(file, mesh.faces + 1, "f %d %d %d")
         if mesh.ground is not None:

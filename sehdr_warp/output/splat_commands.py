@@ -11,8 +11,7 @@ from ..runs.open import load_run_scene, open_run, open_scene
 from .commands import WorldOptions, changed_flags
 
 if TYPE_CHECKING:
-    from ..runs.run import RenderableScene, Run, Splats
-    from .splat_edits import SplatEdits
+    from ..runs.run import RenderableScene
 
 _MESH_SUFFIXES = (".obj", ".abc", ".fbx", ".stl")
 
@@ -109,26 +108,6 @@ class Mesh:
     """cpu or cuda:N; by default the first GPU if there is one."""
 
 
-def _splat_edits(options: EditOptions) -> "SplatEdits":
-    """Return edits that need no photos; raise SehdrError for values that cannot be."""
-    from .splat_edits import SplatEdits
-
-    if options.data is not None and not options.mask_only:
-        raise UsageError("--data: the photos are only read for --mask-only")
-    return SplatEdits(**{name: value for name, value in vars(options).items() if name not in ("mask_only", "data")})
-
-
-def _with_masks(edits: "SplatEdits", options: EditOptions, run: "Run | Splats") -> "SplatEdits":
-    """Return edits with the photos' masks, if --mask-only asks for them."""
-    from ..runs.run import Run
-
-    if not options.mask_only:
-        return edits
-    if not isinstance(run, Run):
-        raise UsageError("--mask-only: needs a run and its photos; a file of Gaussians has none")
-    return replace(edits, mask_views=load_run_scene(run, options.data).views)
-
-
 def run_mesh(args: Mesh) -> None:
     """Run `sehdr-warp mesh`."""
     from .proxy_mesh import check_mesh, write_proxy_mesh
@@ -140,7 +119,9 @@ def run_mesh(args: Mesh) -> None:
 
 def run_export(args: Export) -> None:
     """Run `sehdr-warp export`."""
+    from ..runs.run import Run
     from ..splats import check_new_file, check_suffix
+    from .splat_edits import SplatEdits
 
     if args.out.suffix.lower() in _MESH_SUFFIXES:
         raise UsageError(f"{args.out}: meshes are written by sehdr-warp mesh {args.run} --out {args.out.stem}.usdc")
@@ -150,9 +131,16 @@ def run_export(args: Export) -> None:
         refused = ", ".join(flags)
         raise UsageError(f"{refused}: without effect on a page, which has its own exposure, cameras and axes")
     check_new_file(args.out, cameras=args.cameras, overwrite=args.overwrite)
-    edits = _splat_edits(args.edits)
+    values = dict(vars(args.edits))
+    mask_only, data = values.pop("mask_only"), values.pop("data")
+    if data is not None and not mask_only:
+        raise UsageError("--data: the photos are only read for --mask-only")
+    edits = SplatEdits(**values)  # It refuses values that cannot be, before anything is loaded.
     run = open_scene(args.run, args.device)
-    edits = _with_masks(edits, args.edits, run)
+    if mask_only:
+        if not isinstance(run, Run):
+            raise UsageError("--mask-only: needs a run and its photos; a file of Gaussians has none")
+        edits = replace(edits, mask_views=load_run_scene(run, data).views)
     if args.merge:
         from .merged_scene import merge_scenes
 

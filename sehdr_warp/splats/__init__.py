@@ -98,11 +98,11 @@ def camera_file_of(path: Path) -> Path:
 
 def cameras_beside(path: Path) -> Path | None:
     """Return the file beside a file of Gaussians that holds cameras in its coordinates; None if there is none."""
-    suffix = path.suffix.lower()
-    # Once their name lacked the suffix. Files of one stem may differ in axes: then they count as those of the PLY.
-    is_alone = not any(path.with_name(path.stem + other).exists() for other in SUFFIXES if other != suffix)
-    once = [path.with_name(f"{path.stem}.cameras.json")] * (suffix == ".ply" or is_alone)
-    files = (camera_file_of(path), *once, path.with_name("cameras.json"))
+    files, suffix = [camera_file_of(path), path.with_name("cameras.json")], path.suffix.lower()
+    # Earlier versions wrote scene.cameras.json. Beside several files scene.*, whose axes differ, it is the PLY's.
+    others = (path.with_name(path.stem + other) for other in SUFFIXES if other != suffix)
+    if suffix == ".ply" or not any(other.exists() for other in others):
+        files.insert(1, path.with_name(f"{path.stem}.cameras.json"))
     return next((file for file in files if file.is_file()), None)
 
 

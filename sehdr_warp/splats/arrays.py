@@ -76,6 +76,14 @@ class GaussianArrays:
         length = np.linalg.norm(self.quaternions, axis=1, keepdims=True)
         return np.where(length > 0, self.quaternions / np.where(length > 0, length, 1), [1, 0, 0, 0]).astype(np.float32)
 
+    @property
+    def axis_deviations(self) -> np.ndarray:
+        """Standard deviations [N, 3] along x, y and z, float64."""
+        from scipy.spatial.transform import Rotation
+
+        rotations = Rotation.from_quat(self.unit_quaternions, scalar_first=True).as_matrix()
+        return np.sqrt(np.einsum("nij,nj->ni", rotations**2, np.exp(2 * self.log_scales.astype(np.float64))))
+
     def with_colors(self, harmonics: np.ndarray, color_model: str) -> "GaussianArrays":
         """Return a copy with other harmonics and color model."""
         return replace(self, harmonics=np.ascontiguousarray(harmonics, np.float32), color_model=color_model)

@@ -30,7 +30,7 @@ def write_streamed_sog(path: Path, gaussians: GaussianArrays, overwrite: bool) -
     Arguments as in write_gaussians.
     """
     chunks: list[np.ndarray] = []
-    half = _half_sizes(gaussians)
+    half = DEVIATIONS * gaussians.axis_deviations
     tree = _node(gaussians.means.astype(np.float64), half, np.arange(gaussians.count), chunks)
     names = [f"0_{number}" for number in range(len(chunks))]
     meta = {
@@ -118,11 +118,3 @@ def _node(means: np.ndarray, half: np.ndarray, rows: np.ndarray, chunks: list[np
     halves = rows[order[: len(rows) // 2]], rows[order[len(rows) // 2 :]]
     node["children"] = [_node(means, half, part, chunks) for part in halves]
     return node
-
-
-def _half_sizes(gaussians: GaussianArrays) -> np.ndarray:
-    """Return half the size [N, 3] of the boxes around the Gaussians, float64."""
-    from scipy.spatial.transform import Rotation
-
-    turns = Rotation.from_quat(gaussians.unit_quaternions, scalar_first=True).as_matrix()
-    return DEVIATIONS * np.sqrt(np.einsum("nij,nj->ni", turns**2, np.exp(2.0 * gaussians.log_scales)))

@@ -174,12 +174,8 @@ def _extent(gaussians: GaussianArrays) -> np.ndarray:
 
     It holds what programs draw of the Gaussians but the faint ones, or of all if all are faint.
     """
-    from scipy.spatial.transform import Rotation
-
     counted = gaussians.opacities >= _FAINT
     gaussians = gaussians.rows(counted) if counted.any() else gaussians
-    rotations = Rotation.from_quat(gaussians.unit_quaternions, scalar_first=True).as_matrix()
-    variances = np.einsum("nij,nj->ni", rotations**2, np.exp(2 * gaussians.log_scales.astype(np.float64)))
     deviations = np.sqrt(2 * np.log(np.maximum(gaussians.opacities.astype(np.float64) / _FAINTEST, 1)))
-    reach = deviations[:, None] * np.sqrt(variances)
+    reach = deviations[:, None] * gaussians.axis_deviations
     return np.stack([(gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)])

@@ -13,6 +13,7 @@ from sehdr_warp.output.proxy_mesh import find_ground, mesh_depth, proxy_mesh, wr
 from sehdr_warp.output.splat_edits import Box
 from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.scene.gravity import UpDirection
 from sehdr_warp.scene.wide_camera import pixel_directions
 
 from ..full_disk import full_disk
@@ -71,6 +72,13 @@ def test_vertices_lie_on_the_surfaces(mesh):
     assert (normals[level, 1] > 0).mean() > 0.99, "faces look outwards"
     on_top = np.linalg.norm(mesh.vertices - (0, RADIUS, 0), axis=1) < 0.3
     np.testing.assert_allclose(np.median(mesh.radiance[on_top], axis=0), RED, rtol=1e-3)
+
+
+def test_a_ceiling_is_no_floor():
+    """In photos' coordinates with -Y up, as COLMAP's, what is level and has normals along +Y hangs above."""
+    run = BallOnFloor()
+    run.up = UpDirection(np.array([0.0, -1.0, 0.0]), "gps")
+    assert proxy_mesh(run, WorldTransform.identity(), resolution=24).ground is None
 
 
 @pytest.mark.parametrize("projection", ["equirectangular", "OPENCV_FISHEYE"])
