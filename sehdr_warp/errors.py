@@ -95,6 +95,13 @@ def require_extra(module: str, purpose: str, extra: str) -> Any:
         raise SehdrError(f"{purpose}; run `pip install 'sehdr-warp[{extra}]'`") from None
 
 
+def refuse_paths(loader: str, *values: object) -> None:
+    """Raise TypeError for a path in place of what `loader`() reads from it."""
+    for value in values:
+        if isinstance(value, str | os.PathLike):
+            raise TypeError(f"{os.fspath(value)!r} is a path, expected what sehdr_warp.{loader}() returns for it")
+
+
 def nearest(word: str, known: Iterable[str]) -> str | None:
     """Return the known word that a mistyped one most likely stands for, or None if none is similar."""
     matches = difflib.get_close_matches(word.lower(), sorted(known), 1)

@@ -9,6 +9,8 @@ import torch
 import sehdr_warp as sw
 from sehdr_warp.compat import gsplat
 from sehdr_warp.rasterizer import CudaGraphRunner, HarmonicsGradients, Program, ssim_map
+from sehdr_warp.scene import look_at
+from sehdr_warp.synth.expose import expose, exposure_ladder
 
 # Scenes and responses.
 scene = sw.load_scene("photos", max_size=800)
@@ -20,6 +22,9 @@ assert_type(camera.resized(1920, 1080), sw.Camera)
 assert_type(sw.embedded_scenes(), tuple[str, ...])
 assert_type(sw.load_cameras("cameras.json"), list[tuple[str, sw.Camera]])
 response = sw.response_by_name("srgb")
+assert_type(look_at((0.0, 0.0, 4.0), up=np.array([0.0, 1.0, 0.0])), np.ndarray)
+assert_type(exposure_ladder(scene, response), tuple[float, ...])
+assert_type(expose(scene, response, 0.5, glare=1.0), sw.Scene)
 assert_type(response, sw.Response)
 assert_type(response.encode(torch.zeros(3)), torch.Tensor)
 assert_type(response.encode(0.5), np.ndarray)
@@ -55,6 +60,9 @@ splats = sw.load_splats("scene.ply")
 assert_type(splats, sw.Splats)
 assert_type(sw.merge_scenes(run, splats), sw.MergedScene)
 assert_type(run.render(camera).hdr, torch.Tensor)
+assert_type(run.metrics(), list[dict[str, Any]])
+assert_type(run.decisions(), list[dict[str, Any]])
+assert_type(run.summary(), dict[str, Any])
 assert_type(run.render_ldr(camera, 0.01), torch.Tensor)
 assert_type(run.render_confidence(camera), torch.Tensor | None)
 assert_type(sw.render_views(run, "views", evs=(-2, 0, 2)), list[Path])

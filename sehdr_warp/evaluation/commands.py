@@ -63,7 +63,7 @@ class Compare:
     """Compare trained runs in one table; runs that differ by their seed alone become a mean with its deviation."""
 
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
-    """Folders of runs."""
+    """Folders of runs, or a folder that holds runs."""
     plot: Path | None = None
     """Also draw held-out error against training time to this PNG file."""
     csv: Path | None = None
@@ -100,6 +100,8 @@ def run_evaluate(options: Evaluate) -> None:
     if file is not None:
         write_json(file, figures, result.overwrite)
     print(format_table(figures) if file == result.json else json.dumps(figures))
+    if file is not None:
+        print(file)
 
 
 def _refuse_unused(group: Any, defaults: Any, problem: str) -> None:
@@ -136,7 +138,7 @@ def run_compare(options: Compare) -> None:
         raise InputError(options.plot, "the chart is a PNG file", f"name it {options.plot.with_suffix('.png').name}")
     for path in filter(None, (options.plot, options.csv, options.latex)):
         check_absent(path, options.overwrite)
-    rows = compare_runs([open_run(path, "cpu") for path in options.runs])
+    rows = compare_runs([open_run(path, "cpu") for folder in options.runs for path in _runs_in(folder)])
     for path, format_rows in ((options.csv, comparison_csv), (options.latex, comparison_latex)):
         if path is not None:
             with atomic_path(path, options.overwrite) as file:
@@ -145,3 +147,11 @@ def run_compare(options: Compare) -> None:
         with atomic_path(options.plot, options.overwrite) as file:
             save_picture(training_chart({row.label: row.curves for row in rows}), file, 140)
     print(comparison_table(rows))
+    for path in filter(None, (options.csv, options.latex, options.plot)):
+        print(path)
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    """Return the folder of a run itself; else the folders in it that hold a run, if there are any."""
+    inside = [] if (folder / "config.json").exists() else sorted(file.parent for file in folder.glob("*/config.json"))
+    return inside or [folder]

@@ -6,13 +6,13 @@ import json
 import re
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SehdrError
+from ..errors import SehdrError, refuse_paths
 
 if TYPE_CHECKING:
     from ..runs.run import Run
@@ -41,7 +41,7 @@ class ComparedRuns:
     label: str
     scene: str
     figures: dict[str, list[float | None]]
-    curves: list[list[dict[str, Any]]]
+    curves: list[list[dict[str, Any]]] = field(repr=False)
 
     @property
     def count(self) -> int:
@@ -70,6 +70,7 @@ def compare_runs(runs: "Sequence[Run]") -> list[ComparedRuns]:
     Raises:
         SehdrError: without runs, for a run that is named twice, or one without evaluations in its metrics.
     """
+    refuse_paths("load_run", *([runs] if isinstance(runs, str) else runs))
     if not runs:
         raise SehdrError("compare: no runs; name their folders")
     groups: dict[str, list] = {}

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import SehdrError
+from ..errors import SehdrError, refuse_paths
 from ..scene import Scene, View
 from . import metrics
 from .lights import LightRegion, count_lights, light_regions
@@ -96,6 +96,8 @@ def evaluate(run: "Run", scene: Scene, *, lpips_weights: Path | str | None = Non
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
+    refuse_paths("load_run", run)
+    refuse_paths("load_scene", scene)
     return Evaluation(_run_predictions(run), run.normalize_photos(scene), run.device, lpips_weights).result()
 
 

@@ -252,7 +252,8 @@ class RadianceField(nn.Module):
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
         """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base time."""
         tensors = self.camera_tensors(camera)
-        photo = self.render_train_view(tensors, exposure_time or self.base_time, degree=degree).encoded
+        time = self.base_time if exposure_time is None else exposure_time
+        photo = self.render_train_view(tensors, time, degree=degree).encoded
         assert photo is not None
         return photo.clamp(0, 1)
 

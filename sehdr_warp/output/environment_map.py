@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import SehdrError
+from ..errors import SehdrError, refuse_paths
 from ..files import check_absent
 from ..scene import Camera
 from ..scene.wide_camera import typical_focal_length
@@ -100,6 +100,7 @@ def write_environment_map(
         SehdrError: For options that do not fit, or a point from which next to nothing is visible.
         InputError: If the file exists or a pixel is not finite.
     """
+    refuse_paths("load_run", run)
     path = Path(path)
     check_map(path, size, layout, axes, beyond, pixel)
     color_space(colorspace)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, SehdrError, refuse_paths
 from ..files import atomic_path
 from ..model.baking import agreement, field_of, gaussians_of, refine
 from ..response import response_by_name
@@ -89,6 +89,7 @@ def export(
         SehdrError: For options that do not fit, or edits that leave nothing.
         InputError: For an unknown suffix, if a file exists, or if a value is not finite.
     """
+    refuse_paths("load_run", run)
     path, edits = Path(path), edits or SplatEdits()
     file_model = color_model_of(path)
     kind = kind or ("hdr" if file_model == "linear" else "ldr")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError, SehdrError, require_extra
+from ..errors import InputError, SehdrError, refuse_paths, require_extra
 from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
@@ -112,6 +112,7 @@ def write_film(
         SehdrError: Without PyAV (the extra `film`) or its encoder.
         InputError: If `out` exists (unless overwrite), or is not a film in one file by its suffix.
     """
+    refuse_paths("load_run", run)
     av, kind = film_library(), TRANSFERS[transfer]
     out, first, container_format = Path(out), cameras[0], film_format(out)
     check_rate(fps)

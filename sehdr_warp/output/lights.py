@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..errors import SehdrError
+from ..errors import SehdrError, refuse_paths
 from ..files import atomic_path, check_absent
 from ..scene.wide_camera import typical_focal_length
 from .camera_paths import training_cameras
@@ -106,6 +106,7 @@ def write_lights(
         SehdrError: For a suffix that is not known, or a scene that does not state what clipped.
         InputError: If a file exists.
     """
+    refuse_paths("load_run", run)
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:

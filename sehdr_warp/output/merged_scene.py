@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import SehdrError
+from ..errors import SehdrError, refuse_paths
 from ..model.baking import field_of, gaussians_of
 from ..runs.run import RenderableScene, on_device
 from ..splats import GaussianArrays
@@ -62,6 +62,7 @@ def merge_scenes(run: RenderableScene, *others: RenderableScene) -> MergedScene:
         SehdrError: If some scenes were trained with opacity compensation and others without, because they are
             rendered in different ways.
     """
+    refuse_paths("load_run", run, *others)
     scenes = (run, *others)
     if len({scene.field.antialiased for scene in scenes}) > 1:
         plain = next(scene.path for scene in scenes if not scene.field.antialiased)

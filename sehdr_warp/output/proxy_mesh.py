@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, SehdrError, refuse_paths
 from ..files import atomic_path, check_absent
 from ..progress import track_progress
 from ..scene import Camera
@@ -133,6 +133,7 @@ def write_proxy_mesh(
         InputError: For an unknown suffix, or if the file exists.
         SehdrError: If scikit-image or OpenUSD is missing, for values out of range, or if there is no surface.
     """
+    refuse_paths("load_run", run)
     path, region = Path(path), check_mesh(path, resolution, crop, overwrite)
     transform = world_transform(run, axes, up=up, scale=scale)
     mesh = proxy_mesh(run, transform, resolution=resolution, region=region)

@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, SehdrError, did_you_mean
+from ..errors import InputError, SehdrError, did_you_mean, refuse_paths
 from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
 from ..progress import track_progress
@@ -113,6 +113,7 @@ def render_views(
         SehdrError: For unusable options or an empty set of cameras.
         InputError: If a file would be replaced or a pixel is not finite.
     """
+    refuse_paths("load_run", run)
     out = Path(out)
     transform = world_transform(run, axes, up=up, scale=scale)
     facts = provenance(run) | {"worldMatrix": json.dumps(stored_matrix(run, transform).tolist())}
@@ -291,6 +292,7 @@ def select_cameras(
     Raises:
         SehdrError: If there are none, or `cameras` is neither a known name nor a file.
     """
+    refuse_paths("load_run", run)
     check_cameras(cameras)
     text, choices = str(cameras), ", ".join(SPLITS + PATHS)
     if camera is not None and text in SPLITS + PATHS:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, SehdrError, refuse_paths
 from ..files import atomic_path, check_absent
 from ..own_files import first_unlisted
 from ..progress import track_progress
@@ -71,6 +71,8 @@ def write_report(
         InputError: If a file exists, or the folder holds photos.
         SehdrError: For a scene without views.
     """
+    refuse_paths("load_run", run)
+    refuse_paths("load_scene", scene)
     check_report_folder(Path(out))
     metrics = run.metrics()
     charted = any(training_points(metrics, key) for key in PANELS)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import refuse_paths
 from ..files import atomic_path, check_absent
 from ..kernels.constants import FRUSTUM_MARGIN, NEAR_PLANE
 from ..model.baking import field_of, gaussians_of
@@ -50,6 +51,7 @@ def write_scene_page(
     Raises:
         InputError: If the file exists (unless overwrite), or a value is not finite.
     """
+    refuse_paths("load_run", run)
     path = Path(path)
     check_absent(path, overwrite)
     opening = opening_facts(run)

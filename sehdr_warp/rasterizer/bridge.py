@@ -119,7 +119,7 @@ class _ProgramFunction(torch.autograd.Function):
         tensors_of_program = *tensors, *program._tensors[len(tensors) :]
         indices = [program._indices.get(id(tensor), -1) for tensor in outputs]
         if not program._written.issuperset(indices):
-            raise TypeError(f"{body.__name__}() returns a tensor that program.empty_output() did not make")
+            raise TypeError(f"{body.__name__}() returns what program.empty_output() did not make")
         # Torch makes this node the origin of what it returns; saved as well, neither would ever be freed.
         returned = tuple(tensor.detach() for tensor in outputs)
         ctx.mark_non_differentiable(

@@ -31,7 +31,7 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
     first_name, (first, _) = next(iter(arguments.items()))
     for name, (value, shape) in arguments.items():
         if not isinstance(value, Tensor):
-            kind = f"{type(value).__module__.split('.')[0]}.{type(value).__name__}"
+            kind = f"{type(value).__module__.split('.')[0]}.{type(value).__name__}".removeprefix("builtins.")
             raise TypeError(f"{name} is a {kind}, expected a torch tensor [{', '.join(map(str, shape))}]")
         fits = value.ndim == len(shape)
         if fits:

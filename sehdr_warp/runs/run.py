@@ -257,11 +257,11 @@ class Run(RenderableScene):
         """Return the fraction [N] of clipped values that show each Gaussian; None if it was not measured."""
         return None if self._clipped is None else self._clipped.to(self.device)
 
-    def metrics(self) -> list[dict]:
+    def metrics(self) -> list[dict[str, Any]]:
         """Return the evaluations during the training, as in metrics.jsonl."""
         return self.folder.read_metrics()
 
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, Any]:
         """Return times, memory and counts of the training; empty if it has not ended."""
         return self.folder.read_summary()
 
@@ -269,7 +269,7 @@ class Run(RenderableScene):
         """Return what was noted when the photos were read for the training."""
         return list(self.folder.read_scene()["notes"])
 
-    def decisions(self) -> list[dict]:
+    def decisions(self) -> list[dict[str, Any]]:
         """Return the decisions of the run's plan: name, choice, reason and fields of each; empty without a plan."""
         return self.folder.read_decisions()
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
@@ -14,6 +15,7 @@ from PIL import Image
 from ..errors import InputError
 from ..files import atomic_folder, atomic_path, write_json
 from ..output.exr import write_exr
+from ..response import Response
 from ..scene import Camera, Scene, View, codes_of
 from ..subsets import every_nth
 from .glare import add_glare
@@ -60,7 +62,7 @@ class RadianceView:
 
 def expose(
     scene: Scene,
-    response,
+    response: Response,
     exposure_time: float,
     *,
     glare: float = 0.0,
@@ -97,7 +99,7 @@ def expose(
     return replace(scene, **fields, response=None, chosen_by=None)
 
 
-def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
+def exposure_ladder(scene: Scene, response: Response, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
     """Return ladder_of() the truth of the training views.
 
     Raises:
@@ -107,7 +109,9 @@ def exposure_ladder(scene: Scene, response, count: int = 5, factor: float = 4.0)
     return ladder_of(scene.name, truth, response.encode, count, factor)
 
 
-def ladder_of(name: str, images: Sequence[np.ndarray], encode: Callable, count: int = 5, factor: float = 4.0):
+def ladder_of(
+    name: str, images: Sequence[np.ndarray], encode: Callable[[Any], np.ndarray], count: int = 5, factor: float = 4.0
+) -> tuple[float, ...]:
     """Return `count` exposure times, each `factor` times the last, around a well exposed one of radiance images.
 
     Their geometric middle maximizes the mean well-exposedness exp(-(Z - 0.5)^2 / (2 * 0.2^2)) of the encoded values Z

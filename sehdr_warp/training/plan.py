@@ -8,7 +8,7 @@ from operator import attrgetter
 
 import torch
 
-from ..errors import InputError
+from ..errors import InputError, refuse_paths
 from ..model.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
 from ..runs.config import Config, OptimizerConfig
@@ -126,6 +126,7 @@ def make_plan(scene: Scene, config: Config, device: str | torch.device | None = 
     Raises:
         InputError: For a scene that cannot be trained, and for fields in plan.keep that the scene contradicts.
     """
+    refuse_paths("load_scene", scene)
     device = pick_device(device)
     facts = measure_scene(scene, config.seed)
     check_scene(scene, facts)

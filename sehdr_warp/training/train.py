@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ..errors import InputError
+from ..errors import InputError, refuse_paths
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config
@@ -88,6 +88,7 @@ def create_trainer(
         InputError: If scene, folder or config cannot be used.
         SehdrError: If the disk or the memory is full.
     """
+    refuse_paths("load_scene", scene)
     device, folder, config = pick_device(device), RunWriter(out), as_config(config)
     if tensorboard:
         summary_writer()

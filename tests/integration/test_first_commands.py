@@ -72,11 +72,24 @@ def test_eval_writes_json_and_prints_a_table(run, tmp_path, capsys):
     assert call("eval", run, "--json", file, "--device", "cpu") == 0
     result = json.loads(file.read_text())
     assert result["protocol"]["gt-max"]["psnr_mu"] > 10 and result["ldr"]["psnr"] > 10 and result["train_seconds"] > 0
-    assert "gt-max" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "gt-max" in output and output.endswith(f"\n{file}\n")
     assert call("eval", run, "--json", file, "--device", "cpu") == 1
     capsys.readouterr()
     assert call("eval", run, "--json", "-", "--device", "cpu") == 0
     assert json.loads(capsys.readouterr().out)["ldr"] == result["ldr"]
+
+
+def test_compare_takes_a_folder_of_runs_and_names_its_files(run, tmp_path, capsys):
+    for name in ("a", "b"):
+        shutil.copytree(run, tmp_path / "runs" / name)
+    (tmp_path / "runs" / "notes").mkdir()
+    table = tmp_path / "table.csv"
+    assert call("compare", tmp_path / "runs", "--csv", table) == 0
+    output = capsys.readouterr().out
+    assert "a and 1 more" in output and output.endswith(f"\n{table}\n")
+    assert call("compare", tmp_path / "runs" / "notes") == 1
+    assert "notes: is not a run" in capsys.readouterr().err
 
 
 def test_eval_of_pictures_divides_photos_into_the_regions_of_eval_of_the_run(run, tmp_path, capsys):

@@ -48,6 +48,17 @@ def test_docstrings_name_every_argument_and_field_in_googles_form(name):
     assert not names or {*re.findall(r"^ {4}(\w+): ", match[1], re.MULTILINE)} == {*names}
 
 
+@pytest.mark.parametrize("name", sehdr_warp.__all__)
+def test_a_path_in_place_of_a_run_or_scene_names_what_reads_it(name):
+    function = getattr(sehdr_warp, name)
+    parameters = {} if inspect.isclass(function) else inspect.signature(function).parameters
+    needed = {each.name for each in parameters.values() if each.default is each.empty and each.kind <= 1}
+    for parameter, loader in {"run": "run", "runs": "run", "scene": "scene", "truth": "scene"}.items():
+        if parameter in parameters:
+            with pytest.raises(TypeError, match=rf"'a/path' is a path.*load_{loader}\(\)"):
+                function(**dict.fromkeys(needed) | {parameter: "a/path"})
+
+
 def test_type_checkers_see_every_public_name():
     from sehdr_warp import rasterizer
     from sehdr_warp.compat import gsplat

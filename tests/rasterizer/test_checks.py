@@ -34,7 +34,7 @@ def with_nan_and_logits(opacities):
         ("features", lambda t: t[:, :0], ValueError, r"features has shape \[5, 0\], expected \[N, C\] with C >= 1"),
         ("features", lambda t: t.to("meta"), ValueError, "features is torch.float64 on meta, but means is .* on cpu"),
         ("means", lambda t: t.half(), ValueError, "means is torch.float16, expected torch.float32 or torch.float64"),
-        ("intrinsics", lambda t: [1.0] * 4, TypeError, r"intrinsics is a builtins.list, expected a torch tensor \[4\]"),
+        ("intrinsics", lambda t: [1.0] * 4, TypeError, r"intrinsics is a list, expected a torch tensor \[4\]"),
         (
             "intrinsics",
             lambda t: t * 0,

@@ -195,6 +195,8 @@ def test_names_are_listed_with_what_they_stand_for():
     names = response_names()
     assert "hdr-nerf" in names and all(len(meaning) > 10 for meaning in names.values())
     assert response_by_name("reinhard-gamma").name == "hdr-nerf"
+    with pytest.raises(SehdrError, match="'learned' comes from a training's photos"):
+        response_by_name("learned")
     with pytest.raises(SehdrError, match="did you mean filmic"):
         response_by_name("flimic")
 

@@ -45,7 +45,7 @@ def test_wrong_shapes_types_and_devices_are_named():
         (3, leaves[3][:, None], "opacities has shape"),
         (5, place[0][0], "viewmats has shape"),
         (6, place[1].half(), "Ks is torch.float16, expected torch.float32 or torch.float64"),
-        (6, [[1.0]], "Ks is a builtins.list"),
+        (6, [[1.0]], "Ks is a list"),
         (4, leaves[4][:, :0], r"colors has shape \[200, 0\], which has no channel"),
     ):
         arguments = [*leaves, *place]

@@ -95,7 +95,7 @@ def test_projections_of_batches_are_those_of_each_scene(packed, device):
     [
         ({"camera_model": "ftheta"}, "camera_model 'ftheta' is none of pinhole, ortho, fisheye"),
         ({"sparse_grad": True}, "sparse_grad = True is not supported"),
-        ({"quats": None}, r"quats is a builtins.NoneType, expected a torch tensor \[N, 4\]"),
+        ({"quats": None}, r"quats is a NoneType, expected a torch tensor \[N, 4\]"),
         ({"scales": torch.ones(3, 3)}, r"scales has shape \[3, 3\], expected \[N, 3\]"),
         ({"opacities": torch.ones(3)}, r"opacities has shape \[3\], expected \[N\]"),
         ({"width": 0}, "width 0 is not in 1.."),
@@ -123,7 +123,7 @@ def test_misfits_of_intersections_are_named():
         ("means2d", torch.zeros(2, 5, 3), r"means2d has shape \[2, 5, 3\], expected \[2, N, 2\]"),
         ("radii", torch.ones(2, 5), r"radii has shape \[2, 5\], expected \[2, 5, 2\]"),
         ("radii", None, "radii is a NoneType"),
-        ("depths", [1.0], "depths is a builtins.list"),
+        ("depths", [1.0], "depths is a list"),
     ):
         with pytest.raises((ValueError, TypeError), match=message):
             gsplat.isect_tiles(**(fits | {name: value}), tile_size=16, tile_width=3, tile_height=2)
