@@ -13,8 +13,9 @@ from ..files import has_file, read_bytes
 from ..subsets import first_names
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, exif_exposure, parse_number
-from .file_names import bases_of, fold_name, lies_at, plain_path
+from .file_names import lies_at, plain_path
 from .images import PHOTO_SUFFIXES
+from .photo_names import PhotoNames, fold_name, names_below
 
 EXPOSURES = "exposures.json"
 _LISTS = ("exposures", "exposure_times", "exposure")  # Names under which people list times in other files
@@ -143,30 +144,33 @@ def parse_seconds(value, source: Path, field: str, unit: str = "") -> float:
 def _listed_times(records: Sequence[ImageRecord], source: Path) -> tuple[dict[Path, float], list[str]]:
     """Return the seconds of photos by exposures.json, and notes on names that it could not be matched with.
 
-    The file is {"path": seconds} or a list of {"file": path, "exposure_time": seconds}. Paths are relative to the data
-    folder, to a folder between it and the photos, or to the file's own, or absolute, as in a set that was copied; a
-    name alone is enough if no two photos share it. The suffix may be left out or be that of another kind of photo.
-    Upper and lower case count as equal.
+    The file is {"path": seconds} or a list of {"file": path, "exposure_time": seconds}. A path is a name of the photo
+    (PhotoNames), relative to the folder of exposures.json, or absolute, as in a set that was copied. The suffix may be
+    that of another kind of photo.
     """
-    images = list(dict.fromkeys(record.image for record in records))
-    bases = bases_of(images, source)
-    parents = {image.parent for image in images}
-    places = dict.fromkeys((source, *reversed(bases), *(image.parent for image in images)))
+    photo_names = PhotoNames(records, source)
+    parents = dict.fromkeys(record.image.parent for record in records)
+    places = dict.fromkeys((source, *photo_names.bases, *parents))
     times, notes = {}, _unread_lists(places)
     for place in places:
         if not has_file(place / EXPOSURES):
             continue
         table = _read_times(place / EXPOSURES)
-        names = _names_of(images, [*bases, place])
+        spellings = {name: _spellings(name) for name in table}
+        entries = {each: name for name, ways in reversed(spellings.items()) for each in reversed(ways)}
+        entries |= {ways[0]: name for name, ways in spellings.items()}
+        known = set()
+        for record in records:
+            names = [*photo_names.of(record), *names_below(record.image, [place])]
+            known.update(names)
+            if entry := next((entries[name] for name in names if name in entries), None):
+                times[record.image] = table[entry]
         strange, ambiguous = [], []
-        for name, seconds in table.items():
-            matches = next((names[each] for each in _spellings(name) if each in names), [])
-            if len(matches) == 1:
-                times[matches[0]] = seconds
-            elif matches:
-                two = ", ".join(image.relative_to(bases[-1]).as_posix() for image in matches[:2])
+        for name in (name for name, ways in spellings.items() if known.isdisjoint(ways)):
+            if images := next(filter(None, map(photo_names.sharing, spellings[name])), None):
+                two = ", ".join(image.relative_to(photo_names.bases[0]).as_posix() for image in images[:2])
                 ambiguous.append(f"{name:.90} ({two})")
-            elif not any(lies_at(f"{base}/{plain_path(name)}") for base in {place, *bases, *parents}):
+            elif not any(lies_at(f"{base}/{plain_path(name)}") for base in places):
                 strange.append(name)
         if strange:
             text = first_names([f"{name:.90}" for name in strange])
@@ -195,19 +199,6 @@ def _read_times(path: Path) -> Mapping[str, float]:
         problem = f"is not a table of exposure times ({error!r:.80})"
         raise InputError(path, problem, 'write {"file name": seconds, ...}') from None
     return {str(name): parse_seconds(value, path, str(name)) for name, value in entries}
-
-
-def _names_of(images: Sequence[Path], bases: Sequence[Path]) -> dict[str, list[Path]]:
-    """Map each way to name photos, fold_name(), to those that it fits: paths below the bases, then names alone."""
-    exact: dict[str, list[Path]] = {}
-    alone: dict[str, list[Path]] = {}
-    for image in images:
-        paths = {image.relative_to(base) for base in bases if image.is_relative_to(base)}
-        for key in {key for path in paths for key in (path.as_posix(), path.with_suffix("").as_posix())}:
-            exact.setdefault(fold_name(key), []).append(image)
-        for key in {image.name, image.stem}:
-            alone.setdefault(fold_name(key), []).append(image)
-    return alone | exact
 
 
 def _spellings(name: str) -> list[str]:

@@ -3,7 +3,6 @@
 import itertools
 import os
 import re
-import unicodedata
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -15,6 +14,7 @@ from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import ImageRecord
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
+from .photo_names import fold_name
 
 OTHER_FOLDERS = ("masks", "mask", "hdr", "exr")
 """Folders of pictures that are not photos."""
@@ -179,11 +179,6 @@ def plain_path(name: str) -> str:
     return re.sub(r"^(\./)+", "", name.replace("\\", "/"))
 
 
-def fold_name(name: str) -> str:
-    """Return a name in which upper and lower case, and the forms of an accent, are the same."""
-    return unicodedata.normalize("NFC", name).casefold()
-
-
 def _entries(folder: Path) -> Mapping[str, str]:
     """Return the names in a folder by their folded form; empty if it cannot be read."""
     try:
@@ -227,12 +222,6 @@ def renamed_note(images: Mapping[str, Path | None]) -> list[str]:
         return []
     count = f"{len(others)} photos have" if len(others) > 1 else "1 photo has"
     return [f"{count} another suffix than the set states: {others[0][0]} is {others[0][1]}"]
-
-
-def bases_of(images: Sequence[Path], folder: Path) -> list[Path]:
-    """List the folders that names of photos may be relative to: that of all photos, and those above up to `folder`."""
-    common = Path(os.path.commonpath([image.parent for image in images]))
-    return [common, *(place for place in common.parents if place.is_relative_to(folder))]
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:

@@ -1,7 +1,6 @@
 """Masks: which mask file belongs to which photo, and what its values mean."""
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +10,10 @@ import numpy as np
 from ..files import resolve_inside
 from ..subsets import first_names
 from .dataparser import UNPLACED, ImageRecord
-from .file_names import INVERTED_MASK, bases_of, fold_name, folders_named, lies_at, natural_key, without_mask_mark
+from .file_names import INVERTED_MASK, folders_named, lies_at, natural_key, without_mask_mark
 from .images import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
 from .lens import Lens
+from .photo_names import PhotoNames, fold_name
 
 MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
@@ -26,12 +26,10 @@ _REMEDY = "name each like its photo, such as masks/IMG_1.png or masks/IMG_1.jpg.
 def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[ImageRecord], list[str]]:
     """Give each photo without a mask the mask file that is named like it, in any layout.
 
-    Masks lie in `masks/` or `mask/` of the data folder, under the photo's path below the data folder or below the
-    folder of all photos, with any picture suffix after or instead of the photo's (`masks/cam0/1.jpg.png`,
-    `masks/cam0/1.png`), or under its file name alone if no two photos share that. An ending `_mask`, `-mask` or `.mask`
-    of the stem is ignored, and so is instant-ngp's `dynamic_mask_` before it. Files with such a name beside the photos
-    are masks as well, and so are those of a folder `masks/` or `mask/` there. In sets of several exposures, a mask
-    named like the view serves all its exposures.
+    Masks lie in `masks/` or `mask/` of the data folder, with any picture suffix behind a name of the photo or of its
+    view (PhotoNames), such as `masks/cam0/1.jpg.png` or `masks/cam0/1.png`. An ending `_mask`, `-mask` or `.mask` of
+    the stem is ignored, and so are `mask_` and instant-ngp's `dynamic_mask_` before it. Files with such a name beside
+    the photos are masks as well, and so are those of a folder `masks/` or `mask/` there.
     `mask.png` or `camera_mask.png` of the data folder is the mask of all photos of its shape that have none of their
     own, as of a tripod or a car's bonnet.
 
@@ -46,24 +44,16 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     Raises:
         InputError: if a mask is a link that leads out of the data folder.
     """
-    bases = bases_of([record.image for record in records], folder)
-    shared = Counter(
-        key for image, view in {(s.image, s.view) for s in records} for key in {image.name, image.stem, view}
-    )
+    photo_names = PhotoNames(records, folder)
     places = folders_named(folder, MASK_FOLDERS)
     files = {place: {file: _key(file, place) for file in _files_below(place)} for place in places}
-    index = [{fold_name(key): file for file, key in reversed(keys.items())} for keys in files.values()]
+    tables = [{fold_name(key): file for file, key in reversed(keys.items())} for keys in files.values()]
     beside = {parent: _masks_beside(parent) for parent in {record.image.parent for record in records}}
     common = _common_mask(folder, records)
     masked, mask_files = [], set()
     for record in records:
-        keys = _photo_keys(record, bases, shared)
         near = beside[record.image.parent]
-        tables = [*((masks, keys) for masks in index), (near, [record.image.name, record.image.stem])]
-        candidates = (masks.get(fold_name(key)) for masks, names in tables for key in names)
-        mask = record.mask or next((file for file in candidates if file is not None), None)
-        if mask is not None and record.mask is None:
-            mask = resolve_inside(folder, mask.relative_to(folder).as_posix(), folder)
+        mask = record.mask or photo_names.file_of(record, tables, near, by_view=True)
         if mask is None and common is not None and _has_shape(common[1], record.lens):
             mask = common[0]
         mask_files.add(mask)
@@ -74,7 +64,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         strange = [
             file
             for file, key in keys.items()
-            if file not in mask_files and not any(lies_at(f"{base}/{key}") for base in bases)
+            if file not in mask_files and not any(lies_at(f"{base}/{key}") for base in photo_names.bases)
         ]
         names = [file.relative_to(place).as_posix() for file in strange]
         if names:
@@ -157,15 +147,6 @@ def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> tuple[Path, tu
 def _has_shape(size: tuple[int, int], lens: Lens) -> bool:
     """Return whether a size has the shape of a lens's photos, as far as that is known."""
     return lens is UNPLACED or abs(size[0] * lens.height - size[1] * lens.width) <= max(size)
-
-
-def _photo_keys(record: ImageRecord, bases: Sequence[Path], shared: Counter) -> list[str]:
-    """List the names without suffix under which the masks of a photo are looked for, the most exact first."""
-    image = record.image
-    paths = [image.relative_to(base) for base in bases if image.is_relative_to(base)]
-    keys = [key for path in paths for key in (path.as_posix(), path.with_suffix("").as_posix())]
-    keys += [path.with_name(record.view).as_posix() for path in paths] + [f"{record.split}/{record.view}"]
-    return keys + [key for key in (image.name, image.stem, record.view) if shared[key] == 1]
 
 
 def _key(mask: Path, place: Path) -> str:

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from ..subsets import first_names
 from .dataparser import ImageRecord
-from .file_names import bases_of, is_system_file, natural_key, without_mask_mark
+from .file_names import is_system_file, natural_key, without_mask_mark
 from .heif import HEIF_SUFFIXES, heif_installed
 from .images import PHOTO_SUFFIXES
+from .photo_names import bases_of
 
 # What tools write beside photos, and nobody takes for one.
 _QUIET = {
@@ -86,7 +87,7 @@ def _by_suffix(files: Sequence[Path]) -> str:
 
 def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
     """Yield the files in the folders of the photos, or all below their common folder if it is not the data folder."""
-    common = bases_of(images, folder)[0]
+    common = bases_of(images, folder)[-1]
     deep = common != folder and common.is_relative_to(folder)
     places = [common] if deep else sorted({image.parent for image in images})
     count = 0
