@@ -36,10 +36,10 @@ class ImageRecord:
         hdr: its file of HDR truth.
         derived: the set has no photos; this one is computed from the truth, and `image` is the truth's file.
         linear: the user says that the photo's codes are proportional to light; they are re-encoded by sRGB's curve.
-        gain_map: the photo's light is taken from its gain map and re-encoded by sRGB's curve.
+        gain_map_scale: the photo's light is taken from its gain map and re-encoded by sRGB's curve; to hold light above
+            white, its codes and exposure_time are smaller by this factor. None if the light is that of the codes.
         encoding: what the photo's file states of its colors; None if it states nothing.
-        light_scale: factor from the values of a float photo to the light of the set, by the times that files state; of
-            a photo whose gain map gives its light, the factor by which its codes and its exposure_time are smaller.
+        light_scale: factor from the values of a float photo to the light of the set, by the times that files state.
         time_known: False if exposure_time is only a guess, to be replaced by comparing light with other photos.
         oriented: the lens refers to the pixels after EXIF orientation; None decides by the sizes.
     """
@@ -55,7 +55,7 @@ class ImageRecord:
     hdr: Path | None = None
     derived: bool = False
     linear: bool = False
-    gain_map: bool = False
+    gain_map_scale: float | None = None
     encoding: ColorEncoding | None = None
     light_scale: float = 1.0
     time_known: bool = True
@@ -113,7 +113,7 @@ class DataparserOutputs:
         within_rec709: the light of the stated response lies within Rec.709, to which photos are converted when they
             are read.
         mentioned: names of photos that a note names, and that are in no record.
-        kind: of the photos: encoded, linear, gain-map, raw or float; see images.kind_of() and response_choice.py.
+        kind: of the photos: encoded, linear, gain-map, raw or float; see images.file_kind() and response_choice.py.
     """
 
     format: str

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,10 +21,13 @@ _LARGEST_DEGREE = 8
 
 
 class _Reader:
-    """A big-endian cursor over the bytes of one opcode. Raises ValueError past their end."""
+    """A big-endian cursor over the bytes of one opcode. Raises ValueError past their end.
 
-    def __init__(self, data: bytes):
-        self.data, self.position = data, 0
+    `cell` is the side of the color filter's pattern in pixels, 1 without one: pixels so far apart have one color.
+    """
+
+    def __init__(self, data: bytes, cell: int = 1):
+        self.data, self.cell, self.position = data, cell, 0
 
     def take(self, layout: str) -> tuple:
         size = struct.calcsize(f">{layout}")
@@ -40,29 +44,22 @@ class _Reader:
         return np.frombuffer(self.data, f">{kind}", count, self.position - size).astype(np.float64)
 
 
-@dataclass(frozen=True)
-class _Area:
-    """Rows, columns and planes of an image [H, W, planes] that an opcode changes."""
+class _Area(NamedTuple):
+    """Rows and columns of an image [H, W, planes] that an opcode changes, and views [h, w] of them for each plane."""
 
     rows: slice
     columns: slice
-    planes: range
+    parts: list[np.ndarray]
 
-    @staticmethod
-    def of(reader: _Reader, shape: tuple[int, ...]) -> "_Area":
-        top, left, bottom, right, plane, planes, row_pitch, column_pitch = reader.take("8I")
-        if row_pitch < 1 or column_pitch < 1 or plane >= shape[2]:
-            raise ValueError(f"pitches {row_pitch}, {column_pitch}, first plane {plane} of {shape[2]}")
-        rows = slice(top, min(bottom, shape[0]), row_pitch)
-        columns = slice(left, min(right, shape[1]), column_pitch)
-        return _Area(rows, columns, range(plane, min(plane + planes, shape[2])))
 
-    def change(self, image: np.ndarray, function: Callable[[np.ndarray, int], np.ndarray]) -> None:
-        """Replace the area's values by function(values [h, w], place of the plane in the area)."""
-        for place, plane in enumerate(self.planes):
-            part = image[self.rows, self.columns, plane]
-            if part.size:
-                image[self.rows, self.columns, plane] = function(part, place)
+def _area(reader: _Reader, image: np.ndarray) -> _Area:
+    top, left, bottom, right, plane, planes, row_pitch, column_pitch = reader.take("8I")
+    if row_pitch < 1 or column_pitch < 1 or plane >= image.shape[2]:
+        raise ValueError(f"pitches {row_pitch}, {column_pitch}, first plane {plane} of {image.shape[2]}")
+    rows = slice(top, min(bottom, image.shape[0]), row_pitch)
+    columns = slice(left, min(right, image.shape[1]), column_pitch)
+    parts = [image[rows, columns, each] for each in range(plane, min(plane + planes, image.shape[2]))]
+    return _Area(rows, columns, [part for part in parts if part.size])
 
 
 def apply_opcodes(data: bytes, image: np.ndarray, source: Path, *, cell: int = 1) -> np.ndarray:
@@ -73,7 +70,7 @@ def apply_opcodes(data: bytes, image: np.ndarray, source: Path, *, cell: int = 1
         image: [H, W, planes] float32 in the units of the list: stored samples / 65535 for the first list, light in
             multiples of the white level for the others. Changed in place.
         source: the file, for errors.
-        cell: side of the color filter's pattern in pixels, 1 without one: pixels so far apart have one color.
+        cell: side of the color filter's pattern in pixels, 1 without one.
 
     Returns:
         The image; a new array if an opcode moved pixels.
@@ -85,7 +82,7 @@ def apply_opcodes(data: bytes, image: np.ndarray, source: Path, *, cell: int = 1
         function = _FUNCTIONS.get(number)
         try:
             if function is not None:
-                image = function(_Reader(body), image, cell)
+                image = function(_Reader(body, cell), image)
             elif not flags & _OPTIONAL:
                 name = " (TrimBounds)" if number == _TRIM_BOUNDS else ""
                 problem = f"demands opcode {number}{name} of DNG, which is not supported"
@@ -111,11 +108,11 @@ def _opcodes(data: bytes, source: Path) -> Iterator[tuple[int, int, bytes]]:
         raise InputError(source, f"its list of DNG opcodes is damaged ({error!s:.80})", DAMAGED) from None
 
 
-def _gain_map(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+def _gain_map(reader: _Reader, image: np.ndarray) -> np.ndarray:
     """Multiply by a grid of gains, interpolated bilinearly; places are relative to the image's size."""
     from scipy.ndimage import map_coordinates
 
-    area = _Area.of(reader, image.shape)
+    area = _area(reader, image)
     points_v, points_h = reader.take("2I")
     spacing_v, spacing_h, origin_v, origin_h = reader.take("4d")
     (planes,) = reader.take("I")
@@ -132,29 +129,25 @@ def _gain_map(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
     down = places(area.rows, image.shape[0], origin_v, spacing_v)
     right = places(area.columns, image.shape[1], origin_h, spacing_h)
 
-    def multiply(part: np.ndarray, place: int) -> np.ndarray:
+    columns = np.clip(right, 0, points_h - 1)
+    first = np.minimum(columns.astype(int), max(points_h - 2, 0))
+    share = (columns - first).astype(np.float32)
+    for place, part in enumerate(area.parts):
         grid = gains[:, :, min(place, planes - 1)]
         # Separable: columns of the grid first, so that a large photo needs no coordinates of its own.
-        rows = map_coordinates(
-            grid, np.stack(np.meshgrid(down, np.arange(points_h), indexing="ij")), order=1, mode="nearest"
-        )
-        columns = np.clip(right, 0, points_h - 1)
-        first = np.minimum(columns.astype(int), max(points_h - 2, 0))
-        share = (columns - first).astype(np.float32)
-        rows = rows.astype(np.float32)
+        at = np.stack(np.meshgrid(down, np.arange(points_h), indexing="ij"))
+        rows = map_coordinates(grid, at, order=1, mode="nearest").astype(np.float32)
         after = rows[:, np.minimum(first + 1, points_h - 1)]
-        return part * (rows[:, first] * (1 - share) + after * share)
-
-    area.change(image, multiply)
+        part *= rows[:, first] * (1 - share) + after * share
     return image
 
 
-def _fix_bad_pixels_constant(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+def _fix_bad_pixels_constant(reader: _Reader, image: np.ndarray) -> np.ndarray:
     constant, _ = reader.take("2I")
-    return _fill(image, np.rint(image * 65535) == constant, cell)
+    return _fill(image, np.rint(image * 65535) == constant, reader.cell)
 
 
-def _fix_bad_pixels_list(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+def _fix_bad_pixels_list(reader: _Reader, image: np.ndarray) -> np.ndarray:
     _, points, rectangles = reader.take("3I")
     bad = np.zeros(image.shape, bool)
     places = reader.array("u4", 2 * points).astype(int).reshape(-1, 2)
@@ -162,7 +155,7 @@ def _fix_bad_pixels_list(reader: _Reader, image: np.ndarray, cell: int) -> np.nd
     bad[places[:, 0], places[:, 1]] = True
     for top, left, bottom, right in reader.array("u4", 4 * rectangles).astype(int).reshape(-1, 4):
         bad[top:bottom, left:right] = True
-    return _fill(image, bad, cell)
+    return _fill(image, bad, reader.cell)
 
 
 def _fill(image: np.ndarray, bad: np.ndarray, cell: int) -> np.ndarray:
@@ -181,38 +174,39 @@ def _fill(image: np.ndarray, bad: np.ndarray, cell: int) -> np.ndarray:
     return image
 
 
-def _map_table(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
-    area = _Area.of(reader, image.shape)
+def _map_table(reader: _Reader, image: np.ndarray) -> np.ndarray:
+    area = _area(reader, image)
     (count,) = reader.take("I")
     table = (reader.array("u2", count) / 65535).astype(np.float32)
     if not count:
         raise ValueError("no table")
-    area.change(image, lambda part, _: table[np.clip(np.rint(part * 65535), 0, count - 1).astype(int)])
+    for part in area.parts:
+        part[:] = table[np.clip(np.rint(part * 65535), 0, count - 1).astype(int)]
     return image
 
 
-def _map_polynomial(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
-    area = _Area.of(reader, image.shape)
+def _map_polynomial(reader: _Reader, image: np.ndarray) -> np.ndarray:
+    area = _area(reader, image)
     (degree,) = reader.take("I")
     if degree > _LARGEST_DEGREE:
         raise ValueError(f"degree {degree}")
     terms = reader.array("f8", degree + 1)
-    area.change(image, lambda part, _: np.polynomial.polynomial.polyval(part, terms).astype(np.float32))
+    for part in area.parts:
+        part[:] = np.polynomial.polynomial.polyval(part, terms)
     return image
 
 
 def _along(axis: int, combine: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callable:
     """Return the function of DeltaPerRow and its kin: combine each row (axis 0) or column (axis 1) with a number."""
 
-    def apply(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
-        area = _Area.of(reader, image.shape)
+    def apply(reader: _Reader, image: np.ndarray) -> np.ndarray:
+        area = _area(reader, image)
         (count,) = reader.take("I")
         values = reader.array("f4", count).astype(np.float32)
-        shape = image[area.rows, area.columns].shape
-        if area.planes and count != shape[axis]:
-            raise ValueError(f"{count} numbers for {shape[axis]} {('rows', 'columns')[axis]}")
-        values = values[:, None] if axis == 0 else values[None]
-        area.change(image, lambda part, _: combine(part, values))
+        for part in area.parts:
+            if count != part.shape[axis]:
+                raise ValueError(f"{count} numbers for {part.shape[axis]} {('rows', 'columns')[axis]}")
+            part[:] = combine(part, values[:, None] if axis == 0 else values[None])
         return image
 
     return apply
@@ -243,14 +237,14 @@ class _Polar:
         return self.right**2 + self.down**2
 
 
-def _fix_vignette_radial(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+def _fix_vignette_radial(reader: _Reader, image: np.ndarray) -> np.ndarray:
     terms = reader.array("f8", 5)
     squared = _Polar.of(*reader.take("2d"), image.shape).squared  # pyright: ignore[reportCallIssue]
     image *= np.polynomial.polynomial.polyval(squared, [1.0, *terms]).astype(np.float32)[..., None]
     return image
 
 
-def _warp_rectilinear(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+def _warp_rectilinear(reader: _Reader, image: np.ndarray) -> np.ndarray:
     (planes,) = reader.take("I")
     terms = reader.array("f8", 6 * planes).reshape(-1, 6)
     polar = _Polar.of(*reader.take("2d"), image.shape)  # pyright: ignore[reportCallIssue]
@@ -261,7 +255,7 @@ def _warp_rectilinear(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarr
     return _warp(image, polar, terms, moved)
 
 
-def _warp_rectilinear_2(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+def _warp_rectilinear_2(reader: _Reader, image: np.ndarray) -> np.ndarray:
     """Move pixels by a polynomial of the radius itself, within a range of radii, or by its reciprocal (DNG 1.6)."""
     (planes,) = reader.take("I")
     terms = reader.array("f8", 19 * planes).reshape(-1, 19)
@@ -286,7 +280,7 @@ def _bent(polar: _Polar, factor: np.ndarray, tangential: np.ndarray) -> tuple[np
     return x, y
 
 
-def _warp_fisheye(reader: _Reader, image: np.ndarray, cell: int) -> np.ndarray:
+def _warp_fisheye(reader: _Reader, image: np.ndarray) -> np.ndarray:
     (planes,) = reader.take("I")
     terms = reader.array("f8", 4 * planes).reshape(-1, 4)
     polar = _Polar.of(*reader.take("2d"), image.shape)  # pyright: ignore[reportCallIssue]
@@ -315,7 +309,7 @@ def _warp(image: np.ndarray, polar: _Polar, terms: np.ndarray, moved: Callable) 
     return result
 
 
-_FUNCTIONS: dict[int, Callable[[_Reader, np.ndarray, int], np.ndarray]] = {
+_FUNCTIONS: dict[int, Callable[[_Reader, np.ndarray], np.ndarray]] = {
     1: _warp_rectilinear, 2: _warp_fisheye, 3: _fix_vignette_radial, 4: _fix_bad_pixels_constant,
     5: _fix_bad_pixels_list, 7: _map_table, 8: _map_polynomial, 9: _gain_map, 10: _along(0, np.add),
     11: _along(1, np.add), 12: _along(0, np.multiply), 13: _along(1, np.multiply), 14: _warp_rectilinear_2,

@@ -10,7 +10,7 @@ from PIL import Image
 
 from ..errors import InputError
 from .images import HDR_SUFFIXES, JPEG_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
-from .raw import raw_exposure
+from .raw import read_header
 from .xmp import xmp_of, xmp_values
 
 SHORTEST, LONGEST = 1e-12, 1e12
@@ -64,7 +64,8 @@ def exif_exposure(path: Path) -> ExifExposure:
         return ExifExposure()
     try:
         if path.suffix.lower() in RAW_SUFFIXES:
-            return ExifExposure(*raw_exposure(path))
+            header = read_header(path)
+            return ExifExposure(header.exposure_time, header.iso, header.f_number)
         with open_image(path) as image:
             first = exif_of(image)
             tables = first.get_ifd(_EXIF_IFD), first, _xmp_table(image)

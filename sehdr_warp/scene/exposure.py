@@ -101,7 +101,7 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
 
 def exposures_note(records: Sequence[ImageRecord]) -> tuple[str, ...]:
     """Return a note on the range of known exposure times of the photos that are used, if they differ."""
-    times = [record.seconds / (record.light_scale if record.gain_map else 1) for record in records if record.time_known]
+    times = [record.seconds / (record.gain_map_scale or 1) for record in records if record.time_known]
     if not times or max(times) <= min(times) * 1.01:
         return ()
     span = f"{shutter(min(times))} to {shutter(max(times))}".replace(" s to", " to")

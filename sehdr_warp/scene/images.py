@@ -87,7 +87,7 @@ class EncodedImage:
         return int(np.iinfo(self.pixels.dtype).max)
 
 
-def kind_of(path: Path) -> str:
+def file_kind(path: Path) -> str:
     """Return raw, float or encoded, by the suffix."""
     suffix = path.suffix.lower()
     return "raw" if suffix in RAW_SUFFIXES else "float" if suffix in HDR_SUFFIXES else "encoded"

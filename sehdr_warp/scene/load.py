@@ -1,9 +1,8 @@
 """Load a scene: parse a data folder of any layout, choose the response, preprocess the photos."""
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -95,8 +94,7 @@ def load_scene(
         response_by_name(response)  # An unknown name is refused before the photos are read.
     for candidate in candidates:
         responses_named(candidate)
-    check = partial(check_response, response=response, path=path)
-    dataset = parse_dataset(path, exposure_index=exposure_index, holdout=holdout, cache=cache, check=check)
+    dataset = parse_dataset(path, response=response, exposure_index=exposure_index, holdout=holdout, cache=cache)
     choice = choose_response(dataset, response, method, candidates)
     dataset, curve = choice.dataset, choice.response
     names = unique_names(dataset.records)
@@ -124,16 +122,15 @@ def load_scene(
 def parse_dataset(
     path: Path | str,
     *,
+    response: "str | Path | Response" = "auto",
     exposure_index: int | None = None,
     holdout: int | None = None,
     cache: Path | str | None = None,
-    check: Callable[[DataparserOutputs], None] | None = None,
 ) -> DataparserOutputs:
     """Parse cameras, files, exposure times and splits of a data folder; of photos only headers are read.
 
-    Everything that can refuse a set is checked before structure from motion, which takes minutes. check() is called
-    with the kind of the photos known and cameras not yet found; it may raise InputError. Other arguments and errors are
-    those of load_scene().
+    Everything that can refuse a set is checked before structure from motion, which takes minutes; so is a response that
+    does not apply. Arguments and errors are those of load_scene().
     """
     if holdout is not None and holdout < 0:
         raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
@@ -151,8 +148,7 @@ def parse_dataset(
     with_times = with_float_times if kind == "float" else with_exposure_times
     records, times_known, time_notes = with_times(records, folder)
     dataset = replace(dataset, kind=kind, records=tuple(records), folder=folder, times_known=times_known)
-    if check is not None:
-        check(dataset)
+    check_response(dataset, response, path)
     unplaced: list[str] = []
     if records and records[0].lens is UNPLACED:
         dataset, unplaced = place_photos(dataset, cache)

@@ -16,10 +16,10 @@ from .dataparser import UNPLACED, ImageRecord
 from .float_images import tone_mapped
 from .hdr_files import hdr_size, pixel_aspect
 from .heif import avif_bits
-from .images import EncodedImage, image_sizes, kind_of, open_image, read_ldr, require_file
+from .images import EncodedImage, file_kind, image_sizes, open_image, read_ldr, require_file
 from .lens import Lens
 from .masks import MASK_FOLDERS
-from .raw import raw_sizes, read_raw
+from .raw import read_header, read_raw
 
 FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_NAMED = 3
@@ -115,21 +115,21 @@ def unusable_notes(problems: Sequence[InputError], count: int, *, truth: bool = 
 
 
 def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRecord], list[str]]:
-    kinds = Counter(kind_of(record.image) for record in records)
+    kinds = Counter(file_kind(record.image) for record in records)
     kind = max(_KINDS, key=lambda each: kinds[each])  # Of equal numbers the first in the table.
-    others = [record for record in records if kind_of(record.image) != kind]
+    others = [record for record in records if file_kind(record.image) != kind]
     if not others:
         return kind, list(records), []
     kind_names = " and ".join(name for each, name in _KINDS.items() if each != kind and kinds[each])
     reason = f"were left out, because most are {_KINDS[kind]}: photos of one set are of one kind"
     notes = [f"{_names_text([record.image.name for record in others])} ({kind_names}) {reason}"]
-    return kind, [record for record in records if kind_of(record.image) == kind], notes
+    return kind, [record for record in records if file_kind(record.image) == kind], notes
 
 
 def _check_size(record: ImageRecord) -> ImageRecord:
     """Return the photo with what its file states of its colors. Raises InputError if it cannot be used."""
     width, height = pixel_aspect(record.image), 1.0
-    if kind_of(record.image) == "encoded":
+    if file_kind(record.image) == "encoded":
         with open_image(record.image) as image:
             record = replace(record, encoding=encoding_of(image))
             width, height = _pixel_aspect(image.info)
@@ -157,12 +157,12 @@ def _names_text(names: Sequence[str]) -> str:
 
 def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return (width, height) of the photo as stored and turned upright; raises as read_photo."""
-    kind = kind_of(path)
+    kind = file_kind(path)
     if kind == "encoded":
         return image_sizes(path)
     _refuse_renamed(path)
     if kind == "raw":
-        return raw_sizes(path)
+        return read_header(path)[:2]
     size = hdr_size(path)
     return size, size
 
@@ -175,7 +175,7 @@ def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:
     Raises:
         InputError: if the file is missing, damaged or too large.
     """
-    kind = kind_of(path)
+    kind = file_kind(path)
     if kind == "encoded":
         return read_ldr(path, oriented=oriented)
     return read_raw(path, oriented=oriented) if kind == "raw" else EncodedImage(tone_mapped(path), None)

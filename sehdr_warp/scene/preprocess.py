@@ -22,7 +22,7 @@ from .file_names import unique_names
 from .float_images import float_codes
 from .gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
 from .hdr_files import hdr_size, read_hdr, read_light
-from .images import EncodedImage, kind_of
+from .images import EncodedImage, file_kind
 from .lens import Lens, Undistortion, area_average
 from .masks import mask_note, read_mask
 from .photo_content import ContentCheck, unused_bits_note
@@ -69,7 +69,7 @@ def preprocess(
         photo_storage, len(names), sum(record.lens.width * record.lens.height for record in dataset.records)
     )
     # OpenEXR and LibRaw are read one at a time: their output to the terminal is suppressed for the whole process.
-    quiet = any(record.hdr is not None or kind_of(record.image) != "encoded" for record in dataset.records)
+    quiet = any(record.hdr is not None or file_kind(record.image) != "encoded" for record in dataset.records)
     most = 1 if quiet else _PIXELS_AT_ONCE // max(record.lens.width * record.lens.height for record in dataset.records)
     jobs = ((record, names[i]) for i, record in track_progress("reading views", dataset.records, _log))
     views, problems = [], []
@@ -112,7 +112,7 @@ def _read_stored(
     The problem of a damaged gain map goes to `problems`. `masked` leaves float pictures without the black that their
     transparent parts lie over.
     """
-    srgb, kind = ColorEncoding("sRGB"), kind_of(record.image)
+    srgb, kind = ColorEncoding("sRGB"), file_kind(record.image)
     if record.derived:
         codes = codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8)
         return EncodedImage(codes, None), srgb
@@ -122,10 +122,10 @@ def _read_stored(
         codes = float_codes(pixels * record.light_scale, record.seconds)
         return EncodedImage(codes, light.coverage if masked else None), srgb
     photo, encoding = read_photo(record.image, oriented=oriented), record.encoding or srgb
-    if record.gain_map or (kind == "encoded" and not record.linear):
+    if kind == "encoded" and not record.linear:
         gain_map = read_gain_map(record.image, oriented=oriented, problems=problems)
-        if record.gain_map:
-            photo = light_of(photo, gain_map, record.light_scale)
+        if record.gain_map_scale is not None:
+            photo = light_of(photo, gain_map, record.gain_map_scale)
             encoding = replace(encoding, curves=(), table=None)  # The light is in sRGB's curve already
         elif gain_map is not None:
             photo = with_light_above_white(photo, gain_map)
@@ -201,7 +201,7 @@ class _Preprocessor:
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
         photo, encoding = _read_stored(record, self.gain_map_problems, oriented=oriented, masked=self.alpha == "mask")
-        if photo.levels > 255 and kind_of(record.image) == "encoded" and not record.gain_map:
+        if photo.levels > 255 and file_kind(record.image) == "encoded" and record.gain_map_scale is None:
             self.largest_code = max(self.largest_code, int(photo.pixels.max()))
         masks = resample.borders()
         if stored is not None:

@@ -6,15 +6,16 @@ Light stays in the sensor's own colors, without white balance: there each channe
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..errors import InputError, require_extra
 from ..quiet import silent_stderr
 from .color_primaries import linear_to_srgb
-from .dng import read_dng
+from .dng import DngRaw, read_dng
 from .dng_develop import CLIPPED, clipping_level, develop_dng
 from .images import EncodedImage, check_size, require_file
 from .types import codes_of
@@ -26,14 +27,54 @@ _NOISE = 0.02  # Standard deviation of the logarithm of light near white, from a
 _REMEDY = "develop the photos as JPEG, PNG or TIFF, or convert them to DNG"
 
 
-def raw_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return (width, height) of the developed photo as the sensor lies, and turned upright."""
+class RawHeader(NamedTuple):
+    """What a RAW file states beside its pixels; None for an exposure that it does not.
+
+    Attributes:
+        size: (width, height) of the developed photo as the sensor lies.
+        upright_size: of the photo turned upright.
+        exposure_time: seconds.
+        iso: ISO speed.
+        f_number: focal length over aperture.
+        matrix: [3, 3] from the sensor's white-balanced colors to linear Rec.709; zero without it.
+        balance: factors of red, green and blue on the sensor's colors; empty without them.
+    """
+
+    size: tuple[int, int]
+    upright_size: tuple[int, int]
+    exposure_time: float | None
+    iso: float | None
+    f_number: float | None
+    matrix: np.ndarray
+    balance: tuple[float, ...]
+
+
+def read_header(path: Path) -> RawHeader:
+    """Read the header of a RAW file, once for a file that stays as it is.
+
+    Raises:
+        InputError: if the file is missing or damaged, too large, or holds what LibRaw does not decode.
+    """
+    require_file(path)
+    return _header(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _header(path: Path, changed: int) -> RawHeader:
     dng = read_dng(path)
-    with _open(path) as raw:
+    with _open(path, dng) as raw:
         size, turned = (raw.sizes.width, raw.sizes.height), (raw.sizes.height, raw.sizes.width)
         sizes = (size, turned if raw.sizes.flip in (5, 6) else size) if dng is None else dng.sizes
+        exposure = (raw.other.shutter_speed, raw.other.iso_speed, raw.other.aperture)
+        matrix, xyz_matrix = np.array(raw.color_matrix)[:, :3], np.array(raw.rgb_xyz_matrix)[:3]
+        balances = (tuple(each[:3]) for each in (raw.camera_whitebalance, raw.daylight_whitebalance))
+        balance = next((each for each in balances if min(each) > 0), ())
     check_size(path, *sizes[0])
-    return sizes
+    if not matrix.any() and xyz_matrix.any():
+        to_camera = xyz_matrix @ _XYZ_FROM_REC709
+        matrix = np.linalg.inv(to_camera / to_camera.sum(axis=1, keepdims=True))
+    time, iso, f_number = (value if value > 0 else None for value in exposure)
+    return RawHeader(*sizes, time, iso, f_number, matrix, balance)
 
 
 def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
@@ -44,9 +85,9 @@ def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
     Raises:
         InputError: if the file is missing or damaged, or holds what LibRaw does not decode.
     """
-    raw_sizes(path)
+    read_header(path)  # Checks the size.
     dng = read_dng(path)
-    with _open(path) as raw:
+    with _open(path, dng) as raw:
         if dng is None:
             linear = _develop(raw, oriented)
             return EncodedImage(linear_codes(linear), None)
@@ -83,50 +124,33 @@ def linear_codes(linear: np.ndarray) -> np.ndarray:
     return codes_of(linear_to_srgb(np.where(linear >= CLIPPED, 1, linear)), 16)
 
 
-def raw_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
-    """Return exposure time in seconds, ISO speed and f-number that a RAW file states, None for what it does not."""
-    with _open(path) as raw:
-        metadata = raw.other
-        return tuple(v if v > 0 else None for v in (metadata.shutter_speed, metadata.iso_speed, metadata.aperture))  # type: ignore[return-value]
-
-
 def color_matrix(photos: Sequence[Path]) -> np.ndarray:
     """Return [3, 3] from the sensor's colors to linear Rec.709, with the white balance of the first photo.
 
     Raises:
         InputError: if a file states no colors, or the photos are of different cameras.
     """
-    first = None
-    for photo in photos:
-        with _open(photo) as raw:
-            matrix, xyz_matrix = np.array(raw.color_matrix)[:, :3], np.array(raw.rgb_xyz_matrix)[:3]
-            if not matrix.any() and xyz_matrix.any():
-                to_camera = xyz_matrix @ _XYZ_FROM_REC709
-                matrix = np.linalg.inv(to_camera / to_camera.sum(axis=1, keepdims=True))
-            balance = next((b for b in (raw.camera_whitebalance, raw.daylight_whitebalance) if min(b[:3]) > 0), None)
-        if not matrix.any() or balance is None:
+    first, *_ = headers = [read_header(photo) for photo in photos]
+    for photo, header in zip(photos, headers, strict=True):
+        if not header.matrix.any() or not header.balance:
             raise InputError(photo, "states no color matrix or white balance of its camera", _REMEDY)
-        if first is None:
-            first = matrix, np.array(balance[:3]) / min(balance[:3])
-        elif not np.allclose(matrix, first[0], atol=1e-3):
+        if not np.allclose(header.matrix, first.matrix, atol=1e-3):
             raise InputError(photo, f"is of another camera than {photos[0].name}", "keep the photos of one camera")
-    assert first is not None
-    return first[0] * first[1]
+    return first.matrix * (np.array(first.balance) / min(first.balance))
 
 
 @contextlib.contextmanager
-def _open(path: Path) -> Iterator[Any]:
-    require_file(path)
+def _open(path: Path, dng: DngRaw | None) -> Iterator[Any]:
+    """Open a RAW file by LibRaw; raise InputError if it cannot."""
     rawpy = require_extra("rawpy", f"{path}: RAW files need rawpy", "raw")
     try:
         # LibRaw prints of damage, too.
         with silent_stderr(), rawpy.imread(str(path)) as raw:
             # Linear raw has no filter; what has neither, or other colors, is not a photo of a camera known here.
-            linear = raw.raw_pattern is None and raw.raw_type == rawpy.RawType.Stack and read_dng(path) is not None
+            linear = raw.raw_pattern is None and raw.raw_type == rawpy.RawType.Stack and dng is not None
             if raw.num_colors != 3 or not (linear or raw.raw_pattern is not None):
                 raise InputError(path, "is not a photo through a filter of three colors", _REMEDY)
             yield raw
     except rawpy.LibRawError as error:
-        read_dng(path)  # Its own words come first, for example of a compression that LibRaw does not know.
         reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
         raise InputError(path, f"cannot be read as RAW ({reason})", "copy the file again") from None

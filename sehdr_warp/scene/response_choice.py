@@ -107,7 +107,7 @@ def select_for_codes(
     return select_response(codes, curves, method=method, from_camera=are_camera_jpegs(files))
 
 
-def check_response(dataset: DataparserOutputs, *, response: "str | Path | Response", path: Path | str) -> None:
+def check_response(dataset: DataparserOutputs, response: "str | Path | Response", path: Path | str) -> None:
     """Raise InputError if a named response is not that of photos whose light is known."""
     if dataset.kind == "encoded" or not isinstance(response, str | Path):
         return
@@ -148,7 +148,7 @@ def as_gain_mapped(dataset: DataparserOutputs) -> DataparserOutputs:
     scale = _BELOW_WHITE * 2.0 ** -min(max(most, 0.0), MOST_STOPS_IN_CODES)
     scales = [scale if record.image in headrooms else 1.0 for record in dataset.records]
     records = tuple(
-        replace(record, gain_map=True, light_scale=scale, exposure_time=record.seconds * scale)
+        replace(record, gain_map_scale=scale, exposure_time=record.seconds * scale)
         for record, scale in zip(dataset.records, scales, strict=True)
     )
     return replace(dataset, kind="gain-map", records=records, notes=(*dataset.notes, note))

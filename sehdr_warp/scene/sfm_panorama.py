@@ -16,7 +16,7 @@ from ..parallel import run_interruptibly
 from ..progress import stage, track_progress
 from .colmap_model import ModelImage, SparseModel, read_points
 from .dataparser import PointCloud
-from .images import kind_of, open_image
+from .images import file_kind, open_image
 from .lens import Lens
 from .photos import photo_sizes, read_photo
 from .sfm import (
@@ -76,7 +76,7 @@ def _projection_of(photo: Path) -> str | None:
     Raises:
         InputError: if it states that the photo shows a part of a sphere.
     """
-    if kind_of(photo) != "encoded":
+    if file_kind(photo) != "encoded":
         return None
     with open_image(photo) as image:
         xmp = xmp_of(image)

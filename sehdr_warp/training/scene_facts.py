@@ -11,7 +11,7 @@ from ..runs.config import Config, LossConfig
 from ..runs.values import LoadArguments
 from ..scene import Scene, View, encoded_values
 from ..scene.exif import are_camera_jpegs
-from ..scene.images import kind_of
+from ..scene.images import file_kind
 from ..scene.wide_camera import perspective_views
 from ..subsets import every_nth
 from .initialization import focus_distance, points_on_rays
@@ -102,7 +102,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         view_alignment=view_alignment,
         inward_fraction=inward_fraction,
         light_known=scene.light_known,
-        unclipped=scene.light_known and all(view.source and kind_of(view.source) == "float" for view in views),
+        unclipped=scene.light_known and all(view.source and file_kind(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
     )
 

@@ -16,7 +16,7 @@ from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
 from sehdr_warp.scene.images import open_image
 from sehdr_warp.scene.masks import read_mask
 from sehdr_warp.scene.photos import photo_sizes, read_photo
-from sehdr_warp.scene.raw import color_matrix, raw_exposure
+from sehdr_warp.scene.raw import color_matrix, read_header
 from sehdr_warp.scene.video import codes, decode, open_clip
 from sehdr_warp.scene.video_frames import choose_frames
 from tests.make_scenes import pattern
@@ -210,10 +210,10 @@ READERS = {
     "radiance": Reader(make_radiance, ("*.hdr",), each(read_hdr), cost=0.5),
     "photos": Reader(make_photos, ("*",), each(photo_sizes, read_mask, exif_exposure, read_upright), cost=1.2),
     "places": Reader(make_places, ("*.jpg",), each(read_place), cost=4),
-    "raw": Reader(make_raw, ("*",), each(photo_sizes, raw_exposure, read_matrix, read_upright), cost=2),
+    "raw": Reader(make_raw, ("*",), each(photo_sizes, read_header, read_matrix, read_upright), cost=2),
     "gain-maps": Reader(make_gain_maps, ("*",), each(read_light), cost=1.6),
     "heic": Reader(make_heic, ("*",), each(photo_sizes, exif_exposure, read_upright), cost=0.9),
     "icc": Reader(make_icc, ("*.icc",), each(read_icc), cost=4),
     "video": Reader(make_video, ("*",), each(read_video), cost=150),
-    "dng-opcodes": Reader(make_dng_opcodes, ("*",), each(photo_sizes, raw_exposure, read_upright), cost=6),
+    "dng-opcodes": Reader(make_dng_opcodes, ("*",), each(photo_sizes, read_header, read_upright), cost=6),
 }

@@ -9,7 +9,7 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.raw import color_matrix, raw_sizes, read_raw
+from sehdr_warp.scene.raw import color_matrix, read_header, read_raw
 
 from .dng_files import area, gain_map, jpeg_tiles, longs, mosaic, opcodes, rationals, shorts, write_tagged_dng
 
@@ -124,7 +124,7 @@ def test_active_area_and_crop(tmp_path, top, left):
     tags = LEVELS | {50829: longs(top, left, top + HEIGHT - 8, left + WIDTH - 8)}
     tags |= {50719: longs(10, 6), 50720: longs(80, 60)}
     write_tagged_dng(tmp_path / "a.dng", stored(whole), tags)
-    assert raw_sizes(tmp_path / "a.dng") == ((80, 60), (80, 60))
+    assert read_header(tmp_path / "a.dng")[:2] == ((80, 60), (80, 60))
     np.testing.assert_allclose(light_of(tmp_path / "a.dng"), gradient[6:66, 10:90], rtol=0.01)
 
 
@@ -136,13 +136,13 @@ def test_orientation(tmp_path, orientation, turn):
     write_tagged_dng(tmp_path / "a.dng", stored(mosaic(gradient)), LEVELS | {274: shorts(orientation)})
     upright, turned = light_of(tmp_path / "a.dng"), light_of(tmp_path / "a.dng", oriented=True)
     np.testing.assert_array_equal(turned, turn(upright))
-    assert raw_sizes(tmp_path / "a.dng")[1] == turned.shape[1::-1]
+    assert read_header(tmp_path / "a.dng")[1] == turned.shape[1::-1]
 
 
 def test_pixels_that_are_not_square(tmp_path):
     gradient = EVEN * (0.5 + Y / HEIGHT)[..., None]
     write_tagged_dng(tmp_path / "a.dng", stored(mosaic(gradient)), LEVELS | {50718: rationals(1, 2)})
-    assert raw_sizes(tmp_path / "a.dng")[0] == (WIDTH, 2 * HEIGHT)
+    assert read_header(tmp_path / "a.dng")[0] == (WIDTH, 2 * HEIGHT)
     light = light_of(tmp_path / "a.dng")
     assert light.shape == (2 * HEIGHT, WIDTH, 3)
     expected = TRUTH * (0.5 + ((np.arange(2 * HEIGHT) + 0.5) / 2 - 0.5) / HEIGHT)[:, None]
@@ -226,7 +226,7 @@ def test_lossy_compression(tmp_path, size, meaning):
     write_tagged_dng(tmp_path / "a.dng", codes, tags, pieces=jpeg_tiles(codes, size))
     error = np.abs(light_of(tmp_path / "a.dng") - light)
     assert error.max() < 0.03 and error.mean() < 0.005
-    assert raw_sizes(tmp_path / "a.dng")[0] == (WIDTH, HEIGHT)
+    assert read_header(tmp_path / "a.dng")[0] == (WIDTH, HEIGHT)
 
 
 def test_damaged_pictures_of_lossy_files_are_named(tmp_path):

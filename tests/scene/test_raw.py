@@ -16,7 +16,7 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.dng import read_dng
-from sehdr_warp.scene.raw import color_matrix, linear_codes, raw_exposure, read_raw
+from sehdr_warp.scene.raw import color_matrix, linear_codes, read_header, read_raw
 from sehdr_warp.scene.sfm import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
 from sehdr_warp.training.plan import make_plan
@@ -129,7 +129,7 @@ def test_raw_files_clip_by_channel_in_the_sensors_colors(tmp_path):
     inside = slice(4, -4), slice(4, -4)
     np.testing.assert_allclose(decoded[inside], expected[inside], rtol=0.03)
     assert ((codes == 65535) == (expected >= 0.99))[inside].mean() > 0.999
-    assert raw_exposure(tmp_path / "a.dng")[0] == pytest.approx(1 / 60, rel=1e-4)
+    assert read_header(tmp_path / "a.dng").exposure_time == pytest.approx(1 / 60, rel=1e-4)
     matrix = color_matrix([tmp_path / "a.dng"])
     np.testing.assert_allclose(matrix @ BALANCE, 1, atol=1e-3)
     # A color in the sensor's own comes back as what it is in Rec.709.
