@@ -123,7 +123,7 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
 def has_16_bits(path: Path) -> bool:
     """Return whether a photo that read_ldr decodes has 16 bits; raises as open_image."""
     with open_image(path) as image:
-        deep = image.mode.startswith("I") or _is_grey_alpha_of_16_bits(image) or bool(_low_byte_tiles(image))
+        deep = image.mode.startswith("I") or _is_grey_alpha_of_16_bits(image) or bool(_byte_tiles(image))
         return deep or has_planes_of_16_bits(image)
 
 
@@ -242,11 +242,15 @@ def _decode(image: ImageFile.ImageFile, path: Path) -> tuple[np.ndarray, np.ndar
             second.tile = [tile._replace(args="RGBA") for tile in second.tile]
             grey, alpha = np.moveaxis(np.asarray(second).view(">u2").astype(np.uint16), 2, 0)
         return _split(np.stack([grey, grey, grey, alpha], axis=2))
-    if image.mode in ("RGB", "RGBA") and (low := _low_byte_tiles(image)):
+    if image.mode in ("RGB", "RGBA") and (tiles := _byte_tiles(image)):
+        multiplied = "RGBa;" in str(image.tile)  # By alpha, which Pillow would divide by in 8 bits
         with open_image(path) as second:
-            second.tile = low
-            low_bytes = np.asarray(second)
-        return _split(np.asarray(image).astype(np.uint16) << 8 | low_bytes)
+            image.tile, second.tile = tiles
+            values = np.asarray(image).astype(np.uint16) << 8 | np.asarray(second)
+        if multiplied:
+            light = values[..., :3] * (65535 / np.maximum(values[..., 3:], 1))
+            values[..., :3] = np.rint(np.minimum(light, 65535))
+        return _split(values)
     if image.mode.startswith("I"):
         values = np.asarray(image)
         if values.min() < 0 or values.max() > 65535:
@@ -280,21 +284,22 @@ def _split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     return values[:, :, :3], None if alpha.min() == white else (alpha / np.float32(white)).astype(np.float32)
 
 
-def _low_byte_tiles(image: ImageFile.ImageFile) -> list | None:
-    """Return tiles that decode the low bytes of 16-bit color.
+def _byte_tiles(image: ImageFile.ImageFile) -> tuple[list, list] | None:
+    """Return tiles that decode the high and the low bytes of 16-bit color, as stored; None for other images.
 
     Pillow keeps the high byte; with the other byte order it keeps the low one.
     """
     other = {"16B": "16L", "16L": "16B", "16N": "16B" if np.little_endian else "16L"}
-    tiles = []
+    high, low = [], []
     for tile in image.tile:
         raw, *rest = (tile.args,) if isinstance(tile.args, str) else tile.args or ("",)
         layout, _, depth = str(raw).partition(";")
-        if layout not in ("RGB", "RGBA", "RGBX") or depth not in other:
+        if layout not in ("RGB", "RGBA", "RGBX", "RGBa") or depth not in other:
             return None
-        mode = f"{layout};{other[depth]}"
-        tiles.append(tile._replace(args=mode if isinstance(tile.args, str) else (mode, *rest)))
-    return tiles or None
+        for tiles, order in ((high, depth), (low, other[depth])):
+            mode = f"{layout.upper()};{order}"
+            tiles.append(tile._replace(args=mode if isinstance(tile.args, str) else (mode, *rest)))
+    return (high, low) if high else None
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:

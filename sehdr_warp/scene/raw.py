@@ -28,7 +28,7 @@ _REMEDY = "develop the photos as JPEG, PNG or TIFF, or convert them to DNG"
 
 
 class RawHeader(NamedTuple):
-    """What a RAW file states beside its pixels; None for an exposure that it does not.
+    """Statements of a RAW file beside its pixels; None for an exposure that it does not state.
 
     Attributes:
         size: (width, height) of the developed photo as the sensor lies.

@@ -38,7 +38,7 @@ _POSE_FILES = {
 # By suffix what files of any name hold that state cameras.
 _POSE_CONTENT = {
     ".xml": (b"<chunk", "Metashape"), ".csv": (b"#name,x,y", "RealityScan"), ".xmp": (b"xcr:", "RealityScan"),
-    ".out": (b"Bundle file", "Bundler"),
+    ".out": (b"Bundle file", "Bundler"), ".json": (b'"cameraPoseARFrame"', "3D Scanner App"),
 }  # fmt: skip
 _CAMERA_FILES = ("transforms.json", "reconstruction.json", "poses_bounds.npy")  # Beside a folder of photos
 
@@ -59,10 +59,8 @@ def find_photos(folder: Path) -> DataparserOutputs:
         others = unread_kinds(folder)
         problem = "has no photos and no known layout" + f"; it holds {others}" * bool(others)
         raise InputError(folder, problem, _remedy_without_photos(folder))
-    if len(photos) == 1 and (inner := _folders_with_photos(folder)):
-        raise InputError(
-            photos[0], "is the only photo there", f"give one of its folders with photos: {first_names(inner, 5)}"
-        )
+    if len(photos) == 1 and _folders_with_photos(folder):
+        raise InputError(photos[0], "is the only photo there", _remedy_without_photos(folder))
     copies = find_copies(photos)
     photos = [photo for photo in photos if photo not in copies]
     _require_photos(photos, folder, len(copies))

@@ -53,7 +53,9 @@ def test_photos_deep_in_an_export_are_found_for_the_user(tmp_path):
     """Polycam's raw export: a thumbnail beside keyframes; and a COLMAP set two folders down."""
     photos(tmp_path / "poly" / "keyframes" / "corrected_images")
     Image.fromarray(pattern(16, 12)).save(tmp_path / "poly" / "thumbnail.jpg")
-    with pytest.raises(InputError, match="is the only photo there; give .* with photos: keyframes/corrected_images"):
+    files(tmp_path / "poly", "mesh_info.json")
+    remedy = "give .* with photos: keyframes/corrected_images; poses of Polycam"
+    with pytest.raises(InputError, match=f"is the only photo there; {remedy}"):
         parse_dataset(tmp_path / "poly")
     write_colmap(tmp_path / "work" / "dense" / "1")
     with pytest.raises(InputError, match="give one of its folders with photos: dense/1$"):
@@ -67,11 +69,11 @@ def test_photos_as_3dgs_convert_expects_them(tmp_path):
 
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
-    ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"),
+    ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"), ("frame_00000.json", "3D Scanner App"),
 ])  # fmt: skip
 def test_poses_of_other_programs_are_named(tmp_path, file, tool):
     photos(tmp_path)
-    files(tmp_path, file)
+    (tmp_path / file).write_text('{"cameraPoseARFrame": []}')
     assert any(f"poses of {tool} ({file}) are not read" in note for note in find_photos(tmp_path).notes)
 
 

@@ -266,6 +266,23 @@ def test_16_bits_of_every_kind_of_tiff(tmp_path, options, order):
     assert has_16_bits(tmp_path / "a.tif") and (read.alpha is not None) == (options.get("extrasamples") == [2])
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("compression", [None, "lzw"])
+def test_16_bits_of_a_tiff_whose_color_is_multiplied_by_alpha(tmp_path, order, compression):
+    tifffile = pytest.importorskip("tifffile")
+    pixels = RNG.integers(0, 65536, (21, 34, 4), dtype=np.uint16)
+    pixels[..., 3] = np.where(pixels[..., 3] < 9, 0, pixels[..., 3] | 0x4000)
+    alpha = pixels[..., 3:] / 65535
+    stored = pixels.copy()
+    stored[..., :3] = np.rint(pixels[..., :3] * alpha)
+    options = {"photometric": "rgb", "extrasamples": ["assocalpha"], "byteorder": order, "compression": compression}
+    tifffile.imwrite(tmp_path / "a.tif", stored, **options)
+    read = read_ldr(tmp_path / "a.tif")
+    assert has_16_bits(tmp_path / "a.tif") and read.alpha is not None
+    np.testing.assert_allclose(read.alpha, alpha[..., 0], atol=1e-6)
+    assert np.abs(read.pixels.astype(int) - pixels[..., :3] * (alpha > 0)).max() <= 3  # Of a quarter of the range
+
+
 @pytest.mark.parametrize("interlaced", [False, True])
 def test_16_bits_of_a_png_of_grey_and_alpha(tmp_path, interlaced):
     pixels = RNG.integers(0, 65536, (1, 7, 2), dtype=np.uint16)
