@@ -18,7 +18,7 @@ from .photo_names import fold_name
 
 OTHER_FOLDERS = ("masks", "mask", "hdr", "exr")
 """Folders of pictures that are not photos."""
-_IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
+IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 """Folders of photos, from the full size to reduced copies."""
 LOOKED_FOR = 20
 """Images of a set by whose names their folder is found."""
@@ -54,7 +54,7 @@ def photo_and_truth(image: Path) -> tuple[Path, Path | None]:
 
 def image_folder(folder: Path) -> Path | None:
     """Return the folder of images, at full size if possible, or None."""
-    return next((folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()), None)
+    return next((folder / name for name in IMAGE_FOLDERS if (folder / name).is_dir()), None)
 
 
 def folders_named(folder: Path, names: Sequence[str]) -> list[Path]:
@@ -107,7 +107,6 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         return None
     places = [resolve_inside(folder, each, source) for each in names]
     image = next((place for place in places if os.path.isfile(place)), None)
-    image = image or next((photo for place in places if (photo := sibling(place, PHOTO_SUFFIXES))), None)
     image = image or next((photo for each in names if (photo := _alike(folder, each, source))), None)
     plain = unquote(name)
     return image if image or plain == name else find_image(folder, plain, source)
@@ -142,8 +141,7 @@ def _inside(folder: Path, name: str, source: Path) -> str | None:
         return None
     for start in range(max(above, 1), len(parts)):
         end = "/".join(parts[start:])
-        place = resolve_inside(folder, end, source)
-        if os.path.isfile(place) or sibling(place, PHOTO_SUFFIXES) or sibling(Path(f"{place}.png"), PHOTO_SUFFIXES):
+        if os.path.isfile(resolve_inside(folder, end, source)) or _alike(folder, end, source):
             return end
     return None
 

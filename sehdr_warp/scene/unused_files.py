@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..subsets import first_names
 from .dataparser import ImageRecord
-from .file_names import is_system_file, natural_key, without_mask_mark
+from .file_names import IMAGE_FOLDERS, is_system_file, natural_key, without_mask_mark
 from .heif import HEIF_SUFFIXES, heif_installed
 from .images import PHOTO_SUFFIXES
 from .photo_names import bases_of
@@ -86,8 +86,9 @@ def _by_suffix(files: Sequence[Path]) -> str:
 
 
 def _files_beside(images: Sequence[Path], folder: Path) -> Iterable[Path]:
-    """Yield the files in the folders of the photos, or all below their common folder if it is not the data folder."""
-    common = bases_of(images, folder)[-1]
+    """Yield the files in the folders of the photos; all below `images/`, or their common folder in the data folder."""
+    bases = bases_of(images, folder)
+    common = next((base for base in bases[1:] if base.name in IMAGE_FOLDERS), bases[-1])
     deep = common != folder and common.is_relative_to(folder)
     places = [common] if deep else sorted({image.parent for image in images})
     count = 0

@@ -30,6 +30,11 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     assert said(scene, "not read") == [
         "not used, as files of kinds that are not read: 1 MOV (film.mov), 2 XYZ (clip2.xyz ...)"
     ]
+    write_colmap(tmp_path / "folders", name="left/{:03d}.png")
+    shutil.copytree(tmp_path / "folders/images/left", tmp_path / "folders/images/right")
+    assert said(load(tmp_path / "folders"), "in no view")[0].startswith(
+        "6 photos of images/right are in no view: 000.png"
+    )
     (tmp_path / "plain").mkdir()
     write_colmap(tmp_path / "plain")
     assert not said(load(tmp_path / "plain"), "in no view") and not said(load(tmp_path / "plain"), "not read")
