@@ -3,6 +3,7 @@
 import os
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -207,10 +208,10 @@ def _read(folder: Path) -> DataparserOutputs:
     readers = (
         (has("transforms_train.json", "exposure_train.json"), read_hdr_nerf),
         (has("poses_bounds_exps.npy"), read_hdr_nerf_real),
-        (is_hdr_gs(folder), read_hdr_gs),
-        (beside, read_colmap),
+        (is_hdr_gs(folder, model), partial(read_hdr_gs, model=model)),
+        (beside, partial(read_colmap, source=model)),
         (has("transforms.json") or has("transforms_train.json"), read_transforms),
-        (model is not None and model_fits(folder, model), read_colmap),
+        (model is not None and model_fits(folder, model), partial(read_colmap, source=model)),
         (find_reconstruction(folder) is not None, read_opensfm),
         (has("poses_bounds.npy"), read_llff),
     )

@@ -46,9 +46,10 @@ def _folder_of(names: Sequence[str], folder: Path) -> Path | None:
     return next((place for place, name in files if ".." not in name and (place / name).is_file()), None)
 
 
-def read_colmap(folder: Path) -> DataparserOutputs:
-    """Parse a COLMAP set: one record for each image of the model, in the natural order of the names."""
-    model, source = model_of(folder)
+def read_colmap(folder: Path, source: Path | None = None) -> DataparserOutputs:
+    """Parse a COLMAP set: one record for each image of the model in `source`, in the natural order of the names."""
+    source = source or find_model(folder, anywhere=True) or folder / "sparse"
+    model = registered_model(source)
     names = [image.name for image in model.images[:LOOKED_FOR]]
     images = _images_of_model(source, names, folder) or _folder_of(names, folder)
     if images is None and source == folder:
@@ -92,12 +93,11 @@ def _images_of_model(source: Path, names: Sequence[str], folder: Path) -> Path |
     return next(holds, next(iter(places), None))
 
 
-def model_of(folder: Path) -> tuple[SparseModel, Path]:
-    """Return the model of a set and its folder; raise InputError without registered images."""
-    source = find_model(folder, anywhere=True) or folder / "sparse"
+def registered_model(source: Path) -> SparseModel:
+    """Read a model; raise InputError without registered images."""
     model = read_model(source)
     if not model.images and model.unusable:
         raise model.unusable[0]
     if not model.images:
         raise InputError(source, "the model has no registered views", "run structure from motion again")
-    return model, source
+    return model

@@ -10,7 +10,7 @@ from .dataparser import DERIVED_PHOTOS, NO_POINTS, DataparserOutputs, ImageRecor
 from .exposure import parse_seconds
 from .file_names import natural_key, plain_path, sibling, view_and_exposure
 from .images import HDR_SUFFIXES, LDR_SUFFIXES
-from .read_colmap import IMAGES_REMEDY, model_of
+from .read_colmap import IMAGES_REMEDY, registered_model
 from .read_llff import camera_of_row, images_of_rows, pose_rows
 from .read_transforms import INCOMPLETE, absent_note, frame_pose, frames_of, sparse_points
 from .transforms_lens import frame_lens
@@ -83,7 +83,8 @@ def read_hdr_nerf_real(folder: Path) -> DataparserOutputs:
     path = folder / "poses_bounds_exps.npy"
     rows = pose_rows(path, 18)
     images = images_of_rows(folder / "input_images", path, len(rows))
-    cloud, poses = _poses_by_view(folder) if find_model(folder) is not None else (NO_POINTS, None)
+    model = find_model(folder)
+    cloud, poses = (NO_POINTS, None) if model is None else _poses_by_view(folder, model)
     records, absent = [], set()
     for row, image in zip(rows, images, strict=True):
         view, key = view_and_exposure(image.stem)
@@ -96,22 +97,22 @@ def read_hdr_nerf_real(folder: Path) -> DataparserOutputs:
     return DataparserOutputs("hdr-nerf-real", tuple(records), holdout=(2, 1), cloud=cloud, notes=notes)
 
 
-def is_hdr_gs(folder: Path) -> bool:
-    """Return whether a folder has HDR-GS's synthetic layout.
+def is_hdr_gs(folder: Path, model: Path | None) -> bool:
+    """Return whether a folder with a sparse model has HDR-GS's synthetic layout.
 
     It has exposures of the same views, and truth in exr/ under the views' names: an exr/ of other files beside numbered
     photos of a COLMAP set does not count.
     """
-    if not ((folder / "exr").is_dir() and (folder / "images").is_dir() and find_model(folder) is not None):
+    if model is None or not ((folder / "exr").is_dir() and (folder / "images").is_dir()):
         return False
     exposures = _exposures_by_view(folder / "images")
     with_truth = sum(sibling(folder / "exr" / f"{view}.exr", HDR_SUFFIXES) is not None for view in exposures)
     return bool(exposures) and 2 * with_truth >= len(exposures)
 
 
-def read_hdr_gs(folder: Path) -> DataparserOutputs:
+def read_hdr_gs(folder: Path, model: Path | None = None) -> DataparserOutputs:
     """Parse HDR-GS's synthetic layout: `images/<v>_<e>.png`, `exr/<v>.exr`, a model with one image of each view."""
-    cloud, poses = _poses_by_view(folder)
+    cloud, poses = _poses_by_view(folder, model or folder / "sparse")
     exposures, records = _exposures_by_view(folder / "images"), []
     seconds, notes = _hdr_gs_seconds(folder, 1 + max(key for files in exposures.values() for key in files))
     for view, (lens, pose) in poses.items():
@@ -124,9 +125,9 @@ def read_hdr_gs(folder: Path) -> DataparserOutputs:
     return DataparserOutputs("hdr-gs", tuple(records), "background", (2, 1), cloud, notes)
 
 
-def _poses_by_view(folder: Path) -> tuple[PointCloud, dict[str, tuple]]:
+def _poses_by_view(folder: Path, source: Path) -> tuple[PointCloud, dict[str, tuple]]:
     """Return the points, and lens and pose of each view (names without `_<exposure>`) in natural order."""
-    model, source = model_of(folder)
+    model = registered_model(source)
     poses = {}
     for entry in sorted(model.images, key=lambda image: natural_key(image.name)):
         view = re.sub(r"_\d+$", "", resolve_inside(folder, entry.name, source).stem)
