@@ -110,14 +110,14 @@ def _opcodes(data: bytes, source: Path) -> Iterator[tuple[int, int, bytes]]:
 
 def _gain_map(reader: _Reader, image: np.ndarray) -> np.ndarray:
     """Multiply by a grid of gains, interpolated bilinearly; places are relative to the image's size."""
-    from scipy.ndimage import map_coordinates
+    from scipy.interpolate import RectBivariateSpline
 
     area = _area(reader, image)
     points_v, points_h = reader.take("2I")
     spacing_v, spacing_h, origin_v, origin_h = reader.take("4d")
     (planes,) = reader.take("I")
-    if not (points_v and points_h and planes):
-        raise ValueError("no points")
+    if not (points_v and points_h and planes and np.isfinite([spacing_v, spacing_h, origin_v, origin_h]).all()):
+        raise ValueError("no points, or none at places that are finite")
     gains = reader.array("f4", points_v * points_h * planes).reshape(points_v, points_h, planes)
     if not np.isfinite(gains).all() or gains.min() < 0:
         raise ValueError("gains below zero or not finite")
@@ -128,17 +128,11 @@ def _gain_map(reader: _Reader, image: np.ndarray) -> np.ndarray:
 
     down = places(area.rows, image.shape[0], origin_v, spacing_v)
     right = places(area.columns, image.shape[1], origin_h, spacing_h)
-
-    columns = np.clip(right, 0, points_h - 1)
-    first = np.minimum(columns.astype(int), max(points_h - 2, 0))
-    share = (columns - first).astype(np.float32)
     for place, part in enumerate(area.parts):
-        grid = gains[:, :, min(place, planes - 1)]
-        # Separable: columns of the grid first, so that a large photo needs no coordinates of its own.
-        at = np.stack(np.meshgrid(down, np.arange(points_h), indexing="ij"))
-        rows = map_coordinates(grid, at, order=1, mode="nearest").astype(np.float32)
-        after = rows[:, np.minimum(first + 1, points_h - 1)]
-        part *= rows[:, first] * (1 - share) + after * share
+        # A spline has two points at least.
+        grid = np.pad(gains[:, :, min(place, planes - 1)], ((0, points_v == 1), (0, points_h == 1)), mode="edge")
+        spline = RectBivariateSpline(*(np.arange(size) for size in grid.shape), grid, kx=1, ky=1)
+        part *= spline(down, right).astype(np.float32)
     return image
 
 

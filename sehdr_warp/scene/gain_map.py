@@ -20,7 +20,6 @@ from ..errors import InputError
 from ..subsets import first_names
 from .color_encoding import ColorEncoding, encoding_of, encoding_of_boxes, encoding_of_profile
 from .color_primaries import srgb_to_linear
-from .gain_map_enlargement import enlarge_guided
 from .gain_map_parameters import (
     MOST_STOPS,
     GainMapParameters,
@@ -28,8 +27,10 @@ from .gain_map_parameters import (
     parameters_of_iso,
     parameters_of_xmp,
 )
+from .guided_upsampling import enlarge_guided
 from .heif import HeifItems, is_heif, item_bytes, read_items, register_heif, with_primary
 from .images import PILLOW_ERRORS, EncodedImage, exif_of, open_image, orientation_of, turn_upright
+from .lens import area_average
 from .raw import linear_codes
 from .xmp import xmp_of, xmp_text
 
@@ -89,10 +90,14 @@ class GainMap:
 
 def _at_size_of(guide: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """Return a channel of a gain map at the size of its photo, of which `guide` is [H, W] codes in [0, 1]."""
-    if plane.shape[0] <= guide.shape[0] and plane.shape[1] <= guide.shape[1] and plane.shape != guide.shape:
-        return enlarge_guided(plane, guide)
-    height, width = guide.shape
-    return np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BILINEAR))
+    (height, width), (rows, columns) = guide.shape, plane.shape
+
+    def resized(values: np.ndarray, kind: Image.Resampling = Image.Resampling.BICUBIC) -> np.ndarray:
+        return np.asarray(Image.fromarray(values).resize((width, height), kind))
+
+    if plane.shape == guide.shape or rows > height or columns > width:
+        return resized(plane, Image.Resampling.BILINEAR)
+    return enlarge_guided(plane, guide, reduce=lambda values: area_average(values, columns, rows), enlarge=resized)
 
 
 def light_of(photo: EncodedImage, gain_map: GainMap | None, scale: float = 1.0) -> EncodedImage:

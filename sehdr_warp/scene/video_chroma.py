@@ -1,20 +1,15 @@
-"""Chroma at half of luma's size (4:2:0, 4:2:2) at its full size, with luma as a guide.
-
-Where luma changes, chroma of the same surface usually changes in proportion, so a local linear model of chroma by luma
-(He, Sun and Tang, Guided Image Filtering, 2010) is fitted at the size of the chroma and applied at full size. What the
-model gets wrong by more than noise is added from the stored chroma, so that averages stay what the file states.
-"""
+"""Chroma at half of luma's size (4:2:0, 4:2:2) at its full size, with luma as a guide."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
+from PIL import Image
 
-_RADIUS = 1.0  # Standard deviation of the neighborhood of a fit, in chroma samples
-_NOISE = 3e-4  # Variance of luma codes in [0, 1] below which luma says little: flat areas keep smooth chroma
+from .guided_upsampling import enlarge_guided
+
 _TRUSTED = 2.0  # Median deviations from which a difference to the stored chroma is more than noise
-_REACH = 2  # Samples beside each one that cubic interpolation reads
-_BAND_ROWS = 256  # Chroma rows that are converted at a time, because floats take much memory
-_MARGIN = _REACH + 1  # Chroma rows beside a band that its values depend on
+_REACH = 3  # Samples beside each one that cubic interpolation reads, of a place up to a quarter aside
 
 
 def upsample_chroma(luma: np.ndarray, chroma: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
@@ -29,43 +24,16 @@ def upsample_chroma(luma: np.ndarray, chroma: np.ndarray, offsets: Sequence[floa
     Returns:
         [H, W, C] float32.
     """
-    shape = luma.shape
-    padding = [(0, 0 if offset is None else size % 2) for size, offset in zip(shape, offsets, strict=True)]
+    height, width = luma.shape
+    padding = [(0, 0 if offset is None else size % 2) for size, offset in zip(luma.shape, offsets, strict=True)]
     luma = np.pad(luma, padding, mode="edge")
-    small = _reduce(luma, offsets)
-    center, center_small = _blur(chroma), _blur(small)
-    variance = np.maximum(_blur(small * small) - center_small**2, 0) + _NOISE
-    slope = (_blur(small[..., None] * chroma) - center_small[..., None] * center) / variance[..., None]
-    result = np.zeros((*luma.shape, chroma.shape[2]), np.float32)
-    _add_enlarged(result, slope, offsets, luma[..., None])
-    _add_enlarged(result, chroma - slope * small[..., None], offsets)
-    difference = chroma - _reduce(result, offsets)
-    deviation = np.median(np.abs(difference), axis=(0, 1)) / np.float32(0.6745) * np.float32(_TRUSTED)
-    difference *= np.maximum(0, 1 - (deviation / np.maximum(np.abs(difference), np.float32(1e-9))) ** 2)
-    _add_enlarged(result, difference, offsets)
-    return result[: shape[0], : shape[1]]
-
-
-def _add_enlarged(
-    result: np.ndarray, values: np.ndarray, offsets: Sequence[float | None], factor: np.ndarray | None = None
-) -> None:
-    """Add to result [H, W, C], in place, values [h, w, C] at its size, times factor [H, W, 1]."""
-    step = 1 if offsets[0] is None else 2
-    for top in range(0, len(values), _BAND_ROWS):
-        start, end = max(top - _MARGIN, 0), min(top + _BAND_ROWS, len(values))
-        band = _enlarge(values[start : end + _MARGIN], offsets)[(top - start) * step : (end - start) * step]
-        rows = slice(top * step, end * step)
-        result[rows] += band if factor is None else band * factor[rows]
-
-
-def _blur(values: np.ndarray) -> np.ndarray:
-    from scipy.ndimage import gaussian_filter  # Takes a second to load
-
-    return gaussian_filter(values, (_RADIUS, _RADIUS, 0)[: values.ndim], mode="nearest", truncate=3)
+    change_size = {"reduce": partial(_reduce, offsets=offsets), "enlarge": partial(_enlarge, offsets=offsets)}
+    planes = [enlarge_guided(plane, luma, **change_size, trusted=_TRUSTED) for plane in np.moveaxis(chroma, 2, 0)]
+    return np.stack([plane[:height, :width] for plane in planes], axis=2)
 
 
 def _reduce(values: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
-    """Return averages of [H, W, ...] where the chroma samples lie: of two samples between, of three around one."""
+    """Return averages of [H, W] where the chroma samples lie: of two samples between, of three around one."""
     for axis, offset in enumerate(offsets):
         if offset is None:
             continue
@@ -80,23 +48,9 @@ def _reduce(values: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
 
 
 def _enlarge(values: np.ndarray, offsets: Sequence[float | None]) -> np.ndarray:
-    """Return [h, w, C] at the size of luma, by Catmull-Rom splines (Keys 1981)."""
-    for axis, offset in enumerate(offsets):
-        if offset is None:
-            continue
-        lines = np.moveaxis(values, axis, 0)
-        padded = np.pad(lines, ((_REACH, _REACH), *[(0, 0)] * (lines.ndim - 1)), mode="edge")
-        result = np.empty((2 * len(lines), *lines.shape[1:]), np.float32)
-        for phase in (0, 1):
-            distances = np.arange(-_REACH, _REACH + 1) - (phase - offset) / 2
-            weights = _cubic(np.abs(distances)).astype(np.float32)
-            taps = ((weight, padded[k : k + len(lines)]) for k, weight in enumerate(weights) if weight)
-            result[phase::2] = sum(weight * tap for weight, tap in taps)
-        values = np.moveaxis(result, 0, axis)
-    return values
-
-
-def _cubic(distance: np.ndarray) -> np.ndarray:
-    near = (1.5 * distance - 2.5) * distance**2 + 1
-    far = ((2.5 - 0.5 * distance) * distance - 4) * distance + 2
-    return np.where(distance < 1, near, np.where(distance < 2, far, 0))
+    """Return [h, w] at the size of luma, by Catmull-Rom splines (Keys 1981)."""
+    height, width = (size * (1 if offset is None else 2) for size, offset in zip(values.shape, offsets, strict=True))
+    top, left = (_REACH + (0.0 if offset is None else 0.25 - offset / 2) for offset in offsets)
+    padded = Image.fromarray(np.pad(values, _REACH, mode="edge"))
+    box = (left, top, left + values.shape[1], top + values.shape[0])
+    return np.asarray(padded.resize((width, height), Image.Resampling.BICUBIC, box=box))
