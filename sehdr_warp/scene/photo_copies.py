@@ -1,5 +1,6 @@
-"""Photos that are stored twice: as another kind of file, such as a phone's HEIC beside its JPEG, or as a copy."""
+"""Photos that are stored twice: as another kind of file (a phone's HEIC beside its JPEG), edited, or as a copy."""
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from .sfm import file_digest
 
 _ALIKE = 0.97  # Correlation of two thumbnails of one picture; photos from two places have less
 _SIDE = 32  # Of a thumbnail
+_EDITED = re.compile(r"(?<=^img_)e(?=\d)|-edited$")  # What iOS and Google Photos put into the names of edited photos
 _KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", *JPEG_SUFFIXES, ".bmp")
 """Kinds of files by preference: of two files of one picture the first kind counts, which may hold more bits."""
 
@@ -21,16 +23,16 @@ _KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", *JPEG_SUFFI
 def find_copies(photos: Sequence[Path]) -> dict[Path, Path]:
     """Return the photos that are copies of another one, each with that other one.
 
-    They have the same bytes, or one name but for the suffix and the same picture. A held-out photo would have its copy
-    among the training photos.
+    They have the same bytes, or the same picture and one name but for the suffix or the mark of an edited photo. A
+    held-out photo would have its copy among the training photos, and an editor changes the camera's response.
     """
     copies, photos = _equal_files(photos)
     by_stem: dict[str, list[Path]] = {}
     for photo in photos:
         if photo.suffix.lower() in LDR_SUFFIXES:
-            by_stem.setdefault(photo.stem.lower(), []).append(photo)
-    for group in by_stem.values():
-        best, *others = sorted(group, key=lambda photo: _KINDS.index(photo.suffix.lower()))
+            by_stem.setdefault(_EDITED.sub("", photo.stem.lower()), []).append(photo)
+    for stem, group in by_stem.items():
+        best, *others = sorted(group, key=lambda p: (p.stem.lower() != stem, _KINDS.index(p.suffix.lower())))
         pictures = [_thumbnail(photo) for photo in (best, *others)] if others else []
         for photo, picture in zip(others, pictures[1:], strict=True):
             if pictures[0] is not None and picture is not None and float((pictures[0] * picture).sum()) > _ALIKE:

@@ -203,6 +203,19 @@ def test_copies_of_the_same_bytes_are_left_out_and_named(tmp_path):
     assert dataset.notes == ("1 photo is a copy of others and left out: IMG_2 (1).jpg of IMG_2.jpg",)
 
 
+@pytest.mark.parametrize("edited", ["IMG_E{}.jpg", "img_e{}.HEIC", "IMG_{}-edited.jpg"])
+def test_edited_photos_beside_their_originals_are_left_out_and_named(tmp_path, edited):
+    """As phones write them: another tone is another response. One that shows another picture is a photo."""
+    for i in range(4):
+        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
+        brighter = np.minimum(pattern(96, 64, i if i < 3 else 9) * 1.2, 255).astype(np.uint8)
+        Image.fromarray(brighter).save(tmp_path / edited.format(i), "PNG")
+    dataset = find_photos(tmp_path)
+    names = {record.image.name for record in dataset.records}
+    assert names == {*(f"IMG_{i}.jpg" for i in range(4)), edited.format(3)}
+    assert dataset.notes == (f"3 photos are copies of others and left out: {edited.format(0)} of IMG_0.jpg ...",)
+
+
 @pytest.mark.parametrize("suffix", [".jfif", ".jpe", ".mpo"])
 def test_jpegs_under_their_other_suffixes(tmp_path, suffix):
     for i in range(3):
