@@ -55,8 +55,10 @@ def find_center(
     """Return where a map is rendered and what it leaves out, by the arguments of write_environment_map()."""
     if isinstance(at, str) and at == "center":
         center = map_center(photos)
+    elif isinstance(at, str) and at.startswith("camera:"):
+        center = MapCenter(camera_named(run, at.removeprefix("camera:")).position, 0.0)
     else:
-        center = MapCenter(_point(run, at, transform), 0.0)
+        center = MapCenter(transform.inverse().points(_numbers(at)), 0.0)
     if beyond is not None:
         return center._replace(beyond=beyond / transform.scale)
     if center.beyond:
@@ -64,13 +66,6 @@ def find_center(
         text = "the photos walk around (%s): the map is what surrounds that point beyond %.3g; --beyond changes it"
         log.info(text, place, transform.scale * center.beyond)
     return center
-
-
-def _point(run: "RenderableScene", at: str | tuple[float, float, float], transform: WorldTransform) -> np.ndarray:
-    """Return the point [3] that `at` names, in the scene's coordinates; its numbers are in those of the transform."""
-    if isinstance(at, str) and at.startswith("camera:"):
-        return camera_named(run, at.partition(":")[2]).position
-    return transform.inverse().points(_numbers(at))
 
 
 def _numbers(at: str | tuple[float, float, float]) -> np.ndarray:

@@ -47,7 +47,7 @@ _CHECKED = 3  # Held-out views that the mesh's depth is compared in
 # Triangles nearer to a Gaussian of a light than so many standard deviations and voxels are left out. Of the Gaussians
 # near a vertex so many are asked, because the nearest one may be small.
 _REACH, _CLEAR, _NEAREST = 2.0, 1.5, 8
-_UPRIGHT = np.cos(np.radians(20))  # Cosine between +Y of the file and up with which a level part is a floor
+_UPRIGHT = np.cos(np.radians(20))  # Cosine to +Y of the normal of a floor, and of up in a file that may have a floor
 _LEVEL = 1.0  # Degrees to which a floor counts as level
 _COARSE = 0.1  # Voxels by which rounded coordinates may move a vertex without a warning
 _CLOSE = 0.03  # Relative difference of depth that counts as agreement
@@ -239,19 +239,13 @@ def _large_parts(
     return vertices[corners], faces.reshape(-1, 3), colors[corners]
 
 
-def _areas(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit normals [F, 3] and areas [F] of triangles."""
-    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
-    normals = np.cross(second - first, third - first)
-    lengths = np.linalg.norm(normals, axis=1)
-    return normals / np.maximum(lengths, 1e-20)[:, None], lengths / 2
-
-
 def find_ground(vertices: np.ndarray, faces: np.ndarray, cameras: np.ndarray, voxel: float) -> Ground | None:
     """Return the floor of an upright mesh: the lowest of its large level parts, below the cameras [C, 3]."""
-    normals, areas = _areas(vertices, faces)
-    middles = vertices[faces].mean(axis=1)
-    level = (normals[:, 1] > np.cos(np.radians(20))) & (middles[:, 1] < np.percentile(cameras[:, 1], 10))
+    corners = vertices[faces]
+    normals, middles = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1)
+    lengths = np.linalg.norm(normals, axis=1)
+    areas = lengths / 2
+    level = (normals[:, 1] > _UPRIGHT * np.maximum(lengths, 1e-20)) & (middles[:, 1] < np.percentile(cameras[:, 1], 10))
     if areas[level].sum() < 0.02 * areas.sum():
         return None
     low = middles[level, 1].min()

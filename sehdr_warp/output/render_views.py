@@ -15,6 +15,7 @@ from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
 from ..progress import track_progress
 from ..scene import Camera
+from ..scene.camera import MAX_SIDE
 from ..scene.camera_exchange import EXCHANGE_SUFFIXES
 from ..scene.camera_files import read_camera_file
 from ..scene.images import MAX_PIXELS
@@ -243,7 +244,7 @@ def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
         width, height = (int(side) for side in (size.lower().split("x") if isinstance(size, str) else size))
     except (ValueError, TypeError):
         width = height = 0
-    if min(width, height) < 1 or width * height > MAX_PIXELS:
+    if min(width, height) < 1 or max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
         raise SehdrError(f"size {size!r} is not usable; write width and height in pixels, such as 1920x1080")
     return width, height
 
@@ -326,20 +327,20 @@ def select_cameras(
 
 def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
     """Return the cameras of a file in the scene's coordinates."""
-    file = read_camera_file(path)
-    views, photos_to_scene = file.cameras, from_photos(run)
-    if path.suffix.lower() in EXCHANGE_SUFFIXES:
-        if file.world_matrix is None:
-            to_scene = (transform or world_transform(run)).inverse()
-            return [(name, to_scene.camera(camera)) for name, camera in views]
+    file, own = read_camera_file(path), cameras_beside(Path(run.path))
+    views, steps = file.cameras, [from_photos(run)]  # Most files are in the photos' coordinates.
+    if file.world_matrix is not None:
         try:
-            to_photos = WorldTransform.from_matrix(file.world_matrix).inverse()
+            steps.insert(0, WorldTransform.from_matrix(file.world_matrix).inverse())
         except ValueError as error:
             raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
-        views = [(name, to_photos.camera(camera)) for name, camera in views]
-    elif run.world_matrix is None or ((own := cameras_beside(Path(run.path))) is not None and own.samefile(path)):
-        return views
-    return [(name, photos_to_scene.camera(camera)) for name, camera in views]
+    elif path.suffix.lower() in EXCHANGE_SUFFIXES:
+        steps = [(transform or world_transform(run)).inverse()]
+    elif own is not None and own.samefile(path):
+        steps = []  # They are in the coordinates of the Gaussians beside.
+    for step in steps:
+        views = [(name, step.camera(camera)) for name, camera in views]
+    return views
 
 
 def provenance(run: "RenderableScene") -> dict[str, str]:

@@ -31,6 +31,7 @@ class EditedOpacities:
 
     original: Tensor | None = None
 
+    @torch.no_grad()
     def apply(self, run: Any, edits: SplatEdits | None) -> int:
         """Show what edits leave of a run, or all of it for None; return the number of Gaussians that are shown.
 
@@ -40,8 +41,7 @@ class EditedOpacities:
         logits = run.field.gaussians.opacity_logits
         current = logits.detach().clone()
         original = current if self.original is None else self.original
-        with torch.no_grad():
-            logits.copy_(original)  # Views and masks are counted on the whole scene.
+        logits.copy_(original)  # Views and masks are counted on the whole scene.
         mask = np.ones(len(original), bool)
         if edits is not None:
             means = run.field.normalization.scene_points(run.field.gaussians.means.detach().cpu().numpy())
@@ -49,11 +49,9 @@ class EditedOpacities:
             try:
                 mask = edits.mask(opacities, world_transform(run).points(means), run)
             except SehdrError:
-                with torch.no_grad():
-                    logits.copy_(current)
+                logits.copy_(current)
                 raise
-        with torch.no_grad():
-            logits[torch.from_numpy(~mask).to(logits.device)] = _HIDDEN_LOGIT
+        logits[torch.from_numpy(~mask).to(logits.device)] = _HIDDEN_LOGIT
         self.original = None if edits is None else original
         return int(mask.sum())
 
@@ -68,6 +66,7 @@ class LightGains:
 
     original: tuple[Tensor, Tensor] | None = None
 
+    @torch.no_grad()
     def apply(self, run: Any, lights: Sequence[Light], stops: Mapping[int, float]) -> None:
         """Show lights with gains, and all others as they were trained.
 
@@ -89,16 +88,15 @@ class LightGains:
                 raise SehdrError(f"gain {gain} is not between -{MOST_GAIN:g} and {MOST_GAIN:g} stops")
         parts = model.gaussians.harmonics_dc, model.gaussians.harmonics_rest
         original = self.original or tuple(part.detach().clone() for part in parts)
-        with torch.no_grad():
-            for part, values in zip(parts, original, strict=True):
-                part.copy_(values)
-            for index, gain in stops.items():
-                members = lights[index].members.to(parts[0].device)
-                if model.color_model.name == "log":
-                    parts[0][members] += gain * math.log(2) / HARMONIC_0
-                else:
-                    for part in parts:
-                        part[members] *= 2.0**gain
+        for part, values in zip(parts, original, strict=True):
+            part.copy_(values)
+        for index, gain in stops.items():
+            members = lights[index].members.to(parts[0].device)
+            if model.color_model.name == "log":
+                parts[0][members] += gain * math.log(2) / HARMONIC_0
+            else:
+                for part in parts:
+                    part[members] *= 2.0**gain
         self.original = original if stops else None
 
 
