@@ -253,7 +253,7 @@ class BracketWriter:
         brackets: Options.
         out: Folder that the files belong to.
         folder: Where EXR files are written until all are complete.
-        photos: The same for simulated photos.
+        photos: The same for simulated photos; not used without them.
         views: Entries of the manifest so far.
     """
 

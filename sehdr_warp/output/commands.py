@@ -295,7 +295,7 @@ def run_render(args: Render) -> None:
         raise UsageError(f"{problem}; see sehdr-warp render --help")
     flags = changed_flags(args.film)
     if args.out is not None and may_move(args.cameras):
-        flags = [flag for flag in flags if flag != "--fps"]
+        flags = [flag for flag in flags if flag != "--fps"]  # Files of a moving camera state it, too.
     if args.video is None and flags:
         raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
     if args.out is None and (flags := changed_flags(args.pictures)):
@@ -319,8 +319,8 @@ def run_render(args: Render) -> None:
     count = default_count if args.count is None else args.count
     selection = {"cameras": args.cameras, "camera": args.camera, "count": count}
     if args.out is not None:
-        options = selection | vars(args.world) | vars(args.pictures)
-        files = render_views(run, args.out, size=size, overwrite=args.overwrite, fps=fps, **options)
+        groups = vars(args.world) | vars(args.pictures)  # Their fields are arguments of render_views().
+        files = render_views(run, args.out, size=size, overwrite=args.overwrite, fps=fps, **selection, **groups)
         summary = f"{args.out}: {len(files)} files"
     if args.video is not None:
         transform = world_transform(run, **vars(args.world))

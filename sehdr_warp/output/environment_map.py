@@ -110,10 +110,9 @@ def write_environment_map(
     photos = training_cameras(run)
     center = find_center(run, photos, at, beyond, transform)
     focal = typical_focal_length(photos) if photos else 0.0
-    options = {"beyond": center.beyond, "shares": run.clipped_share()}
-    rendered = render_map(run, center.position, size, layout, transform.rotation, focal, **options)
-    weight = solid_angles(size, layout)
-    place = transform.points(center.position)
+    what = {"beyond": center.beyond, "shares": run.clipped_share()}
+    rendered = render_map(run, center.position, size, layout, transform.rotation, focal, **what)
+    weight, place = solid_angles(size, layout), transform.points(center.position)
     _judge(run, place, photos, rendered.alpha, rendered.distance, weight)
     added = np.zeros_like(rendered.hdr)
     if inpaint:

@@ -121,18 +121,18 @@ def write_lights(
         raise SehdrError(f"{path}: at, beyond and unseen are of the dome's map, which .json has not; write .usda")
     transform = world_transform(run, axes, up=up, scale=scale)
     center = None if suffix == ".json" else find_center(run, training_cameras(run), at, beyond, transform)
-    exposure_of_white(run, reference_white)  # Before minutes of looking for lights
+    factor, unit = exposure_of_white(run, reference_white), "relative radiance"
+    if reference_white is not None:
+        unit = f"white is {reference_white:g}"
+    elif (luminance := luminance_of_one(run)) is not None:
+        factor, unit = luminance, "cd/m^2"
+        text = "%s: in cd/m^2; a value of 1 in plates is %.4g of them, and --reference-white puts all in one unit"
+        log.info(text, path.name, luminance)
+    units = f"{unit}, linear Rec.709"
     lights = run.find_lights()
     if not lights:
         text = "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest"
         log.warning(text, run.path)
-    unit = luminance_of_one(run) if reference_white is None else None
-    factor = unit or exposure_of_white(run, reference_white)
-    relative = "relative radiance" if reference_white is None else f"white is {reference_white:g}"
-    units = f"{relative if unit is None else 'cd/m^2'}, linear Rec.709"
-    if unit is not None:
-        text = "%s: in cd/m^2; a value of 1 in plates is %.4g of them, and --reference-white puts all in one unit"
-        log.info(text, path.name, unit)
     rows = [_describe(f"light_{index}", light, transform, factor) for index, light in enumerate(lights)]
     if center is not None:
         inpainted = _write_rest(run, rest, lights, transform, center, unseen, overwrite)
@@ -232,13 +232,12 @@ def _write_rest(
 
     Returns the share of the map's light that is filled in.
     """
-    (position, beyond), focal = center, typical_focal_length(training_cameras(run))
-    members = [light.members for light in lights]
-    rest = render_map(run, position, MAP_SIZE, "latlong", transform.rotation, focal, without=members, beyond=beyond)
+    focal, members = typical_focal_length(training_cameras(run)), [light.members for light in lights]
+    options = {"without": members, "beyond": center.beyond}
+    rest = render_map(run, center.position, MAP_SIZE, "latlong", transform.rotation, focal, **options)
     hdr, directions, weight = rest.hdr, latlong(MAP_SIZE) @ transform.rotation, solid_angles(MAP_SIZE, "latlong")
-    options = {"focal": focal, "beyond": beyond}
     # Dark lights are not the light around them.
-    source = np.where(_shows_lights(run, members, position, transform.rotation, **options), 0, rest.alpha)
+    source = np.where(_shows_lights(run, members, center, transform.rotation, focal), 0, rest.alpha)
     inpainted = 0.0
     if unseen == "inpaint" and (source > COVERED).any():
         added = (1 - rest.alpha[..., None]) * inpainted_light(hdr, source, directions, weight)
@@ -248,14 +247,15 @@ def _write_rest(
         text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"
         log.info(text, path.name, share, 100 * inpainted)
         hdr = hdr + added
-    header = exr_header("rec709", 1.0, provenance=provenance(run), white_luminance=luminance_of_one(run))
+    facts = provenance(run) | {"worldMatrix": json.dumps(transform.matrix.tolist())}
+    header = exr_header("rec709", 1.0, provenance=facts, white_luminance=luminance_of_one(run))
     header["envmap"] = envmap("latlong")
     write_exr(path, rgb_channels(hdr) | {"A": rest.alpha}, header=header, overwrite=overwrite)
     return inpainted
 
 
 def _shows_lights(
-    run: "Run", members: Sequence[torch.Tensor], position: np.ndarray, to_scene: np.ndarray, focal: float, beyond: float
+    run: "Run", members: Sequence[torch.Tensor], center: MapCenter, to_scene: np.ndarray, focal: float
 ) -> np.ndarray:
     """Return [H, W] whether half of the light of a map's pixel and more comes from Gaussians of lights.
 
@@ -265,6 +265,6 @@ def _shows_lights(
     part = torch.zeros(run.gaussian_count, device=run.device)
     for index in members:
         part[index] = 1
-    options = {"focal_length": focal, "pixel_angle": 2 * np.pi / size, "beyond": beyond, "shares": part}
-    rendered = run.render_directions(position, latlong(size) @ to_scene, **options)
+    options = {"focal_length": focal, "pixel_angle": 2 * np.pi / size, "beyond": center.beyond, "shares": part}
+    rendered = run.render_directions(center.position, latlong(size) @ to_scene, **options)
     return np.kron(as_array(rendered.clipped) > 0.5, np.ones((8, 8), bool))

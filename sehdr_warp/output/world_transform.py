@@ -126,13 +126,13 @@ def world_transform(
     """
     if axes not in AXES:
         raise SehdrError(f"axes {axes!r} is not one of {', '.join(AXES)}")
-    run = run.reference or run
+    run = run.reference or run  # Of merged scenes the first one
     orientation = read_orientation(run)
     if axes == "scene":
         if up is not None:
             raise SehdrError("--up turns the scene upright, and --axes scene leaves it as it is; leave one of them out")
-        factor, back = _checked_scale(scale), from_photos(run).inverse()
-        return WorldTransform(back.rotation, factor * back.translation, factor * back.scale)
+        factor, to_photos = _checked_scale(scale), from_photos(run).inverse()
+        return WorldTransform(to_photos.rotation, factor * to_photos.translation, factor * to_photos.scale)
     by_gps = None if run.up is None else run.up.unit
     factor = _checked_scale(next((each for each in (scale, orientation.scale, by_gps) if each is not None), None))
     direction = _known_up(run, up, orientation)

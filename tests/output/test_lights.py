@@ -91,7 +91,9 @@ def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
 
 def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, logged):
     write_lights(run, tmp_path / "lights.usda", axes="scene")
-    channels, _ = read_exr_channels(tmp_path / "lights_rest.exr")
+    channels, header = read_exr_channels(tmp_path / "lights_rest.exr")
+    matrix = world_transform(run, "scene").matrix
+    np.testing.assert_allclose(json.loads(header["sehdr:worldMatrix"]), matrix)
     filled, alpha = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
     assert "no photo shows 94 % of all directions" in logged[0]
     share = float(re.search(r"sehdr:inpaintedShare = (\S+)", (tmp_path / "lights.usda").read_text())[1])
