@@ -118,10 +118,8 @@ def export(
         remove_earlier(path.parent, [camera_file_of(path).name])
     meaning = f"display colors of {shutter(seconds)}" if kind == "ldr" else "scene-linear radiance"
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, written.count, written.degree, meaning)
-    if edits.shows_part:
-        _log_loss(run, whole, kind, display_time, note=", before the cut")
-    else:
-        _log_loss(run, part, kind, display_time)
+    compared, note = (whole, ", before the cut") if edits.shows_part else (part, "")
+    _log_loss(run, compared, kind, display_time, note)
     if path_is_lossy(path):
         _log_file_loss(path, run, part if edits.shows_part else None, to_file, display_time)
     return path
@@ -204,9 +202,7 @@ def loss_in_words(decibels: float) -> str:
     return "visible loss"
 
 
-def _log_loss(
-    run: "RenderableScene", gaussians: GaussianArrays, kind: str, display_time: float, note: str = ""
-) -> None:
+def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, display_time: float, note: str) -> None:
     """Measure and log how well Gaussians in the scene's coordinates show the scene; `note` ends the line's views."""
     views = _cameras_to_compare(run)
     where = f"{len(views)} view{'s' * (len(views) != 1)}{note}"

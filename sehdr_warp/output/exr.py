@@ -213,12 +213,7 @@ def _camera_attributes(camera: Camera) -> dict[str, Any]:
 
 
 def write_radiance(
-    path: Path | str,
-    image: np.ndarray,
-    *,
-    exposure: float = 1.0,
-    colorspace: str = "rec709",
-    overwrite: bool = False,
+    path: Path | str, image: np.ndarray, *, exposure: float = 1.0, colorspace: str = "rec709", overwrite: bool = False
 ) -> None:
     """Write [H, W, 3] linear RGB as Radiance HDR; negative values become 0 and channels share an 8-bit exponent.
 

@@ -200,12 +200,7 @@ def _hdr_parts(
 
 
 def _camera_files(
-    run: "RenderableScene",
-    views: Sequence[tuple[str, Camera]],
-    transform: WorldTransform,
-    fps: float,
-    *,
-    moves: bool,
+    run: "RenderableScene", views: Sequence[tuple[str, Camera]], transform: WorldTransform, fps: float, *, moves: bool
 ) -> dict[str, str]:
     """Return the names and texts of the files that hold the cameras of a render, as far as they are pinholes.
 

@@ -16,16 +16,7 @@ from ..scene.lens import area_average
 from .comparison import Comparison, opening_of
 from .diagrams import camera_map, training_svg
 from .html import EMPTY, duration, join, markup, page_file, whole_page, with_code
-from .light_pictures import (
-    SPLIT,
-    dial,
-    img,
-    jpeg,
-    jpeg_source,
-    photo_for_display,
-    side_choices,
-    simulated_photo,
-)
+from .light_pictures import SPLIT, dial, img, jpeg, jpeg_source, photo_for_display, side_choices, simulated_photo
 from .light_unit import luminance_of_one, read_light_unit
 from .tonemap import display_gain, expose, fit_tone_map
 from .ultra_hdr import MOST_STOPS, ultra_hdr

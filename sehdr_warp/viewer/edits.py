@@ -124,7 +124,5 @@ def orient(run: Any, request: dict) -> None:
     """Keep with a run the up direction or the scale that a page sets; raise SehdrError for values that cannot be."""
     up, scale = request.get("up"), request.get("scale")
     write_orientation(
-        run,
-        up=None if up is None else [float(value) for value in up],
-        scale=None if scale is None else float(scale),
+        run, up=None if up is None else [float(value) for value in up], scale=None if scale is None else float(scale)
     )

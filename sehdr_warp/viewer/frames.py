@@ -197,11 +197,7 @@ class ViewerScene:
         own = {}
         if hasattr(self, "path"):  # A training has no folder yet.
             transform = world_transform(cast(Any, self))
-            own = {
-                "up": transform.rotation[1].tolist(),
-                "upright": transform.matrix.tolist(),
-                **self._opening(),
-            }
+            own = {"up": transform.rotation[1].tolist(), "upright": transform.matrix.tolist(), **self._opening()}
         facts = {
             "name": self.name,
             "version": self.version,
