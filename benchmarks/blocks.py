@@ -79,7 +79,7 @@ class Study:
     """cpu or cuda:N; the GPUs that follow it are used, too."""
     seconds: float = 1e9
     """Time for the study; what does not fit into it is left out."""
-    json: Path | None = None
+    json: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Result, which is written even if a part of the study fails."""
     began: tyro.conf.Suppress[float] = field(default_factory=time.monotonic)
     """Start of the study, monotonic seconds."""

@@ -128,7 +128,7 @@ class Quality(Output):
     jobs: int = 1
     """Trainings at one time, spread over the GPUs; more than one needs submitit."""
     slurm: str | None = None
-    """Submit to SLURM, with these parameters, such as partition=gpu,time=240 (minutes)."""
+    """Submit to SLURM, with these parameters, such as partition=gpu,time=240 (minutes; a day by default)."""
 
     def measure(self):
         """Run the benchmark and return its result."""

@@ -35,11 +35,7 @@ VIEWS = 4  # Held-out views that are compared
 
 
 def main(
-    runs: tuple[str, ...],
-    /,
-    work: Path = Path("files_work"),
-    json: Path | None = None,
-    overwrite: bool = False,
+    runs: tuple[str, ...], /, work: Path = Path("files_work"), json: Path | None = None, overwrite: bool = False
 ) -> None:
     """Export each run to every kind of file and judge the files.
 

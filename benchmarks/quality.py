@@ -20,7 +20,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from benchmarks.irradiance import LIGHT, irradiance_errors, read_light_maps, store_light
-from sehdr_warp.blocks.jobs import MONTH, slurm_executor
+from sehdr_warp.blocks.jobs import local_executors, slurm_executor, visible_gpus
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.evaluation.metrics import REGIONS
@@ -251,19 +251,10 @@ def row_of(result: dict) -> dict:
 
 def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpips: str | None) -> None:
     """Workers by submitit, each taking job after job; returns when all have ended."""
-    try:
-        import submitit
-    except ImportError:
-        problem = "submitit starts several jobs at once and is not installed"
-        raise SehdrError(f"{problem}; pip install submitit, or take --jobs 1") from None
-    gpus = torch.cuda.device_count() if device == "cuda" and slurm is None else 0
-    shared = -(-at_once // gpus) if gpus else at_once if slurm is None else 1
-    logs = out / "logs"
+    logs, count = out / "logs", torch.cuda.device_count() if device == "cuda" and slurm is None else 0
+    shared = -(-at_once // count) if count else at_once if slurm is None else 1
     if slurm is None:
-        executors = [submitit.LocalExecutor(folder=logs) for _ in range(at_once)]
-        for index, executor in enumerate(executors):
-            on_gpu = {"gpus_per_node": 1, "visible_gpus": [index % gpus]} if gpus else {}
-            executor.update_parameters(timeout_min=MONTH, **on_gpu)
+        executors = local_executors(logs, at_once, visible_gpus(torch.device(device), count) if count else [])
     else:
         executors = [slurm_executor(logs, slurm, gpu=device == "cuda")] * at_once
     workers = [executor.submit(work, jobs, out.absolute(), device, shared, lpips) for executor in executors]

@@ -79,10 +79,7 @@ def write_readme(path: Path, result: dict) -> None:
         temporary.write_text(text[:start] + table + text[text.index("\n\n", start) :], encoding="utf-8")
 
 
-PLOTS: dict[str, Callable[[dict, Path], None]] = {
-    "quality": plots.plot_quality,
-    "kernels": plots.plot_kernels,
-}
+PLOTS: dict[str, Callable[[dict, Path], None]] = {"quality": plots.plot_quality, "kernels": plots.plot_kernels}
 
 
 def _tried_page(path: Path) -> list[str]:

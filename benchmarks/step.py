@@ -73,11 +73,7 @@ def thick_of_training(config: Config) -> int:
 
 
 def make_trainer(
-    scene: Scene,
-    config: Config,
-    device: torch.device,
-    rasterizer: Callable | None = None,
-    ranks: Ranks | None = None,
+    scene: Scene, config: Config, device: torch.device, rasterizer: Callable | None = None, ranks: Ranks | None = None
 ) -> Trainer:
     """Return a trainer in the thick of its training, with opacities spread as training spreads them.
 

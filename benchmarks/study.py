@@ -1,12 +1,13 @@
 """Run a study as a program: its main() takes the command line, its docstring is the help."""
 
+import inspect
 import logging
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_origin
 
 import tyro
 
@@ -22,6 +23,10 @@ def run(main: Callable[..., Any]) -> None:
 
     The arguments before `/` stand without a flag, the others are flags.
     """
+    for name, parameter in inspect.signature(main).parameters.items():
+        starred = parameter.kind is parameter.POSITIONAL_ONLY and get_origin(parameter.annotation) is tuple
+        if starred or parameter.default in (None, False, ()):  # Else the help would say `(default: None)`.
+            main.__annotations__[name] = Annotated[parameter.annotation, tyro.conf.arg(help_behavior_hint="")]
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     program = f"python -m {sys.modules['__main__'].__spec__.name}"  # pyright: ignore[reportOptionalMemberAccess]
     run_program(lambda words: tyro.cli(main, prog=program, args=words, config=MARKERS), sys.argv[1:], program)

@@ -54,12 +54,7 @@ class StoppedTraining(RuntimeError):
 
 
 def train_block(
-    out: Path,
-    index: int,
-    device: str | None,
-    photo_storage: str,
-    versions: str,
-    is_over: threading.Event | None = None,
+    out: Path, index: int, device: str | None, photo_storage: str, versions: str, is_over: threading.Event | None = None
 ) -> BlockResult:
     """Train a block to its end, or continue its training.
 

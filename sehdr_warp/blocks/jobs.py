@@ -11,7 +11,7 @@ import re
 import secrets
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,11 +66,11 @@ def run_blocks(
         return
     slots = min(gpus, len(queue.waiting)) if slurm is None else len(queue.waiting)
     on_cpu = slurm_device == "cpu" if slurm is not None else device.type == "cpu"
-    executors = (
-        _executors(out, device, slots)
-        if slurm is None
-        else [slurm_executor(_logs_folder(out), slurm, gpu=not on_cpu)] * slots
-    )
+    logs = _logs_folder(out)
+    if slurm is None:
+        executors = local_executors(logs, slots, visible_gpus(device, slots) if device.type == "cuda" else [])
+    else:
+        executors = [slurm_executor(logs, slurm, gpu=not on_cpu)] * slots
     arguments = ("cpu" if on_cpu else None), photo_storage, installed_versions()
     # Jobs that run beside each other on this machine share its processors.
     job = BlockJob(max(1, thread_count() // slots) if slurm is None and slots > 1 else None)
@@ -192,17 +192,22 @@ def visible_gpus(device: torch.device, count: int) -> list[str]:
     return [name.strip() for name in names[first : first + count]]
 
 
-def _executors(out: Path, device: torch.device, slots: int) -> list[Any]:
-    """Return an executor of submitit for each job that may run at the same time on this machine."""
-    submitit, logs = _submitit(), _logs_folder(out)
+def local_executors(logs: Path, slots: int, gpus: Sequence[str]) -> list[Any]:
+    """Return an executor of submitit for each job that may run at the same time on this machine.
+
+    Args:
+        logs: Folder of logs and pickled values.
+        slots: Number of jobs.
+        gpus: Names of GPUs in CUDA_VISIBLE_DEVICES, one for each job in turn; empty for jobs without a GPU.
+    """
+    submitit = _submitit()
     executors = [submitit.LocalExecutor(folder=logs) for _ in range(slots)]
-    for executor in executors:
+    for index, executor in enumerate(executors):
         executor.update_parameters(timeout_min=MONTH)
-    if device.type == "cuda":
-        for executor, name in zip(executors, visible_gpus(device, slots), strict=True):
+        if gpus:
             # submitit hides all GPUs from a job that asks for none. It wants numbers there, but passes names on, too.
             executor.update_parameters(gpus_per_node=1)
-            executor.parameters["visible_gpus"] = [name]
+            executor.parameters["visible_gpus"] = [gpus[index % len(gpus)]]
     return executors
 
 
@@ -231,7 +236,7 @@ def slurm_executor(logs: Path, options: Mapping[str, str], *, gpu: bool) -> Any:
 
 def _submitit() -> Any:
     """Return the package submitit; raise SehdrError if it is not installed."""
-    return require_extra("submitit", "submitit, which runs blocks as jobs, is not installed", "blocks")
+    return require_extra("submitit", "submitit, which runs trainings as jobs, is not installed", "blocks")
 
 
 def _logs_folder(out: Path) -> Path:

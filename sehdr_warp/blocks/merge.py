@@ -90,8 +90,7 @@ def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage
     iterations = max(block.values["iteration"] for block in blocks)
     first = RunFolder(folder_of(out, plan, 0)).read_config()
     config = override_config(
-        first,
-        {"schedule.iterations": iterations, "densification.cap_max": len(tensors["means"]), "plan.keep": []},
+        first, {"schedule.iterations": iterations, "densification.cap_max": len(tensors["means"]), "plan.keep": []}
     )
     views = {view["name"]: view for block in blocks for view in block.views}
     description = RunFolder(folder_of(out, plan, 0)).read_scene()

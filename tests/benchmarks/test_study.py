@@ -35,6 +35,7 @@ def test_help_describes_every_option_and_does_nothing_else(name, monkeypatch, ca
     assert ended(monkeypatch, getattr(module, "main", None) or module.write_survey, "--help") == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert text.startswith("usage: python -m")
+    assert not re.search(r"\(default: (None|False|)\)", text)
     assert not re.search(r"(PATH|INT|STR|FLOAT|\]) \((default|required)", text), "an option has no text"
 
 

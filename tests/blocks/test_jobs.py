@@ -65,7 +65,7 @@ def test_a_file_system_that_loses_a_trained_block_is_named(divided, monkeypatch)
             (folder_of(out, plan, 1) / "confidence.safetensors").unlink()
         return SimpleNamespace(done=lambda: True, exception=lambda: None, result=lambda: result)
 
-    monkeypatch.setattr(jobs, "_executors", lambda *_: [SimpleNamespace(submit=submit)])
+    monkeypatch.setattr(jobs, "local_executors", lambda *_: [SimpleNamespace(submit=submit)])
     monkeypatch.setattr(jobs, "ARRIVES", 0.0)
     lost = r"block_02: node far: trained it, and .*block_02 does not hold the trained run: the file system has lost it"
     with pytest.raises(SehdrError, match=rf"{lost}; .*; 1 of 2 blocks are finished; resume=True trains"):
@@ -84,7 +84,7 @@ def test_blocks_at_once_share_the_processors(divided, monkeypatch, at_once, thre
         result = job(*arguments)
         return SimpleNamespace(done=lambda: True, exception=lambda: None, result=lambda: result)
 
-    monkeypatch.setattr(jobs, "_executors", lambda *_: [SimpleNamespace(submit=submit)] * at_once)
+    monkeypatch.setattr(jobs, "local_executors", lambda *_: [SimpleNamespace(submit=submit)] * at_once)
     jobs.run_blocks(out, plan, device=torch.device("cpu"), gpus=at_once)
     devices = {RunFolder(folder_of(out, plan, index)).read_summary()["device"] for index in range(2)}
     assert devices == {f"cpu ({threads} threads)"}

@@ -140,7 +140,7 @@ def test_other_commands_take_the_merged_run(merged, tmp_path):
 
 
 def test_finished_blocks_are_not_run_again(merged, monkeypatch):
-    monkeypatch.setattr(jobs, "_executors", lambda *_: pytest.fail("a job was started"))
+    monkeypatch.setattr(jobs, "local_executors", lambda *_: pytest.fail("a job was started"))
     before = (merged / "checkpoints").stat().st_mtime_ns
     assert call("train", "--resume", "--out", merged, "--device", "cpu") == 0
     assert (merged / "checkpoints").stat().st_mtime_ns == before, "nor merged again"
@@ -201,9 +201,9 @@ def test_blocks_take_the_gpus_that_the_user_made_visible(monkeypatch, first, cou
 
 def test_a_job_of_this_machine_sees_its_gpu_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,GPU-71aa")
-    executors = jobs._executors(tmp_path, torch.device("cuda"), 2)
+    executors = jobs.local_executors(tmp_path, 3, jobs.visible_gpus(torch.device("cuda"), 2))
     running = [executor.submit(os.getenv, "CUDA_VISIBLE_DEVICES") for executor in executors]
-    assert [job.result() for job in running] == ["3", "GPU-71aa"]
+    assert [job.result() for job in running] == ["3", "GPU-71aa", "3"]
 
 
 @pytest.mark.parametrize("flag", [("--blocks", "auto"), ("--blocks=auto",)])
