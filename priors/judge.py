@@ -127,14 +127,7 @@ def main(pack: Path, weights: Path, /, out: Path, folder: Path | None = None, de
 
 @torch.no_grad()
 def _collect(
-    network: LightNetwork,
-    pack: Pack,
-    chosen: np.ndarray,
-    seed: int,
-    device: str,
-    *,
-    plain: bool,
-    **shares: Any,
+    network: LightNetwork, pack: Pack, chosen: np.ndarray, seed: int, device: str, *, plain: bool, **shares: Any
 ) -> dict:
     """Return lists over photos: truth, mean and deviation of clipped values, cues, and what else figures need.
 

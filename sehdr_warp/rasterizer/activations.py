@@ -49,11 +49,7 @@ class _BoundedExponential(torch.autograd.Function):
 
 
 def opacity_penalty(
-    opacities: Tensor,
-    extents: Tensor | None,
-    moments: Tensor | None,
-    weight: float,
-    active_count: Tensor | None = None,
+    opacities: Tensor, extents: Tensor | None, moments: Tensor | None, weight: float, active_count: Tensor | None = None
 ) -> Tensor:
     """Return `weight` times the sum of the opacities that count over the number of Gaussians, a scalar.
 

@@ -17,13 +17,7 @@ from .graph_cache import GraphPool, ReplayedRender, find_pool, get_or_create_poo
 from .memory import oom_context
 from .projection import ProjectedGaussians, RasterInputs, project_to_camera
 from .render_options import RenderOptions
-from .tile_lists import (
-    PackedSplats,
-    TileLists,
-    build_tile_lists,
-    order_intersections,
-    pack_splats,
-)
+from .tile_lists import PackedSplats, TileLists, build_tile_lists, order_intersections, pack_splats
 from .torch_contract import torch_operation
 
 

@@ -317,12 +317,7 @@ class SortedIntersections(NamedTuple):
 
 
 def lists_by_tile(
-    tiles: Tensor,
-    gaussians: Tensor,
-    length: int,
-    packed: PackedSplats | None,
-    grid: TileGrid,
-    keep_emit_order: bool,
+    tiles: Tensor, gaussians: Tensor, length: int, packed: PackedSplats | None, grid: TileGrid, keep_emit_order: bool
 ) -> SortedIntersections:
     """Sort intersections, emitted front to back, by tile, stably.
 

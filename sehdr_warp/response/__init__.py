@@ -14,14 +14,7 @@ if TYPE_CHECKING:
     from .files import responses_in_file
     from .learned import ToneMapper
 
-__all__ = [
-    "Response",
-    "ToneMapper",
-    "response_by_name",
-    "response_names",
-    "responses_in_file",
-    "responses_named",
-]
+__all__ = ["Response", "ToneMapper", "response_by_name", "response_names", "responses_in_file", "responses_named"]
 
 
 def __getattr__(name: str):

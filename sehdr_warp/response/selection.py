@@ -15,14 +15,7 @@ from .analytic import analytic_response
 from .curve import Response
 from .names import DESCRIPTIONS
 from .selection_evidence import collect_evidence
-from .selection_scores import (
-    CODES,
-    ResponseScore,
-    family_curves,
-    likelihoods,
-    score_candidates,
-    tabulate,
-)
+from .selection_scores import CODES, ResponseScore, family_curves, likelihoods, score_candidates, tabulate
 from .table import TabulatedResponse
 
 # How likely it is beforehand that no formula made the photos, and the probability from which a formula is taken for the

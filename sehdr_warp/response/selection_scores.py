@@ -166,21 +166,8 @@ def score_candidates(
     paper = _relative(ranges) - _relative(roughnesses)
     priors = np.array([minus_log_prior(response, from_camera=from_camera) for response in candidates])
     posteriors = likely.total(len(evidence.edges))[:count] + priors
-    return [
-        ResponseScore(
-            response=response,
-            dynamic_range=float(ranges[k]),
-            roughness=float(roughnesses[k]),
-            paper_score=float(paper[k]),
-            edges=float(likely.edges[k]),
-            highlights=float(likely.highlights[k]),
-            span=float(likely.span[k]),
-            density=float(likely.density[k]),
-            prior=float(priors[k]),
-            posterior=float(posteriors[k]),
-        )
-        for k, response in enumerate(candidates)
-    ]
+    columns = ranges, roughnesses, paper, *likely, priors, posteriors  # In the order of ResponseScore's fields.
+    return [ResponseScore(response, *(float(column[k]) for column in columns)) for k, response in enumerate(candidates)]
 
 
 def edge_facts(count: int) -> float:

@@ -80,9 +80,7 @@ def test_one_of_a_stack_is_taken_where_it_is(device, bits):
     photo, other = code_tensor(codes, device), code_tensor(codes[::-1].copy(), device)
     stack, index = torch.stack([other, photo, other]), torch.tensor([1], device=device)
     for alone, stacked in zip(
-        code_residual(light.to(device), photo, scale),
-        code_residual(light.to(device), stack, scale, index),
-        strict=True,
+        code_residual(light.to(device), photo, scale), code_residual(light.to(device), stack, scale, index), strict=True
     ):
         assert torch.equal(alone, stacked)
 
