@@ -6,12 +6,11 @@ scene.exposure_compensation, and only the parts that clearly explain them are co
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import torch
 
-from ..parallel import prefetch_map
 from ..response import Response
 from ..runs.config import Config
 from ..scene import Scene, View
@@ -28,7 +27,6 @@ from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
 from .plan import COMPENSATION, Decision
 
-RESIZED_AT_ONCE = 8  # Photos that are resized in parallel
 POINTS, ROUGH_POINTS = 1500, 500  # Pixels to match for the fit, and for a rough one
 MIN_STOPS, MIN_WHITE_BALANCE, MIN_CORNER_LOSS = 0.15, 0.1, 0.15
 """Smallest corrections: stops of exposure, stops of white balance, fraction of light missing in the corners. Smaller
@@ -96,12 +94,12 @@ class Compensation:
 
     Attributes:
         compensation: Correction of the photos; None if there is no drift.
-        matcher: Matcher of the corrected training photos.
+        matcher: Matcher of the training photos as they are, for use if there is no drift; else None.
         decision: Line of the plan.
     """
 
     compensation: ExposureCompensation | None
-    matcher: Matcher
+    matcher: Matcher | None
     decision: Decision
 
 
@@ -164,16 +162,15 @@ def prepare_photos(
         shared: Decisions of a larger set that the scene is part of, which replace an estimate.
         estimate: Estimate a compensation if the config asks for it.
     """
-    normalization = normalization_of(scene)
+    normalization, result = normalization_of(scene), None
+    compensation = None if shared is None else shared.compensation_of(scene.views)
     if shared is None and estimate and estimates_compensation(scene, config, response):
         result = estimate_compensation(normalization.scene(scene), config, response, device)
-        compensation, decision, get_matcher = result.compensation, result.decision, lambda: result.matcher
-    else:
-        compensation = None if shared is None else shared.compensation_of(scene.views)
-        decision = get_matcher = None
+        compensation = result.compensation
     if compensation is not None:
         scene = compensation.normalize_photos(scene, response)
-    get_matcher = get_matcher or cache(partial(make_matcher, normalization.scene(scene), response, device))
+    matcher, decision = (None, None) if result is None else (result.matcher, result.decision)
+    get_matcher = cache(lambda: matcher or make_matcher(normalization.scene(scene), response, device))
     return PreparedPhotos(scene, compensation, get_matcher, decision)
 
 
@@ -211,7 +208,7 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
         return Compensation(None, matcher, Decision({}, "none", f"matched points {reason}", COMPENSATION))
 
     # Resized once, because the photos are read and corrected several times.
-    small = replace(scene, views=tuple(prefetch_map(at_matching_size, views, RESIZED_AT_ONCE)))
+    small = replace(scene, views=at_matching_size(views))
     matcher = matcher_of(small)
     if times_known and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
         return no_drift(matcher)
@@ -227,11 +224,7 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     # Match again in photos that are already similar: more points are found.
     matcher = matcher_of(parts.of(compensation).normalize_photos(small, response))
     compensation = parts.of(fit(match(matcher)))
-    return Compensation(
-        compensation,
-        matcher_of(compensation.normalize_photos(small, response)),
-        _decision(compensation, parts, times_known),
-    )
+    return Compensation(compensation, None, _decision(compensation, parts, times_known))
 
 
 def _may_drift(views: Sequence[View], matched: MatchedPoints, response: Response) -> bool:

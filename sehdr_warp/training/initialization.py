@@ -25,7 +25,7 @@ from ..scene.wide_camera import perspective_views, pixels_of_directions
 from ..splats import read_gaussians
 from ..splats.arrays import HARMONIC_0
 from ..subsets import every_nth
-from .matching import WHITE_TOLERANCE, Matcher, estimates_at
+from .matching import WHITE_TOLERANCE, Matcher, at_matching_size, estimates_at
 from .strategies import mcmc_cap
 from .strategies.mcmc import MAX_DISTANCE
 
@@ -205,7 +205,7 @@ def start_count(config: Config, pixels: int) -> int:
 
 def make_matcher(scene: Scene, response: Response, device: torch.device | str) -> Matcher:
     """Create a matcher of the training views, with depths around those of the points or of the cameras' focus."""
-    views = perspective_views(scene.train_views)
+    views = at_matching_size(perspective_views(scene.train_views))
     points = every_nth(scene.points, MOST_DEPTHS)
     homogeneous = np.c_[points, np.ones(len(points))]
     depths = [homogeneous[view.camera.project(points).inside] @ view.camera.world_to_camera[2] for view in views]

@@ -28,6 +28,7 @@ from .targets import TrainingView
 
 WHITE_TOLERANCE = 1e-4  # Of values of the harmonics' constant part that are compared with that of white
 LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels
+RESIZED_AT_ONCE = 8  # Photos that are resized in parallel
 PLANES = 48, 256  # Smallest and largest number of depths to try; within these they are a pixel of parallax apart
 WORST_COST = 0.05  # Largest mean difference of encoded colors of a match
 MARGIN = 1.3, 0.004  # Depths with costs below this multiple of the least, plus this, count as equally good
@@ -75,17 +76,16 @@ class Matcher:
         """Prepare photos for matching and estimate the range of depths.
 
         Args:
-            views: Two or more views.
+            views: Two or more views, at_matching_size().
             response: Response by which photos of different exposure are made comparable.
             focus: Approximate distance of the scene, world units.
             device: Torch device.
         """
         base = float(np.median([view.exposure_time for view in views]))
         self._exponent = brightening(views)
-        tables = [_code_table(view, view.exposure_time / base, response, self._exponent) for view in views]
-        matchable = prefetch_map(lambda pair: _matchable(*pair), zip(views, tables, strict=True), len(views))
-        self._images, cameras = zip(*matchable, strict=True)
-        self._cameras, self._masks = cameras, [view.mask for view in views]
+        self._images = [_comparable_codes(view, view.exposure_time / base, response, self._exponent) for view in views]
+        self._cameras = cameras = [view.camera for view in views]
+        self._masks = [view.mask for view in views]
         self.device = torch.device(device)
         neighbors = _neighbors(cameras, cameras)
         self._photos = PhotoSet.of(self._images, cameras, neighbors, device)
@@ -175,40 +175,35 @@ def brightening(views: Sequence[View]) -> float:
     return float(np.clip(np.log(MIDTONE) / np.log(median), LEAST_EXPONENT, 1.0)) if median < MIDTONE else 1.0
 
 
-def _code_table(view: View, ratio: float, response: Response, exponent: float) -> np.ndarray | None:
-    """Return the 8-bit codes [levels + 1] that a view's codes are matched as; None if they stay.
-
-    They are those of 1 / ratio of its exposure, brightened by an exponent.
-    """
+def _comparable_codes(view: View, ratio: float, response: Response, exponent: float) -> np.ndarray:
+    """Return the 8-bit codes [H, W, 3] of 1 / ratio of a photo's exposure, brightened by an exponent."""
     values = np.linspace(0, 1, view.levels + 1)
     is_alike = response.learnable or abs(np.log2(ratio)) <= ALIKE
     if is_alike and exponent == 1:
-        return None
+        return _codes8(view)
     if not is_alike:
         values = np.asarray(response.encode(response.decode(values) / ratio))
-    return codes_of(np.clip(values, 0, 1) ** exponent, 8)
+    return codes_of(np.clip(values, 0, 1) ** exponent, 8)[view.codes]
 
 
-def at_matching_size(view: View) -> View:
-    """Return a view reduced to 8 bits and the size for matching; smaller ones as they are. A mask keeps its size."""
-    if max(view.camera.width, view.camera.height) <= LARGEST_SIDE:
+def at_matching_size(views: Sequence[View]) -> tuple[View, ...]:
+    """Return views reduced to 8 bits and the size for matching; smaller ones as they are. Masks keep their size."""
+    return tuple(prefetch_map(_at_matching_size, views, RESIZED_AT_ONCE))
+
+
+def _at_matching_size(view: View) -> View:
+    """Return one view of at_matching_size()."""
+    scale = LARGEST_SIDE / max(view.camera.width, view.camera.height)
+    if scale >= 1:
         return view
-    codes, camera = _matchable(view, None)
-    return replace(view, codes=codes, camera=camera, hdr=None)
+    size = max(1, round(view.camera.width * scale)), max(1, round(view.camera.height * scale))
+    codes = np.asarray(Image.fromarray(_codes8(view)).resize(size, Image.Resampling.BOX))
+    return replace(view, codes=codes, camera=view.camera.resized(*size), hdr=None)
 
 
-def _matchable(view: View, table: np.ndarray | None) -> tuple[np.ndarray, Camera]:
-    """Return the codes of a photo in 8 bits at the size for matching, mapped by a table, and its camera."""
-    codes, camera = view.codes, view.camera
-    if table is not None:
-        codes = table[codes]
-    elif codes.dtype != np.uint8:
-        codes = codes_of(view.image, 8)
-    scale = min(1.0, LARGEST_SIDE / max(camera.width, camera.height))
-    if scale < 1:
-        size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-        codes, camera = np.asarray(Image.fromarray(codes).resize(size, Image.Resampling.BOX)), camera.resized(*size)
-    return codes, camera
+def _codes8(view: View) -> np.ndarray:
+    """Return the codes of a photo in 8 bits."""
+    return view.codes if view.codes.dtype == np.uint8 else codes_of(view.image, 8)
 
 
 def _probabilities(image: np.ndarray, mask: np.ndarray | None, white: float = WHITE) -> np.ndarray:

@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
 from sehdr_warp.scene.exposure_compensation import ExposureCompensation
+from sehdr_warp.training import matching
 from sehdr_warp.training.compensation import estimate_compensation, estimates_compensation
+from sehdr_warp.training.initialization import make_matcher
 from sehdr_warp.training.matching import at_matching_size
-from sehdr_warp.training.train import create_trainer
+from sehdr_warp.training.train import create_trainer, train
 
 from .wall_and_lamp import WALL, photographed, texture, wall_and_lamp
 
@@ -31,27 +34,28 @@ def drifting():
 
 def found_in(*args):
     result = estimate_compensation(*args)
-    return result.compensation, result.matcher, result.decision
+    return result.compensation, result.decision
 
 
 def test_drift_is_found_where_there_is_some(device):
     scene, times = drifting()
-    drift, matcher, _ = found_in(scene, CONFIG, LINEAR, device)
+    drift, _ = found_in(scene, CONFIG, LINEAR, device)
     fitted = np.array([drift.gains[view.name] for view in scene.views])
     np.testing.assert_allclose(
         fitted, np.repeat(np.array(times)[:, None], 3, 1) / np.exp(np.log(times).mean()), rtol=0.03
     )
+    matcher = make_matcher(drift.normalize_photos(scene, LINEAR), LINEAR, device)
     assert len(matcher.match(matcher.pixels(400, np.random.default_rng(0))).points) > 200
 
 
 def test_stated_times_are_doubted_where_photos_contradict_them(device):
     scene, _ = drifting()
-    drift, _, decision = found_in(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
+    drift, decision = found_in(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
     assert drift.stops > 0.4 and "over the times they state" in decision.choice and decision.always_log
     right = wall_and_lamp(TIMES)
     # A curve that is not the photos' makes right times look wrong, and evened photos would not agree.
     for curve in (LINEAR, response_by_name("gamma")):
-        drift, _, decision = found_in(right, CONFIG, curve, device)
+        drift, decision = found_in(right, CONFIG, curve, device)
         assert drift is None and "do not contradict" in decision.reason
 
 
@@ -65,12 +69,12 @@ def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
     for view, white_balance in zip(views, light, strict=True):
         tinted.append(replace(view, codes=codes_of(view.image * 2**white_balance, 8)))
         darkened.append(replace(view, codes=codes_of(view.image * corners, 8)))
-    drift, _, decision = found_in(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
+    drift, decision = found_in(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
     assert "stay as stated" in decision.choice and "white balance" in decision.reason and drift.corner_loss == 0
     fitted = np.log2([drift.gains[view.name] for view in views])
     np.testing.assert_allclose(fitted, light, atol=0.06)
     assert (fitted[:, 1] == 0).all()
-    drift, _, decision = found_in(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
+    drift, decision = found_in(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
     assert "stay as stated" in decision.choice and drift.corner_loss == pytest.approx(0.5, abs=0.1) and not drift.stops
 
 
@@ -79,7 +83,7 @@ def test_times_that_a_camera_rounds_are_put_right(device):
     off = np.array([0.15, -0.2, 0.05, 0.1, -0.1, -0.15, 0.2, 0.0, -0.05])
     scene = wall_and_lamp(TIMES)
     views = [replace(v, exposure_time=v.exposure_time * 2**-e) for v, e in zip(scene.views, off, strict=True)]
-    drift, _, decision = found_in(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
+    drift, decision = found_in(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
     assert "over the times they state" in decision.choice and "white balance" not in decision.reason
     fitted = np.log2([drift.gains[view.name] for view in views])
     np.testing.assert_allclose(fitted, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
@@ -92,7 +96,7 @@ def test_a_wall_that_is_brighter_from_one_side_is_no_drift(device):
         ahead = rays[..., :2] / rays[..., 2:]
         return 0.5 * texture(position[:2] + ahead * WALL) * 2 ** (2 * ahead[..., :1] - ahead[..., 1:])
 
-    drift, _, decision = found_in(photographed(light_at, TIMES), CONFIG, LINEAR, device)
+    drift, decision = found_in(photographed(light_at, TIMES), CONFIG, LINEAR, device)
     assert drift is None and "do not contradict" in decision.reason
 
 
@@ -159,12 +163,25 @@ def test_large_photos_are_matched_and_evened_small(monkeypatch):
         return even(gains, view, response)
 
     monkeypatch.setattr(ExposureCompensation, "_view", watched)
-    drift, matcher, _ = found_in(replace(scene, views=large), CONFIG, LINEAR, "cpu")
+    drift, _ = found_in(replace(scene, views=large), CONFIG, LINEAR, "cpu")
     assert drift is not None and max(large[0].codes.shape) > most
     assert sizes and max(sizes) <= most
-    assert max(matcher.size(0)) <= most
 
 
 def test_photos_of_matching_size_stay_as_they_are():
-    view = drifting()[0].views[0]
-    assert at_matching_size(view) is view
+    views = drifting()[0].views
+    assert all(small is view for small, view in zip(at_matching_size(views), views, strict=True))
+
+
+def test_a_resumed_training_seeds_from_the_same_reduced_photos(tmp_path, monkeypatch):
+    monkeypatch.setattr(matching, "LARGEST_SIDE", 40)
+    scene = drifting()[0]
+    config = SHORT | {"densification.refine_start_iter": 0, "densification.refine_stop_iter": 30_000}
+    config |= {"schedule.iterations": 50, "mcmc.seed_fraction": 1.0}
+    whole = train(scene, tmp_path / "whole", config, device="cpu")
+    for progress in create_trainer(scene, tmp_path / "cut", config, device="cpu"):
+        if progress.iteration == 10:
+            break
+    resumed = train(scene, tmp_path / "cut", resume=True, device="cpu")
+    assert whole.gaussian_count == resumed.gaussian_count
+    assert torch.equal(whole.field.gaussians.means, resumed.field.gaussians.means)
