@@ -4,13 +4,17 @@ import shlex
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..runs.config_files import config_fields, flag_text
 from ..runs.run import Run
+from ..runs.values import LOAD_OPTIONS, LoadArguments
 from ..subsets import first_names
 
-STILL_RISING = 0.2  # dB that held-out photos gained in the last third of a training that was too short
+if TYPE_CHECKING:
+    from .trainer import Trainer
+
+STILL_RISING = 0.2  # dB that held-out photos gained in the last third of the steps, or since a resume, if too few
 UNFINISHED = 0.5  # dB gained there from which blur, and not movement, explains what differs from the photos
 FALLING = 0.5  # dB that they lost since their best in a training that overfits; seeds differ by up to 0.3 dB
 EXPOSURE_JUMP = 0.4  # Stops between a whole photo and the scene from which its exposure is not as stated
@@ -38,8 +42,23 @@ def best_if_overfitted(points: Sequence[Evaluation]) -> Evaluation | None:
     return best if best is not None and best.psnr - points[-1].psnr > FALLING else None
 
 
+def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) -> list[str]:
+    """Return advice on a training, if it is finished; its commands repeat `data` and the other options by name."""
+    run, photos = trainer.run, len(trainer.scene.train_views)
+    if trainer.iteration < trainer.total:
+        return []
+    words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
+    summary = run.summary() | {"metrics": run.metrics()}
+    return advice(run.path, summary, photos, data.get("path") or "SCENE", words, trainer.first_iteration)
+
+
 def advice(
-    path: Path, summary: Mapping[str, Any], train_photos: int, scene: str = "SCENE", options: Sequence[str] = ()
+    path: Path,
+    summary: Mapping[str, Any],
+    train_photos: int,
+    scene: str = "SCENE",
+    options: Sequence[str] = (),
+    resumed_at: int = 0,
 ) -> list[str]:
     """Return lines of advice on a finished training; none if nothing stands out.
 
@@ -49,17 +68,20 @@ def advice(
         train_photos: Number of photos that were trained on.
         scene: Where the photos are, for the commands.
         options: Words of the command line that the training had, such as --max-size 240, for the commands.
+        resumed_at: Iteration at which the training was resumed, 0 if it was not. Gains before it do not count.
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
     again = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
     points, lines, gain = evaluations(summary["metrics"]), [], 0.0
     if len(points) >= 3:
-        earlier = [point.psnr for point in points if point.iteration <= iterations * 2 / 3 + 1]
-        gain = points[-1].psnr - max(earlier, default=points[0].psnr)
+        since = max(iterations * 2 / 3 + 1, resumed_at)
+        earlier = [point for point in points[:-1] if point.iteration <= since] or points[:1]
+        before = max(earlier, key=attrgetter("psnr"))
+        gain = points[-1].psnr - before.psnr
         if gain > STILL_RISING:
             command = f"sehdr-warp train --resume --out {run} --iterations {2 * iterations}"
             lines.append(
-                f"held-out photos gained {gain:.1f} dB in the last third of the steps; more steps help: {command}"
+                f"held-out photos gained {gain:.1f} dB since iteration {before.iteration}; more steps help: {command}"
             )
         elif best := best_if_overfitted(points):
             lines.append(

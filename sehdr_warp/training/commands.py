@@ -7,10 +7,9 @@ import json
 import logging
 import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -25,6 +24,7 @@ from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
+    from ..runs.run import Run
     from ..runs.run_writer import RunWriter
 
 log = logging.getLogger(__name__)
@@ -124,6 +124,10 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
     _refuse_run(args)
+    if args.training.plan_only and args.output.resume:
+        raise UsageError("--plan-only plans a new training; leave --resume out")
+    if args.output.out is None and not args.training.plan_only:
+        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
     if _in_blocks(args):
         if rank_info is not None:
             raise UsageError("--blocks starts its own processes; leave torchrun out")
@@ -169,15 +173,17 @@ def _train(args: Train, ranks=None) -> None:
     from .machine import precompiling
     from .scene_facts import check_dataset_truth
 
-    output, machine = args.output, args.machine
+    output, out = args.output, args.output.out
+    assert out is not None, "run_train() refuses it"
     # What can be refused is refused before the photos are read, which may take minutes.
-    run = _prepare_folder(output)
-    data = _load_arguments(args, None if run is None else run.read_info()["data"])
-    config = _config(args, None if run is None else run.read_config())
-    device = pick_device(machine.device) if ranks is None else ranks.device
+    resumed = _prepare_folder(out, output)
+    data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
+    config = _config(args, None if resumed is None else resumed.read_config())
+    device = pick_device(args.machine.device) if ranks is None else ranks.device
     loading = _loading(config)
-    if run is not None:  # Its response need not be chosen again; create_trainer() refuses another --response.
-        loading["response"] = response_for_loading(run.read_config(), Response.from_dict(run.read_info()["response"]))
+    if resumed is not None:  # Its response need not be chosen again; create_trainer() refuses another --response.
+        response = Response.from_dict(resumed.read_info()["response"])
+        loading["response"] = response_for_loading(resumed.read_config(), response)
     check_dataset_truth(data, config)
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
@@ -187,13 +193,12 @@ def _train(args: Train, ranks=None) -> None:
         scene = load_scene_and_log_notes(data, **loading)
         from ..console import run_with_progress
         from ..viewer.live import serve_training
-        from .advice import advice, option_words, options_of_run
+        from .advice import advice_on, options_of_run
         from .train import create_trainer
 
-        assert output.out is not None, "_prepare_folder() refuses a training without --out"
         trainer = create_trainer(
             scene,
-            output.out,
+            out,
             config,
             device=device,
             resume=output.resume,
@@ -204,32 +209,27 @@ def _train(args: Train, ranks=None) -> None:
         )
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
-        with serve_training(trainer, str(output.out)) if output.view else nullcontext(trainer) as steps:
+        with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
             # Iterating the trainer trains; serve_training() answers browsers between its steps.
             run_with_progress(steps, trainer.total)
-    photos = len(trainer.scene.train_views)
     typed = configs.named_fields(args.fields) | {"response": args.scene.response, "preset": args.training.preset}
     options = options_of_run(trainer.run) if output.resume else typed | {"seed": args.training.seed}
-    options |= {"device": machine.device, "gpus": machine.gpus if machine.gpus > 1 else None}
-    words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
-    hints = partial(advice, train_photos=photos, scene=data.get("path") or "SCENE", options=words)
-    _print_result(args, trainer.run, hints)
+    options |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
+    _print_result(args, trainer.run, advice_on(trainer, data, options))
 
 
-def _prepare_folder(output: OutputOptions) -> "RunWriter | None":
+def _prepare_folder(out: Path, output: OutputOptions) -> "RunWriter | None":
     """Prepare --out as RunWriter.prepare(); return the run that --resume continues, None for a new one.
 
     Raises SehdrError if --out cannot be used.
     """
     from ..runs.run_writer import RunWriter
 
-    if output.out is None:
-        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
-    folder = RunWriter(output.out)
+    folder = RunWriter(out)
     if folder.prepare(resume=output.resume, overwrite=output.overwrite):
         return folder
     if output.resume:
-        log.info("%s holds no run yet: a training begins there", output.out)
+        log.info("%s holds no run yet: a training begins there", out)
     return None
 
 
@@ -252,12 +252,10 @@ def _loading(config) -> dict[str, Any]:
     return options | {"photo_storage": "memory" if cache == "device" else cache}
 
 
-def _print_result(args: Train, run, advice: Callable[[Path, dict], list[str]] | None = None) -> None:
-    """Print what a training wrote, and advice for a finished one."""
-    summary = run.summary() | {"run": str(run.path), "metrics": run.metrics()}
-    hints = advice(run.path, summary) if advice is not None and summary.get("finished") else []
-    lines = [_ending(run.path, summary), *hints]
-    print(json.dumps(summary | {"advice": hints}) if args.output.json else "\n".join(lines))
+def _print_result(args: Train, run: "Run", advice: Sequence[str] = ()) -> None:
+    """Print what a training wrote, and advice on it."""
+    summary = run.summary() | {"run": str(run.path), "metrics": run.metrics(), "advice": [*advice]}
+    print(json.dumps(summary) if args.output.json else "\n".join([_ending(run.path, summary), *advice]))
 
 
 def _in_blocks(args: Train) -> bool:
@@ -275,7 +273,7 @@ def _in_blocks(args: Train) -> bool:
         return not options.plan_only
     if output.out is None or not is_in_blocks(output.out) or options.plan_only:
         if args.machine.slurm is not None:
-            raise UsageError("--slurm needs --blocks, whose blocks become SLURM jobs")
+            raise UsageError("--slurm needs --blocks")
         return False
     if output.overwrite:
         raise InputError(output.out, "holds a training in blocks", "choose another folder, or add --blocks")
@@ -299,8 +297,7 @@ def _train_blocks(args: Train) -> bool:
     from ..blocks.train import is_in_blocks, train_in_blocks
 
     output, machine = args.output, args.machine
-    if output.out is None:
-        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
+    assert output.out is not None, "run_train() refuses it"
     device = pick_device(machine.device)
     if machine.slurm is None:
         check_devices(device, machine.gpus)

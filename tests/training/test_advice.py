@@ -21,6 +21,13 @@ def test_a_training_that_still_gains_is_told_to_go_on():
     assert line.endswith("sehdr-warp train --resume --out 'runs/my run' --iterations 180") and "2.0 dB" in line
 
 
+def test_gains_before_a_resume_do_not_count():
+    """The last evaluation of a training has its moving average, so the one at a resume is the one to compare with."""
+    figures = summary([20, 22, 24, 25.0, 25.1])
+    assert "1.1 dB since iteration 54" in advice(Path("r"), figures, 50)[0]
+    assert advice(Path("r"), figures, 50, resumed_at=72) == []
+
+
 def test_photos_that_hold_no_more_are_named():
     [line] = advice(Path("r"), summary([20, 26, 25, 24]), 12)
     assert "2.0 dB better at iteration 44" in line and "12 photos" in line

@@ -279,4 +279,5 @@ def test_plan_only_prints_and_trains_nothing(tmp_path, capsys, monkeypatch):
     table = capsys.readouterr().out
     assert "schedule.iterations = " in table and "kept" not in table
     assert call(*arguments[:2]) == 2 and "--out" in capsys.readouterr().err
+    assert call("train", "--resume", *arguments[2:], "--out", "run") == 2 and "--resume" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
