@@ -146,7 +146,7 @@ def _arrays_of(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
     name = field.color_model.name
     facts = {"color_model": name, "base_time": field.base_time, "antialiased": field.antialiased}
     gaussians = GaussianArrays(**tensors, harmonics=harmonics, **facts)
-    if field.color_model.encoded:
+    if field.color_model.display_referred:
         return gaussians, lambda encoded: field.response.decode(np.clip(encoded, 0, 1)) / field.base_time
     return gaussians, None if field.fusion is None else lambda exposure: _fuse(field, exposure)
 

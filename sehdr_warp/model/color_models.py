@@ -24,11 +24,11 @@ class ColorModel:
 
     Attributes:
         name: Name in config.model.radiance.
-        encoded: True if a color is an encoded value, which has no exposure until it is decoded.
+        display_referred: True if a color is an encoded value, which has no exposure until it is decoded.
     """
 
     name = "log"
-    encoded = False
+    display_referred = False
 
     def start(self, encoded: np.ndarray, response: Response) -> np.ndarray:
         """Return [N, 3] start values of the harmonics' constant part from encoded values [N, 3] in [0, 1]."""
@@ -73,7 +73,7 @@ class DisplayModel(ColorModel):
     """The display model: encoded = max(SH(d) + 0.5, 0) (3DGS)."""
 
     name = "display"
-    encoded = True
+    display_referred = True
 
     def start(self, encoded, response):
         """Return encoded values [N, 3] without the offset of 0.5."""

@@ -107,7 +107,7 @@ class RadianceField(nn.Module):
         values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
-        if self.color_model.encoded:
+        if self.color_model.display_referred:
             return self._render_display_colors(camera, values, opacities, ratio, max_intersections)
         color_sets = self._color_sets(values, ratio, extra_images)
         return self._render_color_sets(camera, color_sets, opacities, ratio, max_intersections, encode=encode)
@@ -300,11 +300,11 @@ class RadianceField(nn.Module):
     def _blended_colors(self, position: Tensor, degree: int | None) -> Tensor:
         """Return the colors [N, 3] of the HDR image towards a position [3]; see _decoded()."""
         values = self._evaluate_sh(position, degree)
-        return self.color_model.colors(values) if self.color_model.encoded else self._exposures(values)[1]
+        return self.color_model.colors(values) if self.color_model.display_referred else self._exposures(values)[1]
 
     def _decoded(self, colors: Tensor) -> Tensor:
         """Return the exposures at the base time of colors [..., 3], which may be encoded."""
-        return self.response.decode(colors.clamp(0, 1)) if self.color_model.encoded else colors
+        return self.response.decode(colors.clamp(0, 1)) if self.color_model.display_referred else colors
 
     def _exposures(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return exposures [N, 3] at the base time of each Gaussian's base color and of its HDR color."""

@@ -17,7 +17,7 @@ class TrainRender:
 
     Attributes:
         encoded: Encoded values, extended beyond [0, 1] as by Response.encode_extended.
-        exposure: Exposure of the HDR color at the base time (I^h dt_1 in the paper); None for encoded color models.
+        exposure: Exposure of the HDR color at the base time (I^h dt_1 in the paper); None for display colors.
         base: Exposure of the base color at the base time (I^b); the same tensor as `exposure` without fusion.
         rendering: Result of the rasterizer: transmittance, projected means, extents.
         photo_exposure: Exposure of this photo, the input of the response; None if colors are encoded before they are

@@ -280,7 +280,7 @@ class Run(RenderableScene):
         """
         truth = self.config.loss.uses_hdr
         views = self.normalize_photos(scene).train_views
-        response = None if truth or self.field.color_model.encoded else self.field.response
+        response = None if truth or self.field.color_model.display_referred else self.field.response
         estimates = light_estimates(views, response, self.config.loss, self.device)
         certainties = None if estimates is None else [estimate.certainty for estimate in estimates]
         evidence = gather_evidence(self.field, views, degree=self.degree, truth=truth, certainties=certainties)

@@ -134,7 +134,7 @@ class GradientStep:
     def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:
         """Return the key of a step on one of the views; None if it cannot be captured as a CUDA graph."""
         # Display colors compare the exposure time with the base time on the host, so it must be a number there.
-        if self.field.color_model.encoded and not isinstance(getattr(views, "times", None), float):
+        if self.field.color_model.display_referred and not isinstance(getattr(views, "times", None), float):
             return None
         rows = self.field.gaussians.row_count
         return GraphKey(

@@ -82,7 +82,7 @@ def compared_image(render: TrainRender, target: Target) -> Tensor:
 
 def compares_exposures(config: LossConfig, field: RadianceField) -> bool:
     """Return whether ldr_loss compares exposures: if each pixel has one and the response is known."""
-    decodable = not field.color_model.encoded and field.tone_map == "pixel" and not field.response.learnable
+    decodable = not field.color_model.display_referred and field.tone_map == "pixel" and not field.response.learnable
     return config.ldr_weight > 0 and decodable
 
 

@@ -242,7 +242,7 @@ class TrainingViews:
     def light_estimates(self) -> list[ClippedLight] | None:
         """Estimates of each view's clipped light; None if there are none, or if colors are encoded values."""
         field = self._field
-        response = None if field.color_model.encoded else field.response
+        response = None if field.color_model.display_referred else field.response
         return light_estimates(self._views, response, self._config.loss, field.gaussians.means.device)
 
     @property

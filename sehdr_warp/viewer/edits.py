@@ -79,7 +79,7 @@ class LightGains:
             SehdrError: For a gain out of range, or a model whose lights cannot be scaled.
         """
         model = run.field
-        if model.color_model.encoded or model.fusion is not None:
+        if model.color_model.display_referred or model.fusion is not None:
             raise SehdrError("gains need radiance without fusion, such as that of the default preset")
         for index, gain in stops.items():
             if not 0 <= index < len(lights):
