@@ -108,24 +108,23 @@ class RadianceField(nn.Module):
         if sh_gradient_hook is not None:
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.display_referred:
-            return self._render_display_colors(camera, values, opacities, ratio, max_intersections)
+            rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, opacities)
+            image = rendering.image
+            if ratio != 1.0:
+                image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
+            return TrainRender(image, None, None, rendering, opacities=opacities)
         color_sets = self._color_sets(values, ratio, extra_images)
-        return self._render_color_sets(camera, color_sets, opacities, ratio, max_intersections, encode=encode)
-
-    def _render_display_colors(
-        self,
-        camera: CameraTensors,
-        values: Tensor,
-        opacities: Tensor,
-        ratio: float | Tensor,
-        max_intersections: int | None,
-    ) -> TrainRender:
-        """Render a photo of display colors, at `ratio` times the base time."""
-        rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, opacities)
-        image = rendering.image
-        if ratio != 1.0:
-            image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-        return TrainRender(image, None, None, rendering, opacities=opacities)
+        first, *others = color_sets.values()
+        features = torch.cat([first, *others], dim=1) if others else first
+        rendering = self._rasterize(camera, features, max_intersections, opacities)
+        # A single image is not split, because the derivative of a split is a copy.
+        parts = rendering.image.split(3, dim=2) if others else (rendering.image,)
+        images = dict(zip(color_sets, parts, strict=True))
+        encoded, exposure, photo_exposure = images.get("encoded"), images.get("fused"), None
+        if self.tone_map == "pixel":
+            photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
+            encoded = self.response.encode_extended(photo_exposure) if encode else None
+        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure, opacities)
 
     def _color_sets(self, values: Tensor, ratio: float | Tensor, extra_images: frozenset[str]) -> dict[str, Tensor]:
         """Return the colors [N, 3] that a training view needs, by name: any of encoded, fused and base."""
@@ -138,29 +137,6 @@ class RadianceField(nn.Module):
         if "base" in extra_images and self.fusion is not None:
             color_sets["base"] = base
         return color_sets
-
-    def _render_color_sets(
-        self,
-        camera: CameraTensors,
-        color_sets: dict[str, Tensor],
-        opacities: Tensor,
-        ratio: float | Tensor,
-        max_intersections: int | None,
-        *,
-        encode: bool,
-    ) -> TrainRender:
-        """Render the images of color sets in one rasterization; see render_train_view()."""
-        first, *others = color_sets.values()
-        features = torch.cat([first, *others], dim=1) if others else first
-        rendering = self._rasterize(camera, features, max_intersections, opacities)
-        # A single image is not split, because the derivative of a split is a copy.
-        parts = rendering.image.split(3, dim=2) if len(color_sets) > 1 else (rendering.image,)
-        images = dict(zip(color_sets, parts, strict=True))
-        encoded, exposure, photo_exposure = images.get("encoded"), images.get("fused"), None
-        if self.tone_map == "pixel":
-            photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
-            encoded = self.response.encode_extended(photo_exposure) if encode else None
-        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure, opacities)
 
     @property
     def white(self) -> float:
