@@ -306,3 +306,7 @@ def _contradictions(config: Config) -> Iterator[str]:
         yield f'loss.anchor_weight = {loss.anchor_weight} has no effect: needs response.name = "learned"'
     if config.optimizer.means_final > config.optimizer.means:
         yield f"optimizer.means_final = {config.optimizer.means_final} is greater than optimizer.means"
+    fields = {name for name, value in config if not isinstance(value, BaseModel)}
+    fields |= {f"{table}.{name}" for table, value in config if table not in fields for name, _ in value}
+    if unknown := [path for path in config.plan.keep if path not in fields]:
+        yield f"plan.keep has {unknown[0]!r:.80}, which is not a field"

@@ -98,6 +98,8 @@ def test_every_field_is_documented_and_read(path, item):
         ("[model]\nantialiased = 1", ["model.antialiased = 1", "bool"]),
         ("[fusion]\nexposures = '1'", ["fusion.exposures", "tuple"]),
         ("[schedule]\nevaluate_at = [0]", ["schedule.evaluate_at = 0"]),
+        ("[plan]\nkeep = ['seed', 'mcmc.cap_densty']", ["plan.keep has 'mcmc.cap_densty', which is not a field"]),
+        ("[plan]\nkeep = ['mcmc']", ["plan.keep has 'mcmc', which is not a field"]),
         ("model = 3", ["model = 3", "dictionary"]),
         ("[model", ["TOML"]),
         ("base = 'own.toml'", ["bases"]),
