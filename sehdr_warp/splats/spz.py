@@ -25,6 +25,7 @@ _STREAMS_AT = 16  # Of version 4: byte that states where the sizes of its stream
 _MOST_PER_BYTE = 10_000  # Bytes of a stream for each byte of the file: more is a false count
 _ANTIALIASED, _EXTENDED = 1, 2  # Flags: of opacity compensation; of extensions behind the Gaussians
 _COLOR_SCALE = 0.15  # Of the constant harmonic before it becomes a byte
+_MOST_RESIZED = 0.01  # Share of Gaussians whose sizes may change without a warning
 _MOST = 50_000_000  # Gaussians of a file that is read
 _LARGEST = 2.0**23  # Of a coordinate: 24 bits with a sign
 _DAMAGED = "export it again"
@@ -42,6 +43,10 @@ def write_spz(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     fraction = int(np.clip(22 - np.ceil(np.log2(max(largest, 1e-6))), 0, 24))
     fixed = np.rint(gaussians.means.astype(np.float64) * 2.0**fraction).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
+    sizes = np.rint((gaussians.log_scales + 10) * 16)
+    if (share := ((sizes < 0) | (sizes > 255)).any(axis=1).mean()) > _MOST_RESIZED:
+        text = "%s: %.0f %% of the Gaussians are beyond SPZ's sizes, 0.00005 to 380 units; set another --scale"
+        log.warning(text, path.name, 100 * share)
     colors = np.rint((gaussians.harmonics[:, 0].astype(np.float64) * _COLOR_SCALE + 0.5) * 255)
     higher = np.rint(gaussians.harmonics[:, 1:].astype(np.float64) * 128 + 128)
     largest_index, others = smallest_three(np.roll(gaussians.unit_quaternions.astype(np.float64), -1, axis=1))
@@ -56,7 +61,7 @@ def write_spz(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         positions.tobytes(),
         np.rint(gaussians.opacities * 255).astype(np.uint8).tobytes(),
         np.clip(colors, 0, 255).astype(np.uint8).tobytes(),
-        np.clip(np.rint((gaussians.log_scales + 10) * 16), 0, 255).astype(np.uint8).tobytes(),
+        np.clip(sizes, 0, 255).astype(np.uint8).tobytes(),
         packed.astype("<u4").tobytes(),
         np.clip(higher, 0, 255).astype(np.uint8).tobytes(),
     ]

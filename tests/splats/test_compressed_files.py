@@ -185,6 +185,13 @@ def test_positions_that_24_bits_do_not_hold_are_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_sizes_that_spz_cannot_hold_are_warned_of(tmp_path, caplog):
+    write_gaussians(tmp_path / "a.spz", natural())
+    assert not caplog.messages
+    write_gaussians(tmp_path / "a.spz", natural().transformed(np.diag([0.001, 0.001, 0.001, 1.0])), overwrite=True)
+    assert "a.spz: 92 % of the Gaussians are beyond SPZ's sizes" in caplog.text
+
+
 def test_bounds_beyond_all_numbers_are_one_line_without_warnings(tmp_path):
     write_gaussians(tmp_path / "a.sog", natural())
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
