@@ -12,3 +12,8 @@ def every_nth(items: Any, most: int) -> Any:
 def first_names(names: Sequence[str], most: int = 3) -> str:
     """Return "a, b, c" or, of more than `most` names, "a, b, c ..."."""
     return ", ".join(names[:most]) + " ..." * (len(names) > most)
+
+
+def counted(count: int, one: str, several: str) -> str:
+    """Return "1 photo is" or "3 photos are" of "photo is" and "photos are"."""
+    return f"{count} {one if count == 1 else several}"

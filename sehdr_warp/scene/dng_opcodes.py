@@ -131,7 +131,7 @@ def _gain_map(reader: _Reader, image: np.ndarray) -> np.ndarray:
     for place, part in enumerate(area.parts):
         # A spline has two points at least.
         grid = np.pad(gains[:, :, min(place, planes - 1)], ((0, points_v == 1), (0, points_h == 1)), mode="edge")
-        spline = RectBivariateSpline(*(np.arange(size) for size in grid.shape), grid, kx=1, ky=1)
+        spline = RectBivariateSpline(np.arange(grid.shape[0]), np.arange(grid.shape[1]), grid, kx=1, ky=1)
         part *= spline(down, right).astype(np.float32)
     return image
 

@@ -10,7 +10,7 @@ from statistics import median
 
 from ..errors import InputError
 from ..files import has_file, read_bytes
-from ..subsets import first_names
+from ..subsets import counted, first_names
 from .dataparser import ImageRecord
 from .exif import LONGEST, SHORTEST, exif_exposure, parse_number
 from .file_names import lies_at, plain_path
@@ -53,7 +53,8 @@ def choose_exposure(
     selected = [record for record in records if record.exposure_key in (None, key)]
     missing = sorted({record.view for record in records} - {record.view for record in selected})
     if missing:
-        notes.append(f"{len(missing)} views without exposure {key} were left out: {first_names(missing, 5)}")
+        count = counted(len(missing), f"view without exposure {key} was", f"views without exposure {key} were")
+        notes.append(f"{count} left out: {first_names(missing, 5)}")
     return selected, notes
 
 
@@ -177,7 +178,8 @@ def _listed_times(records: Sequence[ImageRecord], source: Path) -> tuple[dict[Pa
             notes.append(f"{EXPOSURES}: {len(strange)} of its {len(table)} names belong to no photo: {text}")
         if ambiguous:
             text = first_names(ambiguous)
-            notes.append(f"{EXPOSURES}: {len(ambiguous)} names fit several photos, and need their folders: {text}")
+            fit = "fits several photos, and needs its folder", "fit several photos, and need their folders"
+            notes.append(f"{EXPOSURES}: {counted(len(ambiguous), f'name {fit[0]}', f'names {fit[1]}')}: {text}")
     return times, notes
 
 

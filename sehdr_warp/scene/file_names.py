@@ -11,7 +11,7 @@ from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 
 from ..files import resolve_inside
-from ..subsets import first_names
+from ..subsets import counted, first_names
 from .dataparser import ImageRecord
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .photo_names import fold_name
@@ -203,9 +203,8 @@ def distinct(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[st
         keys.add(key)
     if not names:
         return unique, []
-    text = first_names(names)
-    count = f"{len(names)} photos are" if len(names) > 1 else "1 photo is"
-    return unique, [f"{count} listed more than once, and counted once: {text}"]
+    count = counted(len(names), "photo is", "photos are")
+    return unique, [f"{count} listed more than once, and counted once: {first_names(names)}"]
 
 
 def renamed_note(images: Mapping[str, Path | None]) -> list[str]:
@@ -218,7 +217,7 @@ def renamed_note(images: Mapping[str, Path | None]) -> list[str]:
     ]
     if not others:
         return []
-    count = f"{len(others)} photos have" if len(others) > 1 else "1 photo has"
+    count = counted(len(others), "photo has", "photos have")
     return [f"{count} another suffix than the set states: {others[0][0]} is {others[0][1]}"]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..files import resolve_inside
-from ..subsets import first_names
+from ..subsets import counted, first_names
 from .dataparser import UNPLACED, ImageRecord
 from .file_names import INVERTED_MASK, folders_named, lies_at, natural_key, without_mask_mark
 from .images import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
@@ -68,9 +68,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         ]
         names = [file.relative_to(place).as_posix() for file in strange]
         if names:
-            names_text = first_names(names)
-            count = "1 file that fits" if len(names) == 1 else f"{len(names)} files that fit"
-            notes.append(f"{place.name}/ holds {count} no photo: {names_text}; {_REMEDY}")
+            count = counted(len(names), "file that fits", "files that fit")
+            notes.append(f"{place.name}/ holds {count} no photo: {first_names(names)}; {_REMEDY}")
     used = {place for mask in mask_files if mask is not None for place in mask.parents}
     return masked, [*notes, *_unread_masks(folder, places, used)]
 
@@ -184,7 +183,7 @@ def _unread_masks(folder: Path, places: Sequence[Path], used: set[Path]) -> list
         others = sorted(file for file in place.rglob("*") if file.suffix.lower() in _OTHER_MASKS)
         if others:
             names_text = first_names([file.name for file in others])
-            count = f"{len(others)} files" if len(others) > 1 else "1 file"
+            count = counted(len(others), "file", "files")
             notes.append(f"{place.name}/ holds {count} of kinds that are not read as masks: {names_text}; use PNG")
     if not folder.is_dir():
         return notes

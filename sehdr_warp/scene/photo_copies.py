@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
+from ..subsets import counted
 from .heif import HEIF_SUFFIXES
 from .images import JPEG_SUFFIXES, LDR_SUFFIXES, PILLOW_ERRORS, open_image, orientation_of, turn_upright
 from .lens import area_average
@@ -45,7 +46,7 @@ def copies_note(copies: Mapping[Path, Path]) -> list[str]:
     if not copies:
         return []
     copy, photo = next(iter(copies.items()))
-    count = f"{len(copies)} photos are copies" if len(copies) > 1 else "1 photo is a copy"
+    count = counted(len(copies), "photo is a copy", "photos are copies")
     more = " ..." if len(copies) > 1 else ""
     return [f"{count} of others and left out: {copy.name} of {photo.name}{more}"]
 

@@ -5,6 +5,7 @@ from pathlib import Path, PurePosixPath
 
 from ..errors import InputError
 from ..files import has_file, read_lines
+from ..subsets import counted
 from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model
 from .dataparser import DataparserOutputs, ImageRecord
 from .file_names import (
@@ -75,7 +76,10 @@ def read_colmap(folder: Path, source: Path | None = None) -> DataparserOutputs:
     unusable = unusable_notes(model.unusable, len(model.images) + len(model.unusable))
     notes = [*other_models(source), *unusable, *renamed_note(photos), *repeated]
     if absent:
-        notes.append(f"{len(absent)} images of the model are missing and were left out: {absent[0]!r:.90} ...")
+        count = counted(
+            len(absent), "image of the model is missing and was", "images of the model are missing and were"
+        )
+        notes.append(f"{count} left out: {absent[0]!r:.90}{' ...' * (len(absent) > 1)}")
     return DataparserOutputs("colmap", tuple(records), holdout=(8, 0), cloud=model.cloud, notes=tuple(notes))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_text
+from ..subsets import counted
 from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud
 from .file_names import find_image, natural_key
 from .lens import Lens
@@ -61,7 +62,8 @@ def read_opensfm(folder: Path) -> DataparserOutputs:
     if not records:
         raise InputError(images, f"none of the {len(shots)} images of {FILE} is here", "copy the whole set")
     if absent:
-        notes.append(f"{len(absent)} images of {FILE} are missing and were left out: {absent[0]!r:.90} ...")
+        count = counted(len(absent), f"image of {FILE} is missing and was", f"images of {FILE} are missing and were")
+        notes.append(f"{count} left out: {absent[0]!r:.90}{' ...' * (len(absent) > 1)}")
     if len(models) > 1:
         rest = sum(len(each["shots"]) for each in models) - len(shots)
         notes.append(

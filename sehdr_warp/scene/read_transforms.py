@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import read_json, resolve_inside
-from ..subsets import first_names
+from ..subsets import counted, first_names
 from .colmap_model import find_model, read_ply_points, read_points
 from .dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud, pose_from_camera_to_world
 from .exposure import parse_seconds
@@ -202,8 +202,9 @@ def _without_missing_masks(records: list[ImageRecord]) -> tuple[list[ImageRecord
     absent = [record.mask for record in records if record.mask is not None and not record.mask.is_file()]
     if not absent:
         return records, ()
-    names = first_names([mask.name for mask in absent])
-    note = f"{len(absent)} masks that frames state are not here, and their photos count whole: {names}"
+    are = "masks that frames state are not here, and their photos count whole"
+    count = counted(len(absent), "mask that a frame states is not here, and its photo counts whole", are)
+    note = f"{count}: {first_names([mask.name for mask in absent])}"
     return [replace(record, mask=None) if record.mask in absent else record for record in records], (note,)
 
 

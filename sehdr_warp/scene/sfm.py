@@ -24,7 +24,7 @@ from PIL import Image
 from ..errors import InputError, SehdrError
 from ..parallel import preserve_signals, run_interruptibly
 from ..progress import Stage, stage, track_progress
-from ..subsets import first_names
+from ..subsets import counted, first_names
 from .cached_folder import cached_folder
 from .colmap_model import SparseModel, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
@@ -71,10 +71,9 @@ class Reconstruction:
             notes.append(f"{len(unregistered)} of {len(photos)} photos could not be placed and were left out: {first}")
         if self.weak:
             first = first_names([photos[i].name for i in self.weak], 5)
-            few = "1 photo shares few points with others, so its place is uncertain"
-            if len(self.weak) > 1:
-                few = f"{len(self.weak)} photos share few points with others, so their places are uncertain"
-            notes.append(f"{few}: {first}; more photos in between help")
+            few = counted(len(self.weak), "photo shares", "photos share")
+            places = "its place is" if len(self.weak) == 1 else "their places are"
+            notes.append(f"{few} few points with others, so {places} uncertain: {first}; more photos in between help")
         if self.error > MOST_ERROR:
             notes.append(
                 f"the cameras' places are uncertain: points miss their photos by {self.error:.1f} pixels in the mean; "

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..subsets import first_names
+from ..subsets import counted, first_names
 from .dataparser import ImageRecord
 from .file_names import folders_named
 from .hdr_files import is_without_colors
@@ -50,9 +50,8 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     for place in places:
         others = sorted(file.relative_to(place).as_posix() for file in files[place].values() if file not in in_use)
         if others:
-            listing = first_names(others)
-            count = f"{len(others)} files that are" if len(others) > 1 else "1 file that is"
-            notes.append(f"{place.name}/ holds {count} the truth of no photo: {listing}")
+            count = counted(len(others), "file that is", "files that are")
+            notes.append(f"{place.name}/ holds {count} the truth of no photo: {first_names(others)}")
     return result, notes
 
 

@@ -4,7 +4,7 @@ import os
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
-from ..subsets import first_names
+from ..subsets import counted, first_names
 from .dataparser import ImageRecord
 from .file_names import IMAGE_FOLDERS, is_system_file, natural_key, without_mask_mark
 from .heif import HEIF_SUFFIXES, heif_installed
@@ -54,13 +54,12 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
     notes = []
     if photos:
         place = os.path.commonpath([file.parent for file in photos])
-        count_text = f"{len(photos)} photos" if len(photos) > 1 else "1 photo"
         where = Path(place).relative_to(folder).as_posix() if Path(place) != folder else "the folder"
-        names_text, are = first_names([file.name for file in photos]), "are" if len(photos) > 1 else "is"
-        notes.append(f"{count_text} of {where} {are} in no view: {names_text}")
+        count = counted(len(photos), f"photo of {where} is", f"photos of {where} are")
+        notes.append(f"{count} in no view: {first_names([file.name for file in photos])}")
     if broken:
-        links = "links lead" if len(broken) > 1 else "link leads"
-        notes.append(f"{len(broken)} {links} to no file: {first_names([file.name for file in broken])}")
+        links = counted(len(broken), "link leads", "links lead")
+        notes.append(f"{links} to no file: {first_names([file.name for file in broken])}")
     if others:
         notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
     return notes

@@ -112,7 +112,7 @@ def test_an_absolute_name_is_that_of_a_missing_photo(data, name):
     path = data / "sparse" / "0" / "images.txt"
     path.write_text(path.read_text().replace("000.png", name))
     scene = load_scene(data, response="srgb")
-    assert f"1 images of the model are missing and were left out: {name!r} ..." in scene.notes
+    assert f"1 image of the model is missing and was left out: {name!r}" in scene.notes
     assert name not in {str(view.source) for view in scene.views}
 
 

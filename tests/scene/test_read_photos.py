@@ -140,7 +140,7 @@ def test_masks_and_points_that_are_missing_are_named(tmp_path):
         values["frames"][1]["mask_path"] = "masks/r_1.png"
     scene = load(tmp_path, holdout=0)
     assert len(scene.views) == 6
-    assert "1 masks that frames state are not here, and their photos count whole: r_1.png" in scene.notes
+    assert "1 mask that a frame states is not here, and its photo counts whole: r_1.png" in scene.notes
     assert "the points that transforms.json states are not here: 'sparse_pc.ply'" in scene.notes
 
 

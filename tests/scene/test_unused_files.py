@@ -102,7 +102,7 @@ def test_times_and_truth_are_by_path(tmp_path):
     scene = load(tmp_path, holdout=0)
     assert not scene.exposure_times_known
     (note,) = said(scene, "exposures.json")
-    assert note.startswith("exposures.json: 1 names fit several photos, and need their folders: 0000.png (images/cam0/")
+    assert note.startswith("exposures.json: 1 name fits several photos, and needs its folder: 0000.png (images/cam0/")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="names are bytes on POSIX alone")
