@@ -123,6 +123,8 @@ def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRe
     kind_names = " and ".join(name for each, name in _KINDS.items() if each != kind and kinds[each])
     most = "most" if list(kinds.values()).count(kinds[kind]) == 1 else "as many"
     reason = f"were left out, because {most} are {_KINDS[kind]}: photos of one set are of one kind"
+    if kind == "encoded" and kinds["raw"] == kinds[kind]:  # As cameras write RAW and JPEG of each shot
+        reason += "; to train on RAW, whose response is known, give a folder of RAW alone"
     notes = [f"{_names_text([record.image.name for record in others])} ({kind_names}) {reason}"]
     return kind, [record for record in records if file_kind(record.image) == kind], notes
 

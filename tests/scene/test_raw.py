@@ -16,7 +16,9 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.dng import read_dng
+from sehdr_warp.scene.photos import usable_photos
 from sehdr_warp.scene.raw import color_matrix, linear_codes, read_header, read_raw
+from sehdr_warp.scene.read_photos import find_photos
 from sehdr_warp.scene.sfm import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
 from sehdr_warp.training.plan import make_plan
@@ -179,6 +181,16 @@ def test_photos_of_another_kind_than_most_are_left_out(tmp_path):
     scene = load_scene(folder)
     assert len(scene.views) == len(values["frames"]) - 1 and scene.light_known
     assert any(odd.split("/")[-1] in note and "photos of one set are of one kind" in note for note in scene.notes)
+
+
+def test_raw_beside_jpegs_of_the_same_shots_is_named_with_what_to_give(tmp_path):
+    pytest.importorskip("rawpy")
+    for i in range(3):
+        write_dng(tmp_path / f"{i}.dng", np.full((64, 64, 3), 0.5 + 0.1 * i))
+        Image.fromarray(np.full((64, 64, 3), 90 + 40 * i, np.uint8)).save(tmp_path / f"{i}.jpg")
+    photos, kind, (note,) = usable_photos(find_photos(tmp_path).records)
+    assert kind == "encoded" and [photo.image.suffix for photo in photos] == [".jpg"] * 3
+    assert "because as many are photos of codes" in note and note.endswith("give a folder of RAW alone")
 
 
 def test_raw_photos_of_two_cameras_are_refused_before_they_are_matched(tmp_path, monkeypatch):
