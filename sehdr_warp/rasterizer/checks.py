@@ -41,7 +41,7 @@ def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:
         if not fits:
             expected = f"[{', '.join(map(str, shape))}]"
             sizes_text = ", ".join(f"{n} = {sizes[n]}" for n in shape if isinstance(n, str) and n in sizes)
-            expected += f" with {sizes_text}" if sizes_text else ""
+            expected += f" with {sizes_text}" if sizes_text else ": fx, fy, cx, cy" * (name == "intrinsics")
             raise ValueError(f"{name} has shape {list(value.shape)}, expected {expected}")
         if value.layout != torch.strided:
             raise ValueError(f"{name} is a tensor of layout {value.layout}, expected a dense one; use to_dense()")

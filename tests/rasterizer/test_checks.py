@@ -35,6 +35,7 @@ def with_nan_and_logits(opacities):
         ("features", lambda t: t.to("meta"), ValueError, "features is torch.float64 on meta, but means is .* on cpu"),
         ("means", lambda t: t.half(), ValueError, "means is torch.float16, expected torch.float32 or torch.float64"),
         ("intrinsics", lambda t: [1.0] * 4, TypeError, r"intrinsics is a list, expected a torch tensor \[4\]"),
+        ("intrinsics", lambda t: torch.eye(3), ValueError, r"shape \[3, 3\], expected \[4\]: fx, fy, cx, cy"),
         ("intrinsics", lambda t: t * 0, ValueError, "intrinsics are fx 0, fy 0, .* fx, fy above 0"),
         ("intrinsics", lambda t: -t, ValueError, "intrinsics are fx -.*expected finite numbers"),
         ("intrinsics", lambda t: t * NAN, ValueError, "intrinsics are fx nan, .*expected finite numbers"),

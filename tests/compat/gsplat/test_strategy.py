@@ -116,6 +116,40 @@ def test_relocated_gaussians_look_as_the_one_did():
         assert float(together / one) == pytest.approx(1, rel=1e-4)
 
 
+def test_transparent_gaussians_move_to_opaque_ones():
+    torch.manual_seed(0)
+    params, optimizers, _, _ = model(count=6)
+    params["opacities"].data = torch.tensor([0.001, 0.6, 0.001, 0.7, 0.8, 0.001]).logit()
+    sum(value.sum() for value in params.values()).backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+    before, rows = params["means"].detach().clone(), Scene(torch.arange(6))
+    strategy = MCMCStrategy(cap_max=6, noise_lr=0.0)
+    strategy.step_post_backward(params, optimizers, {}, 600, {}, lr=0.1, scene=rows)
+    dead, sources = torch.tensor([0, 2, 5]), rows.rows[[0, 2, 5]]
+    assert set(sources.tolist()) <= {1, 3, 4} and rows.rows[[1, 3, 4]].tolist() == [1, 3, 4]
+    assert torch.equal(params["means"].detach(), before[rows.rows])
+    shared = params["opacities"].detach().sigmoid()
+    assert torch.equal(shared[dead], shared[sources]) and bool((shared > 0.3).all())
+    moments = optimizers["means"].state[params["means"]]["exp_avg"]
+    assert not moments[sources].any()
+
+
+def test_large_gaussians_are_pruned_after_the_first_reset():
+    params, optimizers, _, _ = model(count=3)
+    params["scales"].data[1] = math.log(0.3)
+    strategy = DefaultStrategy(refine_every=1, refine_start_iter=0, reset_every=2, prune_scale3d=0.1, prune_opa=0.001)
+    means2d = torch.zeros(1, 3, 2, requires_grad=True)
+    means2d.grad = torch.zeros(1, 3, 2)
+    info = {"means2d": means2d, "radii": torch.ones(1, 3, 2, dtype=torch.int32)}
+    info |= {"width": 10, "height": 10, "n_cameras": 1}
+    state, others = strategy.initialize_state(), params["means"].detach()[[0, 2]].clone()
+    strategy.step_post_backward(params, optimizers, state, 1, info)
+    assert len(params["means"]) == 3
+    strategy.step_post_backward(params, optimizers, state, 3, info)
+    assert torch.equal(params["means"].detach(), others)
+
+
 def test_noise_fades_with_the_opacity_and_ends():
     params, optimizers, _, _ = model(count=2)
     params["opacities"].data = torch.tensor([0.1, 0.4]).logit()
