@@ -20,6 +20,9 @@ NOISE_CUTOFF = 16.0  # Exponent from which on a Gaussian's noise is below a ten-
 
 _g = geometry(wp.float32)
 _vec3, _vec4 = vector(3, wp.float32), vector(4, wp.float32)
+AdamNumbers = vector(5, wp.float32)
+"""1 - decay of both decays, not as float32 would round it, their logarithms, and epsilon."""
+FIRST_GAIN, SECOND_GAIN, FIRST_DECAY_LOG, SECOND_DECAY_LOG, EPSILON = range(5)  # Indices of AdamNumbers
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
@@ -76,27 +79,26 @@ def active_values(parameters: _floats, active_count: wp.array(dtype=wp.int32), w
 
 @wp.func
 def step_by_adam(
-    i: int, active_count: wp.array(dtype=wp.int32), width: int,
-    first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
+    i: int, active_count: wp.array(dtype=wp.int32), width: int, adam: AdamNumbers,
     gradients: _floats, step: _floats, rate: _floats,
     parameters: _floats, first_moments: _floats, second_moments: _floats,
 ):
     """One step of number i, in place, if it is among the active ones."""
     if i < active_values(parameters, active_count, width):
         gradient = gradients[i]
-        mean = first_moments[i] + first_gain * (gradient - first_moments[i])
-        square = second_moments[i] + second_gain * (gradient * gradient - second_moments[i])
+        mean = first_moments[i] + adam[FIRST_GAIN] * (gradient - first_moments[i])
+        square = second_moments[i] + adam[SECOND_GAIN] * (gradient * gradient - second_moments[i])
         first_moments[i] = mean
         second_moments[i] = square
-        deviation = wp.sqrt(square / bias_correction(second_decay_log, step[0])) + epsilon
-        parameters[i] = parameters[i] - rate[0] / bias_correction(first_decay_log, step[0]) * mean / deviation
+        deviation = wp.sqrt(square / bias_correction(adam[SECOND_DECAY_LOG], step[0])) + adam[EPSILON]
+        parameters[i] = parameters[i] - rate[0] / bias_correction(adam[FIRST_DECAY_LOG], step[0]) * mean / deviation
 
 
 @wp.kernel(module="unique", module_options=NO_AUTODIFF)
 def update_by_adam(
     range_start: int,
     skipped: _floats, active_count: wp.array(dtype=wp.int32), width_a: int, width_b: int, width_c: int, width_d: int,
-    first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
+    adam: AdamNumbers,
     grad_a: _floats, step_a: _floats, rate_a: _floats, parameters_a: _floats, exp_avg_a: _floats, exp_avg_sq_a: _floats,
     grad_b: _floats, step_b: _floats, rate_b: _floats, parameters_b: _floats, exp_avg_b: _floats, exp_avg_sq_b: _floats,
     grad_c: _floats, step_c: _floats, rate_c: _floats, parameters_c: _floats, exp_avg_c: _floats, exp_avg_sq_c: _floats,
@@ -105,27 +107,14 @@ def update_by_adam(
     """Update every number of PARAMETERS_PER_LAUNCH parameters by Adam, in place; none if skipped[0] is not 0.
 
     Launched over the longest parameter. step: [1], already counted up; rate: [1]; all of length 0 for an absent
-    parameter. *_decay_log: logarithms of the decays; *_gain: 1 - decay, not as float32 would round it. exp_avg,
-    exp_avg_sq: first and second moments. active_count, width_*: as of active_values().
+    parameter. exp_avg, exp_avg_sq: first and second moments. active_count, width_*: as of active_values().
     """
     i = range_start + wp.tid()
     if skipped[0] == 0.0:
-        step_by_adam(
-            i, active_count, width_a, first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
-            grad_a, step_a, rate_a, parameters_a, exp_avg_a, exp_avg_sq_a,
-        )  # fmt: skip
-        step_by_adam(
-            i, active_count, width_b, first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
-            grad_b, step_b, rate_b, parameters_b, exp_avg_b, exp_avg_sq_b,
-        )  # fmt: skip
-        step_by_adam(
-            i, active_count, width_c, first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
-            grad_c, step_c, rate_c, parameters_c, exp_avg_c, exp_avg_sq_c,
-        )  # fmt: skip
-        step_by_adam(
-            i, active_count, width_d, first_gain, second_gain, first_decay_log, second_decay_log, epsilon,
-            grad_d, step_d, rate_d, parameters_d, exp_avg_d, exp_avg_sq_d,
-        )  # fmt: skip
+        step_by_adam(i, active_count, width_a, adam, grad_a, step_a, rate_a, parameters_a, exp_avg_a, exp_avg_sq_a)
+        step_by_adam(i, active_count, width_b, adam, grad_b, step_b, rate_b, parameters_b, exp_avg_b, exp_avg_sq_b)
+        step_by_adam(i, active_count, width_c, adam, grad_c, step_c, rate_c, parameters_c, exp_avg_c, exp_avg_sq_c)
+        step_by_adam(i, active_count, width_d, adam, grad_d, step_d, rate_d, parameters_d, exp_avg_d, exp_avg_sq_d)
 
 
 @wp.func
@@ -176,8 +165,7 @@ def harmonics_adam_kernel(count: int):
         basis: wp.array3d(dtype=wp.float32), grad_colors: wp.array3d(dtype=wp.float32), start: int, stride: int,
         update_interval: int,
         step: wp.array(dtype=wp.float32), rate: wp.array(dtype=wp.float32), skipped: wp.array(dtype=wp.float32),
-        active_count: wp.array(dtype=wp.int32),
-        first_gain: float, second_gain: float, first_decay_log: float, second_decay_log: float, epsilon: float,
+        active_count: wp.array(dtype=wp.int32), adam: AdamNumbers,
         parameters: wp.array(dtype=wp.float32), first_moments: wp.array(dtype=wp.float32),
         second_moments: wp.array(dtype=wp.float32),
     ):
@@ -208,16 +196,16 @@ def harmonics_adam_kernel(count: int):
                     grad_color = grad_colors[view, owners[k], channels[k]]
                     gradients[k] += wp.where(orders[k] < basis_count, basis_value, 0.0) * grad_color
             turn_count = wp.ceil(step[0] / float(update_interval))
-            length = rate[0] / bias_correction(first_decay_log, turn_count)
-            enlarged = 1.0 / wp.sqrt(bias_correction(second_decay_log, turn_count))
+            length = rate[0] / bias_correction(adam[FIRST_DECAY_LOG], turn_count)
+            enlarged = 1.0 / wp.sqrt(bias_correction(adam[SECOND_DECAY_LOG], turn_count))
             for k in range(wp.static(VALUES_PER_THREAD)):
-                mean = means[k] + first_gain * (gradients[k] - means[k])
-                square = squares[k] + second_gain * (gradients[k] * gradients[k] - squares[k])
+                mean = means[k] + adam[FIRST_GAIN] * (gradients[k] - means[k])
+                square = squares[k] + adam[SECOND_GAIN] * (gradients[k] * gradients[k] - squares[k])
                 i = index_in_turn(thread + k * stride, turn, update_interval)
                 if i <= final:
                     first_moments[i] = mean
                     second_moments[i] = square
-                    parameters[i] = values[k] - length * mean / (wp.sqrt(square) * enlarged + epsilon)
+                    parameters[i] = values[k] - length * mean / (wp.sqrt(square) * enlarged + adam[EPSILON])
 
     return update_harmonics_by_adam
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import torch
@@ -156,7 +157,7 @@ def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, active_
     for start in range(0, len(steps), kernels.PARAMETERS_PER_LAUNCH):
         group = steps[start : start + kernels.PARAMETERS_PER_LAUNCH]
         absent = kernels.PARAMETERS_PER_LAUNCH - len(group)
-        arguments = [*(step.width for step in group), *[0] * absent, *_decays(betas), epsilon]
+        arguments = [*(step.width for step in group), *[0] * absent, _adam_numbers(betas, epsilon)]
         for parameter, gradient, first_moment, second_moment, step, rate, _ in group:
             flat = (tensor.view(-1) for tensor in (parameter, first_moment, second_moment))
             arguments += [gradient.view(-1), step.view(1), _rate(rate, skipped).view(1), *flat]
@@ -188,7 +189,7 @@ def harmonics_adam_step(
     """
     if not parameter.numel():
         return
-    options = step, _rate(rate, skipped), skipped, _active_count(active_count, skipped), *_decays(betas), epsilon
+    options = step, _rate(rate, skipped), skipped, _active_count(active_count, skipped), _adam_numbers(betas, epsilon)
     values = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
     in_turn = parameter.numel()
@@ -207,9 +208,10 @@ def _rate(rate: Tensor | float, like: Tensor) -> Tensor:
     return rate if isinstance(rate, Tensor) else torch.full_like(like, rate)
 
 
-def _decays(betas: tuple[float, float]) -> tuple[float, ...]:
-    """Return what Adam's kernels need of the decays: 1 - beta and log(beta) of each."""
-    return *(1 - beta for beta in betas), *(math.log(beta) for beta in betas)
+@cache
+def _adam_numbers(betas: tuple[float, float], epsilon: float) -> Any:
+    first, second = betas
+    return kernels.AdamNumbers(1 - first, 1 - second, math.log(first), math.log(second), epsilon)
 
 
 @torch.no_grad()
