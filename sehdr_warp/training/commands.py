@@ -180,17 +180,17 @@ def _train(args: Train, ranks=None) -> None:
     data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
     config = _config(args, None if resumed is None else resumed.read_config())
     device = pick_device(args.machine.device) if ranks is None else ranks.device
-    loading = _loading(config)
+    load_options = _load_options(config)
     if resumed is not None:  # Its response need not be chosen again; create_trainer() refuses another --response.
         response = Response.from_dict(resumed.read_info()["response"])
-        loading["response"] = response_for_loading(resumed.read_config(), response)
+        load_options["response"] = response_for_loading(resumed.read_config(), response)
     check_dataset_truth(data, config)
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
             from .following import PhotoRequest
 
-            ranks.request_photos(PhotoRequest(data, loading))
-        scene = load_scene_and_log_notes(data, **loading)
+            ranks.request_photos(PhotoRequest(data, load_options))
+        scene = load_scene_and_log_notes(data, **load_options)
         from ..console import run_with_progress
         from ..viewer.live import serve_training
         from .advice import advice_on, options_of_run
@@ -239,13 +239,13 @@ def _print_plan(args: Train) -> None:
     from .plan import make_plan
 
     data, config, device = _load_arguments(args, None), _config(args, None), pick_device(args.machine.device)
-    plan = make_plan(load_scene_and_log_notes(data, **_loading(config)), config, device)
+    plan = make_plan(load_scene_and_log_notes(data, **_load_options(config)), config, device)
     cost = estimate.estimate(plan, device, args.machine.gpus)
     values = plan.to_dict() | {"cost": estimate.to_dict(*cost)}
     print(json.dumps(values) if args.output.json else plan.table() + estimate.table(*cost))
 
 
-def _loading(config) -> dict[str, Any]:
+def _load_options(config) -> dict[str, Any]:
     """Return the arguments of load_scene() that a config states."""
     response, cache = config.response, config.schedule.photo_cache
     options = {"response": response.name, "method": response.method, "candidates": response.candidates}
@@ -316,7 +316,7 @@ def _train_blocks(args: Train) -> bool:
         slurm_device="cpu" if device.type == "cpu" and machine.device is not None else None,
         resume=output.resume,
         overwrite=output.overwrite,
-        photo_storage=_loading(config)["photo_storage"],
+        photo_storage=_load_options(config)["photo_storage"],
     )
     if run is not None:
         _print_result(args, run)

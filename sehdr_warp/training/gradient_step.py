@@ -1,13 +1,16 @@
 """One gradient step on a photo: forward, loss, backward, average over the ranks, optimizer step.
 
-Nothing here waits for the device if the number of intersections has a fixed capacity, so that compute_gradients() and
-apply_gradients() can be captured as CUDA graphs.
+GradientStep.run() is the whole step. Nothing in it waits for the device if the number of intersections has a fixed
+capacity, so that StepGraphs can capture it as a CUDA graph; on several GPUs, as one graph before and one after the
+average.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from ..model.adam import Adam
@@ -19,7 +22,7 @@ from ..rasterizer.tile_lists import MAX_SINGLE_SORT
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..scene import Scene
-from .losses import compared_image, compares_exposures, data_loss, extra_images, opacity_loss
+from .losses import compared_image, data_loss, extra_images, opacity_loss
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
 from .scene_facts import largest_hdr_truth
@@ -101,7 +104,8 @@ class GradientStep:
         optimizer: Adam over its parameters.
         strategy: Densification strategy, which accumulates gradients of projected means.
         ranks: Processes that train together.
-        needs_encoded: Whether the loss compares encoded photos; if it compares exposures, they are not computed.
+        step_counters: [3] int64, which each step adds to: steps that were not finite; largest number of intersections,
+            set to 0 by GraphCapacity; steps with more intersections than the capacity. Neither kind of step is applied.
         defer_sh_gradients: Keep the gradients of the harmonics in factored form until the optimizer step: a gradient by
             one color per Gaussian in place of 48 numbers; see HarmonicsGradients for their way.
     """
@@ -113,23 +117,22 @@ class GradientStep:
         field: RadianceField,
         optimizer: Adam,
         strategy: Strategy,
-        step_counters: Tensor,
         ranks: Ranks | None,
         large_scene: bool,
     ):
         """Prepare steps of a training.
 
-        The HDR truth of the scene scales the HDR loss. Steps add to step_counters, see GraphCapacity. In a large scene
-        the opacity penalty spares Gaussians that no photo has shown yet.
+        The HDR truth of the scene scales the HDR loss. In a large scene the opacity penalty spares Gaussians that no
+        photo has shown yet.
         """
         self.field, self.optimizer, self.strategy, self.ranks = field, optimizer, strategy, ranks
-        self._loss, self._step_counters = config.loss, step_counters
-        self.needs_encoded = not compares_exposures(config.loss, field)
-        self.defer_sh_gradients = field.gaussians.means.device.type == "cuda"
+        self._loss, device = config.loss, field.gaussians.means.device
+        self.step_counters = torch.zeros(3, dtype=torch.int64, device=device)
+        self.defer_sh_gradients = device.type == "cuda"
         self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
         # They would fade before a photo shows them. Elsewhere the penalty removes copies that are not needed.
         self._spares_unseen = large_scene
-        self._flat: FlatGradients | None = None
+        self._flat: FlatGradients | None = None  # Buffer that ranks exchange
 
     def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:
         """Return the key of a step on one of the views; None if it cannot be captured as a CUDA graph."""
@@ -148,20 +151,25 @@ class GradientStep:
     def prepare(self, options: StepOptions) -> None:
         """Allocate the statistics that the next step adds to: in a capture, they would lie in the graph's memory."""
         if options.needs_means2d_grad:
-            self.strategy.prepare(self.field.gaussians.row_count, self._step_counters.device)
+            self.strategy.prepare(self.field.gaussians.row_count, self.step_counters.device)
 
-    def compute_and_apply(self, compute: Callable[[], Gradients], apply: Callable[[Gradients], Tensor]) -> StepResult:
-        """Compute gradients, average them over the ranks, and apply them.
+    def run(self, view: TrainingView, options: StepOptions, max_intersections: int | None = None) -> StepResult:
+        """Take a step on a view; arguments as of compute_gradients()."""
+        with self.on_all_rows():
+            gradients = self.compute_gradients(view, options, max_intersections)
+            self.average_gradients()
+            loss = self.apply_gradients(gradients)
+        return StepResult(loss, gradients.image, gradients.rendering.intersection_count)
 
-        `compute` and `apply` are the two functions below, or replay their CUDA graphs; see StepGraphs.run().
-        """
-        with self.field.gaussians.all_rows(self.optimizer):  # CUDA graphs have the reserved rows, too.
-            if self.ranks is not None:
-                self._flat_gradients(self.ranks)  # Allocated here, not in the memory of a CUDA graph.
-            gradients = compute()
-            if self.ranks is not None and self._flat is not None:
-                self.ranks.all_reduce_mean(self._flat.buffer)
-            return StepResult(apply(gradients), gradients.image, gradients.rendering.intersection_count)
+    @contextmanager
+    def on_all_rows(self) -> Iterator[None]:
+        """Run the functions below on all reserved rows within this block, because the number of those is fixed."""
+        with self.field.gaussians.all_rows(self.optimizer):
+            if self.ranks is not None and not (self._flat and self._flat.fits(self.optimizer)):
+                rank, count = self.ranks.rank, self.ranks.count
+                self._flat = None  # Freed first, because it is large. Not allocated in the memory of a CUDA graph.
+                self._flat = FlatGradients(self.optimizer, rank, count, defer_sh=self.defer_sh_gradients)
+            yield
 
     def compute_gradients(
         self, view: TrainingView, options: StepOptions, max_intersections: int | None = None
@@ -181,7 +189,7 @@ class GradientStep:
             degree=options.degree,
             extra_images=extra_images(self._loss, target.exposure_truth is not None),
             max_intersections=max_intersections,
-            encode=self.needs_encoded,
+            encode=not target.scale.compares_exposures,
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
         )
         loss = data_loss(field, render, target, self._loss, self._largest_truth)
@@ -204,9 +212,14 @@ class GradientStep:
         if self.defer_sh_gradients:
             values = sh_gradients[0].contiguous()
             harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, options.degree)
-        if self.ranks is not None:
-            self._flat_gradients(self.ranks).collect(loss, rendering.overflow, harmonics)
+        if self._flat is not None:
+            self._flat.collect(loss, rendering.overflow, harmonics)
         return Gradients(loss.detach(), image.detach(), rendering, harmonics)
+
+    def average_gradients(self) -> None:
+        """Average the gradients over the ranks."""
+        if self.ranks is not None and self._flat is not None:
+            self.ranks.all_reduce_mean(self._flat.buffer)
 
     def apply_gradients(self, gradients: Gradients) -> Tensor:
         """Update the parameters, unless the step is not finite; return its loss. Does not wait for the device."""
@@ -219,7 +232,7 @@ class GradientStep:
             loss,
             overflow,
             harmonics,
-            step_counters=self._step_counters,
+            step_counters=self.step_counters,
             intersections=rendering.needed_intersections,
             active_count=self.field.gaussians.active_count,
         )
@@ -228,10 +241,3 @@ class GradientStep:
             self.strategy.accumulate(rendering, width, height, applied)
         self.optimizer.zero_grad()
         return loss
-
-    def _flat_gradients(self, ranks: Ranks) -> FlatGradients:
-        """Return the buffer of all gradients, which ranks exchange; allocated anew when parameters change."""
-        if self._flat is None or not self._flat.fits(self.optimizer):
-            self._flat = None  # Freed first, because it is large.
-            self._flat = FlatGradients(self.optimizer, ranks.rank, ranks.count, defer_sh=self.defer_sh_gradients)
-        return self._flat

@@ -111,25 +111,30 @@ class RunOutput:
             return
         self._run = None  # A run that was loaded before is older.
         keep = trainer.config.schedule.keep_checkpoints
-        self.folder.write_checkpoint(state.tensors, state.values | {"seconds": trainer.seconds}, keep=keep)
+        self.folder.write_checkpoint(state.tensors, state.values, keep=keep)
         self._saved_at = time.monotonic()
 
-    def finish(self, trainer: Trainer) -> None:
-        """Write the last checkpoint and the summary; after the last step, also the confidence and residual regions.
+    def save_end(self, trainer: Trainer) -> Evidence | None:
+        """Write the last checkpoint.
 
         After the last step, Gaussians that no photo shows are removed before, and the rest is evaluated.
+
+        Returns:
+            The evidence of the photos for the Gaussians, None if no last step was made.
         """
-        evidence, complete = None, trainer.iteration >= trainer.total
-        if complete and trainer.iteration > trainer.first_iteration:
+        evidence = None
+        if trainer.iteration >= trainer.total and trainer.iteration > trainer.first_iteration:
             evidence = remove_unseen(trainer)
             self.evaluate(trainer)
         self.checkpoint(trainer, last=True)
-        if trainer.ranks is not None:
-            trainer.ranks.shutdown()
+        return evidence
+
+    def write_results(self, trainer: Trainer, evidence: Evidence | None) -> None:
+        """Write the summary; after the last step, also the confidence and residual regions. `evidence`: of save_end."""
         self._write_summary(trainer)
         if self._writer is not None:
             self._writer.close()
-        if not complete:
+        if trainer.iteration < trainer.total:
             return
         checkpoint_hash = self.folder.checkpoint_hash
         if self._is_block and evidence is not None and checkpoint_hash is not None:
@@ -151,7 +156,7 @@ class RunOutput:
             "train_seconds": round(trainer.seconds, 3),
             "gaussians": trainer.field.gaussians.count,
             "skipped_steps": trainer.skipped_steps,
-            "overflowed_steps": trainer.capacity.overflows,
+            "overflowed_steps": trainer.overflowed_steps,
         }
         self.folder.write_summary(summary | machine_figures(trainer.device))
 
@@ -163,19 +168,10 @@ class RunOutput:
         self.folder.write_summary(run.summary() | unexplained)
         if regions:
             worst, photos = regions[0], len({region.photo for region in regions})
-            log.warning(
-                "%d regions in %d photos are not explained by the scene; the worst: %s at column %.0f, row %.0f, "
-                "%d pixels %.1f stops %s than the photo (summary.json names %d)",
-                len(regions),
-                photos,
-                worst.photo,
-                worst.column,
-                worst.row,
-                worst.pixels,
-                abs(worst.stops),
-                "darker" if worst.stops > 0 else "brighter",
-                min(len(regions), MAX_LISTED),
-            )
+            place = f"{worst.photo} at column {worst.column:.0f}, row {worst.row:.0f}, {worst.pixels} pixels"
+            stops = f"{abs(worst.stops):.1f} stops {'darker' if worst.stops > 0 else 'brighter'} than the photo"
+            message = "%d regions in %d photos are not explained by the scene; the worst: %s %s (summary.json names %d)"
+            log.warning(message, len(regions), photos, place, stops, min(len(regions), MAX_LISTED))
 
     def _log(self, trainer: Trainer, split: str, figures: dict[str, float]) -> None:
         """Write figures to TensorBoard, if that is on."""

@@ -1,6 +1,6 @@
 """Gradient steps as CUDA graphs.
 
-A graph replays the kernels of GradientStep.compute_gradients() and apply_gradients(); none of their Python code runs.
+A graph replays the kernels of GradientStep.run(); none of its Python code runs.
 It fixes the size of its memory when it is captured, while photos differ in their number of Gaussian-tile
 intersections: GraphCapacity counts them and chooses how many a captured step has memory for.
 """
@@ -10,11 +10,12 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import TypeGuard
 
 import torch
+from torch import Tensor
 
 from ..errors import SehdrError
 from ..rasterizer import CudaGraphRunner
 from ..rasterizer.memory import failed_allocation
-from .gradient_step import Gradients, GradientStep, GraphKey, StepOptions, StepResult
+from .gradient_step import GradientStep, GraphKey, StepOptions, StepResult
 from .targets import ViewStack
 from .training_views import PhotoStream, Views
 
@@ -28,7 +29,7 @@ MAX_RESERVE = 1.5  # Largest number of reserved rows as a multiple of the count;
 class StepGraphs:
     """Runs gradient steps: as CUDA graphs if that is possible, else kernel by kernel, as on a CPU.
 
-    On one GPU, both functions of a step are one graph. On several, they are two, and gradients are averaged between.
+    On one GPU, a step is one graph. On several, it is two, and gradients are averaged between.
 
     Attributes:
         enabled: Whether steps are captured.
@@ -36,10 +37,10 @@ class StepGraphs:
             capture. Sums over more rows have other last bits.
     """
 
-    def __init__(self, step: GradientStep, capacity: "GraphCapacity", *, enabled: bool, deterministic: bool):
+    def __init__(self, step: GradientStep, *, enabled: bool, deterministic: bool):
         """Create the graph runners of a training's steps; they are disabled on a CPU."""
-        self._step, self._capacity = step, capacity
-        device = capacity.step_counters.device
+        self._step, self._capacity = step, GraphCapacity(step.step_counters)
+        device = step.step_counters.device
         self.enabled = enabled and device.type == "cuda"
         self.reserves_rows, self._reserved_rows = self.enabled and not deterministic, 0
         self._first = CudaGraphRunner(device) if self.enabled else None
@@ -48,11 +49,7 @@ class StepGraphs:
         self._eager_keys: set[GraphKey] = set()
 
     def run(self, views: Views, index: int, following: int | None, options: StepOptions, iteration: int) -> StepResult:
-        """Take a gradient step on view `index`; view `following` is fetched meanwhile if photos are streamed.
-
-        Kernel by kernel, it is compute_and_apply(compute_gradients, apply_gradients). On one GPU, one graph replays all
-        of that; on several, one graph replays compute_gradients() and another apply_gradients().
-        """
+        """Do GradientStep.run() on view `index`; view `following` is fetched meanwhile if photos are streamed."""
         step, gaussians = self._step, self._step.field.gaussians
         # Gaussians.surround() has reserved rows for another purpose.
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
@@ -63,7 +60,7 @@ class StepGraphs:
             return self._replay(views, index, following, options, key, iteration)
         with self.on_capture_stream():
             # Without a capacity, so that result.intersections is their number.
-            result = step.compute_and_apply(lambda: step.compute_gradients(views[index], options), step.apply_gradients)
+            result = step.run(views[index], options)
         self._capacity.observe(result.intersections)
         if key is not None:
             self._eager_keys.add(key)
@@ -96,17 +93,15 @@ class StepGraphs:
         if isinstance(views, PhotoStream):
             views.bring(index)
 
-        def compute() -> Gradients:
-            return step.compute_gradients(views.at(self._index), options, capacity)
-
         try:
             if second is None:
-                result = first.run(key, lambda: step.compute_and_apply(compute, step.apply_gradients))
+                result = first.run(key, lambda: step.run(views.at(self._index), options, capacity))
             else:
-                result = step.compute_and_apply(
-                    lambda: first.run(key, compute),
-                    lambda gradients: second.run(key, lambda: step.apply_gradients(gradients)),
-                )
+                with step.on_all_rows():
+                    gradients = first.run(key, lambda: step.compute_gradients(views.at(self._index), options, capacity))
+                    step.average_gradients()
+                    loss = second.run(key, lambda: step.apply_gradients(gradients))
+                result = StepResult(loss, gradients.image, gradients.rendering.intersection_count)
         except RuntimeError as error:
             if failed_allocation(error):
                 raise
@@ -162,13 +157,12 @@ class GraphCapacity:
     """Chooses the intersection capacity of the next capture from counts that steps keep on the device.
 
     Attributes:
-        step_counters: [3] int64, which each step adds to: steps that were not finite; largest number of intersections,
-            set to 0 by rescale(); steps with more intersections than the capacity. Neither kind of step is applied.
+        step_counters: As in GradientStep.
     """
 
-    def __init__(self, device: torch.device | str):
+    def __init__(self, step_counters: Tensor):
         """Start without counts."""
-        self.step_counters = torch.zeros(3, dtype=torch.int64, device=device)
+        self.step_counters = step_counters
         self._intersections = self._capacity = self._largest = 0
         self._host_counters, self._copied = self.step_counters, None
         if self.step_counters.device.type == "cuda":
@@ -183,11 +177,6 @@ class GraphCapacity:
     def observe(self, intersections: int) -> None:
         """Record the exact number of intersections of a step."""
         self._intersections = max(self._intersections, intersections)
-
-    @property
-    def overflows(self) -> int:
-        """Number of steps with more intersections than the capacity. Waits for the device."""
-        return int(self.step_counters[2])
 
     def capacity(self) -> int:
         """Return the capacity for the step that is captured or replayed now; it stays until poll() or rescale()."""

@@ -128,10 +128,7 @@ def _new_trainer(
     *,
     overwrite: bool,
 ) -> Trainer:
-    """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder.
-
-    The callees take the scene in its own coordinates and normalize it themselves, but for the plan.
-    """
+    """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder."""
     normalization = normalization_of(scene)
     config, plan = apply_plan(normalization.scene(scene), config, device)
     check_scene_truth(scene, config.loss)  # Here, before the photos are matched; GradientStep repeats it.
@@ -151,9 +148,7 @@ def _new_trainer(
     if plan is not None and prepared.decision is not None:
         plan = plan.with_decision(prepared.decision)
     # The folder is begun last, when the scene is known to be usable.
-    state = state_of(trainer)
-    state.values["seconds"] = trainer.seconds
-    plan_values = None if plan is None else plan.to_dict()
+    plan_values, state = None if plan is None else plan.to_dict(), state_of(trainer)
     folder.begin(
         scene, config, field, data, plan_values, state, compensation=prepared.compensation, overwrite=overwrite
     )
@@ -201,7 +196,6 @@ def _resumed_trainer(
         text = "the schedule is stretched from %d to %d iterations: rates and densification are those of the longer one"
         log.info(text, before, trainer.total)
     folder.rewind_metrics(trainer.iteration)
-    trainer.seconds = checkpoint.values["seconds"]
     return trainer
 
 

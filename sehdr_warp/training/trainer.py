@@ -4,12 +4,10 @@ Read `Trainer.__iter__` for the loop and `Trainer.step` for a step: gradient ste
 gradient step (forward, loss, backward, optimizer) is in gradient_step.py; run_output.py evaluates, logs and saves, and
 training_state.py lists what a checkpoint holds. On several ranks, each runs this loop; only rank 0 has an output.
 
-The calls of a step: step() -> StepGraphs.run() -> GradientStep.compute_and_apply(), which calls compute_gradients(),
-then apply_gradients(). The first calls RadianceField.render_train_view() -> rasterize() (kernels project, tiles,
-blend_cuda or blend_cpu), then data_loss() and differentiate(); the second calls guarded_step() -> Adam.step() (on a
-GPU, kernels step_updates). On a GPU, StepGraphs.run() captures both as CUDA graphs; a replay repeats their kernels,
-and neither function runs. create_trainer() writes the checkpoint of iteration 0 before the first step,
-RunOutput.after_step() the later ones, and RunOutput.finish() the last one.
+A gradient step is GradientStep.run(). Its compute_gradients() calls RadianceField.render_train_view() -> rasterize()
+(kernels project, tiles, blend_cuda or blend_cpu), then data_loss() and differentiate(); its apply_gradients() calls
+guarded_step() -> Adam.step() (on a GPU, kernels step_updates). On a GPU, StepGraphs.run() captures it as a CUDA graph;
+a replay repeats its kernels. create_trainer() writes the checkpoint of iteration 0, before the first step.
 """
 
 import logging
@@ -40,7 +38,7 @@ from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .scene_facts import is_large
-from .step_graphs import GraphCapacity, StepGraphs
+from .step_graphs import StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
 from .training_state import Pace, TrainingProgress
 from .training_views import PhotoOrder, TrainingViews, check_projections, first_wide_view
@@ -76,7 +74,7 @@ class Trainer:
         strategy: The densification strategy.
         average: Moving average of the Gaussians.
         iteration: Iterations done; a step on several ranks counts one for each photo.
-        first_iteration: Iterations done before this process.
+        first_iteration: Iterations done before this loop began.
         total: Iterations in all.
         batch: Photos of a step, one for each rank; each counts as an iteration.
         step_batch: Photos of the last step: `batch`, or as many as iterations were left.
@@ -121,19 +119,13 @@ class Trainer:
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         check_projections(normalized, config)
         self.can_seed = first_wide_view(normalized) is None  # Seeding samples pixels of pinhole photos.
-        self._get_matcher: Callable[[], Matcher] | None = get_matcher or cache(
-            partial(make_matcher, normalized, field.response, self.device)
-        )
+        make = cache(partial(make_matcher, normalized, field.response, self.device))
+        self._get_matcher: Callable[[], Matcher] | None = get_matcher or make
 
-        field.gaussians.release()  # Rows that another trainer of this field reserved hold its optimizer's moments.
-        self.capacity = GraphCapacity(self.device)
-        self.gradient_step = GradientStep(
-            scene, config, field, self.optimizer, self.strategy, self.capacity.step_counters, ranks, large_scene
-        )
+        field.gaussians.release()  # Another trainer of this field may have reserved rows for its own optimizer.
+        self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, ranks, large_scene)
         use_cuda_graph = config.schedule.use_cuda_graph
-        self.graphs = StepGraphs(
-            self.gradient_step, self.capacity, enabled=use_cuda_graph, deterministic=config.deterministic
-        )
+        self.graphs = StepGraphs(self.gradient_step, enabled=use_cuda_graph, deterministic=config.deterministic)
         self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
         self._result: StepResult | None = None
         self._view_index = 0
@@ -153,12 +145,13 @@ class Trainer:
 
     def __iter__(self) -> Iterator[TrainingProgress]:
         """Train step by step; yield after each step, after evaluation and checkpoint if they are due."""
+        self.first_iteration = self.iteration
         with self._session():
             try:
                 while self._agree_to_continue():
                     before = self.seconds
                     self.run_timed(self.step)
-                    if self.output is not None:
+                    if self.output is not None:  # Evaluation, checkpoint, log.
                         self.output.after_step(self)
                     yield TrainingProgress(self, self._pace.seconds_left(self, self.seconds - before))
             except GeneratorExit:  # The caller left the loop.
@@ -197,14 +190,15 @@ class Trainer:
         return agreed == GO
 
     def _finish(self) -> None:
-        """Save the end of the training; after the last step, also the confidence and the residual regions."""
+        """Save the end of the training; after the last step, also measure the scene on the training photos."""
         self.synchronize()
         self.gather()
         self.check()
-        if self.output is not None:
-            self.output.finish(self)
-        elif self.ranks is not None:
+        evidence = None if self.output is None else self.output.save_end(self)
+        if self.ranks is not None:
             self.ranks.shutdown()
+        if self.output is not None:
+            self.output.write_results(self, evidence)
 
     # One step
 
@@ -214,7 +208,7 @@ class Trainer:
         Raises:
             SehdrError: If more than MAX_SKIPPED steps were not finite, or ranks differ.
         """
-        # The last step may have more photos than iterations are left.
+        # Photo, learning rates and options. The last step may have more photos than iterations are left.
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
         if self.iteration > INTERVALS_FROM * self.total:
@@ -227,7 +221,7 @@ class Trainer:
         opacity_weight = self.config.loss.opacity_weight if refines else 0.0
         options = StepOptions(self.degree, opacity_weight, self.strategy.needs_gradients(self.iteration))
 
-        # Forward, loss, backward, optimizer.
+        # Forward, loss, backward, optimizer step: GradientStep.run().
         self._result = self.graphs.run(self.views.source, self._view_index, self.order.peek(), options, self.iteration)
         # Densification.
         self.strategy.inject_noise(self.iteration, self.field.gaussians, means_lr)
@@ -235,11 +229,11 @@ class Trainer:
             self._densify()
         if not refines:
             self._get_matcher = None  # Its copies of the photos take memory on the device.
-        # Moving average.
+        # Moving average; after the last step, it replaces the Gaussians.
         self.average.update(self.iteration, self.step_batch, self.field.gaussians)
+        # Checks; a checkpoint after this step holds what the ranks gather here.
         if self.came_to(CHECK_EVERY):
             self.check(wait=False)
-        # Before RunOutput.after_step() writes a checkpoint.
         if self.came_to(COMPARE_EVERY) or self.came_to(self.config.checkpoint_interval):
             self.gather()
 
@@ -262,10 +256,10 @@ class Trainer:
         assert result is not None and self._get_matcher is not None
         with self.graphs.on_capture_stream():
             image = result.image
-            rendered = image if self.gradient_step.needs_encoded else self.field.response.encode_extended(image)
-            return seed_gaussians(
-                self.field, self._get_matcher(), rendered, view, self._view_index, number, bound, random_seed
-            )
+            if view.target.scale.compares_exposures:
+                image = self.field.response.encode_extended(image)
+            matcher, index = self._get_matcher(), self._view_index
+            return seed_gaussians(self.field, matcher, image, view, index, number, bound, random_seed)
 
     @property
     def degree(self) -> int:
@@ -324,7 +318,12 @@ class Trainer:
     @property
     def skipped_steps(self) -> int:
         """Number of steps that were skipped because the loss or a gradient was not finite."""
-        return int(self.capacity.step_counters[0])
+        return int(self.gradient_step.step_counters[0])
+
+    @property
+    def overflowed_steps(self) -> int:
+        """Number of steps that were skipped because a CUDA graph had memory for fewer intersections."""
+        return int(self.gradient_step.step_counters[2])
 
     @property
     def run(self) -> Run:

@@ -43,8 +43,8 @@ def state_of(trainer: Trainer) -> TrainingState:
     order, remaining = trainer.order.state()
     parts["generators"] = {"order": order, "device": trainer.generator.get_state()}
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-    counts = {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.capacity.overflows}
-    values = {"iteration": trainer.iteration, "order": remaining} | counts
+    counts = {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
+    values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining} | counts
     return TrainingState(tensors, values)
 
 
@@ -62,9 +62,9 @@ def load_state(trainer: Trainer, state: TrainingState) -> None:
     trainer.order.load_state(generators["order"], values["order"])
     if trainer.generator.get_state().numel() == generators["device"].numel():
         trainer.generator.set_state(generators["device"].cpu())
-    trainer.iteration = trainer.first_iteration = values["iteration"]
-    trainer.capacity.step_counters[0] = values["skipped_steps"]
-    trainer.capacity.step_counters[2] = values.get("overflowed_steps", 0)
+    trainer.iteration, trainer.seconds = values["iteration"], values["seconds"]
+    trainer.gradient_step.step_counters[0] = values["skipped_steps"]
+    trainer.gradient_step.step_counters[2] = values.get("overflowed_steps", 0)
 
 
 class TrainingProgress:

@@ -135,7 +135,7 @@ def test_a_trainer_continues_from_its_state(scene, variant):
     again = state_of(resumed).tensors
     for name, value in state_of(whole).tensors.items():
         assert torch.equal(value, again[name]), name
-    assert resumed.capacity.overflows == 3, "overflows are summed over all sessions, as skipped steps are"
+    assert resumed.overflowed_steps == 3, "overflows are summed over all sessions, as skipped steps are"
 
 
 def test_statistics_of_gaussians_do_not_outlive_the_removal_of_some(scene):

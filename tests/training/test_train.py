@@ -312,6 +312,12 @@ def test_a_config_may_be_a_name_or_fields(scene, tmp_path, config):
     assert training.total == (700 if config == "demo" else 3)
 
 
+def test_a_finished_trainer_is_evaluated_once(scene, tmp_path):
+    trainer = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
+    metrics = trainer.train().metrics()
+    assert trainer.train().metrics() == metrics
+
+
 def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
     training = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
     training.output.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})

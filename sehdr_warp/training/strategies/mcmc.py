@@ -19,7 +19,7 @@ from ...rasterizer.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
 from .base import SEED_STRIDE, Propose, Schedule, Strategy
 
-MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: each Gaussian then shares with one other on average
+MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
 DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
 MAX_NOISE_SIZES = 0.05
 """Noise moves a Gaussian by at most this many of its standard deviations per step (times a normal number)."""
