@@ -14,9 +14,9 @@ from .light_pictures import photo_for_display, photo_light
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
 
-_GREY = 0.3  # Display light at which what photos clip is shown
+_GREY, _DARKEST = 0.3, -12  # Display light at which what photos clip is shown; stops that this may take
 _CLIPPED, _BRIGHTER = 0.99, 4 / 3  # Encoded value that counts as clipped; factor that counts as brighter
-_LEAST_BRIGHTER = 0.002  # Share of a picture that shows light above white
+_LEAST_BRIGHTER = 0.001  # Share of a picture that shows light above white
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,13 @@ class Comparison:
 
 
 def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: float = 1.0) -> int:
-    """Return the stops, from -8 to -1, at which pictures show best what photo and scene hold above white.
+    """Return the stops, from _DARKEST to -1, at which pictures show best what photo and scene hold above white.
 
     The brightest light that a photo can hold is then a middle grey, and brighter light of the scene stands out from it.
     Exposures of exposure_time seconds are at 0 EV; for `gain` see display_gain().
     """
     white = max(float(np.max(each.from_photo)) for each in comparisons) * exposure_time * gain
-    return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), -8, -1))
+    return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), _DARKEST, -1))
 
 
 class Opening(NamedTuple):
