@@ -322,7 +322,7 @@ def select_cameras(
 
 def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
     """Return the cameras of a file in the scene's coordinates."""
-    file, own = read_camera_file(path), cameras_beside(Path(run.path))
+    file = read_camera_file(path)
     views, steps = file.cameras, [from_photos(run)]  # Most files are in the photos' coordinates.
     if file.world_matrix is not None:
         try:
@@ -331,7 +331,7 @@ def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | N
             raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
     elif path.suffix.lower() in EXCHANGE_SUFFIXES:
         steps = [(transform or world_transform(run)).inverse()]
-    elif own is not None and own.samefile(path):
+    elif run.world_matrix is not None and (own := cameras_beside(Path(run.path))) is not None and own.samefile(path):
         steps = []  # They are in the coordinates of the Gaussians beside.
     for step in steps:
         views = [(name, step.camera(camera)) for name, camera in views]
