@@ -148,12 +148,21 @@ def test_rates_of_a_short_training_are_raised_once_and_those_given_stay(scene, f
     assert rates.log_scales == pytest.approx(2.11 * usual.log_scales, rel=5e-3)
     assert rates.opacity_logits == pytest.approx(2.11 * usual.opacity_logits, rel=5e-3)
     assert (rates.means, rates.harmonics_dc) == (usual.means, usual.harmonics_dc)
-    enough = make_plan(scene, config_of(schedule__iterations=30_000, plan__keep=["schedule.iterations"]))
-    assert enough.config.optimizer == usual
-    few, many = (
-        RULES["rates"](replace(facts, photos=n), config_of(schedule__iterations=1000), CPU).fields for n in (40, 41)
+    enough, few, many = (
+        RULES["rates"](replace(facts, photos=photos), config_of(schedule__iterations=steps), CPU).fields
+        for photos, steps in ((40, 30_000), (40, 1000), (41, 1000))
     )
-    assert few and not many
+    assert few and not enough and not many
+
+
+def test_few_photos_learn_view_dependent_color_slowly(facts):
+    def rate(photos: int, **options) -> object:
+        decision = RULES["rates"](replace(facts, photos=photos), config_of(schedule__iterations=30_000, **options), CPU)
+        return decision.fields.get("optimizer.harmonics_rest")
+
+    assert (rate(16), rate(17)) == (2.5e-4, None)
+    assert (rate(4, model__sh_degree=1), rate(5, model__sh_degree=1)) == (2.5e-4, None)
+    assert rate(16, optimizer__harmonics_rest=0.01) is None
 
 
 def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
