@@ -303,7 +303,7 @@ def run_render(args: Render) -> None:
     check_cameras(args.cameras)
     if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
-    files, ramp, summary, fps = [], _ramp(args.film.ev_ramp), "", args.film.fps
+    ramp, fps = _ramp(args.film.ev_ramp), args.film.fps
     check_rate(fps)
     if (pictures := args.pictures).aovs:
         read_aovs(pictures.aovs)
@@ -317,7 +317,7 @@ def run_render(args: Render) -> None:
     run = open_scene(args.run, args.device)
     default_count = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
     count = default_count if args.count is None else args.count
-    selection = {"cameras": args.cameras, "camera": args.camera, "count": count}
+    selection, files, summary = {"cameras": args.cameras, "camera": args.camera, "count": count}, [], ""
     if args.out is not None:
         groups = vars(args.world) | vars(args.pictures)  # Their fields are arguments of render_views().
         files = render_views(run, args.out, size=size, overwrite=args.overwrite, fps=fps, **selection, **groups)

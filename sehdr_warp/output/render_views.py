@@ -136,7 +136,7 @@ def render_views(
     hdr_exposure = exposure_of_white(run, reference_white)
     if (ocio is None) != (view is None):
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
-    ocio_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
+    to_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
     aovs = read_aovs(aovs) if aovs else ()
     views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
     if size is not None:
@@ -150,7 +150,7 @@ def render_views(
         hdr_folder = stack.enter_context(atomic_folder(out / "hdr", overwrite))
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
         bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if brackets else None
-        to_display = shared_tone_map(run, [each for _, each in views]) if ocio_display is None else ocio_display
+        to_display = to_display or shared_tone_map(run, [each for _, each in views])
         for index, (name, view_camera) in track_progress("rendering views", views, log):
             images = render_images(run, view_camera, transform)
             if images.confidence is None and index == 0:
