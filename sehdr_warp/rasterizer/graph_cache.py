@@ -53,10 +53,7 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
     except (TypeError, RuntimeError):  # Arrays among the options, or another thread made a pool meanwhile.
         return None
     # 640.0 equals 640, and is refused where arguments are checked.
-    if pool is None or type(options.width) is not int or type(options.height) is not int:
-        return None
-    # is_capturing() with less host time: the name of a device is a new string.
-    if replays_are_off() or (tensors[0].is_cuda and torch._C._cuda_isCurrentStreamCapturing()):
+    if pool is None or type(options.width) is not int or type(options.height) is not int or replays_are_off():
         return None
     pool.last_use = next(_uses)
     return pool

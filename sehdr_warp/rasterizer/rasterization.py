@@ -159,6 +159,7 @@ def rasterize(
             rendering.image = rendering.image + rendering.transmittance[..., None] * behind
         return rendering
     except (RuntimeError, MemoryError):  # The context around all of it would take 2 us of each call.
+        options.checked(means.device)  # Torch replays no CUDA graph during a capture; this tells what to do.
         with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
             raise
 

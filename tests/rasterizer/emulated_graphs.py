@@ -30,14 +30,6 @@ class Runner:
                 fixed.copy_(new)
 
 
-class Event:
-    def record(self, stream):
-        pass
-
-    def synchronize(self):
-        pass
-
-
 def tensors_of(value) -> Iterator[torch.Tensor]:
     if isinstance(value, torch.Tensor):
         yield value
@@ -55,7 +47,6 @@ def emulate(monkeypatch) -> None:
     monkeypatch.setattr(captured_render, "CudaGraphRunner", Runner)
     monkeypatch.setattr(graph_cache, "on_gpu", lambda tensor: True)
     monkeypatch.setattr(graph_cache, "stream_handle", lambda device: 0)
-    monkeypatch.setattr(torch.cuda, "Event", Event)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device=None: None)
     monkeypatch.setattr(torch, "empty", lambda *shape, pin_memory=False, **options: empty(*shape, **options))
     monkeypatch.setattr(tile_lists, "lists_by_tile", tile_lists._sort_by_tile)

@@ -3,6 +3,7 @@
 import ctypes
 import threading
 import time
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,39 +14,16 @@ from sehdr_warp.compat.gsplat import rasterization
 from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
-from sehdr_warp.rasterizer import block_blending, captured_backward, captured_render, graph_cache, rasterize, tile_lists
+from sehdr_warp.rasterizer import block_blending, captured_render, graph_cache, rasterize, render_options, tile_lists
 from sehdr_warp.rasterizer.memory import OutOfMemory
 from sehdr_warp.rasterizer.render_options import RenderOptions
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera
 
-from .emulated_graphs import emulate
-from .scenes import random_like, random_scene, relative_error
+from .repeated_calls import CALLS, DEVICE, assert_alike, launched, recordings, scene_of
+from .scenes import random_like
 
-DEVICE = "cuda:0" if torch.cuda.is_available() else "cpu"
-CALLS = graph_cache.WARMUP_CALLS + 3
-
-
-@pytest.fixture(autouse=True)
-def nothing_is_recorded(monkeypatch):
-    graph_cache.clear_graphs()
-    if DEVICE == "cpu":
-        emulate(monkeypatch)
-    yield
-    graph_cache.clear_graphs()
-
-
-def launched(*arguments, **options):
-    """rasterize() with room for all pairs, which is never replayed."""
-    return rasterize(*arguments, max_intersections=100_000, **options)
-
-
-def scene_of(count=80, channels=3):
-    return random_scene(count=count, channels=channels).to(torch.float32, DEVICE)
-
-
-def recordings():
-    return sum(size.captured for size in graph_cache._pools.values())
+pytestmark = pytest.mark.usefixtures("no_graphs")
 
 
 def values_and_gradients(splat, scene, *, by_alpha=True, **options):
@@ -63,11 +41,6 @@ def values_and_gradients(splat, scene, *, by_alpha=True, **options):
     return [
         tensor.detach().clone() for tensor in (drawing.image, drawing.alpha, drawing.depths, drawing.radii, *gradients)
     ]
-
-
-def assert_alike(ours, truth):
-    for mine, true in zip(ours, truth, strict=True):
-        assert relative_error(mine, true) < 5e-5  # Without a GPU, two ways of blending.
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -92,90 +65,6 @@ def test_replays_follow_their_arguments_and_their_need_of_room(options, many, mo
                 scene.tensors[4] /= 0.9
             assert_alike(ours, values_and_gradients(launched, scene, **options))
     assert recordings()
-
-
-def test_pictures_stay_and_backward_passes_come_in_any_order():
-    scene = scene_of()
-    shifts = [0.02 * call for call in range(CALLS + graph_cache.MAX_GRAPHS)]
-
-    def render_shifted(splat, shift):
-        return splat(scene.tensors[0] + shift, *scene.arguments[1:]).image
-
-    images = [render_shifted(rasterize, shift) for shift in shifts]
-    truths = [render_shifted(launched, shift) for shift in shifts]
-    assert recordings() == graph_cache.MAX_GRAPHS
-    for place in (*range(1, len(shifts), 2), *range(0, len(shifts), 2)):
-        pair = [
-            torch.autograd.grad((i * random_like(i, place)).sum(), scene.tensors[:5])
-            for i in (images[place], truths[place])
-        ]
-        assert_alike(*pair)
-    assert_alike(images, truths)
-
-
-@pytest.mark.parametrize("one_sort", [1 << 18, 0])
-def test_a_retained_graph_has_the_gradients_of_each_part_in_any_order(one_sort, monkeypatch):
-    monkeypatch.setattr(graph_cache, "MAX_SINGLE_SORT", one_sort)
-    scene = scene_of()
-    replayed, truth = [rasterize(*scene.arguments) for _ in range(CALLS)][-1], launched(*scene.arguments)
-    assert recordings()
-    parts = [
-        (lambda drawing: (drawing.image * random_like(drawing.image, 1)).sum(), scene.tensors[:5]),
-        (lambda drawing: (drawing.image * random_like(drawing.image, 2)).sum(), scene.tensors[4:5]),
-        (lambda drawing: drawing.depths.sum(), scene.tensors[:1]),
-        (lambda drawing: drawing.image.square().sum() + drawing.depths.sum(), scene.tensors[:4]),
-    ]
-    for loss, leaves in (*parts, *reversed(parts)):
-        pair = [torch.autograd.grad(loss(drawing), leaves, retain_graph=True) for drawing in (replayed, truth)]
-        assert_alike(*pair)
-    of_means2d = [
-        torch.autograd.grad(drawing.image.sum(), drawing.means2d, retain_graph=True) for drawing in (replayed, truth)
-    ]
-    assert_alike(*of_means2d)
-    assert_alike(
-        *[torch.autograd.grad(drawing.depths.square().sum(), scene.tensors[:1]) for drawing in (replayed, truth)]
-    )
-
-
-def test_gradients_of_leaves_are_contiguous_and_not_copied(monkeypatch):
-    scene, addresses = scene_of(), []
-    allocate = captured_backward.CapturedBackward.allocate
-
-    def remember(*arguments, **options):
-        memory = allocate(*arguments, **options)
-        addresses.append(memory.zeros.data_ptr())
-        return memory
-
-    monkeypatch.setattr(captured_backward.CapturedBackward, "allocate", remember)
-    for _ in range(CALLS):
-        for tensor in scene.tensors:
-            tensor.grad = None
-        rasterize(*scene.arguments).image.sum().backward()
-    gradients = [tensor.grad for tensor in scene.tensors[:5]]
-    assert all(gradient.is_contiguous() for gradient in gradients)
-    assert {gradient.untyped_storage().data_ptr() for gradient in gradients} == {addresses[-1]}
-
-
-def test_calls_that_require_other_gradients_have_graphs_of_their_own():
-    scene = scene_of()
-    for required in ((0, 5), (4,), tuple(range(7))):
-        for place, tensor in enumerate(scene.tensors):
-            tensor.requires_grad_(place in required)
-        images = [[rasterize(*scene.arguments) for _ in range(CALLS)][-1].image, launched(*scene.arguments).image]
-        leaves, cotangent = [scene.tensors[place] for place in required], random_like(images[0], 1)
-        assert_alike(*[torch.autograd.grad(image, leaves, cotangent) for image in images])
-    assert len(graph_cache._pools) == 3 and all(pool.captured for pool in graph_cache._pools.values())
-
-
-@pytest.mark.parametrize("place", [0, 1, 4])
-def test_a_change_in_place_before_the_backward_pass_of_a_replay_is_refused(place):
-    scene = scene_of()
-    image = [rasterize(*scene.arguments).image for _ in range(CALLS)][-1]
-    assert recordings()
-    with torch.no_grad():
-        scene.tensors[place] *= 1.5
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        image.sum().backward()
 
 
 @pytest.mark.parametrize("one_sort", [1 << 18, 0])
@@ -219,21 +108,6 @@ def test_of_many_gaussians_one_render_is_held(monkeypatch):
     expected = torch.autograd.grad(truth, scene.tensors[:5], cotangent)
     for image in images[-3:]:
         assert_alike(torch.autograd.grad(image, scene.tensors[:5], cotangent), expected)
-
-
-def test_gradients_add_up_over_calls_and_cameras():
-    scene = scene_of()
-    poses, lenses = torch.stack([scene.tensors[5]] * 2), torch.stack([scene.tensors[6]] * 2)
-
-    def summed(splat):
-        for tensor in scene.tensors:
-            tensor.grad = None
-        for _ in range(CALLS):
-            image = splat(*scene.tensors[:5], poses, lenses, scene.width, scene.height).image
-            (image * random_like(image, 1)).sum().backward()
-        return [tensor.grad.clone() for tensor in scene.tensors[:5]]
-
-    assert_alike(summed(rasterize), summed(launched))
 
 
 def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
@@ -357,6 +231,25 @@ def test_a_tensor_may_be_passed_twice():
     assert_alike(torch.autograd.grad(image, [means], cotangent), [expected])
     [pool] = graph_cache._pools.values()
     assert pool.captured
+
+
+def refuse_as_torch_does(*arguments):
+    raise RuntimeError("Cannot call CUDAGeneratorState::replay_prologue during CUDA graph capture")
+
+
+def test_a_call_that_is_known_is_refused_within_a_capture(monkeypatch):
+    scene = scene_of()
+    with torch.no_grad(), nullcontext() if DEVICE == "cpu" else torch.cuda.stream(stream := torch.cuda.Stream()):
+        image = [rasterize(*scene.arguments).image for _ in range(CALLS)][-1]
+        with pytest.raises(RuntimeError, match="give max_intersections"):
+            if DEVICE == "cpu":
+                with monkeypatch.context() as patch:
+                    patch.setattr(captured_render.CapturedRender, "replay", refuse_as_torch_does)
+                    patch.setattr(render_options, "is_capturing", lambda device: True)
+                    rasterize(*scene.arguments)
+            with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=stream):
+                rasterize(*scene.arguments)
+        assert_alike([rasterize(*scene.arguments).image], [image])
 
 
 def test_options_that_equal_those_of_known_calls_are_checked_as_well():
