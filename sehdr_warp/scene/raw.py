@@ -56,11 +56,12 @@ def read_header(path: Path) -> RawHeader:
         InputError: if the file is missing or damaged, too large, or holds what LibRaw does not decode.
     """
     require_file(path)
-    return _header(path, path.stat().st_mtime_ns)
+    stat = path.stat()
+    return _header(path, stat.st_mtime_ns, stat.st_size)
 
 
 @lru_cache(maxsize=4096)
-def _header(path: Path, changed: int) -> RawHeader:
+def _header(path: Path, changed: int, length: int) -> RawHeader:
     dng = read_dng(path)
     with _open(path, dng) as raw:
         size, turned = (raw.sizes.width, raw.sizes.height), (raw.sizes.height, raw.sizes.width)
