@@ -139,11 +139,8 @@ def _inside(folder: Path, name: str, source: Path) -> str | None:
     above = next((number for number, part in enumerate(parts) if part != ".."), len(parts))
     if not (path.anchor or above) or "\0" in name or ".." in parts[above:]:
         return None
-    for start in range(max(above, 1), len(parts)):
-        end = "/".join(parts[start:])
-        if os.path.isfile(resolve_inside(folder, end, source)) or _alike(folder, end, source):
-            return end
-    return None
+    ends = ("/".join(parts[start:]) for start in range(max(above, 1), len(parts)))
+    return next((end for end in ends if _alike(folder, end, source)), None)
 
 
 def _alike(folder: Path, name: str, source: Path) -> Path | None:
