@@ -131,7 +131,10 @@ class DefaultStrategy(Strategy):
 
     def _collect(self, params: Parameters, state: State, info: dict[str, Any], packed: bool) -> None:
         means2d, cameras = info[self.key_for_gradient], info["n_cameras"]
-        gradients = means2d.absgrad if self.absgrad else means2d.grad
+        gradients = getattr(means2d, "absgrad" if self.absgrad else "grad", None)
+        if gradients is None:
+            remedy = "render with absgrad=True" if self.absgrad else "call step_pre_backward() before loss.backward()"
+            raise ValueError(f"info[{self.key_for_gradient!r}] has no gradient; {remedy}")
         half_image = gradients.new_tensor([info["width"], info["height"]]) / 2
         lengths = (gradients * half_image * cameras).norm(dim=-1)
         radii = info["radii"].amax(-1)

@@ -150,6 +150,15 @@ def test_large_gaussians_are_pruned_after_the_first_reset():
     assert torch.equal(params["means"].detach(), others)
 
 
+@pytest.mark.parametrize("absgrad, remedy", [(False, r"call step_pre_backward\(\)"), (True, "absgrad=True")])
+def test_a_step_without_gradients_says_what_is_missing(absgrad, remedy):
+    params, optimizers, _, _ = model(count=3)
+    info = {"means2d": torch.zeros(1, 3, 2, requires_grad=True), "n_cameras": 1}
+    strategy = DefaultStrategy(absgrad=absgrad)
+    with pytest.raises(ValueError, match=rf"'means2d'\] has no gradient; .*{remedy}"):
+        strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, info)
+
+
 def test_noise_fades_with_the_opacity_and_ends():
     params, optimizers, _, _ = model(count=2)
     params["opacities"].data = torch.tensor([0.1, 0.4]).logit()
