@@ -136,7 +136,7 @@ def write_proxy_mesh(
     refuse_paths("load_run", run)
     path, region = Path(path), check_mesh(path, resolution, crop, overwrite)
     transform = world_transform(run, axes, up=up, scale=scale)
-    mesh = proxy_mesh(run, transform, resolution=resolution, region=region)
+    mesh = proxy_mesh(run, transform, up=up, resolution=resolution, region=region)
     with atomic_path(path, overwrite) as temporary:
         if path.suffix.lower() == ".obj":
             _write_obj(temporary, mesh, transform, run)
@@ -172,7 +172,12 @@ def check_mesh(path: Path | str, resolution: int, crop: str | None, overwrite: b
 
 
 def proxy_mesh(
-    run: "RenderableScene", transform: WorldTransform, *, resolution: int = 160, region: Box | Sphere | None = None
+    run: "RenderableScene",
+    transform: WorldTransform,
+    *,
+    up: str | Sequence[float] | None = None,
+    resolution: int = 160,
+    region: Box | Sphere | None = None,
 ) -> ProxyMesh:
     """Return the mesh of a run in the coordinates that a transform leads to; arguments as in write_proxy_mesh."""
     cameras = training_cameras(run)
@@ -195,7 +200,7 @@ def proxy_mesh(
     colors = nearest_values(radiance, vertices / voxel)
     vertices, faces, colors = _large_parts(vertices + low, faces, colors)
     places = np.array([view.camera.position for view in views])
-    stands = (transform.rotation @ scene_up(run))[1] > _UPRIGHT
+    stands = (transform.rotation @ scene_up(run, up))[1] > _UPRIGHT
     ground = find_ground(vertices, faces, places, longest) if stands else None
     return ProxyMesh(vertices.astype(np.float32), faces.astype(np.int32), colors.astype(np.float32), longest, ground)
 

@@ -79,6 +79,8 @@ def test_a_ceiling_is_no_floor():
     run = BallOnFloor()
     run.up = UpDirection(np.array([0.0, -1.0, 0.0]), "gps")
     assert proxy_mesh(run, WorldTransform.identity(), resolution=24).ground is None
+    mesh = proxy_mesh(run, WorldTransform.identity(), up="y", resolution=24)
+    assert mesh.ground is not None, "the up direction that a user states counts, not the one of the photos"
 
 
 @pytest.mark.parametrize("projection", ["equirectangular", "OPENCV_FISHEYE"])
