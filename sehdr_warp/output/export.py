@@ -83,7 +83,8 @@ def export(
         up: As in world_transform.
         scale: As in world_transform.
         edits: What the file leaves out; by default Gaussians too faint to be drawn.
-        overwrite: Replace files that exist, and without `cameras` remove those that an earlier export wrote beside.
+        overwrite: Replace files that exist, and without `cameras` remove those that an earlier export wrote beside,
+            unless the run is the file at `path` and keeps its coordinates.
 
     Raises:
         SehdrError: For options that do not fit, or edits that leave nothing.
@@ -114,7 +115,8 @@ def export(
     write_gaussians(path, written, overwrite=overwrite)
     if cameras:
         _write_cameras(camera_file_of(path), run, to_file, overwrite)
-    elif overwrite:  # Cameras of an earlier export would count as these Gaussians'.
+    elif overwrite and not (to_file.is_identity and Path(run.path).resolve() == path.resolve()):
+        # Cameras of an earlier export would count as these Gaussians'. Those of a file edited in place still fit it.
         remove_earlier(path.parent, [camera_file_of(path).name])
     meaning = f"display colors of {shutter(seconds)}" if kind == "ldr" else "scene-linear radiance"
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, written.count, written.degree, meaning)

@@ -103,6 +103,8 @@ def test_cameras_beside_are_read_again(tmp_path, run):
     with pytest.raises(InputError, match=r"cameras.json: exists already"):
         export(run, tmp_path / "b.ply", cameras=True)
     assert not (tmp_path / "b.ply").exists()
+    export(splats, tmp_path / "a.ply", overwrite=True, axes=None)
+    assert len(load_splats(tmp_path / "a.ply").cameras) == 3, "a file that is edited in place keeps its cameras"
     export(run, tmp_path / "a.ply", overwrite=True)
     assert not (tmp_path / "a.ply.cameras.json").exists(), "these cameras would see other coordinates"
     (tmp_path / "a.ply.cameras.json").write_text("mine")
