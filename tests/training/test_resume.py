@@ -180,6 +180,17 @@ def test_resuming_with_the_same_config_keeps_the_planned_length(scene, tmp_path)
     longer.output.folder.unlock()
 
 
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_a_preset_does_not_stretch_a_run_of_fewer_iterations(preset, tmp_path):
+    flags = "--max-size 32 --device cpu --response hdr-nerf --preset"
+    words = ["train", "embedded", *flags.split(), preset, "--out", tmp_path / "run"]
+    assert call(*words, "--iterations", 3) == 0
+    assert call(*words, "--resume") == 0
+    assert RunFolder(tmp_path / "run").read_config().schedule.iterations == 3
+    assert call(*words, "--resume", "--iterations", 4) == call(*words, "--resume") == 0
+    assert RunFolder(tmp_path / "run").read_config().schedule.iterations == 4
+
+
 def test_resuming_names_other_fields_that_have_the_same_values(scene, tmp_path):
     first = load_config("demo", {"schedule.iterations": 3, "plan.keep": ["schedule.iterations"]})
     train(scene, tmp_path / "run", first, device="cpu")
