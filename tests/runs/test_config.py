@@ -117,6 +117,10 @@ def test_bad_files_name_file_field_and_value(tmp_path, text, words):
         assert word in message
 
 
+def test_a_run_loads_although_its_config_has_a_wrong_name_in_plan_keep():
+    assert load_config("default", {"plan.keep": ("mcmc.cap_densty",), "plan.enabled": False}).plan.keep
+
+
 def test_every_number_has_a_smallest_and_a_largest_value():
     """A file may hold any: 10^400 is no float, and none has so many Gaussians."""
     schema = Config.model_json_schema()
