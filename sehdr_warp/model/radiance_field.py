@@ -77,6 +77,8 @@ class RadianceField(nn.Module):
 
     def camera_tensors(self, camera: Camera) -> CameraTensors:
         """Return a camera of scene coordinates in those of the Gaussians, on their device."""
+        if not isinstance(camera, Camera):
+            raise TypeError(f"camera is a {type(camera).__name__}, expected a Camera, as run.cameras[0].camera is one")
         return CameraTensors.of(self.normalization.camera(camera), self.gaussians.means.device)
 
     def render_train_view(

@@ -13,6 +13,7 @@ from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.run_folder import CameraEntry
 from sehdr_warp.scene import Camera
 
 TIME = 0.25
@@ -54,6 +55,13 @@ def test_display_colours_are_encoded_values():
     assert float(field.render(CAMERA).hdr[12, 16, 1]) == pytest.approx(decoded, rel=1e-4)
     brighter = float(SRGB.encode(torch.tensor(decoded * TIME * 1.5)))
     assert float(photograph(field, 1.5 * TIME).encoded.detach()[12, 16, 1]) == pytest.approx(brighter, abs=1e-4)
+
+
+def test_a_view_in_place_of_its_camera_is_refused_by_name():
+    entry, field = CameraEntry("a", "train", CAMERA, TIME), wall(0.2)
+    for render in (field.render, field.render_ldr):
+        with pytest.raises(TypeError, match=r"camera is a CameraEntry, expected a Camera, as run.cameras\[0\].camera"):
+            render(entry)
 
 
 def test_ldr_is_limited_and_training_goes_on_beyond_white():
