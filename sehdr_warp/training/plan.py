@@ -2,9 +2,11 @@
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from operator import attrgetter
+from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -12,7 +14,7 @@ from ..errors import InputError, refuse_paths
 from ..model.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
 from ..runs.config import Config, OptimizerConfig
-from ..runs.config_files import override_config
+from ..runs.config_files import as_config, override_config
 from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.photos import FEWEST_PHOTOS
@@ -118,19 +120,23 @@ def _format_fields(fields: dict) -> list[str]:
     return [f"{path} = {json.dumps(value)}" for path, value in fields.items()]
 
 
-def make_plan(scene: Scene, config: Config, device: str | torch.device | None = None) -> Plan:
+def make_plan(
+    scene: Scene,
+    config: Config | str | Path | Mapping[str, Any] | None = None,
+    device: str | torch.device | None = None,
+) -> Plan:
     """Decide what the training of a scene can leave out.
 
     Args:
         scene: A scene from load_scene().
-        config: Requested options; fields in config.plan.keep do not change.
+        config: Requested options, as in create_trainer(); fields in config.plan.keep do not change.
         device: Device to train on.
 
     Raises:
         InputError: For a scene that cannot be trained, and for fields in plan.keep that the scene contradicts.
     """
     refuse_paths("load_scene", scene)
-    device = pick_device(device)
+    device, config = pick_device(device), as_config(config) or Config()
     facts = measure_scene(scene, config.seed)
     check_scene(scene, facts)
     check_fields(scene, config)
@@ -308,32 +314,35 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Deci
         step = cpu_step_seconds(facts, config)
         most = max(CPU_FEWEST, math.ceil(CPU_SECONDS / step / 100) * 100)
         if number > most:
-            # Of the seconds and not of the steps: a step is as slow as its photo is large.
             number, seconds = most, most * step
             took = f"{max(1, round(seconds / 60))} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
             reason = f"about {took} on a CPU with {thread_count()} threads; --iterations for more"
-            if seconds > 2 * CPU_SECONDS:  # Of the fewest steps, then.
+            if seconds > 2 * CPU_SECONDS:  # Photos are so large that CPU_FEWEST steps take longer.
                 reason += ", --max-size for smaller photos and less time"
     return Decision({"schedule.iterations": number}, f"{number}", reason)
 
 
 def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
-    # Adam moves a parameter by its rate at most: of fewer steps each is to go farther.
+    # Adam moves a parameter by about its rate in a step, so fewer steps need higher rates.
     steps = config.schedule.iterations
     if facts.photos > SCALED_RATE_PHOTOS:
         return Decision({}, "as they are", f"more than {SCALED_RATE_PHOTOS} photos")
     scale = round(min(MAX_RATE_SCALE, max(1.0, (RATES_FOR / steps) ** RATE_POWER)), 2)
-    usual, harmonics = OptimizerConfig(), (config.model.sh_degree + 1) ** 2
-    as_usual = [name for name in SCALED_RATES if getattr(config.optimizer, name) == getattr(usual, name)]
-    rates = {name: float(f"{getattr(usual, name) * scale:.3g}") for name in as_usual if scale > 1}
-    choice, reason = f"{scale:g} times", f"learning rates are tuned for {RATES_FOR} steps; this training has {steps}"
-    if facts.photos <= harmonics and "harmonics_rest" in as_usual:
+    usual, harmonics, choices, reasons = OptimizerConfig(), (config.model.sh_degree + 1) ** 2, [], []
+    as_usual = {name for name in SCALED_RATES if getattr(config.optimizer, name) == getattr(usual, name)}
+    slow = {"harmonics_rest"} & as_usual if facts.photos <= harmonics else set()
+    scaled = as_usual - slow if scale > 1 else set()
+    rates = {name: float(f"{getattr(usual, name) * scale:.3g}") for name in SCALED_RATES if name in scaled}
+    if scaled:
+        choices.append(f"{scale:g} times")
+        reasons.append(f"learning rates are tuned for {RATES_FOR} steps; this training has {steps}")
+    if slow:
         rates["harmonics_rest"] = FEW_PHOTOS_HARMONICS
-        choice += f", {FEW_PHOTOS_HARMONICS:g} for view-dependent color"
-        reason += f"; {facts.photos} photos determine few of {harmonics} harmonics"
+        choices.append(f"{FEW_PHOTOS_HARMONICS:g} for view-dependent color")
+        reasons.append(f"{facts.photos} photos determine few of {harmonics} harmonics")
     if not rates:
         return Decision({}, "as they are", f"{steps} steps")
-    return Decision({f"optimizer.{name}": rate for name, rate in rates.items()}, choice, reason)
+    return Decision({f"optimizer.{name}": rate for name, rate in rates.items()}, ", ".join(choices), "; ".join(reasons))
 
 
 def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Decision:

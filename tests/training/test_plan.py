@@ -12,7 +12,15 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Camera, codes_of, look_at
-from sehdr_warp.training.plan import PRUNE_NEAR_ANGLE, RULES, Decision, apply_plan, cpu_step_seconds, make_plan
+from sehdr_warp.training.plan import (
+    PRUNE_NEAR_ANGLE,
+    RULES,
+    SCALED_RATES,
+    Decision,
+    apply_plan,
+    cpu_step_seconds,
+    make_plan,
+)
 from sehdr_warp.training.scene_facts import measure_scene
 from sehdr_warp.training.train import train
 
@@ -163,6 +171,22 @@ def test_few_photos_learn_view_dependent_color_slowly(facts):
     assert (rate(16), rate(17)) == (2.5e-4, None)
     assert (rate(4, model__sh_degree=1), rate(5, model__sh_degree=1)) == (2.5e-4, None)
     assert rate(16, optimizer__harmonics_rest=0.01) is None
+
+
+def test_the_plan_names_only_those_rates_that_it_changes(facts):
+    def choice(photos: int, steps: int, **options) -> str:
+        config = config_of(schedule__iterations=steps, **options)
+        return RULES["rates"](replace(facts, photos=photos), config, CPU).choice
+
+    slow, others = "0.00025 for view-dependent color", {f"optimizer__{name}": 0.01 for name in SCALED_RATES[:-1]}
+    assert choice(16, 1000) == f"2.11 times, {slow}"
+    assert choice(16, 30_000) == choice(16, 1000, **others) == slow
+    assert choice(17, 1000, **others) == "2.11 times" and choice(17, 30_000) == "as they are"
+
+
+def test_a_plan_takes_a_config_in_every_form_that_a_training_takes(scene):
+    assert make_plan(scene, device="cpu").config == make_plan(scene, "default", "cpu").config
+    assert make_plan(scene, {"model.sh_degree": 1}, "cpu").config.model.sh_degree == 1
 
 
 def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
