@@ -1,17 +1,19 @@
 """The names by which masks, truth and exposure times refer to photos: one rule for all of them.
 
 A photo is named by its path below the data folder, or below a folder between that and all photos, or by its file name
-alone if no two photos share that. The suffix may be left out; upper and lower case, and the forms in which Unicode
-writes an accent, do not matter. Of several names the longest path counts.
+alone if no two photos in their folders share that, used or not. The suffix may be left out; upper and lower case, and
+the forms in which Unicode writes an accent, do not matter. Of several names the longest path counts.
 """
 
 import os
 import unicodedata
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 
 from ..files import resolve_inside
 from .dataparser import ImageRecord
+from .images import LDR_SUFFIXES
 
 
 def fold_name(name: str) -> str:
@@ -40,12 +42,8 @@ class PhotoNames:
 
     def __init__(self, records: Sequence[ImageRecord], folder: Path):
         """Prepare for at least one photo of a data folder."""
-        self._folder = folder
+        self._records, self._folder = records, folder
         self.bases = bases_of([record.image for record in records], folder)
-        self._alone: dict[str, list[Path]] = {}
-        for image, view in {(record.image, record.view): None for record in records}:
-            for name in set(map(fold_name, (image.name, image.stem, view))):
-                self._alone.setdefault(name, []).append(image)
 
     def of(self, record: ImageRecord, *, by_view: bool = False) -> list[str]:
         """List the names of a photo, fold_name(), the most exact first.
@@ -60,8 +58,22 @@ class PhotoNames:
         unique = (name for name in map(fold_name, alone) if len(self._alone[name]) == 1)
         return [*names_below(image, self.bases), *map(fold_name, views), *unique]
 
+    @cached_property
+    def _alone(self) -> dict[str, list[Path]]:
+        """Map names and views alone, fold_name(), to the photos that have them, and to unused ones of other folders."""
+        alone: dict[str, list[Path]] = {}
+        for image, view in {(record.image, record.view): None for record in self._records}:
+            for name in set(map(fold_name, (image.name, image.stem, view))):
+                alone.setdefault(name, []).append(image)
+        for parent in dict.fromkeys(record.image.parent for record in self._records):
+            for file in (each for each in sorted(parent.glob("*")) if each.suffix.lower() in LDR_SUFFIXES):
+                for photos in (alone.get(name, []) for name in {fold_name(file.name), fold_name(file.stem)}):
+                    if photos and parent not in (photo.parent for photo in photos):
+                        photos.append(file)
+        return alone
+
     def sharing(self, name: str) -> list[Path]:
-        """List the photos that have a file name, fold_name(), with suffix or without."""
+        """List the photos that have a file name, fold_name(), with suffix or without, if the set uses one of them."""
         return self._alone.get(name, [])
 
     def file_of(

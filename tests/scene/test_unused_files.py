@@ -105,6 +105,29 @@ def test_times_and_truth_are_by_path(tmp_path):
     assert note.startswith("exposures.json: 1 name fits several photos, and needs its folder: 0000.png (images/cam0/")
 
 
+def test_a_name_that_an_unused_photo_shares_is_of_no_photo(tmp_path):
+    import OpenEXR
+
+    write_colmap(tmp_path, name="cam{0}/{0}.png")
+    images = tmp_path / "images"
+    (images / "thumbnails").mkdir()
+    # A copy beside its photo shares no name, nor does one in a folder of which no photo is used.
+    for place, name in (("cam5", "0.jpg"), ("cam1", "1.jpg"), ("thumbnails", "1.png")):
+        Image.open(images / "cam0" / "0.png").save(images / place / name)
+    (tmp_path / "exposures.json").write_text(json.dumps({"0": 8} | {f"{i}": 0.5 for i in range(1, 6)}))
+    for folder in ("masks", "hdr"):
+        (tmp_path / folder).mkdir()
+    for i in range(2):
+        Image.new("L", (64, 48), 255).save(tmp_path / "masks" / f"{i}.png")
+        planes = dict.fromkeys("RGB", np.full((48, 64), 2, np.float32))
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, planes).write(str(tmp_path / "hdr" / f"{i}.exr"))
+    dataset = parse_dataset(tmp_path)
+    matches = [(record.mask is not None, record.hdr is not None, record.time_known) for record in dataset.records]
+    assert matches[:3] == [(False, False, False), (True, True, True), (False, False, True)]
+    for count in ("masks/ holds 1 file", "hdr/ holds 1 file", "exposures.json: 1 name fits several photos"):
+        assert said(dataset, count), dataset.notes
+
+
 @pytest.mark.skipif(os.name == "nt", reason="names are bytes on POSIX alone")
 @pytest.mark.parametrize("binary", [False, True])
 def test_names_of_windows_and_in_latin_1(tmp_path, binary):
