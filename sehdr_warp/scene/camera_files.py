@@ -21,6 +21,7 @@ from .transforms_lens import frame_lens
 
 log = logging.getLogger(__name__)
 _DATAPARSER = "dataparser_transforms.json"
+_SPLATS = (".ply", ".splat", ".spz", ".ksplat", ".sog")
 _UNREAD = {".abc": "Alembic", ".fbx": "FBX", ".nk": "Nuke script", ".blend": "Blender"}
 """Files with cameras that no well-kept library for Python reads."""
 
@@ -45,6 +46,10 @@ def read_camera_file(path: Path) -> ExchangeCameras:
     if path.suffix.lower() in _UNREAD:
         problem = f"{_UNREAD[path.suffix.lower()]} files are not read"
         raise InputError(path, problem, "export the camera as OpenUSD (.usda or .usdc), or from Nuke as .chan")
+    if path.suffix.lower() in _SPLATS and path.is_file():
+        raise InputError(
+            path, "holds Gaussians or points, not cameras", "give a camera file or a COLMAP model's folder"
+        )
     if path.is_dir():
         file = ExchangeCameras(_of_colmap(path))
     elif path.suffix.lower() in EXCHANGE_SUFFIXES:

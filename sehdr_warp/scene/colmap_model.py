@@ -173,7 +173,7 @@ def _model_files(folder: Path) -> tuple[Path, Path]:
     names = sorted(path.name for path in {path for pair in kinds for path in pair} if path.is_file())
     missing = "images" if any(name.startswith("cameras") for name in names) else "cameras"
     problem = f"has {', '.join(names) or 'no model'}, but no {missing}.bin or {missing}.txt"
-    raise InputError(folder, problem, "copy the whole model")
+    raise InputError(folder, problem, "copy the whole model, or remove its folder to train without it")
 
 
 def read_points(folder: Path) -> PointCloud:

@@ -64,6 +64,13 @@ def test_a_colmap_model_is_a_camera_file(tmp_path):
         load_cameras(model)
 
 
+def test_a_splat_is_no_camera_file(tmp_path):
+    path = tmp_path / "room.PLY"
+    path.write_bytes(b"ply\nformat binary_little_endian 1.0\n\xff")
+    with pytest.raises(InputError, match=r"room.PLY: holds Gaussians or points, not cameras; give a camera file"):
+        load_cameras(path)
+
+
 @pytest.mark.parametrize(("suffix", "name"), [(".abc", "Alembic"), (".FBX", "FBX")])
 def test_camera_files_of_other_programs_are_told_what_to_export(tmp_path, suffix, name):
     path = tmp_path / f"shot{suffix}"
