@@ -110,7 +110,7 @@ def comparison_latex(rows: Sequence[ComparedRuns]) -> str:
 
 
 def _cells(rows: Sequence[ComparedRuns]) -> list[list[str]]:
-    cells = [["run", "scene", "seeds", *(heading for heading, _ in COLUMNS.values())]]
+    cells = [["run", "scene", "runs", *(heading for heading, _ in COLUMNS.values())]]
     for row in rows:
         cells.append([row.label, row.scene, str(row.count)])
         for column, (_, digits) in COLUMNS.items():
@@ -130,7 +130,7 @@ def comparison_csv(rows: Sequence[ComparedRuns]) -> str:
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["run", "scene", "seeds", *(name for column in COLUMNS for name in (column, f"{column}_sd"))])
+    writer.writerow(["run", "scene", "runs", *(name for column in COLUMNS for name in (column, f"{column}_sd"))])
     for row in rows:
         values = [value for column in COLUMNS for value in (row.mean(column), row.deviation(column))]
         names = (f"'{name}" if name.startswith(_FORMULAS) else name for name in (row.label, row.scene))

@@ -43,7 +43,8 @@ def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):
     table = comparison_table(rows)
     assert "26.00 ± 1.41" in table and "30.00" in table and "100 ±" not in table and len(table.splitlines()) == 3
     csv_rows = list(csv.DictReader(comparison_csv(rows).splitlines()))
-    assert float(csv_rows[0]["psnr_ldr_sd"]) == pytest.approx(2**0.5) and csv_rows[1]["psnr_ldr_sd"] == ""
+    assert csv_rows[0]["runs"] == "2" and float(csv_rows[0]["psnr_ldr_sd"]) == pytest.approx(2**0.5)
+    assert csv_rows[1]["psnr_ldr_sd"] == ""
     latex = comparison_latex(rows)
     assert r"26.00 $\pm$ 1.41" in latex and r"room\_1" in latex and latex.count(r"\\") == 3
 
