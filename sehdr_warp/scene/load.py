@@ -203,12 +203,13 @@ def _read(folder: Path) -> DataparserOutputs:
     def has(*names: str) -> bool:
         return all(has_file(folder / name) for name in names)
 
-    model = find_model(folder, anywhere=True)
+    usual = find_model(folder)
+    model = usual or find_model(folder, anywhere=True)
     beside = model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None
     readers = (
         (has("transforms_train.json", "exposure_train.json"), read_hdr_nerf),
         (has("poses_bounds_exps.npy"), read_hdr_nerf_real),
-        (is_hdr_gs(folder, model), partial(read_hdr_gs, model=model)),
+        (is_hdr_gs(folder, usual), partial(read_hdr_gs, model=usual)),
         (beside, partial(read_colmap, source=model)),
         (has("transforms.json") or has("transforms_train.json"), read_transforms),
         (model is not None and model_fits(folder, model), partial(read_colmap, source=model)),

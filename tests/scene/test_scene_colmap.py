@@ -10,9 +10,10 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene.colmap_model import find_model
 from sehdr_warp.scene.dataparser import reinhard_gamma
 from sehdr_warp.scene.lens import CAMERA_MODELS
+from sehdr_warp.scene.load import parse_dataset
 from sehdr_warp.scene.read_colmap import model_fits, read_colmap
 from sehdr_warp.scene.read_photos import find_photos
-from tests.make_scenes import arc_poses, load, pattern, write_colmap
+from tests.make_scenes import arc_poses, load, pattern, write_blender, write_colmap
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -327,6 +328,18 @@ def test_hdr_gs_layout(tmp_path):
         np.testing.assert_array_equal(view.hdr, truth[i])
         np.testing.assert_allclose(view.image, reinhard_gamma(truth[i] * 8), atol=0.5 / 255 + 1e-6)
         np.testing.assert_allclose(view.camera.world_to_camera, arc_poses(6)[i], atol=1e-12)
+
+
+def test_a_model_elsewhere_makes_no_hdr_gs_set(tmp_path):
+    write_blender(tmp_path)
+    write_colmap(tmp_path / "other")
+    (tmp_path / "other" / "sparse" / "0").rename(tmp_path / "model")
+    shutil.rmtree(tmp_path / "other")
+    (tmp_path / "exr").mkdir()
+    for i in range(6):
+        shutil.copy(tmp_path / "images" / f"r_{i}.png", tmp_path / "images" / f"v{i}_0.png")
+        (tmp_path / "exr" / f"v{i}.exr").touch()
+    assert parse_dataset(tmp_path).format == "transforms"
 
 
 def test_alpha_keeps_pixels_out(tmp_path):
