@@ -45,3 +45,16 @@ def test_an_error_of_a_study_is_one_line(monkeypatch, capsys):
 
     assert ended(monkeypatch, main, "x") == 1
     assert re.fullmatch(r"python -m \S+: x: is not there; name another\n", capsys.readouterr().err)
+
+
+def test_a_default_of_0_is_stated_and_none_is_not(monkeypatch, capsys):
+    def main(seed: int = 0, limit: int | None = None) -> None:
+        """Train.
+
+        Args:
+            seed: of the training.
+            limit: photos.
+        """
+
+    assert ended(monkeypatch, main, "--help") == 0
+    assert re.findall(r"\(default: .*?\)", capsys.readouterr().out) == ["(default: 0)"]
