@@ -25,9 +25,8 @@ def run(main: Callable[..., Any]) -> None:
     """
     for name, parameter in inspect.signature(main).parameters.items():
         starred = parameter.kind is parameter.POSITIONAL_ONLY and get_origin(parameter.annotation) is tuple
-        if (
-            starred or parameter.default in (None, ()) or parameter.default is False
-        ):  # Else the help would say `(default: None)`.
+        absent = parameter.default in (None, ()) or parameter.default is False
+        if starred or absent:  # Else the help would say `(default: None)`.
             main.__annotations__[name] = Annotated[parameter.annotation, tyro.conf.arg(help_behavior_hint="")]
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     program = f"python -m {sys.modules['__main__'].__spec__.name}"  # pyright: ignore[reportOptionalMemberAccess]
