@@ -24,6 +24,7 @@ _MOST_PLACES = 1000  # Folders of a level that are looked at
 DISTORTED = "distorted"  # Folder in which 3DGS's convert.py puts the model of the photos in input/
 _NO_MODELS = {DISTORTED, "images", "input"}
 _REMEDY = "export the model again with COLMAP"
+_COPY_REMEDY = "copy the whole model again, or train on the folder of photos alone"
 _KINDS = ((".bin", ".bin"), (".txt", ".txt"), (".bin", ".txt"), (".txt", ".bin"))  # Of cameras and images
 
 
@@ -226,7 +227,7 @@ class _Bytes:
     def take(self, layout: str) -> tuple:
         size = struct.calcsize(layout)
         if self.position + size > len(self.data):
-            raise InputError(self.path, f"ends early, at byte {len(self.data)}", _REMEDY)
+            raise InputError(self.path, f"ends early, at byte {len(self.data)}", _COPY_REMEDY)
         self.position += size
         return struct.unpack_from(layout, self.data, self.position - size)
 
@@ -235,9 +236,8 @@ class _Bytes:
         (count,) = self.take("<Q")
         remaining = len(self.data) - self.position
         if count * smallest > remaining:
-            raise InputError(
-                self.path, f"count {count} needs {count * smallest} bytes, but {remaining} are left", _REMEDY
-            )
+            problem = f"is cut short or damaged: count {count} needs {count * smallest} bytes, but {remaining} are left"
+            raise InputError(self.path, problem, _COPY_REMEDY)
         return count
 
     def skip_list(self, size: int) -> None:

@@ -130,6 +130,7 @@ PICKLE = b"cos\nsystem\n(S'id'\ntR."
 COLMAP_BINARY = {
     "cameras truncated": ("cameras.bin", lambda content: content[:20], "cameras.bin"),
     "cameras empty": ("cameras.bin", lambda content: b"", "empty"),
+    "images truncated": ("images.bin", lambda content: content[: len(content) // 2], "or train on the folder"),
     "huge camera count": ("cameras.bin", put(0, "<Q", 2**60), "count"),
     "huge image count": ("images.bin", put(0, "<Q", 2**63 + 5), "count"),
     "huge point count": ("points3D.bin", put(0, "<Q", 2**40), "count"),
