@@ -16,7 +16,9 @@ from .dataparser import ImageRecord
 from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .photo_names import fold_name
 
-OTHER_FOLDERS = ("masks", "mask", "hdr", "exr")
+MASK_FOLDERS = ("masks", "mask", "images_mask")
+"""Folders of masks of a set, in any case."""
+OTHER_FOLDERS = (*MASK_FOLDERS, "hdr", "exr")
 """Folders of pictures that are not photos."""
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 """Folders of photos, from the full size to reduced copies."""
@@ -75,8 +77,12 @@ def lies_at(path: str) -> bool:
 
 
 def without_mask_mark(stem: str) -> str:
-    """Return a stem, or a path without suffix, without the mark of masks: `mask_`, `dynamic_mask_` or `_mask`."""
-    return re.sub(r"(^|(?<=/))(dynamic_)?mask[_-](?=.)|(?<=.)[_.-]masks?$", "", stem, flags=re.IGNORECASE)
+    """Return a stem, or a path without suffix, without the mark of masks.
+
+    Marks are `mask_` or `dynamic_mask_` before it, and `_mask` or remove.bg's `-removebg-preview` behind it.
+    """
+    marks = r"(^|(?<=/))(dynamic_)?mask[_-](?=.)|(?<=.)([_.-]masks?|-removebg(-preview)?)$"
+    return re.sub(marks, "", stem, flags=re.IGNORECASE)
 
 
 def find_image(folder: Path, name: str, source: Path) -> Path | None:

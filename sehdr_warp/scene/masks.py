@@ -10,12 +10,11 @@ import numpy as np
 from ..files import resolve_inside
 from ..subsets import counted, first_names
 from .dataparser import UNPLACED, ImageRecord
-from .file_names import INVERTED_MASK, folders_named, lies_at, natural_key, without_mask_mark
+from .file_names import INVERTED_MASK, MASK_FOLDERS, folders_named, lies_at, natural_key, without_mask_mark
 from .images import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
 from .lens import Lens
 from .photo_names import PhotoNames, fold_name
 
-MASK_FOLDERS = ("masks", "mask")
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
 _COMMON = ("mask", "camera_mask")  # Stems of a mask of all photos
 _MOST_LABELS = 31  # Larger values are weights relative to white
@@ -26,10 +25,10 @@ _REMEDY = "name each like its photo, such as masks/IMG_1.png or masks/IMG_1.jpg.
 def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[ImageRecord], list[str]]:
     """Give each photo without a mask the mask file that is named like it, in any layout.
 
-    Masks lie in `masks/` or `mask/` of the data folder, with any picture suffix behind a name of the photo or of its
-    view (PhotoNames), such as `masks/cam0/1.jpg.png` or `masks/cam0/1.png`. An ending `_mask`, `-mask` or `.mask` of
-    the stem is ignored, and so are `mask_` and instant-ngp's `dynamic_mask_` before it. Files with such a name beside
-    the photos are masks as well, and so are those of a folder `masks/` or `mask/` there.
+    Masks lie in a folder of MASK_FOLDERS in the data folder, with any picture suffix behind a name of the photo or of
+    its view (PhotoNames), such as `masks/cam0/1.jpg.png` or `masks/cam0/1.png`. without_mask_mark() says which marks
+    of the stem are ignored. Files with such a mark beside the photos are masks as well, and so are those of a folder of
+    MASK_FOLDERS there.
     `mask.png` or `camera_mask.png` of the data folder is the mask of all photos of its shape that have none of their
     own, as of a tripod or a car's bonnet.
 

@@ -52,6 +52,8 @@ def masks_said(scene):
         "masks/images/{}.png",
         "images/{}_mask.png",
         "images/masks/{}.png",
+        "images/{}-removebg.png",
+        "images_mask/{}-removebg-preview.png",
         "Masks/{}.png",
     ],
 )
