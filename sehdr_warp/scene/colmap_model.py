@@ -75,6 +75,11 @@ def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:
     return max(counts, key=lambda model: counts[model])
 
 
+def has_images(model: Path) -> bool:
+    """Return whether a model has a file of its images, whose poses cameras and points do not state."""
+    return any((model / f"images{end}").is_file() for end in (".bin", ".txt"))
+
+
 def _is_whole_model(place: Path) -> bool:
     return any(all((place / f"{name}{end}").is_file() for name in ("cameras", "images")) for end in (".bin", ".txt"))
 

@@ -12,7 +12,7 @@ from ..errors import InputError, did_you_mean, missing
 from ..files import has_file
 from ..subsets import first_names
 from .camera_checks import check_cameras
-from .colmap_model import find_model
+from .colmap_model import find_model, has_images
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
 from .exposure import choose_exposure, exposures_note, with_exposure_times
 from .file_names import image_folder, unique_names
@@ -205,18 +205,24 @@ def _read(folder: Path) -> DataparserOutputs:
 
     usual = find_model(folder)
     model = usual or find_model(folder, anywhere=True)
-    beside = model is not None and model.is_relative_to(folder / "sparse") and image_folder(folder) is not None
+    posed = model if model is not None and has_images(model) else None
+    beside = posed is not None and posed.is_relative_to(folder / "sparse") and image_folder(folder) is not None
     readers = (
         (has("transforms_train.json", "exposure_train.json"), read_hdr_nerf),
         (has("poses_bounds_exps.npy"), read_hdr_nerf_real),
         (is_hdr_gs(folder, usual), partial(read_hdr_gs, model=usual)),
         (beside, partial(read_colmap, source=model)),
         (has("transforms.json") or has("transforms_train.json"), read_transforms),
-        (model is not None and model_fits(folder, model), partial(read_colmap, source=model)),
+        (posed is not None and model_fits(folder, posed), partial(read_colmap, source=model)),
         (find_reconstruction(folder) is not None, read_opensfm),
         (has("poses_bounds.npy"), read_llff),
+        (model != posed, partial(read_colmap, source=model)),  # Refused: nothing else has poses.
     )
-    return next((reader for fits, reader in readers if fits), find_photos)(folder)
+    dataset = next((reader for fits, reader in readers if fits), find_photos)(folder)
+    if model is not None and posed is None:
+        note = f"{model.relative_to(folder)} has no images.bin or images.txt: its cameras are not used"
+        dataset = replace(dataset, notes=(*dataset.notes, note))
+    return dataset
 
 
 def _with_splits(

@@ -283,6 +283,19 @@ def test_llffs_axes_size_and_focal_length(tmp_path):
         np.testing.assert_allclose(view.image, pattern(64, 48, seed=i) / 255, atol=1e-6)
 
 
+def test_a_model_without_images_does_not_hide_the_poses_of_llff(tmp_path):
+    write_llff(tmp_path)
+    write_colmap(tmp_path / "other", binary=True)
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "other" / "sparse" / "0").rename(tmp_path / "sparse" / "0")
+    (tmp_path / "sparse" / "0" / "images.bin").unlink()
+    scene = load(tmp_path, holdout=0)
+    assert scene.views[0].camera.fx == pytest.approx(50)
+    assert [note for note in scene.notes if "sparse" in note] == [
+        "sparse/0 has no images.bin or images.txt: its cameras are not used"
+    ]
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
