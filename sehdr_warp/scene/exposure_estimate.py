@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..response import Response
-from ..subsets import every_nth
+from ..subsets import every_nth, first_names
 from .exif import LONGEST, SHORTEST
 from .exposure import shutter
 from .exposure_compensation import initial_gains, point_light
@@ -25,7 +25,7 @@ def with_estimated_times(scene: Scene, names: Collection[str], response: Respons
     the views of unknown time, which have a guess.
     """
     timed = [view for view in scene.views if view.name not in names]
-    views, notes = [], []
+    views, by_source = [], {}
     for view in scene.views:
         if view.name not in names:
             views.append(view)
@@ -33,10 +33,21 @@ def with_estimated_times(scene: Scene, names: Collection[str], response: Respons
         factor, shared = _factor(view, timed, scene.points, response)
         time = float(np.clip(view.exposure_time * factor, SHORTEST, LONGEST))
         views.append(replace(view, exposure_time=time))
-        source = f"by {shared} points that other photos show too" if shared else "by its brightness beside the others"
-        source = source if timed else "as a guess, because no photo beside it states one"
-        notes.append(f"{view.name} states no exposure time: {shutter(time)} {source}")
+        source = "by points that other photos show too" if shared else "by brightness beside the others"
+        source = source if timed else "as a guess, because no photo beside states one"
+        by_source.setdefault(source, []).append(views[-1])
+    notes = [_note(guessed, source) for source, guessed in by_source.items()]
     return replace(scene, views=tuple(views), notes=(*scene.notes, *notes))
+
+
+def _note(views: list[View], source: str) -> str:
+    """Return the line on views whose times were found in the same way."""
+    times = [view.exposure_time for view in views]
+    if len(views) == 1:
+        return f"{views[0].name} states no exposure time: {shutter(times[0])} {source}"
+    names = first_names([view.name for view in views])
+    span = f"{shutter(min(times))} to {shutter(max(times))}".replace(" s to", " to")
+    return f"{len(views)} photos state no exposure time: {span} {source} ({names})"
 
 
 def _factor(view: View, timed: list[View], points: np.ndarray, response: Response) -> tuple[float, int]:
