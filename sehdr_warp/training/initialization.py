@@ -24,7 +24,7 @@ from ..scene.response_choice import select_for_views
 from ..scene.wide_camera import perspective_views, pixels_of_directions
 from ..splats import read_gaussians
 from ..splats.arrays import HARMONIC_0
-from ..subsets import every_nth
+from ..subsets import counted, every_nth
 from .matching import WHITE_TOLERANCE, Matcher, at_matching_size, estimates_at
 from .strategies import mcmc_cap
 from .strategies.mcmc import MAX_DISTANCE
@@ -35,6 +35,10 @@ MOST_DEPTHS = 100_000  # Largest number of points that the range of depths is es
 MOST_BRIGHTENED_BY = 100  # Photos whose estimates of clipped light are averaged
 FEWEST_POINTS = 20  # With fewer points, random ones are added, at least FEWEST_RANDOM
 FEWEST_RANDOM = 5000
+_NO_AGREEMENT = (
+    "photos agree on almost no point, as if cameras were wrong or belonged to other photos: compare the order of "
+    "photos and poses, or train on the folder of photos alone, whose cameras are then found"
+)
 DEPTH_RANGE = (0.5, 3.0)
 """Depths of random points in units of the cameras' focus. Nearer ones remain as floaters before the cameras: on the
 embedded room, 0.15 in place of 0.5 costs 14 dB."""
@@ -151,11 +155,13 @@ def start_points(
     if number > len(points):
         matches = _match_points(get_matcher(), number - len(points), config.seed)
         points, colors = (np.concatenate(both) for both in zip((points, colors), matches, strict=True))
-        _log.info("%d points matched between the photos", len(matches[0]))
+        _log.info("%s matched between the photos", counted(len(matches[0]), "point", "points"))
     # Points beyond MAX_DISTANCE move to it: from cameras within the unit ball the direction changes by under a degree.
     distances = np.linalg.norm(points, axis=1, keepdims=True)
     points = points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distances, 1e-12))
     if len(points) < FEWEST_POINTS:
+        if number:
+            _log.warning("%s", _NO_AGREEMENT)
         random = random_points(scene, max(number, FEWEST_RANDOM), rng)
         points, colors = (np.concatenate(both) for both in zip((points, colors), random, strict=True))
     return points, colors

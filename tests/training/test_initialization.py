@@ -69,6 +69,15 @@ def test_a_training_starts_from_a_file_of_gaussians(scene, tmp_path, radiance, d
     assert make_field(scene, few, response, "cpu").gaussians.count == 50
 
 
+def test_photos_that_do_not_belong_to_their_cameras_are_named(logged):
+    scene, rng = replace(toy_scene(), points=np.zeros((0, 3)), point_colors=np.zeros((0, 3))), np.random.default_rng(0)
+    make_field(scene, load_config("default"), LINEAR, "cpu")
+    assert not any("other photos" in line for line in logged)
+    noise = (replace(view, codes=rng.integers(0, 256, view.codes.shape, np.uint8)) for view in scene.views)
+    make_field(replace(scene, views=tuple(noise)), load_config("default"), LINEAR, "cpu")
+    assert any("cameras were wrong or belonged to other photos" in line for line in logged)
+
+
 def test_drawn_points_are_seen_and_repeat(scene):
     points, colors = random_points(scene, 500, np.random.default_rng(0))
     again, _ = random_points(scene, 500, np.random.default_rng(0))
