@@ -130,8 +130,12 @@ def _exposure_jump(offsets: Mapping[str, float], again: str) -> str | None:
         return None
     names = first_names([f"{name} {offsets[name]:+.1f}" for name in jumps])
     what = f"{len(jumps)} photo{'s are' if len(jumps) > 1 else ' is'} brighter or darker than the scene as a whole"
-    remedy = f"state their exposure times in exposures.json beside the photos, or move them elsewhere: {again}"
-    return f"{what} (stops: {names}), as where exposure or sun changed: {remedy}"
+    if 2 * len(jumps) > len(offsets):
+        reason, remedy = "in photos of several days or cameras", "train on those of one day"
+    else:
+        reason = "where exposure or sun changed"
+        remedy = "state their exposure times in exposures.json beside the photos, or move them elsewhere"
+    return f"{what} (stops: {names}), as {reason}: {remedy}: {again}"
 
 
 def _movement(unexplained: Mapping[str, Any] | None, train_photos: int, again: str) -> str | None:

@@ -34,10 +34,12 @@ def test_photos_that_hold_no_more_are_named():
 
 
 def test_photos_of_another_exposure_are_named_with_the_command():
-    figures = summary([28, 28, 28], regions=100) | {"brightness_offsets": {"a": 0.1, "b": -0.9, "c": 0.5}}
+    figures = summary([28, 28, 28], regions=100) | {"brightness_offsets": {"a": 0.1, "b": -0.9, "c": 0.5, "d": 0.0}}
     [line] = advice(Path("r"), figures, 10, "my photos")
     assert line.startswith("2 photos are brighter or darker") and "b -0.9, c +0.5" in line
     assert line.endswith("or move them elsewhere: sehdr-warp train 'my photos' --out r --overwrite")
+    figures["brightness_offsets"]["d"] = 1.0  # Most of them
+    assert "as in photos of several days or cameras: train on those of one day" in advice(Path("r"), figures, 10)[0]
 
 
 def test_commands_keep_the_options_of_the_training():
