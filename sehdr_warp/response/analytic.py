@@ -164,7 +164,7 @@ def analytic_response(name: str) -> Response:
         if not 1.0 <= exponent <= 5.0:
             raise SehdrError(f"response {name!r}: the exponent of gamma-G must be a number from 1 to 5")
         return AnalyticResponse(key, _gamma(exponent))
-    if key in ("auto", "learned"):
+    if name in ("auto", "learned"):  # Other spellings are unknown to trainings, too.
         raise SehdrError(f"response {name!r} comes from a training's photos; name a curve or a file here")
     hint = did_you_mean(name, DESCRIPTIONS)
     names_text = ", ".join((*DESCRIPTIONS, "gamma-G", "colour:NAME"))

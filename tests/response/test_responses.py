@@ -197,6 +197,8 @@ def test_names_are_listed_with_what_they_stand_for():
     assert response_by_name("reinhard-gamma").name == "hdr-nerf"
     with pytest.raises(SehdrError, match="'learned' comes from a training's photos"):
         response_by_name("learned")
+    with pytest.raises(SehdrError, match="'Auto' is neither a file nor a known name"):
+        response_by_name("Auto")
     with pytest.raises(SehdrError, match="did you mean filmic"):
         response_by_name("flimic")
 
