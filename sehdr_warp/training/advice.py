@@ -68,13 +68,16 @@ def advice(
         train_photos: Number of photos that were trained on.
         scene: Where the photos are, for the commands.
         options: Words of the command line that the training had, such as --max-size 240, for the commands.
-        resumed_at: Iteration at which the training was resumed, 0 if it was not. Gains before it do not count.
+        resumed_at: Iteration at which the training was resumed, 0 if it was not. If held-out photos were evaluated
+            there, as at the end of a run that is given more steps, gains before it do not count.
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
     again = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
     points, lines, gain = evaluations(summary["metrics"]), [], 0.0
     if len(points) >= 3:
-        since = max(iterations * 2 / 3 + 1, resumed_at)
+        since = iterations * 2 / 3 + 1
+        if any(point.iteration == resumed_at for point in points):  # Its schedule had ended there.
+            since = max(since, resumed_at)
         earlier = [point for point in points[:-1] if point.iteration <= since] or points[:1]
         before = max(earlier, key=attrgetter("psnr"))
         gain = points[-1].psnr - before.psnr

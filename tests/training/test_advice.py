@@ -26,6 +26,8 @@ def test_gains_before_a_resume_do_not_count():
     figures = summary([20, 22, 24, 25.0, 25.1])
     assert "1.1 dB since iteration 54" in advice(Path("r"), figures, 50)[0]
     assert advice(Path("r"), figures, 50, resumed_at=72) == []
+    # An interrupted training was not evaluated there; the steps before it are of the same schedule.
+    assert advice(Path("r"), figures, 50, resumed_at=75) == advice(Path("r"), figures, 50)
 
 
 def test_photos_that_hold_no_more_are_named():
