@@ -114,5 +114,5 @@ def _trainer(
     others = {name: values[around].to(device) for name, values in tensors.items()}
     trainer.optimizer.trained_rows = len(rows)
     trainer.field.gaussians.surround(others, trainer.optimizer)
-    trainer.iteration = round((1 - PART) * trainer.total)
+    trainer.iteration = trainer.first_iteration = round((1 - PART) * trainer.total)
     return trainer

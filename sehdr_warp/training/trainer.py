@@ -74,7 +74,7 @@ class Trainer:
         strategy: The densification strategy.
         average: Moving average of the Gaussians.
         iteration: Iterations done; a step on several ranks counts one for each photo.
-        first_iteration: Iterations done before this loop began.
+        first_iteration: Iterations done before this process.
         total: Iterations in all.
         batch: Photos of a step, one for each rank; each counts as an iteration.
         step_batch: Photos of the last step: `batch`, or as many as iterations were left.
@@ -130,6 +130,7 @@ class Trainer:
         self._result: StepResult | None = None
         self._view_index = 0
         self.interrupted, self._stopped, self._all_end, self._pace = threading.Event(), False, False, Pace()
+        self._finished = False
 
     # The loop
 
@@ -145,7 +146,8 @@ class Trainer:
 
     def __iter__(self) -> Iterator[TrainingProgress]:
         """Train step by step; yield after each step, after evaluation and checkpoint if they are due."""
-        self.first_iteration = self.iteration
+        if self._finished:
+            return
         with self._session():
             try:
                 while self._agree_to_continue():
@@ -199,6 +201,7 @@ class Trainer:
             self.ranks.shutdown()
         if self.output is not None:
             self.output.write_results(self, evidence)
+        self._finished = self.iteration >= self.total
 
     # One step
 

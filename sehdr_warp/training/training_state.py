@@ -62,7 +62,8 @@ def load_state(trainer: Trainer, state: TrainingState) -> None:
     trainer.order.load_state(generators["order"], values["order"])
     if trainer.generator.get_state().numel() == generators["device"].numel():
         trainer.generator.set_state(generators["device"].cpu())
-    trainer.iteration, trainer.seconds = values["iteration"], values["seconds"]
+    trainer.iteration = trainer.first_iteration = values["iteration"]
+    trainer.seconds = values["seconds"]
     trainer.gradient_step.step_counters[0] = values["skipped_steps"]
     trainer.gradient_step.step_counters[2] = values.get("overflowed_steps", 0)
 

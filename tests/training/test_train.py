@@ -318,6 +318,14 @@ def test_a_finished_trainer_is_evaluated_once(scene, tmp_path):
     assert trainer.train().metrics() == metrics
 
 
+def test_a_trainer_that_was_stepped_to_its_end_is_finished_by_train(scene, tmp_path):
+    trainer = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
+    for _ in range(4):
+        trainer.step()
+    run = trainer.train()
+    assert run.metrics()[-1]["iteration"] == 4 and run.summary()["finished"] and run.field.confidence is not None
+
+
 def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
     training = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
     training.output.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
