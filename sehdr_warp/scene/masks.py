@@ -2,11 +2,14 @@
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
+from ..errors import InputError
 from ..files import resolve_inside
 from ..subsets import counted, first_names
 from .dataparser import UNPLACED, ImageRecord
@@ -112,6 +115,15 @@ def read_mask(path: Path, *, oriented: bool = False, labeled: set[Path] | None =
         return (values > 0).astype(np.float32)
     white = 255 if largest <= 255 else image.levels  # Also of 8-bit values in a 16-bit file.
     return values / np.float32(white)
+
+
+def write_reduced(mask: Path | None, size: tuple[int, int], file: Path) -> None:
+    """Write a mask at the size of a photo's copy, white where it keeps a pixel; all white if it is None or damaged."""
+    kept = np.ones((1, 1), np.float32)
+    with suppress(InputError):  # Named when the photos are read for the training.
+        kept = kept if mask is None else read_mask(mask, oriented=True)
+    reduced = np.asarray(Image.fromarray(kept).resize(size, Image.Resampling.BOX))
+    Image.fromarray(np.uint8(255) * (reduced >= 0.5)).save(file)
 
 
 def mask_note(shares: Sequence[float | None], labeled: int = 0) -> list[str]:

@@ -1,9 +1,11 @@
 """Reader of bare photos, whose cameras structure from motion finds."""
 
+import logging
 import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +23,12 @@ from .photos import FEWEST_PHOTOS
 from .raw import color_matrix
 from .read_colmap import INPUT
 from .read_transforms import is_transforms
-from .sfm import reconstruct
+from .sfm import Reconstruction, reconstruct
 from .sfm_panorama import are_panoramas, reconstruct_panoramas
 from .unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from .video import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
+
+_log = logging.getLogger("sehdr_warp.scene")
 
 _DEEPEST = 3  # Levels of folders in which photos are looked for, to name their folder
 # Files and folders by which a program states cameras, in lower case.
@@ -95,7 +99,9 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
         color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
     refuse_stack(photos, folder)
     try:
-        reconstruction = reconstruct_panoramas(photos, cache) if are_panoramas(photos) else reconstruct(photos, cache)
+        masks = [record.mask for record in dataset.records]
+        place = reconstruct_panoramas if are_panoramas(photos) else partial(_reconstruct, masks=masks)
+        reconstruction = place(photos, cache)
     except InputError as error:
         if poses := _foreign_poses(folder):
             raise InputError(error.path, error.problem, poses[0]) from None
@@ -109,6 +115,22 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
             placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera))
     notes = dataset.notes + reconstruction.notes(photos)
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
+
+
+def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:
+    """Place photos by what their masks keep: the background of an object that turns would place them wrongly.
+
+    Of whole photos if that places fewer than half of them.
+    """
+    if any(masks):
+        with suppress(InputError):
+            result = reconstruct(photos, cache, masks)
+            if 2 * len(result.model.images) >= len(photos):
+                return result
+        _log.warning(
+            "fewer than half of the photos can be placed by what masks keep: cameras are found by whole photos"
+        )
+    return reconstruct(photos, cache)
 
 
 def _require_photos(photos: Sequence[Path], folder: Path, copies: int = 0) -> None:

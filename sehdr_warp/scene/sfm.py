@@ -28,6 +28,7 @@ from ..subsets import counted, first_names
 from .cached_folder import cached_folder
 from .colmap_model import SparseModel, read_model
 from .images import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
+from .masks import write_reduced
 from .photos import read_photo, unusable_notes
 from .sfm_pairs import likely_pairs, pairs_with
 from .sfm_progress import counted_rows
@@ -82,11 +83,14 @@ class Reconstruction:
         return tuple(notes)
 
 
-def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reconstruction:
+def reconstruct(
+    photos: Sequence[Path], cache: Path | str | None = None, masks: Sequence[Path | None] = ()
+) -> Reconstruction:
     """Find cameras (SIMPLE_RADIAL, at the photos' oriented size), poses and points of photos.
 
     Args:
         photos: the files.
+        masks: of the photos, None for a photo without one; pixels below a half give no features. Empty: no masks.
         cache: a folder for results, None for the user's; the same photos are solved once, wherever they lie.
 
     Returns:
@@ -97,9 +101,16 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
     """
     rule = ["likely pairs"] * (EXHAUSTIVE_LIMIT < len(photos) <= COMPARED_LIMIT)
     key = cache_key("photos", MAX_SIDE, SEED, [(photo.name, file_digest(photo)) for photo in photos], *rule)
+    if any(masks):
+        key = cache_key(key, [mask and file_digest(mask) for mask in masks])
 
     def solve(work: Path, result: Path) -> None:
         sizes, small = _write_photos(photos, work / "images")
+        if any(masks):
+            (work / "masks").mkdir()
+            for i, mask in enumerate(masks):
+                if all(small[i]):  # pycolmap finds nothing in an image without a mask of this name.
+                    write_reduced(mask, small[i], work / "masks" / f"{image_name(i)}.png")
         database = work / "database.db"
         groups: dict[tuple, list[int]] = {}  # One set of intrinsics for a size, a device and a focal length.
         for i, photo in enumerate(photos):
@@ -114,7 +125,7 @@ def reconstruct(photos: Sequence[Path], cache: Path | str | None = None) -> Reco
             for (_, (width, height), device), group in groups.items():
                 params = (_focal_prior(device[-1], width, height), width / 2, height / 2, 0.0)
                 names = [image_name(i) for i in group]
-                _extract(database, work / "images", names, "SIMPLE_RADIAL", params)
+                _extract(database, work, names, "SIMPLE_RADIAL", params)
             photo_seconds = progress.seconds / count
             progress.update(count)
         _match(database, count, photo_seconds)
@@ -226,16 +237,18 @@ def _device(photo: Path) -> tuple[str, ...]:
             return ("None",) * 4
 
 
-def _extract(database: Path, images: Path, names: list[str], model: str, params) -> None:
-    """Extract the features of images that share one camera."""
+def _extract(database: Path, work: Path, names: list[str], model: str, params) -> None:
+    """Extract the features of images, in images/ and where masks/ keeps them, that share one camera."""
     import pycolmap
 
     camera_params = ",".join(f"{value:.17g}" for value in params)
     reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=camera_params)
+    if (work / "masks").exists():
+        reader.mask_path = work / "masks"
     for start in range(0, len(names), 8):  # Eight photos at a time, one on each core.
         part = names[start : start + 8]
         with quiet_colmap():
-            options = (database, images, part, pycolmap.CameraMode.SINGLE, reader)
+            options = (database, work / "images", part, pycolmap.CameraMode.SINGLE, reader)
             run_interruptibly(partial(pycolmap.extract_features, *options, device=pycolmap.Device.cpu))
         if start == 0:
             with pycolmap.Database.open(database) as opened:

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -245,6 +246,32 @@ def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
     reconstruction = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
     assert {(image.lens.width, image.lens.height) for image in reconstruction.model.images} == {(567, 426), (708, 532)}
     assert 0 < reconstruction.error < MOST_ERROR and not reconstruction.notes(photos)
+
+
+def test_an_object_that_turns_is_placed_by_its_masks(tmp_path, shared):
+    known = {view.name: view.camera for view in load(shared / "data" / "tankard_turntable", max_size=100).views}
+    for kind, suffix in (("images", "jpg"), ("masks", "png")):
+        (tmp_path / kind).mkdir()
+        for index in range(9669, 9677):
+            shutil.copy(shared / "data" / "tankard_turntable" / kind / f"IMG_{index}.{suffix}", tmp_path / kind)
+    views = load(tmp_path, max_size=100).views
+    turns = [(view.camera.world_to_camera[:3, :3], known[view.name].world_to_camera[:3, :3]) for view in views]
+    assert len(views) >= 6
+    for (a, true_a), (b, true_b) in pairwise(turns):
+        difference = (b @ a.T) @ (true_b @ true_a.T).T
+        assert np.degrees(np.arccos(np.clip((np.trace(difference) - 1) / 2, -1, 1))) < 1
+
+
+def test_masks_that_keep_too_little_are_not_used_for_placing(tmp_path, shared, caplog):
+    (tmp_path / "masks").mkdir()
+    for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]:
+        with Image.open(photo) as image:
+            image.reduce(6).save(tmp_path / photo.name, quality=95)
+            mask = Image.new("L", image.reduce(6).size)
+        mask.paste(255, (0, 0, 60, 60))
+        mask.save(tmp_path / "masks" / f"{photo.stem}.png")
+    assert len(load(tmp_path, max_size=100).views) == 4
+    assert "fewer than half of the photos can be placed by what masks keep" in caplog.text
 
 
 def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypatch, caplog):
