@@ -78,10 +78,10 @@ def safe_names(names: Sequence[str]) -> list[str]:
     """
     cleaned = [_FORBIDDEN.sub("_", name).strip().lstrip(".").encode("utf-8")[:_LONGEST] for name in names]
     cleaned = [name.decode("utf-8", "ignore").rstrip(". ") or "view" for name in cleaned]
-    wanted, result = {name.casefold() for name in cleaned}, {}
+    folded, result = {name.casefold() for name in cleaned}, {}
     for name in cleaned:
         numbered = (f"{name}_{number}" for number in count(2))
-        free = (each for each in numbered if (low := each.casefold()) not in wanted and low not in result)
+        free = (each for each in numbered if (low := each.casefold()) not in folded and low not in result)
         unique = next(free) if name.casefold() in result else name
         result[unique.casefold()] = unique
     return [*result.values()]

@@ -119,10 +119,10 @@ def read_mask(path: Path, *, oriented: bool = False, labeled: set[Path] | None =
 
 def write_reduced(mask: Path | None, size: tuple[int, int], file: Path) -> None:
     """Write a mask at the size of a photo's copy, white where it keeps a pixel; all white if it is None or damaged."""
-    kept = np.ones((1, 1), np.float32)
+    weights = np.ones((1, 1), np.float32)
     with suppress(InputError):  # Named when the photos are read for the training.
-        kept = kept if mask is None else read_mask(mask, oriented=True)
-    reduced = np.asarray(Image.fromarray(kept).resize(size, Image.Resampling.BOX))
+        weights = weights if mask is None else read_mask(mask, oriented=True)
+    reduced = np.asarray(Image.fromarray(weights).resize(size, Image.Resampling.BOX))
     Image.fromarray(np.uint8(255) * (reduced >= 0.5)).save(file)
 
 

@@ -118,9 +118,9 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
 
 
 def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:
-    """Place photos by what their masks keep: the background of an object that turns would place them wrongly.
+    """Place photos by the features inside their masks, as COLMAP does, or by all if that places fewer than half.
 
-    Of whole photos if that places fewer than half of them.
+    A still background would misplace an object that turns.
     """
     if any(masks):
         with suppress(InputError):
@@ -128,7 +128,7 @@ def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequen
             if 2 * len(result.model.images) >= len(photos):
                 return result
         _log.warning(
-            "fewer than half of the photos can be placed by what masks keep: cameras are found by whole photos"
+            "masks leave too little to place half of the photos: cameras are found from whole photos, without masks"
         )
     return reconstruct(photos, cache)
 

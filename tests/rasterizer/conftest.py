@@ -1,4 +1,4 @@
-"""What tests of the rasterizer may ask for."""
+"""Fixtures of the tests of the rasterizer."""
 
 import pytest
 

@@ -42,7 +42,7 @@ def test_a_retained_graph_has_the_gradients_of_each_part_in_any_order(one_sort, 
         (lambda drawing: drawing.depths.sum(), scene.tensors[:1]),
         (lambda drawing: drawing.image.square().sum() + drawing.depths.sum(), scene.tensors[:4]),
     ]
-    for loss, leaves in (*parts, *reversed(parts)):
+    for loss, leaves in parts + parts[::-1]:
         pair = [torch.autograd.grad(loss(drawing), leaves, retain_graph=True) for drawing in (replayed, truth)]
         assert_alike(*pair)
     of_means2d = [

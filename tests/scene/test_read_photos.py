@@ -205,7 +205,7 @@ def test_copies_of_the_same_bytes_are_left_out_and_named(tmp_path):
 
 @pytest.mark.parametrize("edited", ["IMG_E{}.jpg", "img_e{}.HEIC", "IMG_{}-edited.jpg"])
 def test_edited_photos_beside_their_originals_are_left_out_and_named(tmp_path, edited):
-    """As phones write them: another tone is another response. One that shows another picture is a photo."""
+    """Check edited photos as phones name them: of another tone they are copies, of another picture they are photos."""
     for i in range(4):
         Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
         brighter = np.minimum(pattern(96, 64, i if i < 3 else 9) * 1.2, 255).astype(np.uint8)
