@@ -33,7 +33,9 @@ def write_reports(folder: Path) -> list[Path]:
         page, result = PAGES[name], _read(path)
         tables = quality_tables if name == "quality" else TABLES[name]
         parts = [f"# {page['title']}", page["text"], f"```sh\n{result['command']}\n```"]
-        parts += [f"Measure again: `python -m benchmarks.measure {name}`."] if "command" in page else []
+        if "command" in page:
+            folder_of_results = " (`$out` is a folder in `measured/`)" if "$out" in result["command"] else ""
+            parts += [f"Measure again: `python -m benchmarks.measure {name}`{folder_of_results}."]
         parts += [machine_line(result) + "."]
         # Trainings whose times include compiling have no tests over time.
         if name in PLOTS and any(row.get("tests", True) for row in result["rows"]):

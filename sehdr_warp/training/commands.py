@@ -1,7 +1,4 @@
-"""The command line of `sehdr-warp train`.
-
-torch is imported when it runs.
-"""
+"""The command line of `sehdr-warp train`, which imports torch when it runs."""
 
 import json
 import logging
@@ -124,6 +121,8 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
     _refuse_run(args)
+    if args.output.resume and args.output.overwrite:
+        raise UsageError("--resume continues the run in --out, --overwrite replaces it; leave one out")
     if args.training.plan_only and args.output.resume:
         raise UsageError("--plan-only plans a new training; leave --resume out")
     if args.output.out is None and not args.training.plan_only:
