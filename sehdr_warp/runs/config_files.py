@@ -186,20 +186,21 @@ def _read(preset: str | Path) -> tuple[dict, Path]:
         base = values.pop("base", None)
         if not isinstance(base, str | None):
             raise InputError(path, f"base = {base!r} is not a name", f"use one of {preset_names()}, or a file")
-        path = None if base is None else _locate(base, beside=path.parent)
+        path = None if base is None else _locate(base, path)
     return reduce(_merge, reversed(chain.values())), next(iter(chain))
 
 
-def _locate(preset: str | Path, beside: Path | None = None) -> Path:
-    """Return the path of a preset or file; raises InputError if there is none."""
+def _locate(preset: str | Path, file: Path | None = None) -> Path:
+    """Return the path of a preset or file, which `file` states as its base; raises InputError if there is none."""
     if str(preset) in preset_names():
         return Path(str(resources.files("sehdr_warp.configs") / f"{preset}.toml"))
-    path = Path(preset) if beside is None else beside / preset
+    path = Path(preset) if file is None else file.parent / preset
     with suppress(OSError, ValueError):  # Text that cannot be a file name.
         if path.is_file():
             return path
     problem = f"no such preset or file{did_you_mean(str(preset), preset_names())}"
-    raise InputError(str(preset)[:200], problem, f"use one of {', '.join(preset_names())}, or a TOML file")
+    where = f"{preset!s:.200}" if file is None else f"{file}: base = {preset!r:.200}"
+    raise InputError(where, problem, f"use one of {', '.join(preset_names())}, or a TOML file")
 
 
 def _merge(below: dict, above: dict) -> dict:

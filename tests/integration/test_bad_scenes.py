@@ -224,13 +224,6 @@ def test_photos(data, capfd, case):
     assert words in train_refused(capfd, data)
 
 
-@pytest.mark.parametrize("value", [0, 255])
-def test_photos_that_show_nothing(data, capfd, value):
-    for path in (data / "images").iterdir():
-        Image.new("RGB", (64, 48), (value,) * 3).save(path)
-    assert "100.0 %" in train_refused(capfd, data)
-
-
 def test_photos_of_noise_have_no_poses(tmp_path, capfd):
     (tmp_path / "noise").mkdir()
     for i in range(3):
@@ -266,8 +259,19 @@ def test_exposure_times_of_zero_in_exif_count_as_none(tmp_path):
     assert not load_scene(tmp_path / "data", response="srgb").exposure_times_known
 
 
-def test_exposure_index_that_is_not_there(data, capfd):
-    assert "exposure index 3" in train_refused(capfd, data, "--exposure-index", "3")
+@pytest.mark.parametrize(
+    "flag, value, words",
+    [
+        ("--exposure-index", "3", "exposure index 3"),
+        ("--max-size", "0", "0 pixels"),
+        ("--max-size", "-5", "-5"),
+        ("--preset", ".", "."),
+        ("--device", "tpu", "tpu"),
+        ("--response", "kodak", "kodak"),
+    ],
+)
+def test_values_that_cannot_be(data, capfd, flag, value, words):
+    assert words in train_refused(capfd, data, flag, value)
 
 
 TRANSFORMS = {

@@ -12,7 +12,7 @@ from tests.make_scenes import edited_json
 
 from ..full_disk import full_disk
 from ..refusals import call, refused
-from .damage import checkpoint_of, resign, snapshot
+from .damage import resign, snapshot
 
 LITTLE = ("--max-size", "40", "--response", "hdr-nerf", "--model.initial-density", "0")
 
@@ -95,19 +95,3 @@ def test_interrupted_training_can_be_used(tmp_path, capfd):
     rest = process.communicate(timeout=60)[1]
     assert process.returncode == 130 and "--resume" in rest and "Traceback" not in rest
     assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
-
-
-def test_kill_while_a_checkpoint_is_written(embedded_run, tmp_path):
-    """Remains of a killed process beside a checkpoint are not taken for one, and are cleared by the next."""
-    out = tmp_path / "run"
-    shutil.copytree(embedded_run, out)
-    whole = checkpoint_of(out)
-    half = whole.with_name(f".{whole.name[:-1]}9.0123abcd.tmp")
-    shutil.copytree(whole, half)
-    (half / "checkpoint.json").unlink()
-    torn = whole.with_name(f"{whole.name[:-1]}9")
-    shutil.copytree(whole, torn)
-    (torn / "state.safetensors").write_bytes((whole / "state.safetensors").read_bytes()[:1000])
-    assert call("render", out, "--out", tmp_path / "views", "--device", "cpu") == 0
-    assert call("train", "embedded", "--out", out, "--device", "cpu", "--resume") == 0
-    assert [path.name for path in sorted((out / "checkpoints").iterdir()) if path != half] == [whole.name]

@@ -112,10 +112,12 @@ BAD_JSON = (
     '{"exposures": [0, 1]}',
     '{"exposures": "a", "values": [1]}',
     '{"kind": "table"}',
+    '{"kind": ["table"]}',
     "[" * 100000,
 )
 BAD_FILES = [("csv", text) for text in BAD_TABLES.values()] + [("json", text) for text in BAD_JSON]
-BAD_IDS = [*BAD_TABLES, *(f"json {number}" for number in range(len(BAD_JSON)))]
+BAD_FILES.append(("npy", "\x93NUMPY\x01\x00"))
+BAD_IDS = [*BAD_TABLES, *(f"json {number}" for number in range(len(BAD_JSON))), "pickled array"]
 
 
 @pytest.mark.parametrize("suffix, text", BAD_FILES, ids=BAD_IDS)

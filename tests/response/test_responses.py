@@ -175,7 +175,18 @@ def test_numpy_in_numpy_out(response):
 
 
 @pytest.mark.parametrize(
-    "name", ["gamma-0.5", "gamma-nan", "sRGB-ish", "", "no/such/file.csv", "colour:S-Log9", "colour:DICOM GSDF"]
+    "name",
+    [
+        "gamma-0",
+        "gamma-0.5",
+        "gamma-x",
+        "gamma-nan",
+        "sRGB-ish",
+        "",
+        "no/such/file.csv",
+        "colour:S-Log9",
+        "colour:DICOM GSDF",
+    ],
 )
 def test_unknown_names_are_refused(name):
     with pytest.raises(SehdrError) as error:

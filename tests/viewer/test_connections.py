@@ -59,26 +59,17 @@ def test_clients_that_never_read_make_room_for_others(serve, monkeypatch):
         client.close()
 
 
-def test_silent_clients_make_room_for_others(serve, monkeypatch):
-    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 5)
-    server = serve()
-    silent = [socket.create_connection(server.server_address[:2]) for _ in range(20)]
-    assert ask(server, "/scene")[0] == 200
-    assert len(server.connections._open) <= 5
-    for client in silent:
-        client.close()
-
-
 def test_clients_that_never_end_a_request_make_room_for_others(serve, monkeypatch):
     monkeypatch.setattr(connections, "MOST_CONNECTIONS", 5)
     server, begun = serve(), []
     head = b"POST /frame HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 4000000\r\n"
-    for text in (head + b"\r\n{", head, b"GET /sc") * 4:
+    for text in (b"", head + b"\r\n{", head, b"GET /sc") * 4:
         begun.append(socket.create_connection(server.server_address[:2]))
         begun[-1].sendall(text)
     time.sleep(0.2)
     started = time.monotonic()
     assert ask(server, "/scene")[0] == 200 and time.monotonic() - started < 5
+    assert len(server.connections._open) <= 5
     for client in begun:
         client.close()
 
@@ -125,12 +116,6 @@ def test_the_end_of_the_server_ends_a_save(serve):
     server.server_close()
     assert time.monotonic() - started < 10 and not server.viewer._saving.locked() and run.renders < 1000
     client.close()
-
-
-@pytest.mark.parametrize("stops", [float("nan"), float("inf"), 1e300, -31, "1e400", [1]])
-def test_films_of_impossible_stops_are_refused(serve, stops):
-    status, _, content = ask(serve(), "/save", {"cameras": [camera().to_dict()], "kind": "film", "stops": stops})
-    assert status == 400 and b"\n" not in content
 
 
 def test_a_save_that_would_fill_the_disk_is_refused(serve):

@@ -139,6 +139,10 @@ def test_what_is_saved_is_what_render_writes(serve, tmp_path):
         ("/save", {"cameras": [], "kind": "exr"}, 400),
         ("/path", {"cameras": [camera().to_dict()], "count": "many"}, 400),
         ("/training", {"do": "pause"}, 404),
+        *(
+            ("/save", {"cameras": [camera().to_dict()], "kind": "film", "stops": stops}, 400)
+            for stops in (float("nan"), float("inf"), 1e300, -31, "1e400", [1])
+        ),
     ],
 )
 def test_bad_questions_are_answered_in_a_line(serve, path, body, status):
