@@ -24,6 +24,8 @@ class Completion:
     zsh: sehdr-warp completion zsh > DIR/_sehdr-warp, where DIR is in $fpath
 
     fish: sehdr-warp completion fish > ~/.config/fish/completions/sehdr-warp.fish
+
+    Make the folder first if it is missing (mkdir -p).
     """
 
     shell: tyro.conf.Positional[Literal["bash", "zsh", "fish", "tcsh"] | None] = None
