@@ -153,7 +153,6 @@ HELD_BY = {
         "viewer/test_server.py::test_sizes_are_bounded",
         "viewer/test_connections.py::test_clients_that_never_read_make_room_for_others",
         "viewer/test_connections.py::test_clients_that_never_end_a_request_make_room_for_others",
-        "viewer/test_connections.py::test_silent_clients_make_room_for_others",
         f"{REQUESTS}_a_viewer_among_silent_and_deaf_clients",
     ],
     "A save ends when its client leaves": [
