@@ -17,6 +17,7 @@ BRIGHT = 0.7  # Times the photos' white, likewise
 LEAST_SEEN = 0.3  # Pixels of blending weight over all views, likewise
 REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
 FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
+EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras
 MOST_LIGHTS, MOST_VIEWS = 64, 24
 LEAST_ROWS, MOST_ROWS = 128, 724
@@ -57,7 +58,8 @@ class Light:
 
     Attributes:
         shape: its place and size.
-        radiance: [3] in the field's colors; with the shape it gives the light that the training views show.
+        radiance: [3] in the field's colors; with the shape it gives the light that the training views show. If each of
+            these cuts the light off at its border, it is what reaches the middle of the training cameras.
         lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
         deviation: of log2 radiance, stops, of what photos clip, from the confidence of its Gaussians; None if that was
             not measured. Edges and colors that do not clip make a light no surer, because all its photos may err alike.
@@ -95,7 +97,8 @@ def find_lights(
     cameras = [camera for camera, _ in views]
     middle = np.mean([camera.position for camera in cameras], axis=0)
     cameras = every_nth(cameras, MOST_VIEWS)
-    sums = [_view_sums(field, camera, degree) for camera in cameras]
+    panorama = _panorama(middle, typical_focal_length(cameras))
+    *sums, around = [_view_sums(field, camera, degree) for camera in [*cameras, panorama]]
     pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
     mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]
     member = (clipped.to(mean.device) > CLIPPED) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
@@ -108,16 +111,20 @@ def find_lights(
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
     confidence = None if field.confidence is None else field.confidence.to(members.device)[members].cpu().numpy()
     shares = clipped.to(members.device)[members].cpu().numpy()
-    covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
-    total = max(_light_at(field, middle, cameras, degree), 1e-30)
+    places = [camera.position for camera in cameras] + [middle]
+    covered, received = (np.stack([part[i][members].cpu().numpy() for part in [*sums, around]]) for i in (1, 2))
+    total = max(float(around[2].mean(1).sum()), 1e-30)
     lights = []
     for group in _groups(positions, REACH * float(np.median(widths))):
         shape = _shape(positions[group], widths[group], weights[group], middle)
-        area = float(_fit(shape, covered[:, group].sum(1, keepdims=True), cameras)[0])
+        whole = [_in_frame(camera, positions[group], widths[group], weights[group]) for camera in cameras]
+        solid_angles = np.array([shape.solid_angle(place) for place in places])
+        cells = _whole_views(np.append(whole, False), (solid_angles > 0) & (covered[:, group].sum(1) > 0))
+        area = float(_fit(shape, covered[:, group].sum(1, keepdims=True), places, cells)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
         sides = [side * min(max(area, 1e-4), 1e4) ** 0.5 for side in shape.size]
         shape = replace(shape, size=(sides[0], sides[1]))
-        radiance = _fit(shape, received[:, group].sum(1), cameras)
+        radiance = _fit(shape, received[:, group].sum(1), places, cells)
         deviation = None
         if confidence is not None:
             stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
@@ -130,19 +137,12 @@ def find_lights(
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
 
 
-def _light_at(field: RadianceField, point: np.ndarray, cameras: Sequence[Camera], degree: int | None) -> float:
-    """Return the light that reaches a point: the mean of the channels' radiance, integrated over all directions."""
-    focal = typical_focal_length(cameras)
-    # A latitude-longitude map, because its tiles are compact: those of evenly spread directions meet all Gaussians.
+def _panorama(position: np.ndarray, focal: float) -> Camera:
+    """Return a camera at a point that sees all directions in pixels of about the photos' focal length."""
     rows = int(np.clip(np.pi * focal, LEAST_ROWS, MOST_ROWS))
-    angle = np.pi / rows
-    latitude = angle * (np.arange(rows) + 0.5)[:, None] - np.pi / 2
-    longitude = angle * (np.arange(2 * rows) + 0.5)
-    up = np.broadcast_to(np.sin(latitude), (rows, 2 * rows))
-    directions = np.stack([np.cos(latitude) * np.sin(longitude), up, np.cos(latitude) * np.cos(longitude)], axis=2)
-    rays = torch.tensor(directions, dtype=torch.float32, device=field.render_device)
-    visible = field.render_directions(point, rays, focal_length=focal, pixel_angle=angle, degree=degree)
-    return float(angle**2 * (visible.hdr.mean(2) * torch.tensor(np.cos(latitude)).to(visible.hdr)).sum())
+    pose = np.eye(4)
+    pose[:3, 3] = -position
+    return Camera(2 * rows, rows, rows / np.pi, rows / np.pi, rows, rows / 2, pose, "equirectangular")
 
 
 def _view_sums(field: RadianceField, camera: Camera, degree: int | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -189,31 +189,47 @@ def _shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, middl
     return LightShape("rect", position, axes, (width, height))
 
 
-def _fit(shape: LightShape, received: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the values [C] whose products with a shape's solid angles are what cameras receive [V, C].
+def _whole_views(whole: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Return [V + 1], which views tell the size and the radiance of a light; the last one is the panorama.
 
-    By least squares: the radiance of light, or the area of a solid angle as a multiple of the shape's.
+    They are the photos that hold all of it. If every photo cuts it off at its border, only the panorama holds all of
+    its Gaussians; if the panorama does not show it, photos that hold a part must do.
 
-    Cameras that the light is only partly in the frame of are left out, if there are others.
+    Args:
+        whole: [V + 1], whether a photo holds all of the light; False for the panorama.
+        visible: [V + 1], whether a view shows it at all.
     """
-    angles = np.array([shape.solid_angle(camera.position) for camera in cameras])
-    whole = np.array([_in_frame(camera, shape) for camera in cameras]) & (angles > 0)
-    cells = whole if whole.any() else angles > 0
-    if not cells.any():
-        return np.zeros(received.shape[1])
-    return angles[cells] @ received[cells] / (angles[cells] @ angles[cells])
+    photos = whole & visible
+    if photos.any():
+        return photos
+    panorama = np.zeros_like(visible)
+    panorama[-1] = visible[-1]
+    return panorama if panorama.any() else visible
 
 
-def _in_frame(camera: Camera, shape: LightShape) -> bool:
+def _fit(shape: LightShape, received: np.ndarray, places: Sequence[np.ndarray], cells: np.ndarray) -> np.ndarray:
+    """Return the values [C] whose products with a shape's solid angles are what views at places receive [V, C].
+
+    By least squares: the radiance of light, or the area of a solid angle as a multiple of the shape's. Only the views
+    that `cells` [V] names count.
+    """
+    angles = np.array([shape.solid_angle(place) for place in places]) * cells
+    square = angles @ angles
+    return angles @ received / square if square > 0 else np.zeros(received.shape[1])
+
+
+def _in_frame(camera: Camera, positions: np.ndarray, widths: np.ndarray, weights: np.ndarray) -> bool:
+    """Return whether a photo holds a light: nearly all of the weight of its Gaussians, out to EXTENT widths."""
     if camera.projection == "equirectangular":
         return True
-    place = camera.world_to_camera[:3, :3] @ shape.position + camera.world_to_camera[:3, 3]
-    depth = place[2] if camera.is_pinhole else float(np.linalg.norm(place))
-    if depth <= 0:
-        return False
+    places = positions @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depths = places[:, 2] if camera.is_pinhole else np.linalg.norm(places, axis=1)
+    before = depths > 0
+    depths = np.where(before, depths, 1.0)
     if camera.is_pinhole:
-        u, v = camera.fx * place[0] / depth + camera.cx, camera.fy * place[1] / depth + camera.cy
+        u, v = (places[:, :2] / depths[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]).T
     else:
-        v, u = pixels_of_directions(place / depth, camera) + 0.5
-    margin = max(shape.size) / 2 * max(camera.fx, camera.fy) / depth
-    return bool(margin <= u <= camera.width - margin and margin <= v <= camera.height - margin)
+        v, u = pixels_of_directions(places / depths[:, None], camera).T + 0.5
+    margin = EXTENT * widths * max(camera.fx, camera.fy) / depths
+    inside = (margin <= u) & (u <= camera.width - margin) & (margin <= v) & (v <= camera.height - margin)
+    return bool(weights[before & inside].sum() >= WHOLE * weights.sum())

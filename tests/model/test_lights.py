@@ -6,6 +6,7 @@ import torch
 
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.lights import find_lights
+from sehdr_warp.output.environment_map import latlong
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.splats import GaussianArrays
 
@@ -77,6 +78,26 @@ def test_lights_apart_are_two_and_what_is_dark_or_did_not_clip_is_none():
     assert len(find_lights(scene, clipped, views())) == 1
     assert find_lights(field(places, [0.2, 0.2, 0.2], 0.03), torch.ones(len(places)), views()) == []
     assert find_lights(scene, torch.ones(len(places)), []) == []
+
+
+@pytest.mark.parametrize("target", [(-2.3, 0, 4.0), (2.3, 0, 4.0), (0, -1.75, 4.0)])
+def test_a_light_that_every_photo_cuts_off_has_what_a_map_without_it_loses(target):
+    """Large Gaussians at the border of all photos reach beyond it, and a map of the rest lacks all of their light."""
+    scene = field(panel(step=0.3), RADIANCE, 0.15)
+    (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views(target))
+    shown = [float(scene.render(camera).alpha.sum()) for camera, _ in views(target)]
+    assert max(shown) < 0.9 * float(scene.render(views()[0][0]).alpha.sum())
+    directions = torch.tensor(latlong(512), dtype=torch.float32)
+    options = {"focal_length": 240.0, "pixel_angle": 2 * np.pi / 512}
+    middle = np.zeros(3)
+    maps = [
+        scene.render_directions(middle, directions, without=without, **options).hdr.mean(2).numpy()
+        for without in ((), [light.members])
+    ]
+    angles = np.cos(np.arcsin(latlong(512)[..., 1])) * (2 * np.pi / 512) ** 2
+    lost = float(((maps[0] - maps[1]) * angles).sum())
+    assert light.radiance.mean() * light.shape.solid_angle(middle) == pytest.approx(lost, rel=0.05)
+    assert light.share == pytest.approx(lost / float((maps[0] * angles).sum()), rel=0.05)
 
 
 @pytest.mark.parametrize("target", [(0, 0, 4.0), (4.0, 0, 0), (0, 0, -4.0), (0.5, -3.5, 0)])
