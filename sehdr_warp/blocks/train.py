@@ -11,6 +11,7 @@ import torch
 from ..errors import InputError
 from ..files import make_parents, refuse_links, writing
 from ..runs.config import Config
+from ..runs.config_files import require_same_config
 from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.run import Run, load_run
 from ..runs.run_folder import RunFolder
@@ -141,11 +142,7 @@ def _continue(out: Path, data: LoadArguments, config: Config, count: int | None)
         raise InputError(out / FILE, problem, remedy)
     if count is not None and count != len(plan.blocks):
         raise InputError(out / FILE, f"has {len(plan.blocks)} blocks, but {count} were asked for", remedy)
-    if config.model_dump() != plan.config.model_dump():
-        before, now = plan.config.model_dump(), config.model_dump()
-        table = next(name for name in now if now[name] != before[name])
-        problem = f"{table} = {before[table]!r}, but {now[table]!r} was asked for"
-        raise InputError(out / FILE, problem, remedy)
+    require_same_config(config, plan.config, out / FILE, remedy)
     return plan
 
 

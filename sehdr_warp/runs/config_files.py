@@ -1,6 +1,7 @@
 """Configs as files and as flags, and the names of fields in earlier versions."""
 
 import json
+import logging
 import reprlib
 import textwrap
 import tomllib
@@ -20,6 +21,8 @@ from tyro.constructors import PrimitiveConstructorSpec
 from ..errors import InputError, did_you_mean
 from ..files import read_text
 from .config import Config, ConfigError
+
+log = logging.getLogger(__name__)
 
 _MAX_FILE_BYTES = 1 << 20
 _REMEDY = "`sehdr-warp config` lists every field with its meaning"
@@ -92,6 +95,25 @@ def override_config(
             raise InputError(path, f"{part} is a field, not a table", _REMEDY)
         table[name] = value
     return config_from_dict(values, source, flags)
+
+
+def with_iterations_of(saved: Config, config: Config) -> Config:
+    """Return the config of a preset with the iterations of the run that it continues: a preset does not stretch it."""
+    before, own = saved.schedule.iterations, config.schedule.iterations
+    if own > before:
+        log.info("the run has %d iterations, and not the %d of the preset: state iterations to train on", before, own)
+    return override_config(config, {"schedule.iterations": before})
+
+
+def require_same_config(config: Config, saved: Config, file: Path, remedy: str) -> None:
+    """Raise InputError, with the first field that differs and both values, if a config is not the one saved in a file.
+
+    plan.keep may differ, because the fields that the plan kept are compared.
+    """
+    for path, _ in config_fields():
+        old, new = attrgetter(path)(saved), attrgetter(path)(config)
+        if old != new and path != "plan.keep":
+            raise InputError(file, f"{path} = {old!r}, but {new!r} was asked for", remedy)
 
 
 def config_as_toml(config: Config, differing: bool = False) -> str:

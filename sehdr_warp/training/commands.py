@@ -375,9 +375,9 @@ def _config(args: Train, saved):
         overrides[path], flags[path] = configs.value_of(path, text), configs.flag_of(path)
     if saved is not None and options.preset is None:
         return configs.override_config(saved, overrides, flags=flags)
-    if saved is not None and "schedule.iterations" in saved.plan.keep:  # By --iterations, not by the preset.
-        overrides.setdefault("schedule.iterations", saved.schedule.iterations)
     config = configs.load_config(options.preset or "default", overrides, flags)
+    if saved is not None and "schedule.iterations" not in overrides:
+        config = configs.with_iterations_of(saved, config)
     user_fields = {*config.plan.keep, *(path for path in overrides if not path.startswith("plan."))}
     return configs.override_config(config, {"plan.keep": sorted(user_fields)})
 

@@ -12,7 +12,7 @@ import torch
 from ..errors import InputError, refuse_paths
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
-from ..runs.config_files import as_config, config_fields, override_config
+from ..runs.config_files import as_config, override_config, require_same_config, with_iterations_of
 from ..runs.device import pick_device
 from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
@@ -77,7 +77,8 @@ def create_trainer(
             preset or, if resuming, the config of the run.
         device: "cpu", "cuda:0", ...; by default the first GPU, or the CPU if there is none.
         resume: Continue the run in `out` from its newest complete checkpoint; on the CPU the result is that of an
-            uninterrupted training, bit for bit.
+            uninterrupted training, bit for bit. More `schedule.iterations`, in a Config or in fields, stretch its
+            schedule; those of a preset do not.
         overwrite: Replace the run in `out`, once the new one has a checkpoint of its start.
         tensorboard: Write event files to out/tensorboard (needs the extra `tensorboard`).
         data: Arguments with which the scene was loaded, saved to load its photos again.
@@ -89,6 +90,7 @@ def create_trainer(
         SehdrError: If the disk or the memory is full.
     """
     refuse_paths("load_scene", scene)
+    states_iterations = isinstance(config, Config) or (isinstance(config, Mapping) and "schedule.iterations" in config)
     device, folder, config = pick_device(device), RunWriter(out), as_config(config)
     if tensorboard:
         summary_writer()
@@ -96,6 +98,8 @@ def create_trainer(
         resumes = folder.prepare(resume=resume, overwrite=overwrite)  # Again, for those who call this function.
         try:
             if resumes:
+                if config is not None and not states_iterations:
+                    config = with_iterations_of(folder.read_config(), config)
                 trainer = _resumed_trainer(
                     scene, folder, config, device, ranks, tensorboard, is_block=shared is not None
                 )
@@ -170,12 +174,11 @@ def _resumed_trainer(
     """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run."""
     folder.lock()
     info, saved = folder.read_info(), folder.read_config()
-    extended = None
+    before = saved.schedule.iterations
     if config is not None:
-        config = _with_decisions(config, folder)
-        _check_same_config(config, saved, folder)
-        if config.schedule.iterations > saved.schedule.iterations:
-            extended = override_config(saved, {"schedule.iterations": config.schedule.iterations})
+        config = _with_decisions(config, saved, folder)
+        saved = override_config(saved, {"schedule.iterations": max(before, config.schedule.iterations)})
+        require_same_config(config, saved, folder.config_file, "resume with the run's own config, or train anew")
     folder.check_same_scene(scene)
     checkpoint = folder.newest_checkpoint()
     if checkpoint is None:
@@ -183,7 +186,6 @@ def _resumed_trainer(
     field = field_from_checkpoint(checkpoint, saved, info).to(device)
     compensation = exposure_compensation(info)
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
-    before, saved = saved.schedule.iterations, extended or saved
     output = RunOutput(folder, saved, tensorboard=tensorboard, is_block=is_block)
     trainer = Trainer(scene, saved, field, ranks=ranks, output=output)
     try:
@@ -191,7 +193,7 @@ def _resumed_trainer(
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
         problem = f"its state does not fit ({error!r:.120})"
         raise InputError(checkpoint.path, problem, "remove it, or train again") from None
-    if extended is not None:
+    if trainer.total > before:
         folder.extend(trainer.total)
         text = "the schedule is stretched from %d to %d iterations: rates and densification are those of the longer one"
         log.info(text, before, trainer.total)
@@ -199,27 +201,15 @@ def _resumed_trainer(
     return trainer
 
 
-def _with_decisions(config: Config, folder: RunWriter) -> Config:
-    """Return a config with the decisions of a run's plan in place of a plan of its own; fields in plan.keep stay.
+def _with_decisions(config: Config, saved: Config, folder: RunWriter) -> Config:
+    """Return a config with the fields that a run's plan decided, as the run has them; fields in plan.keep stay.
 
     On another machine, the same config may be planned differently.
     """
     if not config.plan.enabled:
         return config
-    fields = {path: value for decision in folder.read_decisions() for path, value in decision["fields"].items()}
-    decided = {path: value for path, value in fields.items() if path not in config.plan.keep}
-    return override_config(config, decided | {"plan.enabled": False})
-
-
-def _check_same_config(config: Config, saved: Config, folder: RunWriter) -> None:
-    """Raise InputError if a config differs from that of the run, but for a longer schedule and for plan.keep."""
-    for path, _ in config_fields():
-        old, new = attrgetter(path)(saved), attrgetter(path)(config)
-        if path == "plan.keep" or (path == "schedule.iterations" and new > old):
-            continue  # The values that the plan kept are compared; a longer schedule goes on.
-        if old != new:
-            problem = f"{path} = {old!r}, but {new!r} was asked for"
-            raise InputError(folder.config_file, problem, "resume with the run's own config, or train anew")
+    paths = {path for decision in folder.read_decisions() for path in decision["fields"]} - set(config.plan.keep)
+    return override_config(config, {path: attrgetter(path)(saved) for path in paths} | {"plan.enabled": False})
 
 
 def _cap_notes(trainer: Trainer) -> Iterator[str]:

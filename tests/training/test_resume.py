@@ -14,7 +14,7 @@ from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
-from sehdr_warp.scene import response_choice
+from sehdr_warp.scene import load_scene, response_choice
 from sehdr_warp.training.run_output import remove_unseen
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
@@ -189,6 +189,32 @@ def test_a_preset_does_not_stretch_a_run_of_fewer_iterations(preset, tmp_path):
     assert RunFolder(tmp_path / "run").read_config().schedule.iterations == 3
     assert call(*words, "--resume", "--iterations", 4) == call(*words, "--resume") == 0
     assert RunFolder(tmp_path / "run").read_config().schedule.iterations == 4
+
+
+def test_a_preset_in_python_does_not_stretch_a_run_and_stated_iterations_do(tmp_path, logged):
+    scene = load_scene("embedded", max_size=32, response="hdr-nerf")
+    train(scene, tmp_path / "run", load_config("fast", {"schedule.iterations": 3}), device="cpu")
+    file = tmp_path / "fast.toml"
+    file.write_text('base = "fast"\n')
+    for config in ("fast", file):
+        assert train(scene, tmp_path / "run", config, device="cpu", resume=True).iterations == 3
+    assert sum("the run has 3 iterations, and not the 1500 of the preset" in line for line in logged) == 2
+    longer = load_config("fast", {"schedule.iterations": 4})
+    assert train(scene, tmp_path / "run", longer, device="cpu", resume=True).iterations == 4
+    train(scene, tmp_path / "fields", {"schedule.iterations": 2}, device="cpu")
+    for fields, iterations in (({"seed": 0}, 2), ({"schedule.iterations": 3}, 3)):
+        assert train(scene, tmp_path / "fields", fields, device="cpu", resume=True).iterations == iterations
+
+
+def test_a_planned_run_that_was_stretched_is_resumed_with_its_preset(scene, tmp_path):
+    config = load_config("default", {"model.initial_density": 4.0, "mcmc.cap_density": 4.0})
+    trainer = create_trainer(scene, tmp_path / "run", config, device="cpu")
+    longer, total = override_config(trainer.config, {"schedule.iterations": trainer.total + 9}), trainer.total + 9
+    trainer.output.folder.unlock()
+    for resumed in (longer, config):
+        trainer = create_trainer(scene, tmp_path / "run", resumed, device="cpu", resume=True)
+        assert trainer.total == total
+        trainer.output.folder.unlock()
 
 
 def test_resuming_names_other_fields_that_have_the_same_values(scene, tmp_path):
