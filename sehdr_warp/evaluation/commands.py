@@ -1,15 +1,21 @@
 """The command lines of `sehdr-warp eval` and `compare`. torch is imported when they run."""
 
 import json
+import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tyro.conf import Positional
 
 from ..errors import InputError, UsageError
 from ..runs.open import enclosing_run_response, load_run_scene_with_confidence, open_run
+
+if TYPE_CHECKING:
+    from ..runs.run import Run
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +69,7 @@ class Compare:
     """Compare trained runs in one table; runs that differ by their seed alone become a mean with its deviation."""
 
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
-    """Folders of runs, or a folder that holds runs."""
+    """Folders of runs, or a folder that holds runs; of these, those without an evaluation yet are left out."""
     plot: Path | None = None
     """Also draw held-out error against training time to this PNG file."""
     csv: Path | None = None
@@ -138,7 +144,7 @@ def run_compare(options: Compare) -> None:
         raise InputError(options.plot, "the chart is a PNG file", f"name it {options.plot.with_suffix('.png').name}")
     for path in filter(None, (options.plot, options.csv, options.latex)):
         check_absent(path, options.overwrite)
-    rows = compare_runs([open_run(path, "cpu") for folder in options.runs for path in _runs_in(folder)])
+    rows = compare_runs([run for folder in options.runs for run in _runs_in(folder)])
     for path, format_rows in ((options.csv, comparison_csv), (options.latex, comparison_latex)):
         if path is not None:
             with atomic_path(path, options.overwrite) as file:
@@ -151,7 +157,14 @@ def run_compare(options: Compare) -> None:
         print(path)
 
 
-def _runs_in(folder: Path) -> list[Path]:
-    """Return the folder of a run itself; else the folders in it that hold a run, if there are any."""
+def _runs_in(folder: Path) -> "list[Run]":
+    """Load the run in a folder; else the runs in the folders in it, without those that have no evaluation yet."""
     inside = [] if (folder / "config.json").exists() else sorted(file.parent for file in folder.glob("*/config.json"))
-    return inside or [folder]
+    runs = [open_run(path, "cpu") for path in inside or [folder]]
+    evaluated = [run for run in runs if run.metrics()]
+    if not evaluated:
+        return runs
+    for run in runs:
+        if run not in evaluated:
+            log.warning("%s: has no evaluations of held-out views yet, and is left out", run.path)
+    return evaluated

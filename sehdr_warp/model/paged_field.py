@@ -18,7 +18,7 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..scene import Camera
 from .gaussians import PARAMETER_NAMES, Gaussians
-from .radiance_field import RadianceField
+from .radiance_field import RadianceField, require_camera
 from .renders import DirectionalRender, RenderedView
 
 CELL = 1 << 16  # Gaussians of a cell
@@ -93,15 +93,15 @@ class PagedField(RadianceField):
 
     def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
         """Render the HDR view of a camera, as RadianceField.render."""
-        return self._part(self.levels(camera, camera.position)).render(camera, degree=degree)
+        return self._part(self._levels_of(camera)).render(camera, degree=degree)
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
         """Render a simulated photo, as RadianceField.render_ldr."""
-        return self._part(self.levels(camera, camera.position)).render_ldr(camera, exposure_time, degree=degree)
+        return self._part(self._levels_of(camera)).render_ldr(camera, exposure_time, degree=degree)
 
     def render_mean(self, camera: Camera, values: Tensor) -> Tensor:
         """Render the mean of values [N], as RadianceField.render_mean."""
-        levels = self.levels(camera, camera.position)
+        levels = self._levels_of(camera)
         part, rows = self._part(levels), self._rows(levels)
         return part.render_mean(camera, values.cpu()[rows].to(self.render_device))
 
@@ -121,6 +121,11 @@ class PagedField(RadianceField):
         cells = range(len(self._low))
         parts = [self._part([(cell, 0)]).radiance_towards(position, degree=degree) for cell in cells]
         return torch.cat([part.to(self.gaussians.means.device) for part in parts])
+
+    def _levels_of(self, camera: Camera) -> list[tuple[int, int]]:
+        """Return the cells to render for a picture of a camera, as levels() does."""
+        require_camera(camera)
+        return self.levels(camera, camera.position)
 
     def _part(self, levels: list[tuple[int, int]]) -> RadianceField:
         """Return the field of some cells, on the device."""

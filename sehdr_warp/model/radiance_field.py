@@ -77,8 +77,7 @@ class RadianceField(nn.Module):
 
     def camera_tensors(self, camera: Camera) -> CameraTensors:
         """Return a camera of scene coordinates in those of the Gaussians, on their device."""
-        if not isinstance(camera, Camera):
-            raise TypeError(f"camera is a {type(camera).__name__}, expected a Camera, as run.cameras[0].camera is one")
+        require_camera(camera)
         return CameraTensors.of(self.normalization.camera(camera), self.gaussians.means.device)
 
     def render_train_view(
@@ -348,6 +347,12 @@ class RadianceField(nn.Module):
         )
         none = features.new_zeros(len(features), 2)
         return Rendering(image, transmittance, none, none[:, 0], none, 0)
+
+
+def require_camera(camera: object) -> None:
+    """Raise TypeError for what is not a Camera, such as an entry of run.cameras."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera is a {type(camera).__name__}, expected a Camera, as run.cameras[0].camera is one")
 
 
 def _unpremultiply(blended: Tensor, alpha: Tensor) -> Tensor:

@@ -90,6 +90,12 @@ def test_compare_takes_a_folder_of_runs_and_names_its_files(run, tmp_path, capsy
     assert "a and 1 more" in output and output.endswith(f"\n{table}\n")
     assert call("compare", tmp_path / "runs" / "notes") == 1
     assert "notes: is not a run" in capsys.readouterr().err
+    (tmp_path / "runs" / "b" / "metrics.jsonl").unlink()  # As of a training that has just begun.
+    assert call("compare", tmp_path / "runs") == 0
+    result = capsys.readouterr()
+    assert "a and 1 more" not in result.out and "runs/b: has no evaluations" in result.err
+    assert call("compare", tmp_path / "runs" / "b") == 1
+    assert "b: has no evaluations of held-out views; train it" in capsys.readouterr().err
 
 
 def test_eval_of_pictures_divides_photos_into_the_regions_of_eval_of_the_run(run, tmp_path, capsys):

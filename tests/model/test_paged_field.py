@@ -16,6 +16,7 @@ from sehdr_warp.model.paged_field import PagedField, boxes_in_view
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import on_device
+from sehdr_warp.runs.run_folder import CameraEntry
 from sehdr_warp.scene import Camera, View, look_at
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.splats.packing import compact_order
@@ -55,6 +56,13 @@ def test_pictures_are_those_of_the_whole(street):
         assert torch.equal(street.render_confidence(place), paged.render_confidence(place))
     away = replace(place, world_to_camera=look_at((0, 0, 3), (0.1, 0, 9), up=(1.0, 0.0, 0.0)))
     assert paged.levels(away, away.position) == [] and not paged.render(away).alpha.any()
+
+
+def test_an_entry_of_a_run_in_place_of_its_camera_is_named(street):
+    paged, entry = PagedField(street, CPU, budget=10**9), CameraEntry("v", "train", camera(3), 0.1)
+    for render in (paged.render, paged.render_ldr, paged.render_confidence):
+        with pytest.raises(TypeError, match="camera is a CameraEntry, expected a Camera"):
+            render(entry)
 
 
 def test_directions_are_those_of_the_whole(street):
