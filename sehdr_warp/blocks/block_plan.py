@@ -28,6 +28,7 @@ from ..scene.exposure_compensation import ExposureCompensation
 from ..scene.normalization import Normalization, normalization_of
 from ..subsets import every_nth
 from ..training.compensation import SharedDecisions, estimate_compensation, estimates_compensation
+from ..training.cost import OVERLAP
 from ..training.initialization import base_time, check_views, match_points, response_for_training
 from ..training.matching import LARGEST_SIDE
 from ..training.plan import STEPS_PER_PHOTO
@@ -41,8 +42,6 @@ MOST_BLOCKS = 10_000
 """Largest number of blocks; more than that many trainings are never one set."""
 FEWEST_POINTS, MATCHED = 500, 4000  # With fewer points in the set, pixels are matched to divide by
 MOST_MATCHED = 400  # Photos that are matched for that
-OVERLAP = 1.3  # Photos and Gaussians of all blocks together, relative to the whole set, for the choice of their number
-
 
 _THREE = Field(min_length=3, max_length=3)
 
@@ -206,14 +205,9 @@ class BlockPlan:
 def make_block_plan(
     data: LoadArguments, config: Config, device: torch.device, count: int | None, **selection: Any
 ) -> BlockPlan | None:
-    """Decide what all blocks of a set share, and divide the set.
+    """Decide what all blocks of a set share, and divide the set into `count` blocks; None chooses their number.
 
-    Args:
-        data: Arguments of load_scene() for the set.
-        config: Options of the training.
-        device: Device to measure on.
-        count: Number of blocks; None chooses it.
-        selection: Further arguments of load_scene(): method, candidates, photo_storage.
+    `data` and `selection` (method, candidates, photo_storage) are arguments of load_scene().
 
     Returns:
         The plan; None if `count` is None and one training does.
@@ -265,12 +259,9 @@ def make_block_plan(
 
 
 def blocks_for(photos: int, pixels: float, config: Config) -> int:
-    """Return the number of blocks for a set: what one training has steps and Gaussians for goes into each.
+    """Return the number of blocks for a set of photos with `pixels` in all.
 
-    Args:
-        photos: Number of training photos.
-        pixels: Of these photos.
-        config: Options of the training.
+    Each block gets what one training has steps and Gaussians for.
     """
     by_photos = OVERLAP * photos * STEPS_PER_PHOTO / REFERENCE_ITERATIONS
     gaussians = config.mcmc.cap_density * math.sqrt(pixels)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import torch
 
@@ -17,10 +16,7 @@ from .block_plan import blocks_for
 def estimate(plan: Plan, device: torch.device, gpus: int = 1) -> tuple[list[Choice], str]:
     """Return ways to train a set with their cost, and which of them is recommended.
 
-    Args:
-        plan: The plan of the training.
-        device: Device to train on; on the CPU, figures for H100 follow those of this machine.
-        gpus: GPUs that may be used.
+    On the CPU, figures for H100 follow those of this machine.
     """
     facts, config = plan.facts, plan.config
     cap = mcmc_cap(config, facts.pixels) if config.densification.strategy == "mcmc" else config.densification.cap_max
@@ -41,13 +37,3 @@ def estimate(plan: Plan, device: torch.device, gpus: int = 1) -> tuple[list[Choi
     others = [replace(each, name=f"{each.name} (H100)") for each in choices(whole, divided, blocks, None, gpus)]
     recommended = recommend(whole, blocks, None) if blocks > 1 else "this machine, or one GPU if that takes too long"
     return [here, *others], recommended
-
-
-def table(rows: list[Choice], recommended: str) -> str:
-    """Return the lines of an estimate."""
-    return "\n".join(["", "estimated cost", *(row.line() for row in rows), f"recommended: {recommended}"])
-
-
-def to_dict(rows: list[Choice], recommended: str) -> dict[str, Any]:
-    """Return plain values of an estimate for --json."""
-    return {"choices": [row.to_dict() for row in rows], "recommended": recommended}

@@ -56,15 +56,10 @@ class StoppedTraining(RuntimeError):
 def train_block(
     out: Path, index: int, device: str | None, photo_storage: str, versions: str, is_over: threading.Event | None = None
 ) -> BlockResult:
-    """Train a block to its end, or continue its training.
+    """Train block `index` of the run in the folder `out`, which has blocks.json, or continue its training.
 
-    Args:
-        out: Folder of the merged run, with blocks.json.
-        index: Number of the block.
-        device: Device to train on; None for the first GPU.
-        photo_storage: Where its photos are stored, see load_scene().
-        versions: installed_versions() of the machine that merges the blocks.
-        is_over: Set when the job has to end soon; its training then stops and saves.
+    `versions` are the installed_versions() of the machine that merges the blocks. The training stops and saves when
+    `is_over` is set.
 
     Returns:
         The result. Errors that a user can act on are returned, so that a job that ran differs from one that died.

@@ -44,17 +44,9 @@ def run_blocks(
     slurm: Mapping[str, str] | None = None,
     slurm_device: str | None = None,
 ) -> None:
-    """Train all blocks of a plan that are not finished.
+    """Train all blocks of a plan that are not finished; arguments as of train_in_blocks().
 
-    Args:
-        out: Folder of the merged run, with blocks.json.
-        plan: The plan.
-        device: The CPU, or the first GPU to use.
-        gpus: Blocks to train at once on this machine, each on a GPU of its own from `device` on. SLURM gets all at
-            once.
-        photo_storage: Where photos are stored, see load_scene().
-        slurm: Parameters of SLURM jobs, such as {"partition": "gpu"}; None for this machine.
-        slurm_device: "cpu" for SLURM jobs without a GPU, which the machine that submits them need not have either.
+    On this machine, `gpus` blocks are trained at once; SLURM gets all.
 
     Raises:
         SehdrError: If submitit is missing, or if blocks cannot be trained, after all others have been.
@@ -66,7 +58,8 @@ def run_blocks(
         return
     slots = min(gpus, len(queue.waiting)) if slurm is None else len(queue.waiting)
     on_cpu = slurm_device == "cpu" if slurm is not None else device.type == "cpu"
-    logs = _logs_folder(out)
+    # A new folder, for logs and for pickled values that submitit exchanges: nobody can have prepared it.
+    logs = out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
     if slurm is None:
         executors = local_executors(logs, slots, visible_gpus(device, slots) if device.type == "cuda" else [])
     else:
@@ -193,12 +186,9 @@ def visible_gpus(device: torch.device, count: int) -> list[str]:
 
 
 def local_executors(logs: Path, slots: int, gpus: Sequence[str]) -> list[Any]:
-    """Return an executor of submitit for each job that may run at the same time on this machine.
+    """Return an executor of submitit for each of `slots` jobs that may run at the same time on this machine.
 
-    Args:
-        logs: Folder of logs and pickled values.
-        slots: Number of jobs.
-        gpus: Names of GPUs in CUDA_VISIBLE_DEVICES, one for each job in turn; empty for jobs without a GPU.
+    `gpus` are names of GPUs as in CUDA_VISIBLE_DEVICES, one for each job in turn; none for jobs without a GPU.
     """
     submitit = _submitit()
     executors = [submitit.LocalExecutor(folder=logs) for _ in range(slots)]
@@ -212,13 +202,7 @@ def local_executors(logs: Path, slots: int, gpus: Sequence[str]) -> list[Any]:
 
 
 def slurm_executor(logs: Path, options: Mapping[str, str], *, gpu: bool) -> Any:
-    """Return submitit's executor for SLURM; raise SehdrError if SLURM is missing or does not know an option.
-
-    Args:
-        logs: Folder of logs and pickled values.
-        options: Parameters of SLURM jobs, `time` in minutes.
-        gpu: Whether a job takes a GPU.
-    """
+    """Return submitit's executor for SLURM; raise SehdrError if SLURM is missing or does not know an option."""
     submitit = _submitit()
     from .slurm_states import job_watcher
 
@@ -237,11 +221,6 @@ def slurm_executor(logs: Path, options: Mapping[str, str], *, gpu: bool) -> Any:
 def _submitit() -> Any:
     """Return the package submitit; raise SehdrError if it is not installed."""
     return require_extra("submitit", "submitit, which runs trainings as jobs, is not installed", "blocks")
-
-
-def _logs_folder(out: Path) -> Path:
-    """Return a new folder for logs, and for pickled values that submitit exchanges: nobody can have prepared it."""
-    return out / FOLDER / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(4)}"
 
 
 def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any]:

@@ -56,16 +56,9 @@ class TrainedBlock(NamedTuple):
 
 
 def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage: str = "auto") -> RunWriter:
-    """Write the merged run of trained blocks to a folder, in place of an earlier merged run.
+    """Write the merged run of trained blocks, whose borders are refined on `device`, in place of an earlier one.
 
-    Args:
-        out: Run folder, with the blocks' runs in `blocks/`.
-        plan: The plan of the blocks.
-        device: Device to refine borders on.
-        photo_storage: Where photos are stored, see load_scene().
-
-    Raises:
-        InputError: If a block is damaged or was trained with other options, or if no Gaussian is in any core.
+    Raises InputError if a block is damaged or was trained with other options, or if no Gaussian is in any core.
     """
     blocks = _without_far_reaching([_trained_block(out, plan, index) for index in range(len(plan.blocks))], plan)
     empty = [plan.blocks[index].name for index, block in enumerate(blocks) if not len(block.evidence.weight_sum)]

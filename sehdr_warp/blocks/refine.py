@@ -41,13 +41,8 @@ def refine_borders(
 ) -> None:
     """Train the Gaussians near borders, in place.
 
-    Args:
-        tensors: Parameters of the N merged Gaussians on the CPU, in the coordinates of the merged run.
-        blocks: [N] index of the block that each Gaussian comes from.
-        out: Folder of the merged run, which has the blocks' configs.
-        plan: The plan of the blocks.
-        device: Device to train on.
-        photo_storage: Where photos are stored, see load_scene().
+    `tensors` are the parameters of the N merged Gaussians on the CPU, in the coordinates of the merged run; `blocks`
+    [N] the index of the block that each comes from.
     """
     places = plan.normalization.scene_points(tensors["means"].numpy())
     distance = torch.from_numpy(plan.division.border_distance(places))

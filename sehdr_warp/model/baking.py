@@ -237,12 +237,6 @@ def refine(
 def agreement(
     picture: Callable[[Camera], Tensor], reference: Callable[[Camera], Tensor], cameras: Sequence[Camera]
 ) -> float:
-    """Return the PSNR of encoded pictures [H, W, 3] against others, dB, at most 120, over all pixels of some cameras.
-
-    Args:
-        picture: Function from a camera to the picture.
-        reference: Function from a camera to the picture to compare with.
-        cameras: Cameras to compare.
-    """
+    """Return the PSNR of encoded pictures [H, W, 3] against others, dB, at most 120, over all pixels of the cameras."""
     errors = [float((picture(camera) - reference(camera)).square().mean()) for camera in cameras]
     return -10 * math.log10(max(float(np.mean(errors)), 1e-12))

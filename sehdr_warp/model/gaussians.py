@@ -171,11 +171,7 @@ class Gaussians(nn.Module):
 
         A block is refined so beside the rest of the scene (blocks/refine.py). Call this before the first step, and not
         if the number of Gaussians will change: that takes the rows. They stay as they are if the optimizer trains the
-        others alone (Adam.trained_rows).
-
-        Args:
-            rows: Tensors of M Gaussians as returned by rows().
-            optimizer: The optimizer of the parameters.
+        others alone (Adam.trained_rows). `rows` are tensors as returned by rows().
         """
         count = self.count
         self.reserve(count + len(rows["means"]), optimizer)

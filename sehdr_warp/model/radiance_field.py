@@ -121,19 +121,21 @@ class RadianceField(nn.Module):
         # A single image is not split, because the derivative of a split is a copy.
         parts = rendering.image.split(3, dim=2) if others else (rendering.image,)
         images = dict(zip(color_sets, parts, strict=True))
-        encoded, exposure, photo_exposure = images.get("encoded"), images.get("fused"), None
+        encoded, exposure, photo_exposure = images.get("encoded"), images.get("exposure"), None
         if self.tone_map == "pixel":
-            photo_exposure = images["fused"] if isinstance(ratio, float) and ratio == 1 else images["fused"] * ratio
+            photo_exposure = images["exposure"]
+            if not (isinstance(ratio, float) and ratio == 1):
+                photo_exposure = photo_exposure * ratio
             encoded = self.response.encode_extended(photo_exposure) if encode else None
         return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure, opacities)
 
     def _color_sets(self, values: Tensor, ratio: float | Tensor, extra_images: frozenset[str]) -> dict[str, Tensor]:
-        """Return the colors [N, 3] that a training view needs, by name: any of encoded, fused and base."""
-        base, fused = self._exposures(values)  # The same tensor without fusion.
-        color_sets = {"fused": fused}
+        """Return the colors [N, 3] that a training view needs, by name: any of encoded, exposure and base."""
+        base, exposure = self._exposures(values)  # The same tensor without fusion.
+        color_sets = {"exposure": exposure}
         if self.tone_map == "gaussian":
             needs_exposure = "exposure" in extra_images or ("base" in extra_images and self.fusion is None)
-            encoded = {"encoded": self.response.encode_extended(fused * ratio)}
+            encoded = {"encoded": self.response.encode_extended(exposure * ratio)}
             color_sets = encoded | color_sets if needs_exposure else encoded
         if "base" in extra_images and self.fusion is not None:
             color_sets["base"] = base

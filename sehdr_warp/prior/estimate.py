@@ -63,12 +63,7 @@ class LightPrior:
     """A loaded network, on one device."""
 
     def __init__(self, network: LightNetwork, deviation_scale: float = 1.0):
-        """Keep a network for estimates.
-
-        Args:
-            network: with its weights.
-            deviation_scale: factor of the deviations, fitted on photos that the network was not trained on.
-        """
+        """Keep a network, and the factor of its deviations, fitted on photos that it was not trained on."""
         self.network, self.deviation_scale = network.eval(), deviation_scale
 
     @torch.no_grad()

@@ -113,18 +113,7 @@ class ChannelResponse(TabulatedResponse, kind="channels"):
     """
 
     def __init__(self, name: str, exposures, values, *, notes: tuple[str, ...] = (), source: str | None = None):
-        """Prepare the curves.
-
-        Args:
-            name: of the response.
-            exposures: [3, K], as of TabulatedResponse.
-            values: [3, K] of red, green and blue.
-            notes: on repairs.
-            source: to name in errors.
-
-        Raises:
-            InputError: as TabulatedResponse does, for any channel.
-        """
+        """Prepare the curves of red, green and blue: arguments and errors as of TabulatedResponse, [3, K] samples."""
         pairs = zip(exposures, values, ("red", "green", "blue"), strict=True)
         self.curves = tuple(TabulatedResponse(f"{name}:{c}", x, y, source=source) for x, y, c in pairs)
         repairs = tuple(note for curve in self.curves for note in curve.notes)

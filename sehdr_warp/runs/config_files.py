@@ -76,16 +76,9 @@ def as_config(config: object) -> Config | None:
 def override_config(
     config: Config, overrides: dict, source: Path | str = "the config", flags: Mapping[str, str] | None = None
 ) -> Config:
-    """Return a config with some fields replaced.
+    """Return a config with some fields replaced; `overrides` and `flags` as in load_config().
 
-    Args:
-        config: The config to change.
-        overrides: Dotted field names and values, as in load_config.
-        source: What error messages name if a field has no flag.
-        flags: As in load_config.
-
-    Raises:
-        InputError: If a field is unknown or its value is wrong.
+    Raises InputError, with the field's flag or else `source`, if a field is unknown or its value is wrong.
     """
     values = config.model_dump()
     for path, value in overrides.items():
@@ -117,12 +110,7 @@ def require_same_config(config: Config, saved: Config, file: Path, remedy: str) 
 
 
 def config_as_toml(config: Config, differing: bool = False) -> str:
-    """Return a config as the text of a TOML file.
-
-    Args:
-        config: The config.
-        differing: Write only the fields that differ from the default preset, without their meanings.
-    """
+    """Return a config as a TOML file; if `differing`, only what differs from the default preset, without meanings."""
     lines, table = ['base = "default"'] if differing else [], ""
     for path, item in config_fields():
         part, _, name = path.rpartition(".")

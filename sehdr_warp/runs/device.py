@@ -13,11 +13,7 @@ if TYPE_CHECKING:
 def pick_device(device: str | torch.device | None) -> torch.device:
     """Return the device that a user names, by default the first GPU, or the CPU if there is none.
 
-    Args:
-        device: "cpu", "cuda", "cuda:N", a torch device, or None.
-
-    Raises:
-        InputError: If torch cannot use the device.
+    Raises InputError for other names than "cpu", "cuda" and "cuda:N", and if torch cannot use the device.
     """
     import torch
 

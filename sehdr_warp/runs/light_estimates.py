@@ -40,15 +40,9 @@ def light_estimates(
     None where nothing clips, where the loss does not use it, or where nothing is known. The views are seen by the
     learned prior if config.light_prior is on; light that a photo's file states counts in any case.
 
-    Args:
-        views: the training views.
-        response: the curve by which exposures are compared; None where they are not.
-        config: of the loss.
-        device: on which the prior runs.
-
-    Returns:
-        What is known of each view. In a training, estimates of panoramas and wide fisheye photos weigh by the solid
-        angles of their pixels, relative to the mean, as the rest of the loss does.
+    The prior runs on `device`. `response` is the curve by which exposures are compared, None if they are not. In a
+    training, estimates of panoramas and wide fisheye photos weigh by the solid angles of their pixels, relative to the
+    mean, as the rest of the loss does.
 
     Raises:
         InputError: if the weights of the prior cannot be read.
@@ -111,12 +105,7 @@ class WidePrior:
     """The prior for the photos of one camera that is not a pinhole, by perspective faces that overlap."""
 
     def __init__(self, prior: LightPrior, camera: Camera):
-        """Prepare the faces.
-
-        Args:
-            prior: network that estimates the light of a face.
-            camera: camera of a panorama or of a fisheye lens.
-        """
+        """Prepare the faces of a panorama or of a photo by a fisheye lens, whose light the prior estimates."""
         self.prior, self.camera = prior, camera
         self._faces: list[_Face] | None = None
 

@@ -25,14 +25,9 @@ log = logging.getLogger(__name__)
 
 
 def open_run(path: Path, device: str | None) -> Run:
-    """Load the run in a folder.
+    """Load the run in a folder to "cpu" or "cuda:N", None for pick_device()'s choice.
 
-    Args:
-        path: Folder of the run.
-        device: "cpu" or "cuda:N"; None for the first GPU, or the CPU if there is none.
-
-    Raises:
-        InputError: If the folder is not a run, or the device is missing.
+    Raises InputError if the folder is not a run, or the device is missing.
     """
     _require(path)
     from .run import load_run
@@ -60,11 +55,9 @@ def _require(
 
 
 def load_scene_and_log_notes(data: LoadArguments, **options: Any) -> Scene:
-    """Load the scene that arguments as a run saves them describe, and log its notes.
+    """Load the scene that arguments with a path, as a run saves them, describe, and log its notes.
 
-    Args:
-        data: The arguments, with a path.
-        options: Further arguments of load_scene, such as response.
+    `options` are further arguments of load_scene(), such as response.
     """
     from ..scene import load_scene
 
@@ -78,15 +71,9 @@ def load_scene_and_log_notes(data: LoadArguments, **options: Any) -> Scene:
 
 
 def load_run_scene(run: Run, data: str | None) -> Scene:
-    """Load the photos of a run in the same way as for its training.
+    """Load the photos of a run in the same way as for its training; `data` says where they are now if they have moved.
 
-    Args:
-        run: The trained run.
-        data: Where the photos are now, if they have moved.
-
-    Raises:
-        SehdrError: If the run does not say where its photos are, and data is None.
-        InputError: If the photos are no longer there.
+    Raises SehdrError if neither it nor the run does, or InputError if they are no longer there.
     """
     from ..scene import is_embedded
 

@@ -165,8 +165,6 @@ class Splats(RenderableScene):
     """A file of Gaussians as a scene to render, re-expose and export. Its response is sRGB.
 
     Attributes:
-        path: The file.
-        field: The radiance field.
         base_time: Exposure time that the file states, seconds; else 1.
         cameras: Views listed in `<name>.cameras.json` beside the file, as export writes it, or in a cameras.json, as
             the reference release of 3D Gaussian Splatting writes it; else none.
@@ -213,16 +211,9 @@ class Run(RenderableScene):
     """A trained scene.
 
     Attributes:
-        path: The run folder.
-        folder: The same as a RunFolder.
+        folder: The files of the run folder.
         config: Options of the training.
-        field: The radiance field, on `device`.
-        cameras: Views of the scene, in its order.
-        response: Camera response.
-        base_time: Exposure time of the photos, seconds.
-        iterations: Iterations of the training.
         train_seconds: Duration of the training.
-        degree: SH degree.
         checkpoint_hash: Hash of the tensors.
         data: Arguments with which the photos were loaded; may be empty.
     """
@@ -317,10 +308,7 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
 def on_device(field: RadianceField, device: torch.device, budget: int | None = None) -> RadianceField:
     """Return a field on a device; if its Gaussians are too many for a GPU, one that copies those that are in view.
 
-    Args:
-        field: The field, on the CPU.
-        device: The device.
-        budget: Bytes of the device's memory that pictures may take; by default MEMORY_SHARE of what is free on a GPU.
+    Pictures may take `budget` bytes of the device's memory, by default MEMORY_SHARE of what is free on a GPU.
     """
     if budget is None and device.type == "cuda":
         budget = int(MEMORY_SHARE * torch.cuda.mem_get_info(device)[0])

@@ -210,9 +210,9 @@ class RunFolder:
         if difference is None:
             return
         if difference.photos:
-            problem = f"photos or masks were changed since the training began: {difference}"
+            problem = f"photos or masks were changed since the training began: {difference.what}"
             raise InputError(self.scene_file, problem, "put them back as they were, or train anew with --overwrite")
-        problem = f"its {difference} differ from those of {scene.name}"
+        problem = f"its {difference.what} differ from those of {scene.name}"
         raise InputError(self.scene_file, problem, "resume with the same data, --max-size and --holdout")
 
     def read_decisions(self) -> list[dict]:
@@ -329,21 +329,16 @@ def describe_scene(scene: Scene) -> dict:
     return {"format": FORMAT, "name": scene.name, "layout": scene.format, **facts, "views": views}
 
 
-@dataclass(frozen=True)
-class SceneDifference:
-    """Difference of two scenes: "layout", "views", or the names of photos.
+class SceneDifference(NamedTuple):
+    """Difference of two scenes.
 
     Attributes:
-        text: In words.
+        what: "layout", "views", or the names of photos.
         photos: Whether the pictures themselves differ.
     """
 
-    text: str
+    what: str
     photos: bool
-
-    def __str__(self) -> str:
-        """Return the text."""
-        return self.text
 
 
 def scene_difference(saved: dict, current: dict) -> SceneDifference | None:

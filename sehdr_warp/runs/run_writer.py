@@ -159,12 +159,8 @@ class RunWriter(RunFolder):
     ) -> None:
         """Write the files of a new run in the locked folder, in place of those of an earlier one.
 
-        Args:
-            scene: As from describe_scene().
-            info: Values of run.json, without format and version.
-            config: The config.
-            plan: Values of plan.json, if there is a plan.
-            state: Tensors and values of its first checkpoint.
+        `scene` is as from describe_scene(), `info` for run.json without format and version, `plan` for plan.json;
+        `state` are tensors and values of the first checkpoint.
         """
         from .. import __version__
 

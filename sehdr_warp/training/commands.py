@@ -22,7 +22,6 @@ from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     from ..runs.run import Run
-    from ..runs.run_writer import RunWriter
 
 log = logging.getLogger(__name__)
 
@@ -112,12 +111,12 @@ class Train:
 def run_train(args: Train, argv: Sequence[str]) -> None:
     """Train, or print the plan, and print what was written and what to do next.
 
-    `argv` are the words of the command line, with which --gpus starts the other ranks.
+    `argv` are the words of the command line, with which --gpus starts a process for each GPU: a rank, see RankInfo.
     """
     _require_scene(args)
-    from .launch import device_of_rank, rank_from_environment
+    from .launch import device_of_rank, launch, rank_from_environment
 
-    gpus, rank_info = args.machine.gpus, rank_from_environment()
+    gpus, device, rank_info = args.machine.gpus, args.machine.device, rank_from_environment()
     if gpus < 1:
         raise UsageError(f"--gpus {gpus} is not 1 or more")
     _refuse_run(args)
@@ -127,7 +126,7 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         raise UsageError("--plan-only plans a new training; leave --resume out")
     if args.output.out is None and not args.training.plan_only:
         raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
-    if _in_blocks(args):
+    if _is_for_blocks(args):
         if rank_info is not None:
             raise UsageError("--blocks starts its own processes; leave torchrun out")
         if _train_blocks(args):
@@ -136,29 +135,26 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     if args.training.plan_only:
         if rank_info is None or rank_info.rank == 0:
             _print_plan(args)
-    elif rank_info is None and gpus > 1:
-        from .launch import launch
-
-        device_of_rank(gpus - 1, args.machine.device)
-        launch(gpus, _run_as_rank, list(argv))
-    elif rank_info is None:
+    elif rank_info is None and gpus == 1:
         _train(args)
+    elif rank_info is None:
+        device_of_rank(gpus - 1, device)
+        launch(gpus, _run_as_rank, list(argv))
     elif gpus not in (1, rank_info.local_count):
         raise UsageError(f"--gpus {gpus}, but {rank_info.local_count} ranks were started; leave it out")
     else:
+        from .following import follow_leader
         from .ranks import join_ranks
 
-        with join_ranks(rank_info, device_of_rank(rank_info.local_rank, args.machine.device)) as ranks:
+        with join_ranks(rank_info, device_of_rank(rank_info.local_rank, device)) as ranks:
             if ranks.leads:
                 _train(args, ranks)
             else:
-                from .following import follow_leader
-
                 follow_leader(ranks, _path_of(args))
 
 
 def _run_as_rank(words: list[str]) -> None:
-    """Run a command line in the process of a rank."""
+    """Run the same command line, and with it run_train(), in the process of a rank."""
     from ..cli import main
     from ..process import prepare
 
@@ -169,20 +165,25 @@ def _run_as_rank(words: list[str]) -> None:
 def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, on this rank."""
     from ..response import Response
+    from ..runs.run_writer import RunWriter
     from .machine import precompiling
     from .scene_facts import check_dataset_truth
 
     output, out = args.output, args.output.out
     assert out is not None, "run_train() refuses it"
     # What can be refused is refused before the photos are read, which may take minutes.
-    resumed = _prepare_folder(out, output)
-    data = _load_arguments(args, None if resumed is None else resumed.read_info()["data"])
-    config = _config(args, None if resumed is None else resumed.read_config())
+    folder = RunWriter(out)
+    info: dict[str, Any] = {}
+    saved = None  # The config of a run that is resumed
+    if folder.prepare(resume=output.resume, overwrite=output.overwrite):
+        info, saved = folder.read_info(), folder.read_config()
+    elif output.resume:
+        log.info("%s holds no run yet: a training begins there", out)
+    data, config = _load_arguments(args, info.get("data")), _config(args, saved)
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     load_options = _load_options(config)
-    if resumed is not None:  # Its response need not be chosen again; create_trainer() refuses another --response.
-        response = Response.from_dict(resumed.read_info()["response"])
-        load_options["response"] = response_for_loading(resumed.read_config(), response)
+    if saved is not None:  # Its response need not be chosen again; create_trainer() refuses another --response.
+        load_options["response"] = response_for_loading(saved, Response.from_dict(info["response"]))
     check_dataset_truth(data, config)
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
@@ -217,31 +218,17 @@ def _train(args: Train, ranks=None) -> None:
     _print_result(args, trainer.run, advice_on(trainer, data, options))
 
 
-def _prepare_folder(out: Path, output: OutputOptions) -> "RunWriter | None":
-    """Prepare --out as RunWriter.prepare(); return the run that --resume continues, None for a new one.
-
-    Raises SehdrError if --out cannot be used.
-    """
-    from ..runs.run_writer import RunWriter
-
-    folder = RunWriter(out)
-    if folder.prepare(resume=output.resume, overwrite=output.overwrite):
-        return folder
-    if output.resume:
-        log.info("%s holds no run yet: a training begins there", out)
-    return None
-
-
 def _print_plan(args: Train) -> None:
     """Print the plan of a training and its cost."""
-    from ..blocks import estimate
+    from ..blocks.estimate import estimate
     from .plan import make_plan
 
     data, config, device = _load_arguments(args, None), _config(args, None), pick_device(args.machine.device)
     plan = make_plan(load_scene_and_log_notes(data, **_load_options(config)), config, device)
-    cost = estimate.estimate(plan, device, args.machine.gpus)
-    values = plan.to_dict() | {"cost": estimate.to_dict(*cost)}
-    print(json.dumps(values) if args.output.json else plan.table() + estimate.table(*cost))
+    choices, recommended = estimate(plan, device, args.machine.gpus)
+    cost = {"choices": [choice.to_dict() for choice in choices], "recommended": recommended}
+    lines = plan.table(), "estimated cost", *(choice.line() for choice in choices), f"recommended: {recommended}"
+    print(json.dumps(plan.to_dict() | {"cost": cost}) if args.output.json else "\n".join(lines))
 
 
 def _load_options(config) -> dict[str, Any]:
@@ -257,8 +244,11 @@ def _print_result(args: Train, run: "Run", advice: Sequence[str] = ()) -> None:
     print(json.dumps(summary) if args.output.json else "\n".join([_ending(run.path, summary), *advice]))
 
 
-def _in_blocks(args: Train) -> bool:
-    """Return whether a command line trains in blocks, which --resume continues without --blocks too."""
+def _is_for_blocks(args: Train) -> bool:
+    """Return whether a command line trains in blocks, which --resume continues without --blocks too.
+
+    Raises UsageError or InputError for options that do not fit.
+    """
     from ..blocks.block_plan import MOST_BLOCKS
     from ..blocks.train import is_in_blocks
 

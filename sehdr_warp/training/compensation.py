@@ -7,6 +7,7 @@ scene.exposure_compensation, and only the parts that clearly explain them are co
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -75,17 +76,12 @@ class MatchedPoints:
         return disagreement(views, self.points, self.visible[: len(views)], response, gains, colors=colors)
 
 
-@dataclass(frozen=True)
-class Parts:
-    """Parts of a compensation to apply."""
+class Parts(NamedTuple):
+    """Parts of a compensation to apply; see ExposureCompensation.parts()."""
 
     exposure: bool
     white_balance: bool
     vignetting: bool
-
-    def of(self, compensation: ExposureCompensation) -> ExposureCompensation:
-        """Return a compensation with these parts alone."""
-        return compensation.parts(exposure=self.exposure, white_balance=self.white_balance, vignetting=self.vignetting)
 
 
 @dataclass(frozen=True)
@@ -152,15 +148,10 @@ def prepare_photos(
     *,
     estimate: bool = True,
 ) -> PreparedPhotos:
-    """Take drift of exposure, white balance and vignetting out of the photos of a scene.
+    """Take drift of exposure, white balance and vignetting out of the photos of a scene, in its own coordinates.
 
-    Args:
-        scene: The scene, in its own coordinates.
-        config: Options of the training, after the plan.
-        response: Response of the camera.
-        device: Device to match points on.
-        shared: Decisions of a larger set that the scene is part of, which replace an estimate.
-        estimate: Estimate a compensation if the config asks for it.
+    Decisions of a larger set that the scene is part of (`shared`) replace an estimate. Without them, drift is estimated
+    if `estimate` and the config, after the plan, asks for it.
     """
     normalization, result = normalization_of(scene), None
     compensation = None if shared is None else shared.compensation_of(scene.views)
@@ -219,11 +210,11 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
         return no_drift(matcher)
     compensation = fit(matched)
     parts = _explanatory_parts(compensation, views, matched, response, times_known)
-    if not (parts.exposure or parts.white_balance or parts.vignetting):
+    if not any(parts):
         return no_drift(matcher)
     # Match again in photos that are already similar: more points are found.
-    matcher = matcher_of(parts.of(compensation).normalize_photos(small, response))
-    compensation = parts.of(fit(match(matcher)))
+    matcher = matcher_of(compensation.parts(**parts._asdict()).normalize_photos(small, response))
+    compensation = fit(match(matcher)).parts(**parts._asdict())
     return Compensation(compensation, None, _decision(compensation, parts, times_known))
 
 

@@ -8,6 +8,10 @@ nodes, or more Gaussians than were measured.
 import math
 from dataclasses import asdict, dataclass, replace
 
+import torch
+
+from ..parallel import thread_count
+
 STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 2.0e-4, 3.4e-10, 2.4e-9
 """Duration of a captured step on one GPU: fixed part, per pixel of a photo, per Gaussian, with densification."""
 NUMBERS, RANK_NUMBERS = 11, 3  # Floats per Gaussian in the all-reduce: 11, plus 3 color gradients per rank
@@ -55,7 +59,7 @@ class Cost:
 
     Attributes:
         seconds: Duration from the start of its process to its end.
-        gpu_bytes: Peak memory of each GPU, with the photos if `photos_on_gpu`.
+        gpu_bytes: Peak memory of each GPU, without the photos.
         network_bytes: Bytes that each node sends and receives.
         disk_bytes: Of the run folder.
         photo_bytes: Of the photos in memory, on each node.
@@ -86,6 +90,21 @@ def exchange_seconds(gaussians: float, gpus: int, nodes: int = 1) -> float:
         return 0.0
     size = exchange_bytes(gaussians, gpus)
     return EXCHANGE_SECONDS + max(size / 4 * NUMBER_SECONDS, size / NETWORK if nodes > 1 else 0.0)
+
+
+def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: torch.device) -> str:
+    """Return a log line about the expected speed of a training of `photos` iterations on `count` ranks."""
+    if device.type == "cpu":
+        shared = f"{count} processes share this machine's {thread_count() * count} threads"
+        return f"plan: ranks: {shared}: no faster than one"
+    step = step_seconds(pixels, gaussians)
+    alone, together = photos * step, photos / count * (step + exchange_seconds(gaussians, count))
+    estimate = (
+        f"an estimated {alone / together:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
+    )
+    if alone < together + START_SECONDS:
+        estimate = f"about {alone:.1g} s of steps are too few to gain by more processes ({estimate})"
+    return f"plan: ranks: {count} GPUs, a photo each in a step: {estimate}"
 
 
 def training_cost(work: Workload, gpus: int = 1, nodes: int = 1) -> Cost:

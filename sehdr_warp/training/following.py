@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from ..errors import InputError, SehdrError
@@ -15,9 +14,9 @@ from ..runs.open import load_scene_and_log_notes
 from ..runs.run import exposure_compensation, field_from_checkpoint
 from ..runs.run_folder import describe_scene, scene_difference
 from ..runs.values import LoadArguments
-from ..scene import Scene, View
+from ..scene import Scene
 from ..scene.exposure_compensation import ExposureCompensation
-from .plan import gain_of_ranks
+from .cost import gain_of_ranks
 from .ranks import Ranks
 from .trainer import Trainer
 from .training_state import TrainingState, load_state, state_of
@@ -126,13 +125,10 @@ def _training_part(scene: Scene) -> Scene:
 
 def _bytes_of(scene: Scene) -> int:
     """Return about how many bytes the arrays of a scene take."""
-    photos = [array for view in scene.views for array in _arrays(view) if array is not None]
-    return sum(array.nbytes + 64 for array in (*photos, scene.points, scene.point_colors))
-
-
-def _arrays(view: View) -> tuple[np.ndarray | None, ...]:
-    """Return the arrays of a view."""
-    return view.codes, view.mask, view.hdr, view.light_above_white
+    arrays = [scene.points, scene.point_colors]
+    for view in scene.views:
+        arrays += [view.codes, view.mask, view.hdr, view.light_above_white]
+    return sum(array.nbytes + 64 for array in arrays if array is not None)
 
 
 def _check_same_photos(ranks: Ranks, shared: SharedTraining, scene: Scene) -> None:
@@ -141,5 +137,5 @@ def _check_same_photos(ranks: Ranks, shared: SharedTraining, scene: Scene) -> No
     name = shared.scene["name"]
     difference = scene_difference(shared.scene, describe_scene(replace(scene, name=name)))
     if difference is not None:
-        problem = f"{ranks.info} reads other photos than rank 0: {difference} differ"
+        problem = f"{ranks.info} reads other photos than rank 0: {difference.what} differ"
         raise InputError(scene.name, problem, "copy the same set to all nodes, or use a shared file system")

@@ -80,16 +80,8 @@ def make_field(
 ) -> RadianceField:
     """Return the field at iteration 0, in the normalized coordinates of the scene.
 
-    Args:
-        scene: in its own coordinates.
-        config: of the training.
-        response: of the camera.
-        device: that the field is on.
-        get_matcher: returns the matcher of the photos, in normalized coordinates.
-        time: exposure time that colors refer to, seconds; by default base_time().
-
-    Raises:
-        InputError: for a scene that cannot be trained.
+    The scene is in its own coordinates, the matcher of its photos in normalized ones. `time` is the exposure time that
+    colors refer to, seconds, by default base_time(). Raises InputError for a scene that cannot be trained.
     """
     check_views(scene)
     time = time or base_time(scene)

@@ -44,10 +44,8 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
     """Apply torch's settings for a training within this block.
 
     torch runs on one thread, so that its sums do not depend on the number of cores; this costs nothing, because the
-    kernels have their own threads, and the interpreter's lock is handed over sooner.
-
-    Args:
-        deterministic: Also give sums on a GPU a fixed order.
+    kernels have their own threads, and the interpreter's lock is handed over sooner. If `deterministic`, sums on a GPU
+    have a fixed order too.
     """
     threads, ordered = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     memory: Any = torch.utils.deterministic

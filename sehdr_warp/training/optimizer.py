@@ -78,17 +78,8 @@ def guarded_step(
 
     The decision is applied on the device, without waiting for it.
 
-    Args:
-        optimizer: The optimizer.
-        loss: Scalar loss.
-        overflow: Scalar bool, whether there were more intersections than memory.
-        harmonics: Gradients of the harmonics in factored form.
-        step_counters: As in decide_step().
-        intersections: As in decide_step().
-        active_count: As in Adam.step().
-
-    Returns:
-        A scalar float tensor: 1 if the step was applied, else 0.
+    Arguments are those of decide_step() and Adam.step(). Returns a scalar float tensor: 1 if the step was applied, else
+    0.
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     gradients += [] if harmonics is None else [harmonics.grad_colors]
@@ -101,9 +92,6 @@ class FlatGradients:
     """The gradients of all parameters of an optimizer in one buffer, which ranks exchange.
 
     Behind them are two numbers of the step: its loss, and whether there were more intersections than memory.
-
-    Attributes:
-        buffer: The buffer.
     """
 
     def __init__(self, optimizer: Adam, rank: int, count: int, *, defer_sh: bool):

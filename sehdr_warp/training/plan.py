@@ -18,7 +18,7 @@ from ..runs.config_files import as_config, override_config
 from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.photos import FEWEST_PHOTOS
-from .cost import CPU_GAUSSIAN, CPU_PIXEL, START_SECONDS, exchange_seconds, step_seconds
+from .cost import CPU_GAUSSIAN, CPU_PIXEL
 from .initialization import base_time, start_count
 from .scene_facts import SceneFacts, largest_hdr_truth, measure_scene
 from .strategies import mcmc_cap
@@ -80,10 +80,6 @@ class Plan:
     facts: SceneFacts
     decisions: tuple[Decision, ...]
     user_fields: dict[str, object]
-
-    def with_decision(self, decision: Decision) -> "Plan":
-        """Return the plan with one more decision."""
-        return replace(self, decisions=(*self.decisions, decision))
 
     def to_dict(self) -> dict:
         """Return plain values for plan.json and --json."""
@@ -168,21 +164,6 @@ def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Conf
         return plan.config, plan
     check_fields(scene, config)
     return config, None
-
-
-def gain_of_ranks(count: int, gaussians: int, pixels: int, photos: int, device: torch.device) -> str:
-    """Return a log line about the expected speed of a training of `photos` iterations on `count` ranks."""
-    if device.type == "cpu":
-        shared = f"{count} processes share this machine's {thread_count() * count} threads"
-        return f"plan: ranks: {shared}: no faster than one"
-    step = step_seconds(pixels, gaussians)
-    alone, together = photos * step, photos / count * (step + exchange_seconds(gaussians, count))
-    estimate = (
-        f"an estimated {alone / together:.1f} times one for {gaussians} Gaussians and {pixels / 1e6:.2g} megapixels"
-    )
-    if alone < together + START_SECONDS:
-        estimate = f"about {alone:.1g} s of steps are too few to gain by more processes ({estimate})"
-    return f"plan: ranks: {count} GPUs, a photo each in a step: {estimate}"
 
 
 def check_scene(scene: Scene, facts: SceneFacts) -> None:

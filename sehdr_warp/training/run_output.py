@@ -34,20 +34,12 @@ MAX_DB = 100.0  # Score of identical images, so that a mean over views is finite
 
 
 class RunOutput:
-    """Evaluates, logs and saves a training.
-
-    Attributes:
-        folder: The run folder.
-    """
+    """Evaluates, logs and saves a training."""
 
     def __init__(self, folder: RunWriter, config: Config, *, tensorboard: bool = False, is_block: bool = False):
-        """Prepare to write to a run folder, which need not exist yet.
+        """Prepare to write to a run folder, which need not exist yet, and event files if `tensorboard`.
 
-        Args:
-            folder: The run folder.
-            config: Options of the training.
-            tensorboard: Write event files.
-            is_block: The run is a block of a larger one, whose photos are not compared with it at the end.
+        The photos of a block of a larger run (`is_block`) are not compared with it at the end.
         """
         self.folder, self._is_block = folder, is_block
         total = config.schedule.iterations
@@ -67,7 +59,7 @@ class RunOutput:
         return self._run
 
     def after_step(self, trainer: Trainer) -> None:
-        """Evaluate held-out views, write a checkpoint and log, each if it is due; after the last step finish() does."""
+        """Evaluate held-out views, write a checkpoint and log, each if it is due. The last step's are in save_end()."""
         iteration = trainer.iteration
         evaluate = not self._evaluate_at.isdisjoint(range(iteration - trainer.step_batch + 1, iteration + 1))
         evaluate &= iteration < trainer.total

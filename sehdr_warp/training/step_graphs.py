@@ -17,7 +17,7 @@ from ..rasterizer import CudaGraphRunner
 from ..rasterizer.memory import failed_allocation
 from .gradient_step import GradientStep, GraphKey, StepOptions, StepResult
 from .targets import ViewStack
-from .training_views import PhotoStream, Views
+from .training_views import PhotoStream, ViewSource
 
 HEADROOM = 1.25  # Capacity as a multiple of the largest count; the photos of a scene differ by a factor of up to 1.32
 MIN_HEADROOM = 1.08  # After densification, a capacity below this multiple of the expected count is replaced
@@ -48,10 +48,12 @@ class StepGraphs:
         self._index = torch.zeros(1, dtype=torch.int64, device=device)
         self._eager_keys: set[GraphKey] = set()
 
-    def run(self, views: Views, index: int, following: int | None, options: StepOptions, iteration: int) -> StepResult:
+    def run(
+        self, views: ViewSource, index: int, following: int | None, options: StepOptions, iteration: int
+    ) -> StepResult:
         """Do GradientStep.run() on view `index`; view `following` is fetched meanwhile if photos are streamed."""
         step, gaussians = self._step, self._step.field.gaussians
-        # Gaussians.surround() has reserved rows for another purpose.
+        # Not if Gaussians.surround() has, for those that are rendered but not trained.
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
             self._reserve_rows(iteration)
         step.prepare(options)
@@ -66,7 +68,7 @@ class StepGraphs:
             self._eager_keys.add(key)
         return result
 
-    def can_replay(self, views: Views, key: GraphKey | None) -> TypeGuard[ViewStack | PhotoStream]:
+    def can_replay(self, views: ViewSource, key: GraphKey | None) -> TypeGuard[ViewStack | PhotoStream]:
         """Return whether a step can be a graph: its photo is selected by an index on the device, and its kernels ran.
 
         A kernel must have been compiled before it is captured, so the first step of a key runs kernel by kernel.
@@ -117,10 +119,7 @@ class StepGraphs:
     def adapt(self, count: int, reallocations: int, iteration: int) -> None:
         """Adapt rows, capacity and graphs after Gaussians were added or removed.
 
-        Args:
-            count: Number of Gaussians before.
-            reallocations: Gaussians.reallocations before.
-            iteration: Iterations done.
+        `count` and `reallocations` are those of the Gaussians before.
         """
         gaussians = self._step.field.gaussians
         if self.reserves_rows:
@@ -154,16 +153,14 @@ class StepGraphs:
 
 
 class GraphCapacity:
-    """Chooses the intersection capacity of the next capture from counts that steps keep on the device.
-
-    Attributes:
-        step_counters: As in GradientStep.
-    """
+    """Chooses the intersection capacity of the next capture from counts that steps keep on the device."""
 
     def __init__(self, step_counters: Tensor):
-        """Start without counts."""
+        """Start without counts; step_counters as in GradientStep."""
         self.step_counters = step_counters
-        self._intersections = self._capacity = self._largest = 0
+        self._expected = 0  # Intersections of the next photos, at most
+        self._counted = 0  # The most that a step had before the last poll()
+        self._capacity = 0  # Of the captured graphs; 0 chooses anew
         self._host_counters, self._copied = self.step_counters, None
         if self.step_counters.device.type == "cuda":
             self._host_counters = torch.zeros(3, dtype=torch.int64, pin_memory=True)
@@ -172,15 +169,15 @@ class GraphCapacity:
     @property
     def has_counts(self) -> bool:
         """True if observe() has recorded a step."""
-        return self._intersections > 0
+        return self._expected > 0
 
     def observe(self, intersections: int) -> None:
         """Record the exact number of intersections of a step."""
-        self._intersections = max(self._intersections, intersections)
+        self._expected = max(self._expected, intersections)
 
     def capacity(self) -> int:
         """Return the capacity for the step that is captured or replayed now; it stays until poll() or rescale()."""
-        self._capacity = self._capacity or max(MIN_CAPACITY, math.ceil(HEADROOM * self._intersections))
+        self._capacity = self._capacity or max(MIN_CAPACITY, math.ceil(HEADROOM * self._expected))
         return self._capacity
 
     def poll(self, *, wait: bool = True) -> tuple[int, bool]:
@@ -199,28 +196,24 @@ class GraphCapacity:
             skipped, needed, _ = self._host_counters.tolist()
             self._host_counters.copy_(self.step_counters, non_blocking=True)
             self._copied.record(torch.cuda.current_stream(self.step_counters.device))
-        self._largest = needed
+        self._counted = needed
         if not 0 < self._capacity < needed:
             return skipped, False
-        self._intersections, self._capacity = needed, 0
+        self._expected, self._capacity = needed, 0
         return skipped, True
 
     def rescale(self, growth: float, *, same_memory: bool) -> bool:
         """Adapt the capacity after densification changed the count by the factor `growth`.
 
-        Args:
-            growth: New count over the old.
-            same_memory: Whether the Gaussians stayed in the same memory, so that captured graphs are still valid.
-
-        Returns:
-            True if the current capacity, and with it the captured graphs, can be kept.
+        Returns whether the current capacity, and with it the captured graphs, can be kept: only if the Gaussians stayed
+        in the same memory.
         """
-        needed = self._largest or int(self.step_counters[1]) or self._intersections
+        needed = self._counted or int(self.step_counters[1]) or self._expected
         # The lower bound does not grow: new Gaussians are small, so intersections grow more slowly than the count.
-        self._intersections = math.ceil(max(needed * growth, MIN_SHRINK * self._intersections))
+        self._expected = math.ceil(max(needed * growth, MIN_SHRINK * self._expected))
         self.step_counters[1].zero_()
-        self._largest = 0
-        if same_memory and self._capacity >= MIN_HEADROOM * self._intersections:
+        self._counted = 0
+        if same_memory and self._capacity >= MIN_HEADROOM * self._expected:
             return True
         self._capacity = 0
         return False

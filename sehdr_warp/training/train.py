@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -150,7 +151,7 @@ def _new_trainer(
         brighten_clipped(field, normalization.scene(prepared.scene).train_views, light)
     trainer.seconds = seconds + time.perf_counter() - started
     if plan is not None and prepared.decision is not None:
-        plan = plan.with_decision(prepared.decision)
+        plan = replace(plan, decisions=(*plan.decisions, prepared.decision))
     # The folder is begun last, when the scene is known to be usable.
     plan_values, state = None if plan is None else plan.to_dict(), state_of(trainer)
     folder.begin(

@@ -91,15 +91,10 @@ class Trainer:
         ranks: Ranks | None = None,
         output: RunOutput | None = None,
     ):
-        """Prepare a training; create_trainer() does this for a scene and a run folder.
+        """Prepare a training on the device of the field; create_trainer() does this for a scene and a run folder.
 
-        Args:
-            scene: Scene with at least two training views.
-            config: Options of the training, after the plan.
-            field: Field at iteration 0, on the device to train on.
-            get_matcher: Returns the matcher of the training photos that seeding uses, created at the first call.
-            ranks: Processes that train together.
-            output: Run folder to evaluate, log and save to; None to save nothing.
+        `config` is that after the plan. get_matcher() returns the matcher of the training photos that seeding uses,
+        by default a new one. `ranks` train together.
         """
         self.scene, self.config, self.field, self.ranks, self.output = scene, config, field, ranks, output
         rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)

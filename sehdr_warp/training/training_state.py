@@ -15,14 +15,10 @@ if TYPE_CHECKING:
 
 
 class TrainingState(NamedTuple):
-    """Everything that determines the next step of a training.
+    """Everything that determines the next step of a training, as named tensors and plain values.
 
     On the CPU a training that continues from it repeats an uninterrupted one bit for bit. No global random state is
     used.
-
-    Attributes:
-        tensors: Named tensors.
-        values: Plain values.
     """
 
     tensors: dict[str, Tensor]

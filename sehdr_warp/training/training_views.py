@@ -80,27 +80,6 @@ class PhotoOrder:
             raise ValueError(f"the order of the photos names others than the {self._count} there are")
 
 
-def make_view_source(source: PhotoSource, where: str, use_cuda_graph: bool) -> "Views":
-    """Return the views of a source in the form that steps take, captured as CUDA graphs or not.
-
-    `where` is the value of schedule.photo_cache.
-    """
-    device = torch.device(source.device)
-    if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
-        return source
-    limit = MAX_MEMORY_PART * torch.cuda.mem_get_info(device)[0]
-    if where in ("memory", "disk") or (where == "auto" and source.bytes > limit):
-        log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", source.bytes / 1e9, device)
-        try:
-            return PhotoStream(source) if use_cuda_graph else source
-        except ValueError as error:
-            log.info("%s: they are copied one by one, and steps are not captured as CUDA graphs", error)
-            return source
-    views = list(source)
-    # Only captured steps need all photos in one tensor.
-    return (ViewStack.of(views) if use_cuda_graph else None) or views
-
-
 class PhotoStream:
     """A replacement of ViewStack with SLOTS photos on the device.
 
@@ -222,8 +201,8 @@ class PhotoStream:
         return arrays
 
 
-Views = ViewStack | PhotoStream | Sequence[TrainingView]
-"""Source that steps select views from: a ViewStack if all photos are on a GPU, a PhotoStream if they are streamed to
+ViewSource = ViewStack | PhotoStream | Sequence[TrainingView]
+"""What steps take views from by number: a ViewStack if all photos are on a GPU, a PhotoStream if they are streamed to
 it, a PhotoSource on a CPU; a PhotoSource or a list on a GPU without CUDA graphs."""
 
 
@@ -258,9 +237,22 @@ class TrainingViews:
             self._photos.scale.use_intervals()
 
     @cached_property
-    def source(self) -> Views:
+    def source(self) -> ViewSource:
         """The views that a step selects from: on the device, or in a source that uploads them one by one."""
-        return make_view_source(self._photos, self._config.schedule.photo_cache, self._use_cuda_graph)
+        photos, where, device = self._photos, self._config.schedule.photo_cache, torch.device(self._photos.device)
+        if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
+            return photos
+        limit = MAX_MEMORY_PART * torch.cuda.mem_get_info(device)[0]
+        if where in ("memory", "disk") or (where == "auto" and photos.bytes > limit):
+            log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", photos.bytes / 1e9, device)
+            try:
+                return PhotoStream(photos) if self._use_cuda_graph else photos
+            except ValueError as error:
+                log.info("%s: they are copied one by one, and steps are not captured as CUDA graphs", error)
+                return photos
+        views = list(photos)
+        # Only captured steps need all photos in one tensor.
+        return (ViewStack.of(views) if self._use_cuda_graph else None) or views
 
     @cached_property
     def _photos(self) -> PhotoSource:

@@ -157,7 +157,7 @@ def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capf
 
     assert "exists and is not empty" in line("--out", merged, "--blocks", "2")
     assert "has 2 blocks, but 3 were asked for" in line("--out", merged, "--blocks", "3", "--resume", *FLAGS)
-    assert "schedule = " in line("--out", merged, "--resume", "--iterations", "999", "--preset", "fast")
+    assert "schedule.iterations = " in line("--out", merged, "--resume", "--iterations", "999", "--preset", "fast")
     assert "too few for 9 blocks" in line("--out", tmp_path / "run", "--blocks", "9")
     assert "--blocks with fusion.enabled" in refused(
         capfd,

@@ -139,9 +139,8 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
     for known, line_count in ((False, 1), (True, 0)):
         plan = make_plan(replace(drifting, exposure_times_known=known), config_of())
-        with_gains = plan.with_decision(
-            Decision({}, "taken out of the photos", "", "exposure-compensation", always_log=True)
-        )
+        gains = Decision({}, "taken out of the photos", "", "exposure-compensation", always_log=True)
+        with_gains = replace(plan, decisions=(*plan.decisions, gains))
         for case, count in ((plan, line_count), (with_gains, 0)):
             lines = [line for line in case.lines() if "no exposure times" in line and "exposures.json" in line]
             assert len(lines) == count
