@@ -21,7 +21,7 @@ from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene, codes_of, load_scene
-from sehdr_warp.scene.raw import linear_codes
+from sehdr_warp.scene.raw.decode import linear_codes
 from sehdr_warp.synth.expose import SensorNoise, exposure_ladder, noisy
 from sehdr_warp.training.train import train
 

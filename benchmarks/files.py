@@ -17,9 +17,9 @@ import torch
 
 import sehdr_warp as sw
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.camera_paths import common_focus, evenly, training_cameras
-from sehdr_warp.output.export import export
-from sehdr_warp.output.proxy_mesh import proxy_mesh
+from sehdr_warp.output.cameras.paths import common_focus, evenly, training_cameras
+from sehdr_warp.output.export.gaussians import export
+from sehdr_warp.output.export.proxy_mesh import proxy_mesh
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.world_transform import WorldTransform, file_transform, read_direction, world_transform
 from sehdr_warp.response import response_by_name

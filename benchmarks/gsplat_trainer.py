@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sehdr_warp.model.gaussians import Gaussians
-from sehdr_warp.rasterizer.ssim import image_distance
+from sehdr_warp.rasterizer.losses.ssim import image_distance
 from sehdr_warp.scene import Camera, Scene
 from sehdr_warp.training.initialization import random_points
 

@@ -12,9 +12,9 @@ import torch
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.baking import sphere_directions
 from sehdr_warp.model.lights import LightShape
-from sehdr_warp.output.environment_map import latlong, solid_angles
+from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
 from sehdr_warp.scene import Camera
-from sehdr_warp.scene.hdr_files import read_exr_channels
+from sehdr_warp.scene.images.hdr_files import read_exr_channels
 
 FOLDER = "light"
 LIGHT = "light.npz"

@@ -7,8 +7,8 @@ from itertools import product
 import torch
 
 from sehdr_warp.kernels.constants import TILE_SIZE
-from sehdr_warp.rasterizer.cuda_graphs import CudaGraphRunner
-from sehdr_warp.rasterizer.graph_cache import WARMUP_CALLS, clear_graphs
+from sehdr_warp.rasterizer.cuda_graphs.cache import WARMUP_CALLS, clear_graphs
+from sehdr_warp.rasterizer.cuda_graphs.runner import CudaGraphRunner
 from sehdr_warp.rasterizer.rasterization import rasterize
 from sehdr_warp.rasterizer.reference import rasterize_reference
 

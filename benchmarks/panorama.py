@@ -19,12 +19,12 @@ from scenes.generator.render import _sensor, load_mitsuba
 from scenes.generator.stage import Stage
 from sehdr_warp.evaluation.metrics import mu_law
 from sehdr_warp.model.baking import sphere_directions
-from sehdr_warp.output.environment_map import latlong, solid_angles, write_environment_map
+from sehdr_warp.output.lighting.environment_map import latlong, solid_angles, write_environment_map
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 from sehdr_warp.synth.expose import ladder_of
 from sehdr_warp.training.plan import PRUNE_NEAR_ANGLE
 from sehdr_warp.training.train import train

@@ -23,7 +23,7 @@ from PIL import Image
 
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.files import write_json
-from sehdr_warp.output.ultra_hdr import MOST_STOPS, jpeg_with_gain_map, ultra_hdr
+from sehdr_warp.output.images.ultra_hdr import MOST_STOPS, jpeg_with_gain_map, ultra_hdr
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import load_scene

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import NullLocator
 
-from sehdr_warp.output.charts import COLORS, RULE
+from sehdr_warp.output.report.charts import COLORS, RULE
 
 from .report_tables import median_of_runs
 from .results import groups

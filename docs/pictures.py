@@ -16,10 +16,10 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
 import sehdr_warp as sw
-from sehdr_warp.output.camera_paths import interpolate
-from sehdr_warp.output.comparison import compare, darker_stops
-from sehdr_warp.output.images import as_array, quantize
-from sehdr_warp.output.tonemap import expose as expose_light
+from sehdr_warp.output.cameras.paths import interpolate
+from sehdr_warp.output.images.ldr_files import as_array, quantize
+from sehdr_warp.output.images.tonemap import expose as expose_light
+from sehdr_warp.output.report.comparison import compare, darker_stops
 from sehdr_warp.synth.expose import expose, exposure_ladder
 
 PICTURES = Path(__file__).parent / "images"

@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image
 
 import sehdr_warp as sw
-from sehdr_warp.output.environment_map import latlong
-from sehdr_warp.output.exr import write_exr
-from sehdr_warp.output.tonemap import encode_srgb
+from sehdr_warp.output.images.exr import write_exr
+from sehdr_warp.output.images.tonemap import encode_srgb
+from sehdr_warp.output.lighting.environment_map import latlong
 from sehdr_warp.scene import look_at
 
 PLACE = np.array([0.0, 0.1, 0.3])

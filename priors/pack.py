@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.study import run
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 
 from .panoramas import ROOM_SIZE, WIDTH, half_size, listed_sources, to_rgbe, write_pack
 

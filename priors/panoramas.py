@@ -87,7 +87,7 @@ def read_pack(path: Path) -> Pack:
 
 def pack_of_folder(folder: Path, pack: Pack) -> Pack:
     """Return a pack of the panoramas of a folder, .hdr and .exr, as a packed file would hold them, with pack's rest."""
-    from sehdr_warp.scene.hdr_files import read_hdr
+    from sehdr_warp.scene.images.hdr_files import read_hdr
 
     files = sorted(file for file in folder.iterdir() if file.suffix in (".hdr", ".exr"))
     panoramas = np.stack([from_rgbe(to_rgbe(half_size(read_hdr(file), WIDTH))) for file in files])

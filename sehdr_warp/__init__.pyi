@@ -5,16 +5,16 @@ from .evaluation.compare import compare_runs
 from .evaluation.evaluate import evaluate
 from .evaluation.folder import evaluate_folder
 from .output.brackets import write_brackets
-from .output.environment_map import write_environment_map
-from .output.export import export
+from .output.export.gaussians import export
+from .output.export.proxy_mesh import write_proxy_mesh
+from .output.export.splat_edits import SplatEdits
 from .output.film import write_film
-from .output.lights import write_lights
+from .output.lighting.environment_map import write_environment_map
+from .output.lighting.lights import write_lights
 from .output.merged_scene import MergedScene, merge_scenes
-from .output.proxy_mesh import write_proxy_mesh
 from .output.render_views import render_views, select_cameras
-from .output.report import write_report
+from .output.report.write import write_report
 from .output.scene_page import write_scene_page
-from .output.splat_edits import SplatEdits
 from .output.world_transform import write_orientation
 from .rasterizer import Rendering, differentiable, rasterize, rasterize_directions, spherical_harmonics, ssim
 from .response import Response, response_by_name, response_names
@@ -22,7 +22,7 @@ from .runs.config import Config
 from .runs.config_files import load_config, preset_names
 from .runs.run import Run, Splats, load_run, load_splats
 from .scene import Camera, Scene, View, embedded_scenes, load_cameras, load_scene
-from .scene.exposure_stack import calibrate
+from .scene.exposure.stack import calibrate
 from .training.initialization import match_points
 from .training.plan import Plan, make_plan
 from .training.train import create_trainer, train

@@ -41,9 +41,9 @@ COMMANDS = {
         "envmap": Command("output.commands", "EnvironmentMap", "run_environment_map"),
         "lights": Command("output.commands", "Lights", "run_lights"),
         "meter": Command("output.commands", "Meter", "run_meter"),
-        "export": Command("output.splat_commands", "Export", "run_export"),
-        "mesh": Command("output.splat_commands", "Mesh", "run_mesh"),
-        "convert": Command("output.splat_commands", "Convert", "run_convert"),
+        "export": Command("output.export.commands", "Export", "run_export"),
+        "mesh": Command("output.export.commands", "Mesh", "run_mesh"),
+        "convert": Command("output.export.commands", "Convert", "run_convert"),
     },
     "choose and calibrate": {
         "presets": Command("runs.commands", "Presets", "run_presets"),

@@ -4,7 +4,7 @@ import tyro
 from sehdr_warp.arguments import parse
 from sehdr_warp.errors import UsageError
 from sehdr_warp.output.commands import Render
-from sehdr_warp.output.splat_commands import Convert
+from sehdr_warp.output.export.commands import Convert
 
 
 def test_a_signal_while_flags_are_read_ends_the_program(monkeypatch):

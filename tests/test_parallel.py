@@ -71,7 +71,7 @@ IMPORTS = """
 import os, signal, sys
 from sehdr_warp.process import prepare
 prepare()
-from sehdr_warp.scene.sfm import quiet_colmap
+from sehdr_warp.scene.sfm.reconstruction import quiet_colmap
 with quiet_colmap():
     os.kill(os.getpid(), signal.SIGTERM)
 """

@@ -11,8 +11,8 @@ from sehdr_warp.model.color_models import EXPOSURE_FLOOR
 from sehdr_warp.model.fusion import NeuralExposureFusion
 from sehdr_warp.model.renders import TrainRender
 from sehdr_warp.rasterizer import ssim
-from sehdr_warp.rasterizer.exposure_fusion import fusion_weights
-from sehdr_warp.rasterizer.photo_loss import ClippedWeights, clipped_light_energy
+from sehdr_warp.rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy
+from sehdr_warp.rasterizer.ops.exposure_fusion import fusion_weights
 from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response.table import TabulatedResponse
 from sehdr_warp.runs.config import LossConfig

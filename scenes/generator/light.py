@@ -13,10 +13,10 @@ import numpy as np
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import read_json
-from sehdr_warp.output.environment_map import envmap
-from sehdr_warp.output.exr import exr_header, rgb_channels, write_exr
+from sehdr_warp.output.images.exr import exr_header, rgb_channels, write_exr
+from sehdr_warp.output.lighting.environment_map import envmap
 from sehdr_warp.scene import Camera
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 from sehdr_warp.synth.expose import truth_path
 
 from .recipes import Recipe, make_cameras, split_of

@@ -16,9 +16,9 @@ import numpy as np
 from sehdr_warp import __version__
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import atomic_path, write_json
-from sehdr_warp.output.exr import exr_header
+from sehdr_warp.output.images.exr import exr_header
 from sehdr_warp.scene import Camera
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 from sehdr_warp.synth.expose import RadianceView, truth_path, write_radiance
 
 from .recipes import VIEWS, Recipe, make_cameras, split_of

@@ -13,7 +13,7 @@ import numpy as np
 from sehdr_warp.errors import InputError
 from sehdr_warp.files import atomic_folder, read_json, write_json
 from sehdr_warp.scene.dataparser import DERIVED_PHOTOS, reinhard_gamma
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 from sehdr_warp.synth.expose import RadianceView, ladder_of, write_radiance, write_tables
 
 # Below half's 65504 by more than a lossy file errs.

@@ -24,7 +24,7 @@ from ..runs.config_files import config_from_dict, field_and_problem, override_co
 from ..runs.open import load_scene_and_log_notes
 from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationValues
 from ..scene import Scene, View
-from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.normalization import Normalization, normalization_of
 from ..subsets import every_nth
 from ..training.compensation import SharedDecisions, estimate_compensation, estimates_compensation

@@ -137,7 +137,7 @@ def _evaluate_pictures(options: Evaluate, truth_path: str) -> dict[str, Any]:
 def run_compare(options: Compare) -> None:
     """Print the table and write the files that are asked for."""
     from ..files import atomic_path, check_absent
-    from ..output.charts import save_picture, training_chart
+    from ..output.report.charts import save_picture, training_chart
     from .compare import compare_runs, comparison_csv, comparison_latex, comparison_table
 
     if options.plot is not None and options.plot.suffix.lower() != ".png":

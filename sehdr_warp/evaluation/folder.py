@@ -7,9 +7,9 @@ from typing import Any
 import torch
 
 from ..errors import InputError, refuse_paths
-from ..output.images import safe_names
+from ..output.images.ldr_files import safe_names
 from ..scene import Scene
-from ..scene.hdr_files import read_hdr
+from ..scene.images.hdr_files import read_hdr
 from ..subsets import first_names
 from .evaluate import Evaluation, Predictions
 

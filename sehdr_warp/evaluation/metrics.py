@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..rasterizer.ssim import ssim_map
+from ..rasterizer.losses.ssim import ssim_map
 
 CLIPPED_CODE = 250
 """A pixel of a photo is clipped if a channel reaches this code of 255, because JPEG changes 255 by a few codes."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..rasterizer import HarmonicsGradients
-from ..rasterizer.step_updates import AdamStep, StepFlags, adam_steps, harmonics_adam_step
+from ..rasterizer.ops.step_updates import AdamStep, StepFlags, adam_steps, harmonics_adam_step
 from .gaussians import PARAMETER_NAMES
 
 FIRST_HARMONIC = {"harmonics_dc": 0, "harmonics_rest": 1}

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import hardtanh
 
-from ..rasterizer.activations import bounded_exponential
+from ..rasterizer.ops.activations import bounded_exponential
 from ..response import Response
 
 EXPOSURE_FLOOR = 1e-6  # Smallest exposure of the linear model, so that logs are finite; 0.01 of 8-bit black in sRGB

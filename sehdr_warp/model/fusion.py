@@ -13,9 +13,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from ..rasterizer.cuda_graphs import is_capturing
-from ..rasterizer.exposure_fusion import fuse_exposures
-from ..rasterizer.interpolation import interpolate
+from ..rasterizer.cuda_graphs.runner import is_capturing
+from ..rasterizer.ops.exposure_fusion import fuse_exposures
+from ..rasterizer.ops.interpolation import interpolate
 from ..response.curve import Response
 from .exposure import bracket_log_radiance
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_harmonics
-from ..rasterizer.cuda_graphs import without_replays
+from ..rasterizer.cuda_graphs.runner import without_replays
 from ..response import Response
 from ..scene import Camera
 from ..scene.normalization import Normalization

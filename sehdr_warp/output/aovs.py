@@ -12,8 +12,8 @@ import numpy as np
 from ..errors import SehdrError, did_you_mean
 from ..scene import Camera
 from ..scene.wide_camera import pixel_directions
-from .exr import Part, as_data
-from .images import as_array
+from .images.exr import Part, as_data
+from .images.ldr_files import as_array
 from .world_transform import WorldTransform
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from ..files import atomic_folder, atomic_path, remove, write_json
 from ..model.exposure import Exposure, Items, read_exposures
 from ..own_files import is_own
 from ..scene import Camera
-from .colorspace import color_space, from_rec709
-from .exr import (
+from .images.colorspace import color_space, from_rec709
+from .images.exr import (
     PAST_HALF,
     Part,
     check_finite,
@@ -29,7 +29,7 @@ from .exr import (
     stored_pixel_type,
     write_multipart_exr,
 )
-from .images import exposure_exif, quantize, safe_names, write_picture
+from .images.ldr_files import exposure_exif, quantize, safe_names, write_picture
 
 log = logging.getLogger(__name__)
 LDR_FORMATS = ("jpeg", "png", "png16")

@@ -217,7 +217,7 @@ class Meter:
 
 def run_meter(args: Meter) -> None:
     """Run `sehdr-warp meter`."""
-    from .light_unit import meter, read_light_unit
+    from .lighting.unit import meter, read_light_unit
 
     run = open_run(args.run, args.device)
     if args.view is None:
@@ -237,9 +237,9 @@ def run_meter(args: Meter) -> None:
 
 def run_lights(args: Lights) -> None:
     """Run `sehdr-warp lights`."""
-    from .light_unit import luminance_of_one
-    from .lights import lights_table, write_lights
-    from .map_center import check_place
+    from .lighting.lights import lights_table, write_lights
+    from .lighting.map_center import check_place
+    from .lighting.unit import luminance_of_one
     from .world_transform import world_transform
 
     if args.out is None:
@@ -259,12 +259,12 @@ def run_lights(args: Lights) -> None:
 
 def run_environment_map(args: EnvironmentMap) -> None:
     """Run `sehdr-warp envmap`."""
-    from .colorspace import color_space
-    from .map_center import check_place
+    from .images.colorspace import color_space
+    from .lighting.map_center import check_place
 
     color_space(args.colorspace)  # Before anything is loaded
     check_place(args.at)
-    from .environment_map import check_map, write_environment_map
+    from .lighting.environment_map import check_map, write_environment_map
 
     check_map(args.out, args.size, args.layout, args.world.axes, args.beyond, args.pixel)
     options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
@@ -273,7 +273,7 @@ def run_environment_map(args: EnvironmentMap) -> None:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
-    from .colorspace import color_space
+    from .images.colorspace import color_space
 
     color_space(args.pictures.colorspace)  # Before anything is loaded
     from .aovs import read_aovs
@@ -351,7 +351,7 @@ def _ramp(text: str | None) -> tuple[float, float]:
 def run_report(args: Report) -> None:
     """Run `sehdr-warp report`."""
     from ..evaluation.evaluate import evaluate
-    from .report import check_report_folder, write_report
+    from .report.write import check_report_folder, write_report
 
     check_absent(args.out / "report.html", args.overwrite)
     check_report_folder(args.out)

@@ -18,10 +18,10 @@ from ..errors import InputError, SehdrError, refuse_paths, require_extra
 from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
-from .colorspace import color_space, matrix_to
-from .images import as_array
+from .images.colorspace import color_space, matrix_to
+from .images.ldr_files import as_array
+from .images.tonemap import display_gain, encode_srgb
 from .render_views import shared_tone_map
-from .tonemap import display_gain, encode_srgb
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene

@@ -14,8 +14,8 @@ from PIL import Image
 from ..model.color_models import rec709_of
 from ..scene import View
 from .html import EMPTY, data_block, join, markup
-from .images import as_array, quantize
-from .tonemap import display_gain, encode_srgb
+from .images.ldr_files import as_array, quantize
+from .images.tonemap import display_gain, encode_srgb
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene

@@ -13,7 +13,7 @@ from ..model.baking import field_of, gaussians_of
 from ..runs.run import RenderableScene, on_device
 from ..splats import GaussianArrays
 from ..splats.arrays import join_gaussians
-from .camera_paths import training_cameras
+from .cameras.paths import training_cameras
 from .world_transform import WorldTransform, from_photos
 
 

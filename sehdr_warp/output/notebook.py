@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .html import duration, markup, page_file, whole_page
-from .images import as_array
+from .images.ldr_files import as_array
+from .images.tonemap import display_gain
 from .light_pictures import dial
-from .tonemap import display_gain
 
 if TYPE_CHECKING:
     from ..runs.run import Run

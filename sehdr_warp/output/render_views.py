@@ -16,22 +16,22 @@ from ..model.exposure import Items
 from ..progress import track_progress
 from ..scene import Camera
 from ..scene.camera import MAX_SIDE
-from ..scene.camera_exchange import EXCHANGE_SUFFIXES
-from ..scene.camera_files import read_camera_file
-from ..scene.images import MAX_PIXELS
+from ..scene.images.ldr_files import MAX_PIXELS
+from ..scene.readers.camera_exchange import EXCHANGE_SUFFIXES
+from ..scene.readers.camera_files import read_camera_file
 from ..splats import cameras_beside
 from ..subsets import first_names
 from .aovs import ViewImages, data_parts, read_aovs, render_images
 from .brackets import Brackets, PictureHeader, bracket_exposures, remove_earlier
-from .camera_exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
-from .camera_paths import evenly, interpolate, training_cameras
-from .colorspace import from_rec709
-from .exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
-from .framing import default_path, film_camera
-from .images import as_array, quantize, safe_names, write_picture
-from .light_unit import luminance_of_one, read_light_unit
-from .ocio import ocio_view
-from .tonemap import ToneMap, exposure_of_white, fit_tone_map
+from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
+from .cameras.framing import default_path, film_camera
+from .cameras.paths import evenly, interpolate, training_cameras
+from .images.colorspace import from_rec709
+from .images.exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
+from .images.ldr_files import as_array, quantize, safe_names, write_picture
+from .images.ocio import ocio_view
+from .images.tonemap import ToneMap, exposure_of_white, fit_tone_map
+from .lighting.unit import luminance_of_one, read_light_unit
 from .world_transform import WorldTransform, from_photos, stored_matrix, world_transform
 
 if TYPE_CHECKING:

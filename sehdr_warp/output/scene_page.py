@@ -20,12 +20,12 @@ from ..model.baking import field_of, gaussians_of
 from ..runs.run import Splats
 from ..scene import Camera
 from ..splats.arrays import HARMONIC_0
-from .camera_paths import facts_of_cameras, training_cameras
-from .framing import opening_facts
+from .cameras.framing import opening_facts
+from .cameras.paths import facts_of_cameras, training_cameras
+from .export.splat_edits import SplatEdits, most_visible, without_strays
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
+from .images.tonemap import display_gain
 from .light_pictures import curve_table
-from .splat_edits import SplatEdits, most_visible, without_strays
-from .tonemap import display_gain
 from .world_transform import WorldTransform, world_transform
 
 if TYPE_CHECKING:

@@ -1,12 +1,18 @@
-"""Differentiable splatting as torch operations of Warp kernels, and a bridge for kernels of users."""
+"""Differentiable splatting as torch operations of Warp kernels, and a bridge for kernels of users.
+
+- rasterization.py: rasterize(), by projection.py, tile_lists.py and blending.py. sphere.py: all directions of a point.
+- cuda_graphs/: renders that repeat, replayed. losses/: SSIM and residuals. ops/: other operations.
+- bridge.py, custom_ops.py, torch_contract.py: kernels of users, torch.compile, and what torch expects of an operation.
+- warp_launch/: launches of kernels on torch tensors.
+"""
 
 from . import custom_ops as custom_ops  # Registers what torch.compile calls in place of the operations.
 from .bridge import Program, differentiable
-from .cuda_graphs import CudaGraphRunner
-from .harmonics import HarmonicsGradients, spherical_harmonics
+from .cuda_graphs.runner import CudaGraphRunner
+from .losses.ssim import ssim, ssim_map
+from .ops.harmonics import HarmonicsGradients, spherical_harmonics
 from .rasterization import Rendering, rasterize
 from .sphere import rasterize_directions
-from .ssim import ssim, ssim_map
 
 __all__ = [
     "CudaGraphRunner",

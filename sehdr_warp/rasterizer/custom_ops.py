@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from ..kernels.constants import ALPHA_THRESHOLD, NEAR_PLANE
-from .harmonics import check_harmonics, spherical_harmonics
+from .losses.ssim import ssim, ssim_map
+from .ops.harmonics import check_harmonics, spherical_harmonics
 from .rasterization import Rendering, check_shapes, rasterize
 from .render_options import RenderOptions
 from .sphere import rasterize_directions
-from .ssim import ssim, ssim_map
 from .torch_contract import HALF, register_compiled
 
 Operation = Callable[..., list[Tensor]]

@@ -27,7 +27,7 @@ from ..kernels import (
 from ..kernels.constants import ALPHA_THRESHOLD
 from ..kernels.project import projection_kernel
 from .blending import exp_squarings
-from .ssim import CPU_LANES
+from .losses.ssim import CPU_LANES
 from .warp_launch.loading import compile_for_cpu, uses_fused_multiply_add
 
 log = logging.getLogger(__name__)

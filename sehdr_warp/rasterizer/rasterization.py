@@ -11,9 +11,9 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
-from .captured_render import FEATURES, flatten
 from .checks import check_cameras, check_opacities, check_tensors
-from .graph_cache import GraphPool, ReplayedRender, find_pool, get_or_create_pool
+from .cuda_graphs.cache import GraphPool, ReplayedRender, find_pool, get_or_create_pool
+from .cuda_graphs.captured_render import FEATURES, flatten
 from .memory import oom_context
 from .projection import ProjectedGaussians, RasterInputs, project_to_camera
 from .render_options import RenderOptions
@@ -206,7 +206,7 @@ _Begun = ProjectedGaussians | ReplayedRender
 def _begin(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool | None) -> _Begun:
     """Project to one camera. On a GPU, a repeated call replays a CUDA graph, which renders the image as well.
 
-    pool: CUDA graphs of calls like this one (graph_cache.py); None if it is to be launched.
+    pool: CUDA graphs of calls like this one (cuda_graphs/cache.py); None if it is to be launched.
     """
     graph = None if pool is None else pool.begin_render(tensors, options)
     return _launch_projection(tensors, options) if graph is None else graph.render(tensors)

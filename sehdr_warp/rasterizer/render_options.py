@@ -6,7 +6,7 @@ import torch
 
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .checks import boolean, check_render_options, integer, is_not_negative, real
-from .cuda_graphs import is_capturing
+from .cuda_graphs.runner import is_capturing
 
 MAX_INTERSECTIONS = 2**31 - 1  # They are counted in int32.
 MAX_SIDE = 1 << 20  # Of an image, in pixels.

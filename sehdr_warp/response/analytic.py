@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError, did_you_mean
-from ..rasterizer.response_curves import FormulaCurve, encode_with_slope
+from ..rasterizer.ops.response_curves import FormulaCurve, encode_with_slope
 from .curve import HALF_CODE, Response
 from .names import DESCRIPTIONS
 

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from ..errors import SehdrError
-from ..rasterizer.interpolation import interpolate
+from ..rasterizer.ops.interpolation import interpolate
 from .curve import HALF_CODE, Response
 
 # Added to exposures before the logarithm: a hundredth of 8-bit black in sRGB.

@@ -22,7 +22,7 @@ from ..model.radiance_field import RadianceField
 from ..model.renders import DirectionalRender, RenderedView
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
-from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.gravity import UpDirection
 from ..scene.normalization import Normalization
 from ..splats import cameras_beside, read_gaussians

@@ -36,7 +36,7 @@ from ..files import UnreadableError, has_file, refuse_links
 from ..model.confidence import Evidence
 from ..response import Response
 from ..scene import Camera, Scene
-from ..scene.images import MAX_PIXELS
+from ..scene.images.ldr_files import MAX_PIXELS
 from .checkpoint import Checkpoint, read_checkpoint
 from .config import Config
 from .config_files import config_from_dict, override_config

@@ -22,7 +22,7 @@ from ..files import atomic_folder, atomic_path, make_parents, remove_stale, requ
 from ..model.confidence import Evidence
 from ..model.radiance_field import RadianceField
 from ..scene import Scene
-from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.gravity import find_up
 from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
 from .config import Config

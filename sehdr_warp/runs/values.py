@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from ..errors import InputError
 from ..files import UnreadableError, read_json, read_text
-from ..scene.exif import LONGEST, SHORTEST
 from ..scene.gravity import LEAST_UNIT, MOST_UNIT
+from ..scene.images.exif import LONGEST, SHORTEST
 from .config_files import field_and_problem
 
 FORMAT = 3

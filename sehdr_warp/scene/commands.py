@@ -66,7 +66,7 @@ def run_responses(args: Responses) -> None:
 def run_calibrate(args: Calibrate) -> None:
     """Calibrate the response of an exposure stack and write it."""
     from ..model.exposure import seconds
-    from .exposure_stack import calibrate
+    from .exposure.stack import calibrate
 
     times = None if args.exposures is None else seconds(args.exposures, "--exposures")
     calibrate(args.stack, times=times, channel=args.channel, out=args.out, overwrite=args.overwrite)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputError
-from .color_encoding import ColorEncoding
+from .color.encoding import ColorEncoding
 from .lens import Lens
 
 DERIVED_PHOTOS = "reinhard-gamma"

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 from ..files import resolve_inside
 from ..subsets import counted, first_names
 from .dataparser import ImageRecord
-from .images import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
+from .images.ldr_files import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .photo_names import fold_name
 
 MASK_FOLDERS = ("masks", "mask", "images_mask")

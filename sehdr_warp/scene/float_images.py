@@ -9,8 +9,8 @@ import numpy as np
 from ..errors import InputError
 from ..subsets import every_nth
 from .dataparser import ImageRecord, reinhard_gamma
-from .exposure import stated_times
-from .hdr_files import exr_exposure_time, read_hdr
+from .exposure.times import stated_times
+from .images.hdr_files import exr_exposure_time, read_hdr
 from .types import codes_of
 
 _MIDDLE_GREY = 0.18

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..subsets import every_nth
 from .camera import Camera
-from .images import PILLOW_ERRORS, exif_of, open_image
+from .images.ldr_files import PILLOW_ERRORS, exif_of, open_image
 from .types import Scene, View
 
 log = logging.getLogger(__name__)

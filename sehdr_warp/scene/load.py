@@ -12,26 +12,26 @@ from ..errors import InputError, did_you_mean, missing
 from ..files import has_file
 from ..subsets import first_names
 from .camera_checks import check_cameras
-from .colmap_model import find_model, has_images
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
-from .exposure import choose_exposure, exposures_note, with_exposure_times
+from .exposure.times import choose_exposure, exposures_note, with_exposure_times
 from .file_names import image_folder, unique_names
 from .float_images import with_float_times
 from .masks import assign_masks
 from .photos import usable_photos
 from .preprocess import preprocess
-from .read_colmap import model_fits, read_colmap
-from .read_hdr_sets import is_hdr_gs, read_hdr_gs, read_hdr_nerf, read_hdr_nerf_real
-from .read_llff import read_llff
-from .read_opensfm import find_reconstruction, read_opensfm
-from .read_photos import find_photos, place_photos
-from .read_transforms import is_transforms, read_transforms
+from .readers.bare_photos import find_photos, place_photos
+from .readers.colmap import model_fits, read_colmap
+from .readers.colmap_model import find_model, has_images
+from .readers.hdr_sets import is_hdr_gs, read_hdr_gs, read_hdr_nerf, read_hdr_nerf_real
+from .readers.llff import read_llff
+from .readers.opensfm import find_reconstruction, read_opensfm
+from .readers.transforms import is_transforms, read_transforms
 from .response_choice import check_response, choose_response
 from .truth_files import assign_truth
 from .types import Scene
 from .unused_files import ARCHIVE_SUFFIXES, unused_notes
-from .video import UNSTITCHED_SUFFIXES, is_video
-from .video_frames import read_video
+from .video.decode import UNSTITCHED_SUFFIXES, is_video
+from .video.frames import read_video
 
 if TYPE_CHECKING:
     from ..response import Response
@@ -109,7 +109,7 @@ def load_scene(
     scene = preprocess(dataset, curve, max_size, photo_storage, names)
     named_views = zip(names, dataset.records, strict=True)
     if guessed := {name for name, record in named_views if not record.time_known}:
-        from .exposure_estimate import with_estimated_times
+        from .exposure.estimate import with_estimated_times
 
         scene = with_estimated_times(scene, guessed, curve)
     light_known = dataset.kind != "encoded" or curve.name == dataset.stated_response

@@ -14,7 +14,7 @@ from ..files import resolve_inside
 from ..subsets import counted, first_names
 from .dataparser import UNPLACED, ImageRecord
 from .file_names import INVERTED_MASK, MASK_FOLDERS, folders_named, lies_at, natural_key, without_mask_mark
-from .images import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
+from .images.ldr_files import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
 from .lens import Lens
 from .photo_names import PhotoNames, fold_name
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from .color_primaries import srgb_to_linear
+from .color.primaries import srgb_to_linear
 
 _MOST_BITS_UNSCALED = 14  # Of sensors, whose codes some programs store in 16 bits as they are
 _NEARLY_WHITE = 0.97  # Part of a sensor's range in which its clipped codes end

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ..files import resolve_inside
 from .dataparser import ImageRecord
-from .images import LDR_SUFFIXES
+from .images.ldr_files import LDR_SUFFIXES
 
 
 def fold_name(name: str) -> str:

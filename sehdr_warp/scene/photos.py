@@ -11,15 +11,15 @@ from typing import Any
 
 from ..errors import InputError
 from ..subsets import first_names
-from .color_encoding import encoding_of, note_of
+from .color.encoding import encoding_of, note_of
 from .dataparser import UNPLACED, ImageRecord
 from .file_names import MASK_FOLDERS
 from .float_images import tone_mapped
-from .hdr_files import hdr_size, pixel_aspect
-from .heif import avif_bits
-from .images import EncodedImage, file_kind, image_sizes, open_image, read_ldr, require_file
+from .images.hdr_files import hdr_size, pixel_aspect
+from .images.heif import avif_bits
+from .images.ldr_files import EncodedImage, file_kind, image_sizes, open_image, read_ldr, require_file
 from .lens import Lens
-from .raw import read_header, read_raw
+from .raw.decode import read_header, read_raw
 
 FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_NAMED = 3

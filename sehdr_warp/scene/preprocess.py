@@ -14,23 +14,23 @@ from ..errors import InputError
 from ..parallel import prefetch_map
 from ..progress import track_progress
 from .camera import Camera
-from .color_encoding import DEVIATION, ColorEncoding
-from .color_primaries import linear_to_srgb
-from .color_srgb_codes import FloatTable, bands_of
+from .color.encoding import DEVIATION, ColorEncoding
+from .color.primaries import linear_to_srgb
+from .color.srgb_codes import FloatTable, bands_of
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .file_names import unique_names
 from .float_images import float_codes
-from .gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
-from .hdr_files import hdr_size, read_hdr, read_light
-from .images import EncodedImage, file_kind
+from .images.gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
+from .images.hdr_files import hdr_size, read_hdr, read_light
+from .images.ldr_files import EncodedImage, file_kind
 from .lens import Lens, Undistortion, area_average
 from .masks import mask_note, read_mask
 from .photo_content import ContentCheck, unused_bits_note
 from .photo_storage import PhotoKeeper
 from .photos import fitted_lens, read_photo, unusable_notes
-from .raw import linear_codes
+from .raw.decode import linear_codes
 from .types import Scene, View, codes_of
-from .video_color import codes_in_rec709
+from .video.color import codes_in_rec709
 from .wide_camera import solid_angles
 
 if TYPE_CHECKING:

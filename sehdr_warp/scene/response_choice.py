@@ -11,12 +11,12 @@ import numpy as np
 from ..errors import InputError
 from ..subsets import every_nth
 from .dataparser import DataparserOutputs
-from .exif import are_camera_jpegs
-from .gain_map import MOST_STOPS_IN_CODES, read_gain_map
-from .images import has_16_bits
+from .images.exif import are_camera_jpegs
+from .images.gain_map import MOST_STOPS_IN_CODES, read_gain_map
+from .images.ldr_files import has_16_bits
 from .photo_content import ContentCheck
 from .preprocess import read_codes
-from .raw import color_matrix
+from .raw.decode import color_matrix
 from .types import View
 
 if TYPE_CHECKING:

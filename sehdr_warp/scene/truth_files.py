@@ -7,8 +7,8 @@ from pathlib import Path
 from ..subsets import counted, first_names
 from .dataparser import ImageRecord
 from .file_names import folders_named
-from .hdr_files import is_without_colors
-from .images import HDR_SUFFIXES, LDR_SUFFIXES
+from .images.hdr_files import is_without_colors
+from .images.ldr_files import HDR_SUFFIXES, LDR_SUFFIXES
 from .photo_names import PhotoNames, fold_name
 
 TRUTH_FOLDERS = ("hdr", "exr")

@@ -7,8 +7,8 @@ from pathlib import Path
 from ..subsets import counted, first_names
 from .dataparser import ImageRecord
 from .file_names import IMAGE_FOLDERS, is_system_file, natural_key, without_mask_mark
-from .heif import HEIF_SUFFIXES, heif_installed
-from .images import PHOTO_SUFFIXES
+from .images.heif import HEIF_SUFFIXES, heif_installed
+from .images.ldr_files import PHOTO_SUFFIXES
 from .photo_names import bases_of
 
 # What tools write beside photos, and nobody takes for one.

@@ -14,7 +14,7 @@ from PIL import Image
 
 from ..errors import InputError
 from ..files import atomic_folder, atomic_path, write_json
-from ..output.exr import write_exr
+from ..output.images.exr import write_exr
 from ..response import Response
 from ..scene import Camera, Scene, View, codes_of
 from ..subsets import every_nth

@@ -15,7 +15,7 @@ import torch
 from ..response import Response
 from ..runs.config import Config
 from ..scene import Scene, View
-from ..scene.exposure_compensation import (
+from ..scene.exposure.compensation import (
     ExposureCompensation,
     disagreement,
     fit_gains,

@@ -15,7 +15,7 @@ from ..runs.run import exposure_compensation, field_from_checkpoint
 from ..runs.run_folder import describe_scene, scene_difference
 from ..runs.values import LoadArguments
 from ..scene import Scene
-from ..scene.exposure_compensation import ExposureCompensation
+from ..scene.exposure.compensation import ExposureCompensation
 from .cost import gain_of_ranks
 from .ranks import Ranks
 from .trainer import Trainer

@@ -17,7 +17,7 @@ from ..model.adam import Adam
 from ..model.gaussians import moments_of
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients, Rendering
-from ..rasterizer.step_updates import differentiate
+from ..rasterizer.ops.step_updates import differentiate
 from ..rasterizer.tile_lists import MAX_SINGLE_SORT
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config

@@ -4,10 +4,10 @@ from torch import Tensor
 
 from ..model.radiance_field import RadianceField
 from ..model.renders import TrainRender
-from ..rasterizer.activations import opacity_penalty
-from ..rasterizer.code_residual import code_residual
-from ..rasterizer.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
-from ..rasterizer.ssim import image_distance, ssim
+from ..rasterizer.losses.code_residual import code_residual
+from ..rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
+from ..rasterizer.losses.ssim import image_distance, ssim
+from ..rasterizer.ops.activations import opacity_penalty
 from ..response import ToneMapper
 from ..runs.config import LossConfig
 from .targets import Target, mu_law

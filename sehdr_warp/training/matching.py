@@ -17,8 +17,8 @@ from torch import Tensor
 from ..model.color_models import ColorModel
 from ..model.radiance_field import RadianceField
 from ..parallel import prefetch_map
-from ..rasterizer.code_residual import sample_residual_pixels
-from ..rasterizer.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matched_points, matching_costs, trusted_depths
+from ..rasterizer.losses.code_residual import sample_residual_pixels
+from ..rasterizer.ops.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matched_points, matching_costs, trusted_depths
 from ..response import Response
 from ..scene import Camera, View, codes_of
 from ..splats.arrays import HARMONIC_0

@@ -15,7 +15,7 @@ from ..model.adam import BETAS, FIRST_HARMONIC, Adam
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients
-from ..rasterizer.step_updates import decide_step, finiteness_of
+from ..rasterizer.ops.step_updates import decide_step, finiteness_of
 from ..runs.checkpoint import under
 from ..runs.config import Config
 

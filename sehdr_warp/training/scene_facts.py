@@ -10,8 +10,8 @@ from ..errors import InputError
 from ..runs.config import Config, LossConfig
 from ..runs.values import LoadArguments
 from ..scene import Scene, View, encoded_values
-from ..scene.exif import are_camera_jpegs
-from ..scene.images import file_kind
+from ..scene.images.exif import are_camera_jpegs
+from ..scene.images.ldr_files import file_kind
 from ..scene.wide_camera import perspective_views
 from ..subsets import every_nth
 from .initialization import focus_distance, points_on_rays

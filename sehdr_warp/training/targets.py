@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..model.renders import CameraTensors
-from ..rasterizer.code_residual import CodeScale, code_tensor, code_values
+from ..rasterizer.losses.code_residual import CodeScale, code_tensor, code_values
 from ..response import Response
 from ..scene import View
 

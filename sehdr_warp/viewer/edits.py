@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..model.lights import Light
-from ..output.splat_edits import SplatEdits
+from ..output.export.splat_edits import SplatEdits
 from ..output.world_transform import world_transform, write_orientation
 from ..scene import View
 from ..splats.arrays import HARMONIC_0

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..model.lights import Light
-from ..output.camera_paths import facts_of_cameras
-from ..output.framing import opening_facts
+from ..output.cameras.framing import opening_facts
+from ..output.cameras.paths import facts_of_cameras
+from ..output.export.splat_edits import SplatEdits
+from ..output.images.tonemap import display_gain
 from ..output.light_pictures import curve_table
-from ..output.light_unit import luminance_of_one
+from ..output.lighting.unit import luminance_of_one
 from ..output.merged_scene import merge_scenes
-from ..output.splat_edits import SplatEdits
-from ..output.tonemap import display_gain
 from ..output.world_transform import from_photos, world_transform
 from ..scene import Camera
 from .edits import EditedOpacities, LightGains

@@ -21,10 +21,10 @@ from typing import Any, cast
 from PIL import Image
 
 from ..errors import SehdrError
-from ..output.camera_paths import interpolate
+from ..output.cameras.paths import interpolate
 from ..output.film import write_film
 from ..output.html import page_file
-from ..output.images import quantize
+from ..output.images.ldr_files import quantize
 from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page

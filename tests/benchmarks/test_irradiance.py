@@ -9,8 +9,8 @@ import torch
 
 from benchmarks.irradiance import NORMALS, irradiance_errors, read_light_maps
 from sehdr_warp.errors import InputError
-from sehdr_warp.output.environment_map import latlong
-from sehdr_warp.output.exr import rgb_channels, write_exr
+from sehdr_warp.output.images.exr import rgb_channels, write_exr
+from sehdr_warp.output.lighting.environment_map import latlong
 from sehdr_warp.scene import Camera
 
 PLACE = np.array([0.5, -1.0, 2.0])

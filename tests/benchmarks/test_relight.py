@@ -9,7 +9,7 @@ import pytest
 from benchmarks.irradiance import LightMap, read_light, store_light
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.lights import Light, LightShape
-from sehdr_warp.output.environment_map import latlong
+from sehdr_warp.output.lighting.environment_map import latlong
 from sehdr_warp.scene import embedded_folder
 
 PLACE = np.array([1.0, -2.0, 1.5])

@@ -3,7 +3,7 @@
 import pytest
 
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.scene.exposure_compensation import ExposureCompensation
+from sehdr_warp.scene.exposure.compensation import ExposureCompensation
 from sehdr_warp.training.compensation import SharedDecisions
 from sehdr_warp.training.train import create_trainer
 

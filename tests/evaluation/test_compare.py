@@ -11,7 +11,7 @@ import sehdr_warp as sw
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table, format_table
 from sehdr_warp.evaluation.evaluate import evaluate
-from sehdr_warp.output.exr import write_exr
+from sehdr_warp.output.images.exr import write_exr
 from sehdr_warp.runs.config import Config
 
 from ..refusals import call

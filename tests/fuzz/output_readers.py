@@ -11,8 +11,8 @@ import numpy as np
 from scipy.io import savemat
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.camera_exchange import usd_cameras
-from sehdr_warp.output.ocio import ocio_view
+from sehdr_warp.output.cameras.exchange import usd_cameras
+from sehdr_warp.output.images.ocio import ocio_view
 from sehdr_warp.own_files import LIST
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_cameras

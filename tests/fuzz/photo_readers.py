@@ -6,22 +6,23 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sehdr_warp.output.exr import Part, write_exr, write_multipart_exr
+from sehdr_warp.output.images.exr import Part, write_exr, write_multipart_exr
 from sehdr_warp.scene import Camera, Scene, View, look_at
-from sehdr_warp.scene.color_encoding import encoding_of
-from sehdr_warp.scene.exif import exif_exposure
-from sehdr_warp.scene.gain_map import light_of, read_gain_map
+from sehdr_warp.scene.color.encoding import encoding_of
 from sehdr_warp.scene.gravity import find_up
-from sehdr_warp.scene.hdr_files import hdr_size, read_exr_channels, read_hdr
-from sehdr_warp.scene.images import open_image
+from sehdr_warp.scene.images.exif import exif_exposure
+from sehdr_warp.scene.images.gain_map import light_of, read_gain_map
+from sehdr_warp.scene.images.hdr_files import hdr_size, read_exr_channels, read_hdr
+from sehdr_warp.scene.images.ldr_files import open_image
 from sehdr_warp.scene.masks import read_mask
 from sehdr_warp.scene.photos import photo_sizes, read_photo
-from sehdr_warp.scene.raw import color_matrix, read_header
-from sehdr_warp.scene.video import codes, decode, open_clip
-from sehdr_warp.scene.video_frames import choose_frames
+from sehdr_warp.scene.raw.decode import color_matrix, read_header
+from sehdr_warp.scene.video.decode import codes, decode, open_clip
+from sehdr_warp.scene.video.frames import choose_frames
 from tests.make_scenes import pattern
-from tests.scene.clips import pan, write_clip
-from tests.scene.dng_files import (
+from tests.scene.color.test_encoding import icc_profile
+from tests.scene.images.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
+from tests.scene.raw.dng_files import (
     area,
     gain_map,
     jpeg_tiles,
@@ -32,8 +33,7 @@ from tests.scene.dng_files import (
     write_dng,
     write_tagged_dng,
 )
-from tests.scene.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
-from tests.scene.test_color_encoding import icc_profile
+from tests.scene.video.clips import pan, write_clip
 from tests.trial.test_sets import exif_of_place
 
 from .reader import Reader, each

@@ -12,7 +12,7 @@ from sehdr_warp.blocks.block_plan import BlockPlan
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.model.confidence import Evidence
 from sehdr_warp.model.gaussians import Gaussians
-from sehdr_warp.output.light_unit import read_light_unit
+from sehdr_warp.output.lighting.unit import read_light_unit
 from sehdr_warp.output.world_transform import read_orientation
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config

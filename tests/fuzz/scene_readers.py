@@ -10,12 +10,12 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from sehdr_warp.scene import load_cameras, load_scene
-from sehdr_warp.scene.colmap_model import read_ply_points
-from sehdr_warp.scene.read_colmap import read_colmap
-from sehdr_warp.scene.read_hdr_sets import read_hdr_nerf, read_hdr_nerf_real
-from sehdr_warp.scene.read_llff import read_llff
-from sehdr_warp.scene.read_opensfm import read_opensfm
-from sehdr_warp.scene.read_transforms import read_transforms
+from sehdr_warp.scene.readers.colmap import read_colmap
+from sehdr_warp.scene.readers.colmap_model import read_ply_points
+from sehdr_warp.scene.readers.hdr_sets import read_hdr_nerf, read_hdr_nerf_real
+from sehdr_warp.scene.readers.llff import read_llff
+from sehdr_warp.scene.readers.opensfm import read_opensfm
+from sehdr_warp.scene.readers.transforms import read_transforms
 from sehdr_warp.synth.expose import RadianceView
 from tests.make_scenes import pattern, write_blender, write_colmap, write_llff, write_reinhard
 from tests.output.helpers import camera

@@ -11,7 +11,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from sehdr_warp import load_scene
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 
 from ..make_scenes import edited_json, png_of, write_blender, write_colmap
 from ..refusals import call, train_refused

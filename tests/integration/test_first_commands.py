@@ -8,8 +8,8 @@ import pytest
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.open import enclosing_run_response
-from sehdr_warp.scene.hdr_files import read_hdr
-from sehdr_warp.scene.images import read_ldr
+from sehdr_warp.scene.images.hdr_files import read_hdr
+from sehdr_warp.scene.images.ldr_files import read_ldr
 
 from ..refusals import call
 

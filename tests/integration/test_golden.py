@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp import cli
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "golden"
 RENDERED = ("render", DATA / "splats.ply", "--cameras", DATA / "cameras.json")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 
 from ..refusals import call, refused
 

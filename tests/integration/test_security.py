@@ -52,11 +52,11 @@ HELD_BY = {
     "Nothing that is read is run or unpickled": [
         f"{HERE}_no_code_unpickles_or_evaluates",
         f"{HERE}_pickles_are_refused",
-        "scene/test_scene_images.py::test_other_formats_and_colors_are_refused_and_no_program_is_started",
+        "scene/images/test_ldr_files.py::test_other_formats_and_colors_are_refused_and_no_program_is_started",
     ],
     "Text from outside enters HTML escaped": [
-        "output/test_report_page.py::test_browsers_run_our_script_and_no_other",
-        "output/test_report_page.py::test_no_markup_is_made_but_by_the_one_function",
+        "output/report/test_page.py::test_browsers_run_our_script_and_no_other",
+        "output/report/test_page.py::test_no_markup_is_made_but_by_the_one_function",
         f"{PLACES}_names_of_photos_on_pages_and_terminals",
     ],
     "Control characters from outside": [
@@ -64,7 +64,7 @@ HELD_BY = {
         f"{PLACES}_names_in_lists_on_terminals",
     ],
     "Pictures are decoded by content": [
-        "scene/test_scene_images.py::test_other_formats_and_colors_are_refused_and_no_program_is_started",
+        "scene/images/test_ldr_files.py::test_other_formats_and_colors_are_refused_and_no_program_is_started",
         f"{PHOTOS}_photos_that_were_made",
     ],
     "Sizes and counts are bounded": [
@@ -75,7 +75,7 @@ HELD_BY = {
         f"{RUNS}_a_sparse_checkpoint_is_refused_by_its_length",
         f"{SENT_RUNS}_tensors_of_a_run",
         "splats/test_streamed_sog.py::test_a_small_index_takes_no_memory_that_its_chunks_do_not_state",
-        "scene/test_heif.py::test_parts_of_an_item_that_overlap_take_no_memory",
+        "scene/images/test_heif.py::test_parts_of_an_item_that_overlap_take_no_memory",
     ],
     "Pipes and devices are not read": [
         f"{CASES}_inputs_that_are_pipes_are_not_waited_for",
@@ -95,25 +95,25 @@ HELD_BY = {
         f"{HERE}_names_of_a_set_stay_inside",
         f"{SETS}_links_that_lead_out_of_a_set",
         "scene/test_masks.py::test_folders_that_lead_out_of_the_set_are_not_searched",
-        "scene/test_scene_colmap.py::test_the_folder_of_photos_may_be_a_link",
+        "scene/readers/test_colmap.py::test_the_folder_of_photos_may_be_a_link",
     ],
     "OpenUSD and MATLAB files, and videos": [
         "test_sandbox.py::test_bounds",
-        "scene/test_video.py::test_counts_beyond_the_file_take_no_memory",
+        "scene/video/test_decode.py::test_counts_beyond_the_file_take_no_memory",
     ],
     "A stage that refers to files": [
         "test_sandbox.py::test_a_stage_leads_to_no_other_folder",
-        "scene/test_video.py::test_a_clip_that_names_other_files_is_refused",
+        "scene/video/test_decode.py::test_a_clip_that_names_other_files_is_refused",
         "trial/test_clips.py::test_clips_that_were_made",
     ],
     "LUTs of a config must be files": [
-        "output/test_ocio.py::test_luts_that_cannot_be_read_are_told_in_a_line",
+        "output/images/test_ocio.py::test_luts_that_cannot_be_read_are_told_in_a_line",
         f"{LOOKS}_luts_that_were_made",
         f"{LOOKS}_archives_of_configs",
     ],
     "The caches": [
-        "rasterizer/test_kernel_cache.py::test_damaged_modules_go_and_are_told_once",
-        "scene/test_video_frames.py::test_frames_are_kept_in_the_cache",
+        "rasterizer/warp_launch/test_kernel_cache.py::test_damaged_modules_go_and_are_told_once",
+        "scene/video/test_frames.py::test_frames_are_kept_in_the_cache",
     ],
     "The processes of one training": ["training/test_ranks.py::test_ranks_stay_alike_and_one_can_go_on"],
     "It reads the paths": [f"{PLACES}_what_commands_open"],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.plane_sweep import PhotoSet, matched_points, matching_costs, trusted_depths
+from sehdr_warp.rasterizer.ops.plane_sweep import PhotoSet, matched_points, matching_costs, trusted_depths
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.camera import look_at
 

@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
-from sehdr_warp.rasterizer import patches
-from sehdr_warp.rasterizer.ssim import image_distance, ssim, ssim_map
+from sehdr_warp.rasterizer.losses import patches
+from sehdr_warp.rasterizer.losses.ssim import image_distance, ssim, ssim_map
 
 SHAPES = [(32, 48, 3), (37, 29, 3), (5, 4, 3), (1, 1, 1), (1, 40, 2), (40, 1, 3), (11, 11, 1), (16, 9, 27), (3, 2, 9)]
 
@@ -46,7 +46,7 @@ def relative_error(value, truth):
 @pytest.fixture(params=["runs", "single", "patches"])
 def kernels(request, monkeypatch, device):
     """All kernels on the CPU: runs of 16, those of narrow images, and those of a GPU, emulated."""
-    module = import_module("sehdr_warp.rasterizer.ssim")
+    module = import_module("sehdr_warp.rasterizer.losses.ssim")
     if request.param == "single":
         monkeypatch.setattr(module, "CPU_LANES", 1)
     elif request.param == "patches" and device == "cpu":

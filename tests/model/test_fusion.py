@@ -8,7 +8,7 @@ import torch
 
 from sehdr_warp.model.exposure import exposure_times
 from sehdr_warp.model.fusion import NeuralExposureFusion
-from sehdr_warp.rasterizer.exposure_fusion import fusion_weights
+from sehdr_warp.rasterizer.ops.exposure_fusion import fusion_weights
 from sehdr_warp.response import response_by_name
 
 BASE_TIME = 2.0

@@ -6,7 +6,7 @@ import torch
 
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.lights import find_lights
-from sehdr_warp.output.environment_map import latlong
+from sehdr_warp.output.lighting.environment_map import latlong
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.splats import GaussianArrays
 

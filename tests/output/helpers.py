@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sehdr_warp.scene import Camera, look_at
-from sehdr_warp.scene.hdr_files import read_exr_channels
+from sehdr_warp.scene.images.hdr_files import read_exr_channels
 
 
 def radiance(height=24, width=32, seed=0):

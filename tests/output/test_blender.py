@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sehdr_warp.output.environment_map import latlong, solid_angles
-from sehdr_warp.output.export import export
-from sehdr_warp.output.exr import exr_header, rgb_channels, write_exr
-from sehdr_warp.output.proxy_mesh import write_proxy_mesh
+from sehdr_warp.output.export.gaussians import export
+from sehdr_warp.output.export.proxy_mesh import write_proxy_mesh
+from sehdr_warp.output.images.exr import exr_header, rgb_channels, write_exr
+from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
 from sehdr_warp.output.render_views import render_views, select_cameras
 from sehdr_warp.output.world_transform import world_transform
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 
+from .export.test_splat_edits import run_of, splats
 from .helpers import AnalyticRun
-from .test_splat_edits import run_of, splats
 
 SIZE, FRAMES, RADIUS = (320, 180), (0, 2), 0.02
 NORMALS = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (0.6, 0.64, 0.48)]
@@ -54,7 +54,7 @@ def opened(tmp_path_factory):
     for name in ("splats.glb", "splats.usdc"):
         export(scene, folder / name)
     if importlib.util.find_spec("skimage"):
-        from .test_proxy_mesh import BallOnFloor
+        from .export.test_proxy_mesh import BallOnFloor
 
         write_proxy_mesh(BallOnFloor(), folder / "proxy.usdc", resolution=48)
     facts = {"points": points.tolist(), "radius": RADIUS, "frames": FRAMES, "size": SIZE, "normals": NORMALS}

@@ -7,11 +7,11 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.brackets import bracket_exposures, write_brackets
-from sehdr_warp.output.images import exposure_exif
-from sehdr_warp.scene.images import read_ldr
+from sehdr_warp.output.images.ldr_files import exposure_exif
+from sehdr_warp.scene.images.ldr_files import read_ldr
 
 from .helpers import GammaResponse, camera, radiance, read_exr
-from .test_exr import read_openimageio
+from .images.test_exr import read_openimageio
 
 EXIF_IFD, EXPOSURE_TIME, EXPOSURE_BIAS = 0x8769, 0x829A, 0x9204
 

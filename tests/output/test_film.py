@@ -12,7 +12,6 @@ import pytest
 from sehdr_warp.cli import parse_command
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.output import film
-from sehdr_warp.output.colorspace import color_space
 from sehdr_warp.output.commands import (
     EnvironmentMap,
     FilmOptions,
@@ -22,10 +21,11 @@ from sehdr_warp.output.commands import (
     run_environment_map,
     run_render,
 )
+from sehdr_warp.output.export.commands import Convert, Export, run_convert, run_export
 from sehdr_warp.output.film import encode, write_film
+from sehdr_warp.output.images.colorspace import color_space
+from sehdr_warp.output.images.tonemap import display_gain
 from sehdr_warp.output.render_views import shared_tone_map
-from sehdr_warp.output.splat_commands import Convert, Export, run_convert, run_export
-from sehdr_warp.output.tonemap import display_gain
 from sehdr_warp.own_files import LIST
 
 from .helpers import AnalyticRun

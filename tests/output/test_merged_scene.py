@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.export import export
+from sehdr_warp.output.export.gaussians import export
+from sehdr_warp.output.export.splat_edits import SplatEdits
 from sehdr_warp.output.merged_scene import merge_scenes
 from sehdr_warp.output.scene_page import write_scene_page
-from sehdr_warp.output.splat_edits import SplatEdits
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.splats.arrays import HARMONIC_0
 
-from .test_splat_edits import run_of, splats
+from .export.test_splat_edits import run_of, splats
 
 
 @pytest.fixture

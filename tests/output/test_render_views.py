@@ -6,10 +6,10 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.camera_paths import common_focus, interpolate, orbit
-from sehdr_warp.output.images import safe_names
+from sehdr_warp.output.cameras.paths import common_focus, interpolate, orbit
+from sehdr_warp.output.images.ldr_files import safe_names
+from sehdr_warp.output.images.tonemap import display_gain
 from sehdr_warp.output.render_views import render_views, select_cameras
-from sehdr_warp.output.tonemap import display_gain
 from sehdr_warp.own_files import LIST
 from sehdr_warp.scene import Camera, load_cameras
 

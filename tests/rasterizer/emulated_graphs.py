@@ -7,7 +7,8 @@ from dataclasses import fields, is_dataclass
 import torch
 import warp as wp
 
-from sehdr_warp.rasterizer import captured_render, graph_cache, tile_lists
+from sehdr_warp.rasterizer import tile_lists
+from sehdr_warp.rasterizer.cuda_graphs import cache, captured_render
 from sehdr_warp.rasterizer.warp_launch import packing
 
 
@@ -45,8 +46,8 @@ def emulate(monkeypatch) -> None:
     """Let calls on the CPU be replayed, with block kernels emulated; ordinary kernels must not run in blocks."""
     empty = torch.empty
     monkeypatch.setattr(captured_render, "CudaGraphRunner", Runner)
-    monkeypatch.setattr(graph_cache, "on_gpu", lambda tensor: True)
-    monkeypatch.setattr(graph_cache, "stream_handle", lambda device: 0)
+    monkeypatch.setattr(cache, "on_gpu", lambda tensor: True)
+    monkeypatch.setattr(cache, "stream_handle", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device=None: None)
     monkeypatch.setattr(torch, "empty", lambda *shape, pin_memory=False, **options: empty(*shape, **options))
     monkeypatch.setattr(tile_lists, "lists_by_tile", tile_lists._sort_by_tile)

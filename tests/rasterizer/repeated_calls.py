@@ -2,12 +2,13 @@
 
 import torch
 
-from sehdr_warp.rasterizer import graph_cache, rasterize
+from sehdr_warp.rasterizer import rasterize
+from sehdr_warp.rasterizer.cuda_graphs import cache
 
 from .scenes import random_scene, relative_error
 
 DEVICE = "cuda:0" if torch.cuda.is_available() else "cpu"
-CALLS = graph_cache.WARMUP_CALLS + 3
+CALLS = cache.WARMUP_CALLS + 3
 
 
 def launched(*arguments, **options):
@@ -20,7 +21,7 @@ def scene_of(count=80, channels=3):
 
 
 def recordings():
-    return sum(size.captured for size in graph_cache._pools.values())
+    return sum(size.captured for size in cache._pools.values())
 
 
 def assert_alike(ours, truth):

@@ -6,9 +6,9 @@ import torch
 import warp as wp
 
 from sehdr_warp.kernels.clipped_light import REACH
-from sehdr_warp.rasterizer import patches
-from sehdr_warp.rasterizer.code_residual import code_tensor
-from sehdr_warp.rasterizer.photo_loss import ClippedWeights, clipped_light_energy
+from sehdr_warp.rasterizer.losses import patches
+from sehdr_warp.rasterizer.losses.code_residual import code_tensor
+from sehdr_warp.rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy
 
 from .scenes import relative_error
 

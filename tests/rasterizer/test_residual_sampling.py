@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.code_residual import code_tensor, sample_residual_pixels
+from sehdr_warp.rasterizer.losses.code_residual import code_tensor, sample_residual_pixels
 
 SIZE = 24, 18  # At which pixels are told, of a photo of 12 x 9
 

@@ -12,8 +12,8 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.response.calibration import calibrate_codes
 from sehdr_warp.scene.commands import Calibrate, run_calibrate
-from sehdr_warp.scene.exposure_stack import read_stack
-from sehdr_warp.scene.images import read_ldr
+from sehdr_warp.scene.exposure.stack import read_stack
+from sehdr_warp.scene.images.ldr_files import read_ldr
 
 CODES = np.arange(10, 246) / 255
 

@@ -8,7 +8,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.file_names import list_images
 from sehdr_warp.scene.masks import read_mask
-from sehdr_warp.scene.read_photos import find_photos
+from sehdr_warp.scene.readers.bare_photos import find_photos
 from tests.make_scenes import (
     RadianceView,
     arc_poses,

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.photos import usable_photos
-from sehdr_warp.scene.read_photos import find_photos
+from sehdr_warp.scene.readers.bare_photos import find_photos
 from tests.make_scenes import pattern, png_of
 
 

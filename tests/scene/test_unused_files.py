@@ -10,8 +10,8 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.colmap_model import find_model
 from sehdr_warp.scene.load import parse_dataset
+from sehdr_warp.scene.readers.colmap_model import find_model
 from tests.make_scenes import edited_json, load, pattern, write_blender, write_colmap
 
 

@@ -8,7 +8,7 @@ import pytest
 from scenes.generator.recipes import RECIPES, make_cameras
 from scenes.generator.render import Settings, _render_view, denoise
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from scenes.generator.light import PLACES, render_light
 from scenes.generator.recipes import RECIPES
 from scenes.generator.render import load_mitsuba
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.environment_map import latlong
+from sehdr_warp.output.lighting.environment_map import latlong
 from sehdr_warp.scene import embedded_folder, embedded_scenes, load_scene
 
 SCENES = [name for name in RECIPES if name in embedded_scenes()]

@@ -8,7 +8,7 @@ import pytest
 
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera
-from sehdr_warp.scene.color_primaries import matrix_to_rec709
+from sehdr_warp.scene.color.primaries import matrix_to_rec709
 from sehdr_warp.synth.expose import RadianceView, expose
 from tests import refusals
 from tests.make_scenes import arc_poses, load, write_blender, write_reinhard

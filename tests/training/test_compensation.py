@@ -10,7 +10,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
-from sehdr_warp.scene.exposure_compensation import ExposureCompensation
+from sehdr_warp.scene.exposure.compensation import ExposureCompensation
 from sehdr_warp.training import matching
 from sehdr_warp.training.compensation import estimate_compensation, estimates_compensation
 from sehdr_warp.training.initialization import make_matcher

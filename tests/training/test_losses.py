@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from sehdr_warp.model.renders import TrainRender
-from sehdr_warp.rasterizer.code_residual import code_tensor
-from sehdr_warp.rasterizer.ssim import ssim
+from sehdr_warp.rasterizer.losses.code_residual import code_tensor
+from sehdr_warp.rasterizer.losses.ssim import ssim
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import LossConfig
 from sehdr_warp.training.losses import image_loss, ldr_loss, linear_loss

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.rasterizer.plane_sweep import BORDER
+from sehdr_warp.rasterizer.ops.plane_sweep import BORDER
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.splats.arrays import HARMONIC_0

@@ -10,7 +10,7 @@ import torch
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.color_models import make_color_model
 from sehdr_warp.model.renders import TrainRender
-from sehdr_warp.rasterizer.ssim import ssim
+from sehdr_warp.rasterizer.losses.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.runs.config_files import load_config, override_config, preset_names

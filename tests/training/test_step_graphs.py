@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.rasterizer.step_updates import decide_step
+from sehdr_warp.rasterizer.ops.step_updates import decide_step
 from sehdr_warp.training.step_graphs import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
 
 from .recorded import check_recorded_like_launched

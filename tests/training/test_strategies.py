@@ -8,7 +8,7 @@ import torch
 
 from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.rasterizer import rasterize
-from sehdr_warp.rasterizer.relocation import relocation_sums
+from sehdr_warp.rasterizer.ops.relocation import relocation_sums
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.strategies import AdcStrategy, Proposals, make_strategy, mcmc
 from sehdr_warp.training.strategies.adc import rotate, sample_half

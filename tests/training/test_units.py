@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from sehdr_warp.model.baking import field_of, gaussians_of
-from sehdr_warp.output.export import export
+from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.scene import Scene
 from sehdr_warp.splats import read_gaussians
 from sehdr_warp.training.train import train

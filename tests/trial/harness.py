@@ -21,7 +21,7 @@ from pathlib import Path
 from urllib.request import Request, urlopen
 
 from sehdr_warp import cli
-from sehdr_warp.output import export
+from sehdr_warp.output.export import gaussians
 from sehdr_warp.synth.expose import RadianceView
 from tests.make_scenes import write_blender, write_reinhard
 from tests.training.toy import toy_scene
@@ -84,7 +84,7 @@ def _spare_time() -> None:
     figures, docstrings = importlib.import_module("matplotlib.figure"), importlib.import_module("tyro._docstrings")
     save, make = figures.Figure.savefig, docstrings._ClassTokenization.make
     figures.Figure.savefig = lambda figure, *given, **options: save(figure, *given, **options | {"dpi": 40})
-    export.refine = partial(export.refine, steps=9)
+    gaussians.refine = partial(gaussians.refine, steps=9)
     docstrings._ClassTokenization.make = staticmethod(cache(make))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.scene.hdr_files import read_hdr
+from sehdr_warp.scene.images.hdr_files import read_hdr
 from tests.fuzz.mutate import NUMBERS, VALUES
 from tests.make_scenes import write_colmap
 

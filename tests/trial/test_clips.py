@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.make_scenes import pattern
-from tests.scene.clips import pan, write_clip
+from tests.scene.video.clips import pan, write_clip
 
 from .hostile import MARKUP, tried
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from sehdr_warp.output.tonemap import encode_srgb
+from sehdr_warp.output.images.tonemap import encode_srgb
 from sehdr_warp.own_files import LIST, first_unlisted
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Camera, look_at
-from tests.scene.clips import write_clip
 from tests.scene.panorama_room import light, walls
+from tests.scene.video.clips import write_clip
 
 from .harness import COMMANDS, SEED, TRAIN, VIEW, browse, call, files_in
 

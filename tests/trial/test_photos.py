@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from tests.make_scenes import pattern
-from tests.scene.dng_files import area, gain_map, longs, opcodes, shorts, write_tagged_dng
-from tests.scene.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
-from tests.scene.test_color_encoding import icc_profile
+from tests.scene.color.test_encoding import icc_profile
+from tests.scene.images.gain_map_files import iso_metadata, write_heif_pair, write_jpeg_pair, xmp_segment
+from tests.scene.raw.dng_files import area, gain_map, longs, opcodes, shorts, write_tagged_dng
 
 from .hostile import MARKUP, SHORT, gif_named, heic, patched, photo, png, scripts_of, tried
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.output.exr import rgb_channels
-from sehdr_warp.output.exr import write_exr as write_channels
+from sehdr_warp.output.images.exr import rgb_channels
+from sehdr_warp.output.images.exr import write_exr as write_channels
 from tests.make_scenes import pattern, write_colmap
 
 from .hostile import EITHER, FAR, MARKUP, NAN, SHORT, case, gif_named, heic, link, png, put, tried

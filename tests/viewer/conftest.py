@@ -12,7 +12,7 @@ from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Server, Viewer
 
 from ..output.helpers import AnalyticRun
-from ..output.test_report import make
+from ..output.report.test_write import make
 
 
 @contextmanager

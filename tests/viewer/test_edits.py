@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from sehdr_warp.model.lights import Light, LightShape
-from sehdr_warp.output.splat_edits import SplatEdits
+from sehdr_warp.output.export.splat_edits import SplatEdits
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.scene import Camera, View
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Viewer
 
-from ..output.test_splat_edits import run_of, splats
+from ..output.export.test_splat_edits import run_of, splats
 from .browser import browser, page_of
 from .conftest import serving
 from .test_page import until

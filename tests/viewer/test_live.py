@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.images import quantize
+from sehdr_warp.output.images.ldr_files import quantize
 from sehdr_warp.output.light_pictures import photo_for_display
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.viewer.live import SHARE, LiveTraining, serve_training

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from sehdr_warp.output.images.tonemap import display_gain, encode_srgb
 from sehdr_warp.output.notebook import run_html
-from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.scene import Camera
 
 from ..output.helpers import AnalyticRun, read_exr

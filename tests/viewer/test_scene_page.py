@@ -13,19 +13,19 @@ import torch
 
 from sehdr_warp.errors import InputError, UsageError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.output.export import export
-from sehdr_warp.output.images import as_array
+from sehdr_warp.output.export.commands import Export, run_export
+from sehdr_warp.output.export.gaussians import export
+from sehdr_warp.output.export.splat_edits import SplatEdits
+from sehdr_warp.output.images.ldr_files import as_array
+from sehdr_warp.output.images.tonemap import display_gain, encode_srgb
 from sehdr_warp.output.scene_page import write_scene_page
-from sehdr_warp.output.splat_commands import Export, run_export
-from sehdr_warp.output.splat_edits import SplatEdits
-from sehdr_warp.output.tonemap import display_gain, encode_srgb
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera
 from sehdr_warp.training.train import train
 
+from ..output.export.test_splat_edits import run_of, splats
 from ..output.helpers import Entry, camera
-from ..output.test_splat_edits import run_of, splats
 from ..training.toy import toy_scene
 from .browser import browser, page_of, pinch, pixels
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from ...rasterizer import spherical_harmonics as evaluate
 from ...rasterizer.checks import check_shape, check_tensors, integer
-from ...rasterizer.harmonics import MAX_DEGREE
+from ...rasterizer.ops.harmonics import MAX_DEGREE
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:

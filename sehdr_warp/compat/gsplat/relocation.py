@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from ...rasterizer.checks import check_shape, check_tensors
-from ...rasterizer.relocation import MOST_COPIES, relocation_sums
+from ...rasterizer.ops.relocation import MOST_COPIES, relocation_sums
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer
 from ...rasterizer import Rendering
-from ...rasterizer.step_updates import add_gradient_statistics
+from ...rasterizer.ops.step_updates import add_gradient_statistics
 from ...runs.config import AdcConfig, Config
 from .base import Propose, Schedule, Strategy
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, moments_of
-from ...rasterizer.relocation import (
+from ...rasterizer.ops.relocation import (
     SampledRows,
     copy_rows,
     count_copies,
@@ -15,7 +15,7 @@ from ...rasterizer.relocation import (
     scale_rows,
     share_opacities,
 )
-from ...rasterizer.step_updates import add_position_noise
+from ...rasterizer.ops.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
 from .base import SEED_STRIDE, Propose, Schedule, Strategy
 

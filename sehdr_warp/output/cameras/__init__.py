@@ -1,0 +1,1 @@
+"""Cameras to render: paths for films, framing of the subject, and camera files for other programs."""

@@ -1,0 +1,284 @@
+"""A trained scene as a file of Gaussians: what viewers show, or scene-linear radiance; what is lost is measured."""
+
+import json
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ...errors import InputError, SehdrError, refuse_paths
+from ...files import atomic_path
+from ...model.baking import agreement, field_of, gaussians_of, refine
+from ...response import response_by_name
+from ...runs.run import on_device
+from ...scene import Camera
+from ...scene.exposure.times import shutter
+from ...splats import (
+    STREAMED_SOG,
+    GaussianArrays,
+    camera_file_of,
+    check_new_file,
+    check_suffix,
+    color_model_of,
+    path_is_lossy,
+    read_gaussians,
+    write_gaussians,
+)
+from ...subsets import every_nth, first_names
+from ..brackets import remove_earlier
+from ..cameras.paths import training_cameras
+from ..images.tonemap import display_gain
+from ..world_transform import WorldTransform, file_transform, is_y_down, stored_matrix, world_transform
+from .splat_edits import SplatEdits, most_visible, without_strays
+
+if TYPE_CHECKING:
+    from ...runs.run import RenderableScene
+
+log = logging.getLogger(__name__)
+KINDS = ("ldr", "hdr")
+_MAX_COMPARED = 8  # Views in which a file is compared with the scene
+_DARKER = 4  # Stops below the photos' exposure, where light above their white shows
+_WORDS = ((42.0, "no visible loss"), (36.0, "close copy"), (30.0, "small differences"))  # From this many dB on
+
+
+def export(
+    run: "RenderableScene",
+    path: Path | str,
+    *,
+    kind: str | None = None,
+    exposure_time: float | None = None,
+    degree: int | None = None,
+    cameras: bool = False,
+    axes: str | None = "upright",
+    up: str | Sequence[float] | None = None,
+    scale: float | None = None,
+    edits: SplatEdits | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write the Gaussians of a trained run; return the path.
+
+    How well the file keeps the scene is measured on pictures and logged. Harmonics by suffix and kind:
+
+    suffix          kind   color model                   harmonics are fitted, unless the run has
+    .ply            ldr    display                       display colors of this exposure
+    .ply            hdr    linear as the run, else log   linear or log colors without fusion
+    USD             hdr    linear                        linear colors without fusion
+    .glb and small  ldr    display                       display colors of this exposure
+
+    Args:
+        run: From load_run, train, load_splats or merge_scenes.
+        path: The file; its suffix decides: see sehdr_warp.splats.SUFFIXES.
+        kind: "ldr" for the colors of a photo, which viewers show, refined to the run's own pictures; "hdr" for
+            scene-linear radiance. None: hdr for USD, else ldr.
+        exposure_time: Seconds, of ldr colors; by default the scene's.
+        degree: Pad harmonics with zeros up to this degree, for readers that take no other; at most 3.
+        cameras: Also write `<name>.cameras.json` beside it (scene.ply.cameras.json), in the form of the reference
+            release of 3D Gaussian Splatting.
+        axes: "upright" or "scene" (see world_transform); None keeps the coordinates of a file of Gaussians, and only
+            turns them over if one file has +Y up and the other -Y.
+        up: As in world_transform.
+        scale: As in world_transform.
+        edits: What the file leaves out; by default Gaussians too faint to be drawn.
+        overwrite: Replace files that exist, and without `cameras` remove those that an earlier export wrote beside,
+            unless the run is the file at `path` and keeps its coordinates.
+
+    Raises:
+        SehdrError: For options that do not fit, or edits that leave nothing.
+        InputError: For an unknown suffix, if a file exists, or if a value is not finite.
+    """
+    refuse_paths("load_run", run)
+    path, edits = Path(path), edits or SplatEdits()
+    file_model = color_model_of(path)
+    kind = kind or ("hdr" if file_model == "linear" else "ldr")
+    _check(path, kind, file_model, exposure_time, degree)
+    check_new_file(path, cameras=cameras, overwrite=overwrite)  # Before minutes of fitting
+    if cameras and not any(entry.camera.is_pinhole for entry in run.cameras):
+        raise SehdrError(f"{run.path}: has no cameras, or none that is a pinhole, to write; leave --cameras out")
+    for_edits, to_file = _file_coordinates(run, path, axes, up, scale)
+    seconds = run.base_time if exposure_time is None else float(exposure_time)
+    # Colors that are converted to Rec.709 are encoded by sRGB, at the exposure that shows middle grey as the photos do.
+    display_time = seconds if run.color_matrix is None else seconds * display_gain(run.response)
+    hdr_model = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
+    means = run.field.gaussians.means.detach().cpu().numpy()
+    edits.check_regions(for_edits.points(run.field.normalization.scene_points(means)))  # Before minutes of fitting
+    whole = _gaussians_in_colors(run, "display" if kind == "ldr" else hdr_model, display_time)
+    mask = edits.mask(whole.opacities, for_edits.points(whole.means), run)
+    part = _select_rows(run, whole, mask, edits, display_time)
+    written = part if to_file.is_identity else part.transformed(to_file.matrix)
+    if run.world_matrix is not None:
+        written = replace(written, world_matrix=stored_matrix(run, to_file))
+    written = written.padded(degree or 0)
+    write_gaussians(path, written, overwrite=overwrite)
+    if cameras:
+        _write_cameras(camera_file_of(path), run, to_file, overwrite)
+    elif overwrite and not (to_file.is_identity and Path(run.path).resolve() == path.resolve()):
+        # Cameras of an earlier export would count as these Gaussians'. Those of a file edited in place still fit it.
+        remove_earlier(path.parent, [camera_file_of(path).name])
+    meaning = f"display colors of {shutter(seconds)}" if kind == "ldr" else "scene-linear radiance"
+    log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, written.count, written.degree, meaning)
+    compared, note = (whole, ", before the cut") if edits.shows_part else (part, "")
+    _log_loss(run, compared, kind, display_time, note)
+    if path_is_lossy(path):
+        _log_file_loss(path, run, part if edits.shows_part else None, to_file, display_time)
+    return path
+
+
+class _FileCoordinates(NamedTuple):
+    """Transforms from the scene's coordinates.
+
+    Attributes:
+        for_edits: To those that the regions of edits are in: `axes`, before a file with -Y up is turned over.
+        to_file: To those of the file.
+    """
+
+    for_edits: WorldTransform
+    to_file: WorldTransform
+
+
+def _file_coordinates(
+    run: "RenderableScene", path: Path, axes: str | None, up: str | Sequence[float] | None, scale: float | None
+) -> _FileCoordinates:
+    """Return the coordinates of a file, by the arguments of export()."""
+    if axes is None:
+        turn = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) != is_y_down(path) else np.eye(3)
+        turned = WorldTransform(turn, np.zeros(3))
+        return _FileCoordinates(turned, turned)
+    requested = world_transform(run, axes, up=up, scale=scale)
+    return _FileCoordinates(requested, file_transform(requested, path) if axes == "upright" else requested)
+
+
+def _select_rows(
+    run: "RenderableScene", gaussians: GaussianArrays, mask: np.ndarray, edits: SplatEdits, display_time: float
+) -> GaussianArrays:
+    """Return the Gaussians of a mask without strays; the most visible ones, refined, if they are too many."""
+    part, most = gaussians.rows(mask), edits.max_gaussians
+    if most is not None and part.count > most:
+        subset = gaussians.rows(most_visible(mask, most, run))
+        # The fit must not bring back what an edit removed, floaters included.
+        picture = _renderer(part, run, display_time) if edits.changes_pictures else _photo_renderer(run, display_time)
+        part = refine(subset, picture, training_cameras(run)) if gaussians.color_model == "display" else subset
+    return without_strays(part, training_cameras(run))
+
+
+def _gaussians_in_colors(run: "RenderableScene", color_model: str, display_time: float) -> GaussianArrays:
+    """Return the Gaussians of a run in the scene's coordinates and in the colors of a file.
+
+    Display colors are those of a photo of `display_time` seconds.
+    """
+    photos = training_cameras(run)
+    positions = np.array([camera.position for camera in photos]).reshape(-1, 3)
+    if color_model != "display":
+        return gaussians_of(run.field, color_model, positions, color_matrix=run.color_matrix)
+    if run.field.color_model.name == "display" and display_time == run.base_time and run.color_matrix is None:
+        return gaussians_of(run.field, "display", positions)
+    if run.is_paged:
+        problem = f"does not fit into {run.device}, on which display colors are fitted to pictures"
+        raise SehdrError(f"{run.path}: {problem}; use --device cpu, or kind hdr in a .ply")
+    gaussians = gaussians_of(run.field, "display", positions, display_time, run.color_matrix)
+    return refine(gaussians, _photo_renderer(run, display_time), photos)
+
+
+def _check(path: Path, kind: str, file_model: str | None, exposure_time: float | None, degree: int | None) -> None:
+    if kind not in KINDS:
+        raise SehdrError(f"kind {kind!r} is not one of {', '.join(KINDS)}")
+    if file_model not in (None, "linear" if kind == "hdr" else "display"):
+        limit = "is tagged as scene-linear" if file_model == "linear" else "knows display colors only"
+        raise InputError(path, f"{check_suffix(path)} {limit}, and kind {kind} is not", "leave the kind out")
+    if exposure_time is not None and kind == "hdr":
+        raise SehdrError("an HDR file has no exposure time; leave it out, or write kind ldr")
+    if exposure_time is not None and not 0 < exposure_time < math.inf:
+        raise SehdrError(f"exposure time {exposure_time:g} is not positive and finite; give seconds")
+    if degree is not None and not 0 <= degree <= 3:
+        raise SehdrError(f"harmonics of degree {degree} are not supported; give 0 to 3")
+
+
+def loss_in_words(decibels: float) -> str:
+    """Return what a PSNR of pictures means to the eye."""
+    for least, words in _WORDS:
+        if decibels >= least:
+            return words
+    return "visible loss"
+
+
+def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, display_time: float, note: str) -> None:
+    """Measure and log how well Gaussians in the scene's coordinates show the scene; `note` ends the line's views."""
+    views = _cameras_to_compare(run)
+    where = f"{len(views)} view{'s' * (len(views) != 1)}{note}"
+    if not views:
+        log.info("it is not compared with the scene, which has no cameras of its own")
+    elif kind == "ldr":
+        decibels = agreement(_renderer(gaussians, run, display_time), _photo_renderer(run, display_time), views)
+        words = loss_in_words(decibels)
+        text = "kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white"
+        log.info(text, decibels, where, words)
+    else:
+        times = display_time, display_time / 2**_DARKER
+        bright, dim = (agreement(_renderer(gaussians, run, t), _srgb_renderer(run, t), views) for t in times)
+        words = loss_in_words(min(bright, dim))
+        text = "kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s (%s)"
+        log.info(text, bright, dim, _DARKER, where, words)
+
+
+def _log_file_loss(
+    path: Path, run: "RenderableScene", part: GaussianArrays | None, to_file: WorldTransform, display_time: float
+) -> None:
+    """Measure and log what a compressed file loses, read back, beside the part that was exported or the scene."""
+    views = _cameras_to_compare(run)
+    if not views:
+        return
+    # SPZ does not state the exposure time.
+    gaussians = replace(read_gaussians(path).transformed(to_file.inverse().matrix), base_time=display_time)
+    if part is None:
+        reference, name = _photo_renderer(run, display_time), "the scene"
+    else:
+        reference, name = _renderer(part, run, display_time), "what was exported"
+    decibels = agreement(_renderer(gaussians, run, display_time), reference, views)
+    files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
+    size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
+    log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, name, loss_in_words(decibels), size)
+
+
+def _cameras_to_compare(run: "RenderableScene") -> Sequence[Camera]:
+    held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
+    views = held_out or [entry.camera for entry in run.cameras]
+    return every_nth(views, _MAX_COMPARED)
+
+
+def _photo_renderer(run: "RenderableScene", time: float) -> Callable:
+    """Return a function that renders simulated photos; in Rec.709 and sRGB if the photos have a sensor's colors."""
+    return _srgb_renderer(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
+
+
+def _srgb_renderer(run: "RenderableScene", time: float) -> Callable:
+    """Return a function that renders radiance at an exposure time, encoded by sRGB."""
+    encode = response_by_name("srgb").encode
+    return lambda camera: encode(run.render(camera).hdr * time)
+
+
+def _renderer(gaussians: GaussianArrays, run: "RenderableScene", time: float) -> Callable:
+    """Return a function that renders Gaussians in the scene's coordinates as sRGB, on the run's device."""
+    field = on_device(field_of(gaussians), run.device)
+    return lambda camera: field.render_ldr(camera, time)
+
+
+def _write_cameras(path: Path, run: "RenderableScene", transform: WorldTransform, overwrite: bool) -> None:
+    described, wide = [], [entry.name for entry in run.cameras if not entry.camera.is_pinhole]
+    if wide:
+        log.info("%s: without %s, because it holds pinholes alone", path.name, first_names(wide, 5))
+    for index, entry in enumerate(run.cameras):
+        if not entry.camera.is_pinhole:
+            continue
+        camera = transform.camera(entry.camera)
+        pose = camera.camera_to_world
+        size = {"width": camera.width, "height": camera.height}
+        place = {"position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()}
+        lens = {"fy": camera.fy, "fx": camera.fx}
+        if (camera.cx, camera.cy) != (camera.width / 2, camera.height / 2):  # An addition to the reference release's
+            lens |= {"cx": camera.cx, "cy": camera.cy}
+        described.append({"id": index, "img_name": entry.name, **size, **place, **lens})
+    with atomic_path(path, overwrite) as temporary:
+        temporary.write_text(json.dumps(described), encoding="utf-8")

@@ -1,0 +1,109 @@
+"""Display pictures of scene-linear radiance: a tone map for eyes, and plain exposure stops.
+
+The tone map is Reinhard's extended global operator (Reinhard et al. 2002, Eq. 4) on luminance, with the key and the
+white point found from the scene (Reinhard 2003). Scaling by luminance alone would leave bright colors outside the
+display's gamut, and mapping each channel alone would bleach them; the two are mixed by the display luminance.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...errors import SehdrError
+
+if TYPE_CHECKING:
+    from ...runs.run import RenderableScene
+
+# ITU-R BT.709 luminance weights.
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+MIDDLE_GREY = 0.18
+# Below this part of the brightest per cent, a pixel says nothing about the scene's key.
+_FLOOR = 1e-6
+# Reinhard 2003 uses the extremes; percentiles keep a lamp's filament from deciding the picture.
+_LOW, _HIGH, _WHITE = 1.0, 99.0, 99.8
+
+
+@dataclass(frozen=True)
+class ToneMap:
+    """Reinhard's operator with fixed parameters.
+
+    Attributes:
+        scale: Factor on radiance that brings the scene's log-average to its key.
+        white: Least scaled luminance that is shown as white.
+    """
+
+    scale: float
+    white: float
+
+    def __call__(self, radiance: np.ndarray) -> np.ndarray:
+        """Convert [..., 3] linear Rec.709 radiance to sRGB-encoded float32 in [0, 1]; negative radiance counts as 0."""
+        scaled = np.maximum(np.asarray(radiance, np.float32), 0) * np.float32(self.scale)
+        luminance = (scaled @ LUMINANCE.astype(np.float32))[..., None]
+        displayed = self._curve(luminance)
+        by_luminance = scaled * (displayed / np.maximum(luminance, 1e-12))
+        weight = np.minimum(displayed, 1)
+        return encode_srgb(by_luminance * (1 - weight) + self._curve(scaled) * weight)
+
+    def _curve(self, value: np.ndarray) -> np.ndarray:
+        return value * (1 + value / np.float32(self.white**2)) / (1 + value)
+
+
+def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
+    """Return one tone map for pictures of a scene, each [H, W, 3] linear Rec.709 radiance.
+
+    Black scenes get the identity. Raises ValueError without pictures.
+    """
+    # float64 before the logarithm: radiance may be small in its units.
+    values = np.concatenate([(np.maximum(np.asarray(p, np.float64), 0) @ LUMINANCE).ravel() for p in pictures])
+    values = values[np.isfinite(values) & (values > 0)]  # Writers refuse what is not finite, and say where.
+    if not values.size:
+        return ToneMap(1.0, 1.0)
+    values = values[values > np.percentile(values, _HIGH) * _FLOOR]
+    logs = np.log2(values)
+    (low, high), average = np.percentile(logs, (_LOW, _HIGH)), logs.mean()
+    # Between 0.09 for a mostly dark scene with highlights and 0.36 for a bright one.
+    key = MIDDLE_GREY * 2.0 ** np.clip((2 * average - low - high) / max(high - low, 1e-6), -1, 1)
+    scale = key / 2.0**average
+    # A white below 1 would make the curve convex, and brighten everything.
+    return ToneMap(float(scale), float(max(np.percentile(values, _WHITE) * scale, 1.0)))
+
+
+def expose(radiance: np.ndarray, stops: float, *, scale: float = 1.0) -> np.ndarray:
+    """Return [..., 3] radiance as a display shows it: radiance scale 2^stops, clipped to [0, 1], sRGB-encoded.
+
+    `scale` brings the picture to its normal exposure: the base exposure time, or ToneMap.scale.
+    """
+    return encode_srgb(np.asarray(radiance, np.float32) * np.float32(scale * 2.0**stops))
+
+
+def encode_srgb(linear: np.ndarray) -> np.ndarray:
+    """Encode display-linear values, limited to [0, 1], by IEC 61966-2-1; float32."""
+    linear = np.clip(np.asarray(linear, np.float32), 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - np.float32(0.055))
+
+
+def display_gain(response: Any) -> float:
+    """Return the factor from exposures of a response to display light that shows a photo's middle grey as middle grey.
+
+    It is 1 for an sRGB or linear camera.
+    """
+    grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
+    return MIDDLE_GREY / grey if grey > 0 else 1.0
+
+
+def exposure_of_white(run: "RenderableScene", white: float | None) -> float:
+    """Return the seconds to multiply radiance by so that a file holds display white as `white`; 1 for None.
+
+    Display white is 1 / MIDDLE_GREY times the light that photos show as middle grey (see display_gain): for a camera
+    whose curve is sRGB, the photos' white; for a logarithm less than that.
+
+    Raises:
+        SehdrError: For a white outside 0.001 to 10000.
+    """
+    exposure = 1.0 if white is None else white * run.base_time * display_gain(run.response)
+    if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
+        raise SehdrError(f"white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
+    return exposure

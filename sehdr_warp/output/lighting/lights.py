@@ -1,0 +1,270 @@
+"""The lights of a trained scene as JSON or as OpenUSD lights, with a map of everything else."""
+
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ...errors import SehdrError, refuse_paths
+from ...files import atomic_path, check_absent
+from ...scene.wide_camera import typical_focal_length
+from ..cameras.paths import training_cameras
+from ..images.exr import exr_header, rgb_channels, write_exr
+from ..images.ldr_files import as_array
+from ..images.tonemap import exposure_of_white
+from ..render_views import provenance
+from ..world_transform import WorldTransform, world_transform
+from .environment_map import COVERED, envmap, inpainted_light, latlong, render_map, solid_angles
+from .map_center import MapCenter, find_center
+from .unit import luminance_of_one
+
+if TYPE_CHECKING:
+    from ...runs.run import Run
+
+log = logging.getLogger(__name__)
+SUFFIXES = (".json", ".usda")
+UNSEEN = ("inpaint", "black")
+MAP_SIZE = 1024  # Pixels across of the map of what is not a light
+_STAGE = """#usda 1.0
+(
+    customLayerData = {{
+        string "sehdr:scene" = {scene}
+    }}
+    defaultPrim = "Lights"
+    metersPerUnit = 1
+    upAxis = "Y"
+)
+
+def Xform "Lights"
+{{
+    custom string sehdr:units = {units}
+    custom matrix4d sehdr:worldMatrix = ( {matrix} )
+
+{lights}
+}}
+"""
+_LIGHT = """    def {kind} "{name}"
+    {{
+        custom float3 sehdr:lowerBound = {bound}
+        custom float sehdr:shareOfLight = {share}
+{deviation}        color3f inputs:color = {color}
+        float inputs:intensity = {intensity}
+        bool inputs:normalize = 0
+{size}        matrix4d xformOp:transform = ( {rows} )
+        uniform token[] xformOpOrder = ["xformOp:transform"]
+    }}"""
+_DOME = """    def DomeLight "Rest"
+    {{
+        custom float sehdr:inpaintedShare = {inpainted}
+        color3f inputs:color = (1, 1, 1)
+        float inputs:intensity = {intensity}
+        asset inputs:texture:file = {asset}
+        token inputs:texture:format = "latlong"
+    }}"""
+
+
+def write_lights(
+    run: "Run",
+    path: Path | str,
+    *,
+    axes: str = "upright",
+    up: str | None = None,
+    scale: float | None = None,
+    at: str | tuple[float, float, float] = "center",
+    beyond: float | None = None,
+    unseen: str = "inpaint",
+    reference_white: float | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write the lights of a scene; return the files.
+
+    A light is a group of Gaussians that the photos clipped. With its size, its radiance gives the light that the
+    training views show. A USD file has a SphereLight or RectLight for each, and a DomeLight for everything else: a
+    map as write_environment_map() takes it at the same place, `<stem>_rest.exr`, in which the lights are dark. Its
+    alpha is the coverage by photos. If the unit of the run's light is known, lights and dome are in cd/m^2, as USD has
+    them.
+
+    Args:
+        run: From load_run or train.
+        path: .json, or .usda.
+        axes: As in world_transform.
+        up: As in world_transform.
+        scale: As in world_transform.
+        at: Place of the dome's map, as in write_environment_map(). Lights stay where they are.
+        beyond: Distance within which the map leaves everything out, as there.
+        unseen: "inpaint": directions of the dome that no photo covers get the light around them, so that they do not
+            darken what the dome lights. "black": they are black.
+        reference_white: Value of the photos' white in the plates that the lights go with, as in render_views; lights
+            and dome are then in the units of these plates, also if the unit of light is known.
+        overwrite: Replace files that exist.
+
+    Raises:
+        SehdrError: For a suffix that is not known, or a scene that does not state what clipped.
+        InputError: If a file exists.
+    """
+    refuse_paths("load_run", run)
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise SehdrError(f"{path}: lights are written as one of {', '.join(SUFFIXES)}; choose a suffix")
+    if unseen not in UNSEEN:
+        raise SehdrError(f"unseen {unseen!r} is not one of {', '.join(UNSEEN)}")
+    rest = path.with_name(f"{path.stem}_rest.exr")
+    files = [path] if suffix == ".json" else [path, rest]
+    for file in files:
+        check_absent(file, overwrite)
+    if suffix == ".json" and (at, beyond, unseen) != ("center", None, "inpaint"):
+        raise SehdrError(f"{path}: at, beyond and unseen are of the dome's map, which .json has not; write .usda")
+    transform = world_transform(run, axes, up=up, scale=scale)
+    center = None if suffix == ".json" else find_center(run, training_cameras(run), at, beyond, transform)
+    factor, unit = exposure_of_white(run, reference_white), "relative radiance"
+    if reference_white is not None:
+        unit = f"white is {reference_white:g}"
+    elif (luminance := luminance_of_one(run)) is not None:
+        factor, unit = luminance, "cd/m^2"
+        text = "%s: in cd/m^2; a value of 1 in plates is %.4g of them, and --reference-white puts all in one unit"
+        log.info(text, path.name, luminance)
+    units = f"{unit}, linear Rec.709"
+    lights = run.find_lights()
+    if not lights:
+        text = "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest"
+        log.warning(text, run.path)
+    rows = [_describe(f"light_{index}", light, transform, factor) for index, light in enumerate(lights)]
+    if center is not None:
+        inpainted = _write_rest(run, rest, lights, transform, center, unseen, overwrite)
+        mark = "@@@" if "@" in rest.name else "@"  # USD's quotes of a path
+        asset = f"{mark}./{rest.name}{mark}"
+        dome = _DOME.format(asset=asset, intensity=repr(float(factor)), inpainted=repr(inpainted))
+        matrix = ", ".join(_tuple(row) for row in transform.matrix.T)  # USD's matrices act on row vectors.
+        scene = json.dumps(run.scene_name, ensure_ascii=False)  # OpenUSD reads \u00e9 as u00e9.
+        lines = "\n".join([*map(_usd, rows), dome])
+        text = _STAGE.format(scene=scene, units=json.dumps(units), matrix=matrix, lights=lines)
+    else:
+        facts = {**provenance(run), "units": units, "axes": axes, "world_matrix": transform.matrix.tolist()}
+        text = json.dumps({**facts, "lights": rows}, indent=1)
+    with atomic_path(path, overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return files
+
+
+def lights_table(lights: Sequence[Any], unit: float | None = None, transform: WorldTransform | None = None) -> str:
+    """Return lights as lines of text: shape, place, size, radiance, how sure it is, and share of the scene's light.
+
+    Args:
+        lights: As from find_lights().
+        unit: cd/m^2 of a radiance of 1; None if it is not known.
+        transform: To the coordinates of places and sizes; None for those of the scene.
+    """
+    if not lights:
+        return "no lights: nothing that the photos clipped gives light"
+    transform = transform or WorldTransform.identity()
+    lines = [f"  share  shape  {'radiance' if unit is None else 'cd/m^2':>10}  at least  stops   place, size"]
+    for light in lights:
+        sides = light.shape.size[: 2 if light.shape.kind == "rect" else 1]
+        size = " x ".join(f"{transform.scale * side:.3g}" for side in sides)
+        place = ", ".join(f"{value:.3g}" for value in transform.points(light.shape.position))
+        sure = "    -" if light.deviation is None else f"{light.deviation:5.2f}"
+        radiances = (unit or 1.0) * np.mean([light.radiance, light.lower_bound], axis=1)
+        figures = " ".join(f"{value:9.3g}" for value in radiances)
+        lines.append(f"{100 * light.share:5.1f} %  {light.shape.kind:6} {figures}  {sure}   ({place}), {size}")
+    return "\n".join(lines)
+
+
+def _describe(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:
+    """Return a light as plain values, in the coordinates and the unit of the file."""
+    shape = light.shape
+    return {
+        "name": name,
+        "shape": shape.kind,
+        "position": transform.points(shape.position).tolist(),
+        "axes": (shape.axes @ transform.rotation.T).tolist(),
+        "size": [transform.scale * side for side in shape.size],
+        "radiance": (unit * np.asarray(light.radiance, float)).tolist(),
+        "lower_bound": (unit * np.asarray(light.lower_bound, float)).tolist(),
+        "deviation_stops": light.deviation,
+        "share_of_light": light.share,
+    }
+
+
+def _usd(row: dict) -> str:
+    radiance = np.maximum(row["radiance"], 0)
+    intensity = max(float(radiance.max()), 1e-12)
+    width, height = row["size"]
+    sphere = row["shape"] == "sphere"
+    size = {"radius": width / 2} if sphere else {"width": width, "height": height}
+    # USD's rectangles emit along -Z; matrices act on row vectors.
+    across, upward, normal = np.array(row["axes"])
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([-across, upward, -normal])
+    matrix[3, :3] = row["position"]
+    deviation = row["deviation_stops"]
+    return _LIGHT.format(
+        kind="SphereLight" if sphere else "RectLight",
+        name=row["name"],
+        bound=_tuple(row["lower_bound"]),
+        share=repr(float(row["share_of_light"])),
+        deviation="" if deviation is None else f"        custom float sehdr:deviationStops = {deviation!r}\n",
+        color=_tuple(radiance / intensity),
+        intensity=repr(intensity),
+        size="".join(f"        float inputs:{name} = {value!r}\n" for name, value in size.items()),
+        rows=", ".join(_tuple(line) for line in matrix),
+    )
+
+
+def _tuple(values) -> str:
+    return "(" + ", ".join(repr(float(value)) for value in values) + ")"
+
+
+def _write_rest(
+    run: "Run",
+    path: Path,
+    lights: Sequence[Any],
+    transform: WorldTransform,
+    center: MapCenter,
+    unseen: str,
+    overwrite: bool,
+) -> float:
+    """Write the map of a scene's surroundings, with the lights dark; arguments as in write_lights.
+
+    Returns the share of the map's light that is filled in.
+    """
+    focal, members = typical_focal_length(training_cameras(run)), [light.members for light in lights]
+    options = {"without": members, "beyond": center.beyond}
+    rest = render_map(run, center.position, MAP_SIZE, "latlong", transform.rotation, focal, **options)
+    hdr, directions, weight = rest.hdr, latlong(MAP_SIZE) @ transform.rotation, solid_angles(MAP_SIZE, "latlong")
+    # Dark lights are not the light around them.
+    source = np.where(_shows_lights(run, members, center, transform.rotation, focal), 0, rest.alpha)
+    inpainted = 0.0
+    if unseen == "inpaint" and (source > COVERED).any():
+        added = (1 - rest.alpha[..., None]) * inpainted_light(hdr, source, directions, weight)
+        filled, total = (float((light.mean(2) * weight).sum()) for light in (added, hdr + added))
+        inpainted = filled / max(total, 1e-30)
+        share = 100 * float((weight * (1 - rest.alpha)).sum() / weight.sum())
+        text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"
+        log.info(text, path.name, share, 100 * inpainted)
+        hdr = hdr + added
+    facts = provenance(run) | {"worldMatrix": json.dumps(transform.matrix.tolist())}
+    header = exr_header("rec709", 1.0, provenance=facts, white_luminance=luminance_of_one(run))
+    header["envmap"] = envmap("latlong")
+    write_exr(path, rgb_channels(hdr) | {"A": rest.alpha}, header=header, overwrite=overwrite)
+    return inpainted
+
+
+def _shows_lights(
+    run: "Run", members: Sequence[torch.Tensor], center: MapCenter, to_scene: np.ndarray, focal: float
+) -> np.ndarray:
+    """Return [H, W] whether half of the light of a map's pixel and more comes from Gaussians of lights.
+
+    Measured in a coarser map, since what is filled in is smooth.
+    """
+    size = MAP_SIZE // 8
+    part = torch.zeros(run.gaussian_count, device=run.device)
+    for index in members:
+        part[index] = 1
+    options = {"focal_length": focal, "pixel_angle": 2 * np.pi / size, "beyond": center.beyond, "shares": part}
+    rendered = run.render_directions(center.position, latlong(size) @ to_scene, **options)
+    return np.kron(as_array(rendered.clipped) > 0.5, np.ones((8, 8), bool))

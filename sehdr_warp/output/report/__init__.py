@@ -1,0 +1,1 @@
+"""The report of a training: an HTML page with diagrams, and pictures for papers."""

@@ -1,0 +1,90 @@
+"""One view beside its photo: what a report shows of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ...scene import View
+from ..cameras.paths import interpolate
+from ..images.ldr_files import as_array
+from ..light_pictures import photo_for_display, photo_light
+
+if TYPE_CHECKING:
+    from ...runs.run import RenderableScene
+
+_GREY, _DARKEST = 0.3, -12  # Display light at which what photos clip is shown; stops that this may take
+_CLIPPED, _BRIGHTER = 0.99, 4 / 3  # Encoded value that counts as clipped; factor that counts as brighter
+_LEAST_BRIGHTER = 0.001  # Share of a picture that shows light above white
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A view beside its photo; pictures are [H, W, 3] radiance unless stated.
+
+    Attributes:
+        name: Of the view.
+        photo: Encoded values in [0, 1].
+        from_photo: Radiance that the photo alone gives, its response inverted.
+        hdr: Rendered radiance.
+        truth: HDR truth, if the scene has it.
+        confidence: [H, W] in [0, 1] of the render, if it was measured.
+        new: Rendered half-way to the nearest other view, if there is one.
+    """
+
+    name: str
+    photo: np.ndarray
+    from_photo: np.ndarray
+    hdr: np.ndarray
+    truth: np.ndarray | None = None
+    confidence: np.ndarray | None = None
+    new: np.ndarray | None = None
+
+    @property
+    def light_above_white(self) -> float:
+        """Share of the values that the photo clips, and that the scene shows brighter than all of the photo's light."""
+        return float(((self.photo > _CLIPPED) & (self.hdr > _BRIGHTER * self.from_photo.max())).mean())
+
+
+def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: float = 1.0) -> int:
+    """Return the stops, from _DARKEST to -1, at which pictures show best what photo and scene hold above white.
+
+    The brightest light that a photo can hold is then a middle grey, and brighter light of the scene stands out from it.
+    Exposures of exposure_time seconds are at 0 EV; for `gain` see display_gain().
+    """
+    white = max(float(np.max(each.from_photo)) for each in comparisons) * exposure_time * gain
+    return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), _DARKEST, -1))
+
+
+class Opening(NamedTuple):
+    """Stops from the exposure, title and lead with which a report shows photo and scene first."""
+
+    stops: int
+    title: str
+    lead: str
+
+
+def opening_of(comparison: Comparison, exposure_time: float, gain: float = 1.0) -> Opening:
+    """Return how a report opens: as dark as shows the light above white, or as the photo was taken if there is none.
+
+    Arguments as in darker_stops().
+    """
+    if comparison.light_above_white < _LEAST_BRIGHTER:
+        lead = f"View {comparison.name}, in which the scene shows next to no light above the photo's white."
+        return Opening(0, "Photo and scene", lead)
+    stops = darker_stops([comparison], exposure_time, gain)
+    darker = f"{-stops} stop{'s' * (stops < -1)} darker"
+    lead = f"View {comparison.name}, {darker}. What the photo clipped stays flat."
+    return Opening(stops, "Light above white", lead)
+
+
+def compare(run: "RenderableScene", view: View, views: Sequence[View]) -> Comparison:
+    """Render a view of a run and compare it with its photo; `views` are all views of the scene."""
+    confidence, hdr, new = run.render_confidence(view.camera), as_array(run.render(view.camera).hdr), None
+    others = [other.camera for other in views if other.name != view.name]
+    if others:
+        nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
+        new = as_array(run.render(interpolate([view.camera, nearest], 3)[1]).hdr)
+    confidence = None if confidence is None else as_array(confidence)
+    return Comparison(view.name, photo_for_display(run, view), photo_light(run, view), hdr, view.hdr, confidence, new)

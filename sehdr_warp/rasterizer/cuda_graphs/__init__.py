@@ -1,0 +1,1 @@
+"""CUDA graphs: capture of launches, and renders that are replayed with their backward passes."""

@@ -1,0 +1,266 @@
+"""One render as a CUDA graph on memory of its own, and its backward passes."""
+
+import ctypes
+import os
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...kernels.caller_memory import write_last
+from ...kernels.project import projection_kernel
+from ..block_blending import BlockBackward, blend_on_cuda, fixed_blend_blocks
+from ..projection import ProjectedGaussians, RasterInputs, project_to_camera, projection_parameters
+from ..render_options import MAX_INTERSECTIONS, RenderOptions
+from ..tile_lists import (
+    MAX_SINGLE_SORT,
+    IntersectionOffsets,
+    PackedSplats,
+    TileLists,
+    build_tile_lists,
+    fixed_pack_splats,
+    order_intersections,
+    pack_splats,
+)
+from ..warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar, warp_stream
+from .caller_memory import CallerMemory
+from .captured_backward import CapturedBackward, GradientLayout, GradientMemory
+from .runner import CudaGraphRunner
+
+MAX_COPIED_GAUSSIANS = MAX_SINGLE_SORT
+"""More of them, without a backward pass, are read where they are, and the image is written where it stays."""
+SPINS = 200  # Looks at the number of intersections before other threads may run in between, and from query to query.
+HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
+MIN_INTERSECTIONS = 1 << 12
+RASTERIZE_TENSORS = 7
+"""Number of tensors of a call of rasterize(). A render of 2D Gaussians has six, see flatten()."""
+FEATURES = 4
+"""Index of features among the tensors of rasterize(); those of flatten() end with them."""
+_let_others_run: Callable[[], object] = getattr(os, "sched_yield", partial(time.sleep, 0))
+"""Lets other threads run. On Linux time.sleep(0) takes 50 us, to which timers are rounded up."""
+
+
+class ReplayResult(NamedTuple):
+    """Tensors that a replayed CUDA graph has written.
+
+    Attributes:
+        image: [H, W, C].
+        transmittance: [H, W].
+        others: means2d, depths and extents; extents alone if the graph begins with 2D Gaussians.
+        gradients: for the backward pass; None if that allocates them.
+    """
+
+    image: Tensor
+    transmittance: Tensor
+    others: Sequence[Tensor]
+    gradients: GradientMemory | None
+
+
+class CapturedRender:
+    """One render on fixed memory as a CUDA graph, which also copies the number of intersections to the host.
+
+    The graph copies inputs in and results out, see CallerMemory. With many Gaussians and without gradients these copies
+    would take a sixth of the time: what reads inputs and what writes the image is then launched on the caller's memory,
+    before and after the graph.
+
+    Args:
+        tensors: the seven tensors of a call of rasterize(), or flatten() of RasterInputs.
+        options: of the image.
+        intersections: the least number to allocate memory for.
+        differentiable: whether gradients by the tensors that require them are needed.
+
+    Attributes:
+        max_intersections: that there is memory for.
+        backward: the backward passes; None unless differentiable.
+    """
+
+    def __init__(
+        self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
+    ) -> None:
+        """Launch the render once, then capture it."""
+        self._options, self._projects = options, len(tensors) == RASTERIZE_TENSORS
+        self._are_contiguous = all(tensor.is_contiguous() for tensor in tensors)
+        many = len(tensors[0]) > MAX_COPIED_GAUSSIANS
+        self._copies = differentiable or options.depth or not self._projects or not many
+        self._inputs = [tensor.detach().contiguous() for tensor in tensors]
+        if self._copies:
+            self._inputs = [tensor.clone() for tensor in self._inputs]
+        first, features = self._inputs[0], self._inputs[FEATURES if self._projects else -1]
+        channels = features.shape[1] + (options.depth and self._projects)
+        self._image = first.new_empty(options.height, options.width, channels)
+        self._transmittance = first.new_empty(options.height, options.width)
+        self._counter = torch.empty(1, dtype=torch.int64, device="cpu", pin_memory=True)
+        self._count = ctypes.c_int64.from_address(self._counter.data_ptr())
+        self._stream = torch.cuda.current_stream(first.device)
+        self._runner, self._callers = CudaGraphRunner(first.device), CallerMemory(first.device)
+        self.backward: CapturedBackward | None = None
+
+        splats, packed = self._project_and_pack()
+        # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
+        with self._runner.on_capture_stream():
+            offsets = self._order_and_count(splats, packed)
+            limit = int(HEADROOM * max(intersections, int(offsets.cumulative_counts[-1])))
+            self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
+            layout = self._layout_for(tensors, self._blend(splats, packed, self._list(splats, packed, offsets)))
+            # With more Gaussians memory is worth more than the host's time.
+            self._gradients = layout.like if differentiable and not many else None
+            if self._copies:
+                self._callers.read(self._inputs)
+                self._write(splats)
+            del offsets
+        if self._copies:
+            del splats, packed
+            splats, blend = self._runner.capture(None, self._render)
+            if differentiable:
+                gaussians = without_features(self._inputs) if self._projects else []
+                self.backward = CapturedBackward(layout, blend, gaussians, options, splats.projected)
+        else:
+            lists = self._runner.capture(
+                None, lambda: self._list(splats, packed, self._order_and_count(splats, packed))
+            )
+            self._fix_launches(splats, packed, lists)
+            self._inputs = []  # The caller's.
+        self._results = [*([self._image, self._transmittance] if self._copies else ()), *self._projection_of(splats)]
+
+    def _render(self) -> tuple[RasterInputs, BlockBackward]:
+        """Run all stages, which the methods below are, in their order."""
+        self._callers.read(self._inputs)
+        splats, packed = self._project_and_pack()
+        lists = self._list(splats, packed, self._order_and_count(splats, packed))
+        backward = self._blend(splats, packed, lists)
+        self._write(splats)
+        return splats, backward
+
+    def _project_and_pack(self) -> tuple[RasterInputs, PackedSplats]:
+        options = self._options
+        splats = _project(self._inputs, options) if self._projects else unflatten(self._inputs)
+        pads = not self._copies or self._image.shape[2] % 4 > 0
+        return splats, pack_splats(splats, options.alpha_threshold, options.width, options.height, pads=pads)
+
+    def _order_and_count(self, splats: RasterInputs, packed: PackedSplats) -> IntersectionOffsets:
+        _, _, depths, _, extents = splats.projected
+        offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
+        launch(write_last, 1, offsets.cumulative_counts, self._counter)  # What follows waits longer for a copy.
+        return offsets
+
+    def _list(self, splats: RasterInputs, packed: PackedSplats, offsets: IntersectionOffsets) -> TileLists:
+        (_, _, depths, _, extents), options = splats.projected, self._options
+        size = options.width, options.height
+        return build_tile_lists(packed, offsets, depths, extents, *size, self.max_intersections, keep_emit_order=False)
+
+    def _blend(self, splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> BlockBackward:
+        outputs, threshold = (self._image, self._transmittance), self._options.alpha_threshold
+        return blend_on_cuda(splats.features, lists, packed, *outputs, threshold, False, keeps_padded=True)
+
+    def _write(self, splats: RasterInputs) -> None:
+        zeros = 0 if self._gradients is None else self._gradients.numel()
+        self._callers.write([self._image, self._transmittance, *self._projection_of(splats)], zeros)
+
+    def _projection_of(self, splats: RasterInputs) -> list[Tensor]:
+        """Return what a render returns beside image and transmittance."""
+        means2d, _, depths, _, extents = splats.projected
+        return [means2d, depths, extents] if self._projects else [extents]
+
+    def _layout_for(self, tensors: Sequence[Tensor], blend: BlockBackward) -> GradientLayout:
+        """Return the layout of the gradients that these tensors of a call require."""
+        if not self._projects:
+            return GradientLayout(blend, [], copies_features=_is_trained(tensors[-1]))
+        inputs = zip(without_features(tensors), without_features(self._inputs), strict=True)
+        gaussians = [like if tensor.requires_grad else None for tensor, like in inputs]
+        # Features with depths get their gradient through torch.cat().
+        copies_features = _is_trained(tensors[FEATURES]) and not self._options.depth
+        return GradientLayout(blend, gaussians, copies_features=copies_features)
+
+    def _fix_launches(self, splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> None:
+        """Prepare the launches of _launch()."""
+        assert packed.padded is not None
+        options, outputs = self._options, (self._image, self._transmittance)
+        size = options.width, options.height
+        self._project = _fixed_projection(self._inputs, options, splats.projected)
+        self._pack = fixed_pack_splats(splats, packed, options.alpha_threshold, *size)
+        self._fixed_blend = fixed_blend_blocks(packed.padded, lists, packed, *outputs, options.alpha_threshold)
+
+    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor] = ()) -> ReplayResult:
+        """Render. Call count_intersections() before the next replay: the GPU has then read the table of addresses.
+
+        outputs: contiguous, to write what follows image and transmittance to. By default they are new tensors.
+        """
+        if self._count.value < 0:  # The last call ended before its count was read, for example by lack of memory.
+            self._stream.synchronize()
+        self._count.value = -1
+        if not self._copies:
+            return self._launch(tensors)
+        new = self._results[: len(self._results) - len(outputs)]
+        image, transmittance, *others = *map(torch.empty_like, new), *outputs
+        zeros = None if self._gradients is None else torch.empty_like(self._gradients)
+        # Copies must live until the graph is launched.
+        inputs = tensors if self._are_contiguous else [tensor.contiguous() for tensor in tensors]
+        self._callers.set(inputs, (image, transmittance, *others), zeros)
+        self._runner.replay()
+        # Views of the gradients are made while the GPU renders.
+        gradients = None if zeros is None or self.backward is None else self.backward.allocate(zeros)
+        return ReplayResult(image, transmittance, others, gradients)
+
+    def _launch(self, tensors: Sequence[Tensor]) -> ReplayResult:
+        """Do what replay() does without copies of the features and of the image."""
+        inputs = [tensor.contiguous() for tensor in tensors]
+        features = inputs.pop(FEATURES)
+        stream = warp_stream(features.device)
+        self._project.launch((), [tensor.data_ptr() for tensor in inputs], stream)
+        self._pack.launch((), (features.data_ptr(),), stream)
+        self._runner.replay()
+        image, transmittance = torch.empty_like(self._image), torch.empty_like(self._transmittance)
+        self._fixed_blend.launch((), (image.data_ptr(), transmittance.data_ptr()), stream)
+        others = [torch.empty_like(result) for result in self._results]
+        torch._foreach_copy_(others, self._results)  # pyright: ignore[reportPrivateImportUsage]
+        return ReplayResult(image, transmittance, others, None)
+
+    def count_intersections(self) -> int:
+        """Wait for the last render's count; return it. Those beyond max_intersections were left out."""
+        count, looks = self._count, 0
+        while count.value < 0:
+            looks += 1
+            if looks > SPINS:
+                _let_others_run()
+            if looks % SPINS == 0 and self._stream.query() and count.value < 0:
+                raise RuntimeError("the GPU has not counted the intersections of a render")
+        return count.value
+
+
+def _is_trained(tensor: Tensor) -> bool:
+    """Return whether torch keeps the tensor's gradient, and so would copy one that is not contiguous."""
+    return tensor.is_leaf and tensor.requires_grad
+
+
+def _project(inputs: Sequence[Tensor], options: RenderOptions) -> RasterInputs:
+    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = inputs
+    projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
+    if options.depth:
+        features = torch.cat([features, projected.depths[:, None]], 1)
+    return RasterInputs(projected, features)
+
+
+def flatten(inputs: RasterInputs) -> tuple[Tensor, ...]:
+    """Return the six tensors of RasterInputs."""
+    return *inputs.projected, inputs.features
+
+
+def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
+    """Return the RasterInputs of flatten()."""
+    return RasterInputs(ProjectedGaussians(*tensors[:-1]), tensors[-1])
+
+
+def _fixed_projection(inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
+    """Return the launch of _project() for any inputs, to the same outputs."""
+    gaussians = without_features(inputs)
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
+    arguments = *gaussians, *projection_parameters(options), None, *projected
+    return fixed_launch(kernel, len(projected.depths), *arguments, whole=gaussians)
+
+
+def without_features(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Return the inputs of the projection among the tensors of rasterize()."""
+    return [*tensors[:FEATURES], *tensors[FEATURES + 1 :]]

@@ -1,0 +1,218 @@
+"""Exposure stacks: photos of one still scene at several times, and the camera's response by them."""
+
+import logging
+import math
+import shlex
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, starmap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from ...errors import InputError
+from ..dataparser import UNPLACED, ImageRecord
+from ..file_names import list_images
+from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
+from .times import shutter, with_exposure_times
+
+if TYPE_CHECKING:
+    from ...response import Response
+    from ...response.calibration import Calibration
+    from ...response.table import ChannelResponse
+
+log = logging.getLogger(__name__)
+
+
+# RMS stops from which a channel's curve clearly differs from the shared one, and by which a photo may miss its time.
+CHANNELS_DIFFER, WRONG_TIME = 0.15, 0.25
+CSV_ROWS = 1024  # Of a file with a column for each channel
+# What makes photos a stack: the least factor between times, and the least rank correlation in thumbnails of this side
+# over the pixels that neither clips. Real stacks correlate by 0.98 and more, photos from different places by 0.9.
+LEAST_STEP, LEAST_ALIKE, THUMBNAIL, LEAST_SHOWN, MOST_OF_STACK = 1.4, 0.96, 64, 0.05, 32
+
+
+def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list[Path], Sequence[float]]:
+    """List the photos of a folder and their exposure times.
+
+    Raises:
+        InputError: for a folder without photos, or if there is not one time for each.
+    """
+    files = list_images(folder, LDR_SUFFIXES) if folder.is_dir() else []
+    if not files:
+        raise InputError(folder, "is not a folder of photos", "give a folder of one scene at several exposure times")
+    if times is None:
+        records = [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in files]
+        records, times_known, notes = with_exposure_times(records, folder)
+        if not times_known or not all(record.time_known for record in records):
+            raise InputError(folder, "its photos state no exposure times", "give times, or an exposures.json")
+        for note in notes:
+            log.info(note)
+        times = [record.seconds for record in records]
+    if len(times) != len(files):
+        raise InputError(folder, f"has {len(files)} photos, and {len(times)} times are given", "give one for each")
+    return files, times
+
+
+def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
+    """Raise InputError if photos are an exposure stack.
+
+    In a stack each time differs from the others by a factor, and photos rank the brightness of places alike.
+    """
+    if len(photos) > MOST_OF_STACK or any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
+        return
+    try:
+        records, times_known, _ = with_exposure_times(
+            [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in photos], folder
+        )
+        records = sorted(records, key=lambda record: record.seconds)
+        steps = [b.seconds / a.seconds for a, b in pairwise(records)]
+        times_known = times_known and all(record.time_known for record in records)
+        if not times_known or min(steps) < LEAST_STEP or not all(starmap(_alike, pairwise(_thumbnails(records)))):
+            return
+    except (InputError, *PILLOW_ERRORS):
+        return  # The readers of these photos report what is wrong with them.
+    span = f"{shutter(records[0].seconds)} to {shutter(records[-1].seconds)}"
+    problem = f"its {len(photos)} photos are an exposure stack from one place ({span}), which does not show depth"
+    command = f"`sehdr-warp calibrate {shlex.quote(str(photos[0].parent))} --out camera.csv`"
+    remedy = f"take photos from different places; {command} finds the camera's response in the stack"
+    raise InputError(folder, problem, remedy)
+
+
+def _thumbnails(records: Sequence[ImageRecord]) -> Iterator[np.ndarray]:
+    for record in records:
+        with open_image(record.image) as image:
+            small = image.convert("L")
+            small.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+            yield np.asarray(small)
+
+
+def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+    """Return whether thumbnails rank the brightness of places alike, except black and white ones."""
+    if one.shape != other.shape:
+        return False
+    exposed = (np.minimum(one, other) > 8) & (np.maximum(one, other) < 247)
+    if exposed.mean() < LEAST_SHOWN:
+        return False
+    from scipy.stats import rankdata
+
+    return bool(np.corrcoef(rankdata(one[exposed]), rankdata(other[exposed]))[0, 1] >= LEAST_ALIKE)
+
+
+def calibrate(
+    stack: Path | str,
+    *,
+    times: Sequence[float] | None = None,
+    channel: str | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+) -> "Response":
+    """Measure the response of the camera that took an exposure stack (Debevec and Malik 1997); exposure 1 is white.
+
+    The residual, channels that clearly differ, and photos that do not fit their times are logged.
+
+    Args:
+        stack: a folder of photos of one still scene.
+        times: seconds, in the order of the files' names; by default exposures.json's, or EXIF's (which counts ISO and
+            f-number too).
+        channel: "red", "green" or "blue" alone, or "each" for a curve of each; by default one curve for all three.
+        out: a CSV file for the curve, which `response_by_name` reads; a plot goes beside it, with the suffix .png.
+        overwrite: replace these files.
+
+    Raises:
+        InputError: if the stack does not determine a curve, for another suffix, or a file that exists.
+    """
+    from ...files import atomic_path, check_absent
+    from ...response.calibration import CHANNELS, calibrate_codes
+
+    folder = Path(stack)
+    paths = [] if out is None else [Path(out), Path(out).with_suffix(".png")]
+    if paths and paths[0].suffix.lower() != ".csv":
+        raise InputError(paths[0], "the curve is a CSV file", f"name it {paths[0].with_suffix('.csv').name}")
+    for path in paths:
+        check_absent(path, overwrite)
+    files, times = read_stack(folder, times)
+    name = folder.name if out is None else Path(out).stem
+    photos = [read_ldr(file).pixels for file in files]
+    try:
+        channels = CHANNELS if channel == "each" else (channel,)
+        curves = [calibrate_codes(photos, times, channel=each, name=name) for each in channels]
+    except InputError as error:
+        raise InputError(folder, *error.args[0].split(": ", 1)[1].split("; ", 1)) from None
+    for calibration in curves:
+        _tell(calibration, files, channel)
+    response = curves[0].response if len(curves) == 1 else _join(name, curves)
+    if paths:
+        with atomic_path(paths[1], overwrite) as picture:
+            _plot(curves, times, picture)
+        with atomic_path(paths[0], overwrite) as table:
+            table.write_text("\n".join([*_rows(response), ""]), encoding="utf-8")
+    return response
+
+
+def _join(name: str, calibrations: Sequence["Calibration"]) -> "ChannelResponse":
+    """Return the channels' curves as one response, in which equal middle codes are neutral (Debevec and Malik)."""
+    from ...response.table import ChannelResponse
+
+    codes = np.arange(256) / 255
+    exposures = [calibration.response.decode(codes) for calibration in calibrations]
+    exposures = [each * (exposures[1][128] / each[128]) for each in exposures]
+    return ChannelResponse(name, exposures, [codes] * 3)
+
+
+def _rows(response: "Response") -> Iterator[str]:
+    """Yield the lines of a CSV file: a row for each code, or of four columns at even steps of log exposure."""
+    curves = getattr(response, "curves", None)
+    if curves is None:
+        yield "exposure,value"
+        for code, exposure in enumerate(response.decode(np.arange(256) / 255)):
+            yield f"{exposure:.9g},{code / 255:.9g}"
+        return
+    darkest = min(float(curve.decode(np.array([1 / 255]))[0]) for curve in curves) / 4
+    brightest = max(curve.clip_exposure for curve in curves)
+    exposures = np.r_[0.0, np.geomspace(darkest, brightest, CSV_ROWS)]
+    yield "exposure,red,green,blue"
+    for row in zip(exposures, *(curve.encode(exposures) for curve in curves), strict=True):
+        yield ",".join(f"{number:.9g}" for number in row)
+
+
+def _tell(calibration: "Calibration", files: list[Path], channel: str | None) -> None:
+    from ...response.calibration import CHANNELS
+
+    log.info("%d photos, residual %.3f stops", len(files), calibration.residual)
+    spread = {name: value for name, value in zip(CHANNELS, calibration.channel_spread, strict=True) if value == value}
+    if channel is None and max(spread.values(), default=0.0) > CHANNELS_DIFFER:
+        spread_text = ", ".join(f"{name} {value:.2f}" for name, value in spread.items())
+        log.warning(
+            "the channels' curves differ from the shared one, stops: %s; --channel each keeps them", spread_text
+        )
+    for file, off in zip(files, calibration.photo_offsets, strict=True):
+        if abs(off) > WRONG_TIME:
+            side = "brighter" if off > 0 else "darker"
+            log.warning("%s is %.2f stops %s than its time says", file.name, abs(off), side)
+
+
+def _plot(calibrations: Sequence["Calibration"], times: Sequence[float], path: Path) -> None:
+    """Plot the curves over their samples: encoded value against stops from white."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    exposures, values = np.concatenate([calibration.samples for calibration in calibrations]).T
+    axes.plot(np.log2(exposures), values * 255, ".", color="#9aa4ae", markersize=2, label="samples", rasterized=True)
+    codes = np.arange(1, 256)
+    colors = ("#c0392b", "#2e8b57", "#0072b2") if len(calibrations) == 3 else ("#0072b2",)
+    labels = ("red", "green", "blue") if len(calibrations) == 3 else ("response",)
+    for calibration, color, label in zip(calibrations, colors, labels, strict=True):
+        stops = np.log2(calibration.response.decode(codes / 255))
+        axes.plot(stops, codes, color=color, linewidth=1.8, label=label)
+    axes.set(xlabel="exposure, stops from white", ylabel="8-bit code", ylim=(0, 260))
+    axes.set_xlim(left=max(axes.get_xlim()[0], -14))
+    axes.grid(color="#e1e4e8", linewidth=0.8)
+    span = f"{len(times)} photos over {math.log2(max(times) / min(times)):.1f} stops"
+    residual = max(calibration.residual for calibration in calibrations)
+    title = f"{calibrations[0].response.name}: {span}, residual {residual:.3f} stops"
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.legend(frameon=False, loc="upper left", markerscale=4)
+    figure.savefig(path, dpi=140, facecolor="white", format="png")

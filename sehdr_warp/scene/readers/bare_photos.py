@@ -1,0 +1,207 @@
+"""Reader of bare photos, whose cameras structure from motion finds."""
+
+import logging
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import InputError
+from ...subsets import first_names
+from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord
+from ..exposure.stack import refuse_stack
+from ..file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
+from ..images.heif import HEIF_SUFFIXES, register_heif
+from ..images.ldr_files import PHOTO_SUFFIXES
+from ..photos import FEWEST_PHOTOS
+from ..raw.decode import color_matrix
+from ..sfm.panoramas import are_panoramas, reconstruct_panoramas
+from ..sfm.reconstruction import Reconstruction, reconstruct
+from ..unused_files import ARCHIVE_SUFFIXES, unread_kinds
+from ..video.decode import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
+from .colmap import INPUT
+from .colmap_model import find_model
+from .photo_copies import copies_note, find_copies
+from .transforms import is_transforms
+
+_log = logging.getLogger("sehdr_warp.scene")
+
+_DEEPEST = 3  # Levels of folders in which photos are looked for, to name their folder
+# Files and folders by which a program states cameras, in lower case.
+_POSE_FILES = {
+    "cameras.xml": "Metashape", "bundle.out": "Bundler", "bundle.rd.out": "Bundler", "sfm_data.json": "OpenMVG",
+    "cameras.sfm": "Meshroom", "model.nvm": "VisualSFM", "registration.csv": "RealityCapture",
+    "mesh_info.json": "Polycam", "metadata.json": "Record3D", "arposes.txt": "ARKit", "cams": "MVSNet",
+    "cameras_sphere.npz": "NeuS", "cameras.npz": "IDR", "pose": "NSVF", "camera": "Nerfies", "dslr": "ScanNet++",
+    "groundtruth.txt": "TUM", "traj.txt": "Replica", "images.lst": "RealityScan",
+}  # fmt: skip
+# By suffix what files of any name hold that state cameras.
+_POSE_CONTENT = {
+    ".xml": (b"<chunk", "Metashape"), ".csv": (b"#name,x,y", "RealityScan"), ".xmp": (b"xcr:", "RealityScan"),
+    ".out": (b"Bundle file", "Bundler"), ".json": (b'"cameraPoseARFrame"', "3D Scanner App"),
+}  # fmt: skip
+_CAMERA_FILES = ("transforms.json", "reconstruction.json", "poses_bounds.npy")  # Beside a folder of photos
+
+
+def find_photos(folder: Path) -> DataparserOutputs:
+    """Parse bare photos of a folder, or its `images/` or `input/`: records without cameras, which place_photos() adds.
+
+    Raises:
+        InputError: if there are none, or too few.
+    """
+    places = (place for place in (folder, folder / "images", folder / INPUT) if place.is_dir())
+    candidates = [list_images(place, PHOTO_SUFFIXES) for place in places]
+    # A single picture beside `images/` is a cover.
+    photos = next((each for each in candidates if len(each) > 1), next(filter(None, candidates), []))
+    if not photos:
+        if heif := next((file for file in sorted(folder.iterdir()) if file.suffix.lower() in HEIF_SUFFIXES), None):
+            register_heif(heif)
+        others = unread_kinds(folder)
+        problem = "has no photos and no known layout" + f"; it holds {others}" * bool(others)
+        raise InputError(folder, problem, _remedy_without_photos(folder))
+    if len(photos) == 1 and _folders_with_photos(folder):
+        raise InputError(photos[0], "is the only photo there", _remedy_without_photos(folder))
+    copies = find_copies(photos)
+    photos = [photo for photo in photos if photo not in copies]
+    _require_photos(photos, folder, len(copies))
+    notes = [*copies_note(copies), *_foreign_poses(folder), *_cameras_above(folder)]
+    if model := find_model(folder, anywhere=True):
+        place = model.relative_to(folder).as_posix()
+        notes.append(f"the COLMAP model in {place} names none of these photos and is not used")
+    for place in ("sparse/0", "sparse"):
+        if not model and any((folder / place / f"images{end}").is_file() for end in (".bin", ".txt")):
+            notes.append(f"{place} is not read, because it has no cameras.bin or cameras.txt: cameras are found anew")
+    if photos[0].parent == folder and (
+        inner := [name for name in _folders_with_photos(folder) if name not in OTHER_FOLDERS]
+    ):
+        notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
+    records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)
+    names = tuple(photo.name for photo in copies)
+    return DataparserOutputs("photos", tuple(records), notes=tuple(notes), mentioned=names)
+
+
+def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[DataparserOutputs, list[str]]:
+    """Find the cameras of bare photos, as find_photos() returned them, by structure from motion; see reconstruct().
+
+    Returns:
+        The dataset with its points and the photos that could be placed, and the names of the others.
+
+    Raises:
+        InputError: if the photos are an exposure stack, or of several cameras' sensors, or cannot be placed.
+    """
+    photos, folder = [record.image for record in dataset.records], dataset.folder
+    _require_photos(photos, folder)
+    if dataset.kind == "raw":
+        color_matrix(photos)  # Refuse photos of several cameras before minutes of matching.
+    refuse_stack(photos, folder)
+    try:
+        masks = [record.mask for record in dataset.records]
+        place = reconstruct_panoramas if are_panoramas(photos) else partial(_reconstruct, masks=masks)
+        reconstruction = place(photos, cache)
+    except InputError as error:
+        if poses := _foreign_poses(folder):
+            raise InputError(error.path, error.problem, poses[0]) from None
+        raise
+    model, placed, unplaced = reconstruction.model, [], []
+    cameras = {int(Path(image.name).stem): image for image in model.images}
+    for i, record in enumerate(dataset.records):
+        if (image := cameras.get(i)) is None:
+            unplaced.append(record.image.name)
+        else:
+            placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera))
+    notes = dataset.notes + reconstruction.notes(photos)
+    return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
+
+
+def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:
+    """Place photos by the features inside their masks, as COLMAP does, or by all if that places fewer than half.
+
+    A still background would misplace an object that turns.
+    """
+    if any(masks):
+        with suppress(InputError):
+            result = reconstruct(photos, cache, masks)
+            if 2 * len(result.model.images) >= len(photos):
+                return result
+        _log.warning(
+            "masks leave too little to place half of the photos: cameras are found from whole photos, without masks"
+        )
+    return reconstruct(photos, cache)
+
+
+def _require_photos(photos: Sequence[Path], folder: Path, copies: int = 0) -> None:
+    beside = f" beside {copies} copies" if copies else ""
+    if len(photos) < 2:
+        problem = f"is the only photo{beside}; one view does not show depth"
+        raise InputError(photos[0], problem, "add photos from other places")
+    if len(photos) < FEWEST_PHOTOS:
+        problem = f"holds {len(photos)} photos{beside}: depth and light cannot be told apart from so few"
+        raise InputError(folder, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
+
+
+def _remedy_without_photos(folder: Path) -> str:
+    """Return what to give in place of a folder that holds no photos."""
+    with suppress(OSError):
+        above = folder.resolve().parent
+        if find_model(above) and image_folder(above):
+            return f"give {above}"
+        if inner := _folders_with_photos(folder):
+            poses = "".join(f"; {note}" for note in _foreign_poses(folder))
+            return f"give one of its folders with photos: {first_names(inner, 5)}{poses}"
+        for file in sorted(folder.iterdir()):
+            suffix = file.suffix.lower()
+            if suffix in VIDEO_SUFFIXES:
+                return f"give the clip itself: {file.name}"
+            if suffix in ARCHIVE_SUFFIXES:
+                return f"unpack {file.name}, and give the folder with its photos"
+            if suffix in UNSTITCHED_SUFFIXES:
+                return UNSTITCHED_REMEDY
+    return "give photos (JPEG, PNG, TIFF, HEIC, RAW, EXR), a COLMAP set or a transforms.json"
+
+
+def _folders_with_photos(folder: Path) -> list[str]:
+    """List folders with photos below a folder, at most _DEEPEST levels down, as paths relative to it.
+
+    Of a set with cameras it is the folder of the set.
+    """
+    result: dict[str, None] = {}
+    for root, folders, _ in os.walk(folder):
+        place = Path(root).relative_to(folder)
+        deepest = len(place.parts) >= _DEEPEST
+        folders[:] = [] if deepest else sorted(name for name in folders if not is_system_file(name))
+        if place.parts and list_images(folder / place, PHOTO_SUFFIXES):
+            above = folder / place.parent
+            has_cameras = any((above / name).is_file() for name in _CAMERA_FILES) or find_model(above) is not None
+            is_set = place.parent.parts and has_cameras
+            result[(place.parent if is_set else place).as_posix()] = None
+    return list(result)
+
+
+def _cameras_above(folder: Path) -> list[str]:
+    """Return a note if the folder above holds cameras of a set to which the photos may belong."""
+    above = folder.resolve().parent
+    files = [above / name for name in _CAMERA_FILES if (above / name).is_file()]
+    cameras = find_model(above) or next(iter(files), None)
+    return (
+        [] if cameras is None else [f"cameras of {cameras} are not used, cameras are found anew: give {above} for them"]
+    )
+
+
+def _foreign_poses(folder: Path) -> list[str]:
+    """Return a note on poses of other programs beside bare photos: they are not read, and cameras are found anew."""
+    entries = sorted(folder.iterdir())
+    tools = [f"{tool} ({file.name})" for file in entries if (tool := _POSE_FILES.get(file.name.lower()))]
+    kinds = {file.suffix.lower(): file for file in reversed(entries) if file.suffix.lower() in _POSE_CONTENT}
+    for suffix, file in sorted(kinds.items()):
+        mark, tool = _POSE_CONTENT[suffix]
+        if file.is_file() and file.name.lower() not in _POSE_FILES:
+            with suppress(OSError), file.open("rb") as opened:
+                tools += [f"{tool} ({file.name})"] if mark in opened.read(1 << 16) else []
+    remedy = "are not read, cameras are found anew: export them for COLMAP or nerfstudio"
+    notes = [f"poses of {', '.join(tools)} {remedy}"] if tools else []
+    frames = [file.name for file in entries if is_transforms(file)]
+    return notes + [f"{name} states cameras: to use them, give the file itself" for name in frames[:1]]

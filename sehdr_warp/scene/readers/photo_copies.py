@@ -1,0 +1,78 @@
+"""Photos that are stored twice: as another kind of file (a phone's HEIC beside its JPEG), edited, or as a copy."""
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import InputError
+from ...subsets import counted
+from ..images.heif import HEIF_SUFFIXES
+from ..images.ldr_files import JPEG_SUFFIXES, LDR_SUFFIXES, PILLOW_ERRORS, open_image, orientation_of, turn_upright
+from ..lens import area_average
+from ..sfm.reconstruction import file_digest
+
+_ALIKE = 0.97  # Correlation of two thumbnails of one picture; photos from two places have less
+_SIDE = 32  # Of a thumbnail
+_EDITED = re.compile(r"(?<=^img_)e(?=\d)|-edited$")  # What iOS and Google Photos put into the names of edited photos
+_KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", *JPEG_SUFFIXES, ".bmp")
+"""Kinds of files by preference: of two files of one picture the first kind counts, which may hold more bits."""
+
+
+def find_copies(photos: Sequence[Path]) -> dict[Path, Path]:
+    """Return the photos that are copies of another one, each with that other one.
+
+    They have the same bytes, or the same picture and one name but for the suffix or the mark of an edited photo. A
+    held-out photo would have its copy among the training photos, and an editor changes the camera's response.
+    """
+    copies, photos = _equal_files(photos)
+    by_stem: dict[str, list[Path]] = {}
+    for photo in photos:
+        if photo.suffix.lower() in LDR_SUFFIXES:
+            by_stem.setdefault(_EDITED.sub("", photo.stem.lower()), []).append(photo)
+    for stem, group in by_stem.items():
+        best, *others = sorted(group, key=lambda p: (p.stem.lower() != stem, _KINDS.index(p.suffix.lower())))
+        pictures = [_thumbnail(photo) for photo in (best, *others)] if others else []
+        for photo, picture in zip(others, pictures[1:], strict=True):
+            if pictures[0] is not None and picture is not None and float((pictures[0] * picture).sum()) > _ALIKE:
+                copies[photo] = best
+    return copies
+
+
+def copies_note(copies: Mapping[Path, Path]) -> list[str]:
+    """Return a note on what find_copies() found; none if it found nothing."""
+    if not copies:
+        return []
+    copy, photo = next(iter(copies.items()))
+    count = counted(len(copies), "photo is a copy", "photos are copies")
+    more = " ..." if len(copies) > 1 else ""
+    return [f"{count} of others and left out: {copy.name} of {photo.name}{more}"]
+
+
+def _equal_files(photos: Sequence[Path]) -> tuple[dict[Path, Path], list[Path]]:
+    """Return the photos that have the bytes of one with a shorter name, each with that one, and all others."""
+    sizes, firsts, copies = Counter(photo.stat().st_size for photo in photos), {}, {}
+    for photo in sorted(photos, key=lambda photo: len(photo.name)):
+        if sizes[photo.stat().st_size] > 1 and photo != (first := firsts.setdefault(file_digest(photo), photo)):
+            copies[photo] = first
+    return copies, [photo for photo in photos if photo not in copies]
+
+
+def _thumbnail(photo: Path) -> np.ndarray | None:
+    """Return [_SIDE, _SIDE] values of an upright photo without their mean, of unit length; None if it has fewer pixels.
+
+    None also if it cannot be decoded.
+    """
+    try:
+        with open_image(photo) as image:
+            image.draft("L", (256, 256))
+            grey = turn_upright(np.asarray(image.convert("L")), orientation_of(image))
+    except (InputError, *PILLOW_ERRORS):
+        return None
+    if min(grey.shape) < _SIDE:
+        return None
+    values = area_average(grey, _SIDE, _SIDE)
+    values -= values.mean()
+    return values / max(float(np.linalg.norm(values)), 1e-6)

@@ -1,0 +1,1 @@
+"""Structure from motion through pycolmap: cameras and points of bare photos and panoramas."""

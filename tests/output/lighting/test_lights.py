@@ -1,0 +1,152 @@
+"""Files of lights: what they hold, read by OpenUSD, and that they light as the scene does."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.errors import InputError, SehdrError, UsageError
+from sehdr_warp.model.baking import field_of
+from sehdr_warp.model.lights import Light, LightShape
+from sehdr_warp.output.commands import Lights, WorldOptions, run_lights
+from sehdr_warp.output.lighting.environment_map import latlong, write_environment_map
+from sehdr_warp.output.lighting.lights import write_lights
+from sehdr_warp.output.world_transform import world_transform
+from sehdr_warp.runs.run import Splats
+from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
+
+from ..helpers import Entry, camera
+from .test_environment_map import lamps
+
+PANEL = LightShape("rect", np.array([1.0, 0.5, 2.0]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (0.4, 0.2))
+BALL = LightShape("sphere", np.array([0.0, 0.0, 3.0]), np.eye(3), (0.3, 0.3))
+LIGHTS = [
+    Light(PANEL, np.array([8.0, 4.0, 2.0]), np.ones(3), 0.7, 0.5, torch.tensor([0])),
+    Light(BALL, np.array([3.0, 3.0, 3.0]), np.ones(3), None, 0.2, torch.tensor([1, 2])),
+]
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A scene of six lamps, of which three belong to two lights."""
+    cameras = tuple(Entry(str(i), "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0, 0, 9))) for i in range(3))
+    scene = Splats(tmp_path / "run", field_of(lamps()), cameras)
+    scene.find_lights = lambda: LIGHTS
+    return scene
+
+
+def test_json_has_every_figure(tmp_path, run):
+    assert write_lights(run, tmp_path / "lights.json", axes="scene") == [tmp_path / "lights.json"]
+    lights_file = json.loads((tmp_path / "lights.json").read_text())
+    first, second = lights_file["lights"]
+    assert first["position"] == [1.0, 0.5, 2.0] and first["size"] == [0.4, 0.2] and first["shape"] == "rect"
+    assert first["radiance"] == [8, 4, 2] and first["deviation_stops"] == 0.7 and second["deviation_stops"] is None
+    assert (first["share_of_light"], second["shape"]) == (0.5, "sphere") and "Rec.709" in lights_file["units"]
+
+
+def test_usd_lights_stand_and_shine_as_the_scene_s(tmp_path, run):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdLux
+
+    run.scene_name = 'Café "1"'
+    files = write_lights(run, tmp_path / "lights.usda", axes="scene")
+    assert files == [tmp_path / "lights.usda", tmp_path / "lights_rest.exr"]
+    stage = Usd.Stage.Open(str(files[0]))
+    assert stage.GetRootLayer().customLayerData["sehdr:scene"] == run.scene_name
+    panel = UsdLux.RectLight(stage.GetPrimAtPath("/Lights/light_0"))
+    ball = UsdLux.SphereLight(stage.GetPrimAtPath("/Lights/light_1"))
+    color = np.array(panel.GetColorAttr().Get()) * panel.GetIntensityAttr().Get()
+    assert color == pytest.approx([8, 4, 2]) and not panel.GetNormalizeAttr().Get()
+    assert (panel.GetWidthAttr().Get(), panel.GetHeightAttr().Get()) == pytest.approx((0.4, 0.2))
+    assert ball.GetRadiusAttr().Get() == pytest.approx(0.15)
+    matrix = np.array(UsdGeom.Xformable(panel).ComputeLocalToWorldTransform(0))
+    assert matrix[3, :3] == pytest.approx([1, 0.5, 2])
+    # USD's rectangles emit along -Z, and no light is mirrored.
+    assert np.array([0, 0, -1, 0]) @ matrix == pytest.approx([0, 0, -1, 0])
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
+    root = stage.GetDefaultPrim()
+    assert root.GetAttribute("sehdr:units").Get() == "relative radiance, linear Rec.709"
+    assert np.array(root.GetAttribute("sehdr:worldMatrix").Get()) == pytest.approx(np.eye(4))
+    dome = UsdLux.DomeLight(stage.GetPrimAtPath("/Lights/Rest"))
+    assert (
+        dome.GetTextureFileAttr().Get().path == "./lights_rest.exr" and dome.GetTextureFormatAttr().Get() == "latlong"
+    )
+
+
+def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
+    write_lights(run, tmp_path / "lights.usda", axes="scene", unseen="black")
+    image = read_hdr(tmp_path / "lights_rest.exr")
+    run.find_lights = list
+    write_lights(run, tmp_path / "a@b.usda", axes="scene", unseen="black")
+    assert "= @@@./a@b_rest.exr@@@\n" in (tmp_path / "a@b.usda").read_text(), "paths with @ have their own quotes"
+    whole = read_hdr(tmp_path / "a@b_rest.exr")
+    directions = latlong(1024)
+    for index, axis in enumerate(np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]):
+        place = np.unravel_index(np.argmax(directions @ axis), directions.shape[:2])
+        expected = 0 if index < 3 else whole[place]
+        assert image[place] == pytest.approx(expected, abs=1e-3) and whole[place].max() > 1
+
+
+def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, logged):
+    write_lights(run, tmp_path / "lights.usda", axes="scene")
+    channels, header = read_exr_channels(tmp_path / "lights_rest.exr")
+    matrix = world_transform(run, "scene").matrix
+    np.testing.assert_allclose(json.loads(header["sehdr:worldMatrix"]), matrix)
+    filled, alpha = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
+    assert "no photo shows 94 % of all directions" in logged[0]
+    share = float(re.search(r"sehdr:inpaintedShare = (\S+)", (tmp_path / "lights.usda").read_text())[1])
+    assert f"{100 * share:.0f} % of the map's light" in logged[0] and share > 0.5
+    write_lights(run, tmp_path / "dark.usda", axes="scene", unseen="black")
+    dark = read_hdr(tmp_path / "dark_rest.exr")
+    assert "sehdr:inpaintedShare = 0.0" in (tmp_path / "dark.usda").read_text()
+    unseen, visible = alpha == 0, alpha > 0.98
+    assert not dark[unseen].any() and filled[visible] == pytest.approx(dark[visible], rel=0.05, abs=0.2)
+    # The three lamps that are lights are dark in the map, and do not darken what is filled in around them.
+    lit = dark[dark.mean(2) > 1]
+    assert filled[unseen].min() > 0.5 * lit.min() and filled[unseen].max() < 1.01 * lit.max()
+
+
+def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
+    run.find_lights = list
+    place = {"at": (0.5, 0.2, 1.0), "beyond": 4.3, "axes": "scene"}  # One lamp is nearer.
+    write_lights(run, tmp_path / "lights.usda", unseen="black", **place)
+    rest = read_hdr(tmp_path / "lights_rest.exr")
+    write_environment_map(run, tmp_path / "env.exr", size=1024, **place)
+    np.testing.assert_allclose(rest, read_hdr(tmp_path / "env.exr"), rtol=2e-3, atol=1e-4)
+    write_lights(run, tmp_path / "center.usda", unseen="black", axes="scene")
+    assert np.abs(read_hdr(tmp_path / "center_rest.exr") - rest).max() > 1
+    with pytest.raises(SehdrError, match=r"which \.json has not; write \.usda"):
+        write_lights(run, tmp_path / "lights.json", **place)
+    with pytest.raises(UsageError, match="--at, --beyond: set for a file"):
+        run_lights(Lights(run=run.path, at="0,0,1", beyond=1.0))
+    with pytest.raises(UsageError, match="--unseen: set for a file"):
+        run_lights(Lights(run=run.path, unseen="black"))
+
+
+def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
+    run.find_lights = list
+    run_lights(Lights(run=run.path))
+    assert capsys.readouterr().out == "no lights: nothing that the photos clipped gives light\n"
+
+
+def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
+    run_lights(Lights(run=run.path, world=WorldOptions(axes="scene")))
+    assert "(1, 0.5, 2), 0.4 x 0.2" in capsys.readouterr().out
+    run_lights(Lights(run=run.path, world=WorldOptions(scale=10.0)))
+    place = ", ".join(f"{value:.3g}" for value in world_transform(run, scale=10.0).points(PANEL.position))
+    assert f"({place}), 4 x 2" in capsys.readouterr().out
+
+
+def test_what_cannot_be_written_is_refused(tmp_path, run):
+    with pytest.raises(SehdrError, match="choose a suffix"):
+        write_lights(run, tmp_path / "lights.txt")
+    with pytest.raises(SehdrError, match="unseen 'grey' is not one of inpaint, black"):
+        write_lights(run, tmp_path / "lights.usda", unseen="grey")
+    (tmp_path / "lights_rest.exr").write_text("mine")
+    with pytest.raises(InputError, match="lights_rest.exr"):
+        write_lights(run, tmp_path / "lights.usda")
+    assert not (tmp_path / "lights.usda").exists()

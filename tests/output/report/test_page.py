@@ -1,0 +1,263 @@
+"""report.html as strangers meet it: valid, alone, small, and with the light that it says it has."""
+
+import ast
+import base64
+import hashlib
+import html
+import io
+import os
+import re
+import shutil
+import subprocess
+import zlib
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp import output
+from sehdr_warp.output.images.tonemap import display_gain
+from sehdr_warp.output.notebook import run_html
+from sehdr_warp.output.report.comparison import Comparison, darker_stops, opening_of
+from sehdr_warp.output.report.diagrams import training_svg
+from sehdr_warp.output.report.write import write_report
+from sehdr_warp.output.world_transform import world_transform
+from sehdr_warp.response import response_by_name
+
+from ...viewer.browser import browser, page_of
+from ..helpers import AnalyticRun
+from ..lighting.test_lights import LIGHTS
+from .test_write import make
+
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+PLAN = [{"name": "brackets", "choice": "plain <scaling>", "reason": "0.0% of the pixels clip"}]
+FIGURES = {"psnr": 31.4, "ssim": 0.9}, {"psnr_mu": 28.2, "ssim_mu": None}
+EVALUATION = {
+    "views": [{"name": "v_1", "ldr": FIGURES[0], "protocol": {"gt-max": FIGURES[1]}}],
+    "ldr": FIGURES[0],
+    "protocol": {"gt-max": FIGURES[1]},
+    "regions": {"clipped": {"fraction": 0.25, "psnr_ldr": 20.0, "psnr_mu": {"gt-max": None}}},
+}
+
+
+def page(tmp_path, *, unexplained=True, **options):
+    run, scene = make(tmp_path, **options)
+    named = {"photo": "v_0", "column": 5.0, "row": 7.0, "pixels": 9, "stops": 1.25}
+    worst = [named | {"box": [4, 6, 3, 3]}, named | {"stops": -2.0, "box": [5, 7, 1, 1]}]
+    run.summary = lambda: {"unexplained": {"regions": 2, "photos": 1, "worst": worst}} if unexplained else {}
+    run.decisions = lambda: PLAN
+    return write_report(run, scene, tmp_path / "report", evaluation=EVALUATION)[0].read_text()
+
+
+def validate(text):
+    """HTML that no parser, and none of the validators that are here, complains about."""
+    pytest.importorskip("html5lib").HTMLParser(strict=True).parse(text)
+    folders = [
+        Path(folder, "vnu-jar/build/dist/vnu.jar") for folder in os.environ.get("NODE_PATH", "").split(os.pathsep)
+    ]
+    commands = [["tidy", "-q", "-e"], *(["java", "-jar", str(jar), "-"] for jar in folders if jar.is_file())]
+    for command in (command for command in commands if shutil.which(command[0])):
+        checked = subprocess.run(command, input=text, capture_output=True, text=True)
+        assert checked.returncode == 0 and not checked.stderr, checked.stderr
+
+
+def headings(text):
+    return re.findall(r"<h2>(.*?)</h2>", text)
+
+
+def test_the_page_is_valid_alone_and_complete(tmp_path):
+    text = page(tmp_path)
+    validate(text)
+    assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", text) and "url(" not in text
+    assert len(text) < 5e6
+    expected = ["Light above white", "Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
+    assert headings(text) == [*expected, "What was left out, and why", "Figures", "Error against time", "Cameras"]
+    assert "<li>a note of <code>the training</code></li>" in text
+    assert text.index("<h2>Light above white") < text.index('class="facts"') < text.index("<h2>Photo, scene, truth")
+    for checked in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
+        assert checked in text
+    assert '<rect x="3.8" y="5.8"' in text  # Around the box, by three units of a 32-pixel photo
+
+
+def test_lights_are_listed_with_what_is_certain_of_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(AnalyticRun, "clipped_share", lambda self: True)
+    monkeypatch.setattr(AnalyticRun, "find_lights", lambda self: LIGHTS * 7, raising=False)
+    text = page(tmp_path)
+    validate(text)
+    place = ", ".join(f"{value:.3g}" for value in world_transform(make(tmp_path)[0]).points(LIGHTS[0].shape.position))
+    assert "Lights" in headings(text) and "The first 12 of 14." in text
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", text[text.index("<h2>Lights") : text.index("<h2>Confidence")])
+    assert len(cells) == 12 * 7
+    assert [cell.replace("\N{THIN SPACE}", "") for cell in cells[:7]] == [
+        *("panel", "0.4\N{MULTIPLICATION SIGN}0.2", place),
+        *("50.0%", "4.67", "1", "0.7"),
+    ]
+    assert cells[7] == "lamp" and cells[13] == "\N{EN DASH}"
+
+
+def test_what_is_not_known_is_left_out(tmp_path):
+    text = page(tmp_path, truth=False, splits=("train", "train"), metrics=None, unexplained=False)
+    assert "What stays unexplained" not in headings(text) and "Error against time" not in headings(text)
+    assert "none is held out" in text and 'data-name="Truth"' not in text
+    assert "--out views --cameras train --evs" in text
+    assert headings(text)[1] == "Photo and scene" and "Scene and truth" not in text
+
+
+def test_the_pictures_keep_the_light_and_look_like_photos(tmp_path):
+    imagecodecs = pytest.importorskip("imagecodecs")
+    run, scene = make(tmp_path)
+    thumbnail = re.search(r'src="data:image/jpeg;base64,([^"]*)" alt="Scene of v_1"', page(tmp_path))
+    decoded = imagecodecs.ultrahdr_decode(base64.b64decode(thumbnail[1])).astype(np.float64)[..., :3]
+    exposure = run.render(scene.views[1].camera).hdr * 0.5
+    light = exposure * display_gain(run.response)
+    inside = light < 16
+    assert inside.any() and np.median(decoded[inside] / light[inside]) == pytest.approx(1, abs=0.02)
+    plain = np.asarray(Image.open(io.BytesIO(base64.b64decode(thumbnail[1])))) / 255
+    np.testing.assert_allclose(plain.mean((0, 1)), run.response.encode(exposure).clip(0, 1).mean((0, 1)), atol=0.01)
+
+
+def test_middle_grey_of_the_photo_is_shown_as_middle_grey():
+    assert display_gain(response_by_name("srgb")) == pytest.approx(1, rel=1e-4)
+    response = response_by_name("hdr-nerf")
+    grey = response.encode(np.array([0.18 / display_gain(response)]))
+    assert grey[0] == pytest.approx(0.4614, abs=1e-3)
+
+
+def test_a_run_shows_itself_in_a_notebook():
+    run = AnalyticRun()
+    text = run_html(run)
+    page = html.unescape(re.fullmatch(r'<iframe srcdoc="([^"]*)" [^<>]*sandbox[^<>]*></iframe>', text)[1])
+    validate(page)
+    assert "1,234 Gaussians" in page and "t_0" in page and not re.findall(r"https?://", page)
+    packed = re.search(r'data-light="scene">([^<]*)<', page)[1]
+    light = np.frombuffer(zlib.decompress(base64.b64decode(packed)), "<f2").reshape(24, 32, 3)
+    np.testing.assert_allclose(light, run.render(run.cameras[3].camera).hdr * 0.5, rtol=1e-3)
+    run.cameras = []
+    assert "dial" in run_html(run) and "data-light=" not in run_html(run).replace("script[data-light]", "")
+
+
+EVIL = """</script><script>window.PWNED=1</script><img src=x onerror="window.PWNED=1">'"&"""
+
+
+def evil_report(tmp_path):
+    """A report in which all that a run and its photos say is markup."""
+    run, scene = make(tmp_path)
+    run.response = SimpleNamespace(name=EVIL, encode=run.response.encode, decode=run.response.decode)
+    run.path, run.scene_name = EVIL, EVIL
+    for entry in run.cameras:
+        entry.name += EVIL
+    views = tuple(replace(view, name=f"{view.name}{EVIL}") for view in scene.views)
+    scene = replace(scene, name=EVIL, notes=(EVIL,), views=views)
+    region = {"photo": views[0].name, "column": 5.0, "row": 7.0, "pixels": 9, "stops": 1.25, "box": [4, 6, 3, 3]}
+    unexplained = {"regions": EVIL, "photos": EVIL, "worst": [region]}
+    run.summary = lambda: {"device": EVIL, "unexplained": unexplained}
+    run.notes = lambda: [EVIL + EVIL]
+    run.decisions = lambda: [{"name": EVIL, "choice": EVIL, "reason": EVIL}]
+    evaluation = EVALUATION | {
+        "views": [EVALUATION["views"][0] | {"name": EVIL}],
+        "regions": {EVIL: EVALUATION["regions"]["clipped"]},
+    }
+    return run, write_report(run, scene, tmp_path / "report", evaluation=evaluation)[0]
+
+
+class _Elements(HTMLParser):
+    """The scripts of a page, and every attribute that is not one of ours."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.scripts, self.handlers, self.sources = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.handlers += [name for name in attributes if name.startswith("on")]
+        self.sources += [attributes[name] for name in ("src", "href") if name in attributes]
+        if tag == "script" and attributes.get("type", "text/javascript") == "text/javascript":
+            self.scripts.append("")
+
+    def handle_data(self, data):
+        if self.lasttag == "script" and self.scripts and not self.scripts[-1]:
+            self.scripts[-1] = data
+
+
+def test_what_a_run_says_is_text_and_only_our_scripts_have_leave(tmp_path):
+    run, path = evil_report(tmp_path)
+    notebook = html.unescape(re.search(r'srcdoc="([^"]*)"', run_html(run))[1])
+    for text in (path.read_text(), notebook):
+        elements = _Elements(text)
+        assert not elements.handlers and len(elements.scripts) == 1
+        assert all(source.startswith("data:image/") for source in elements.sources)
+        digest = base64.b64encode(hashlib.sha256(elements.scripts[0].encode()).digest()).decode()
+        policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])
+        assert f"script-src 'sha256-{digest}';" in policy and policy.startswith("default-src 'none';")
+        assert "unsafe-inline" not in policy.replace("style-src 'unsafe-inline'", "")
+    assert path.read_text().count("PWNED") > 20
+
+
+def test_browsers_run_our_script_and_no_other(tmp_path):
+    _, path = evil_report(tmp_path)
+    text = path.read_text()
+    forced = tmp_path / "forced.html"  # As if one had come through all the same.
+    forced.write_text(text.replace("</main>", "<script>window.PWNED=1</script><img src=x onerror='PWNED=1'></main>"))
+    with browser() as chromium:
+        for file in (path, forced):
+            page = chromium.new_page()
+            page.goto(file.as_uri())
+            page.wait_for_timeout(500)
+            assert page.evaluate("typeof window.PWNED") == "undefined"
+            assert page.evaluate("typeof startDial") == "function"
+            assert page.evaluate("document.querySelectorAll('.dial canvas').length") == 1
+            page.close()
+
+
+@pytest.mark.parametrize("path", sorted(Path(output.__file__).parent.rglob("*.py")), ids=lambda path: path.name)
+def test_no_markup_is_made_but_by_the_one_function(path):
+    """Of f-strings nothing escapes what goes in, and a template that is made of text is no template."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        for part in node.values if isinstance(node, ast.JoinedStr) else ():
+            if isinstance(part, ast.Constant):
+                assert not re.search(r"<[a-zA-Z/!]", part.value), f"{path.name}:{node.lineno}"
+        name = getattr(getattr(node, "func", None), "id", "")
+        if name == "markup":
+            assert isinstance(node.args[0], ast.Constant | ast.Name), f"{path.name}:{node.lineno}"
+        assert name != "Markup" or path.name == "html.py", f"{path.name}:{node.lineno}"
+
+
+def test_the_opening_shows_what_photos_clip_as_grey():
+    flat = np.full((4, 4, 3), 2.0)
+    thumbnail = Comparison("v", np.ones((4, 4, 3)), flat, flat * 30)
+    # White of 2 s^-1 for half a second is an exposure of 1: two stops darker it is a quarter.
+    assert darker_stops([thumbnail], 0.5) == -2
+    assert darker_stops([thumbnail], 0.5, gain=8.0) == -5
+    assert darker_stops([thumbnail], 1e-9) == -1 and darker_stops([thumbnail], 1e9) == -12
+    assert opening_of(thumbnail, 0.5).lead == "View v, 2 stops darker. What the photo clipped stays flat."
+
+
+def test_a_photo_that_clips_nothing_is_opened_as_it_was_taken():
+    flat = np.full((4, 4, 3), 0.5)
+    opening = opening_of(Comparison("v", flat, flat, flat), 0.5)
+    assert (opening.stops, opening.title) == (0, "Photo and scene") and "next to no light" in opening.lead
+
+
+def test_a_scene_without_light_above_white_is_not_opened_dark():
+    white, flat = np.ones((4, 4, 3)), np.full((4, 4, 3), 2.0)
+    assert opening_of(Comparison("v", white, flat, flat), 0.5).title == "Photo and scene"
+    steep = flat * [[[1.0, 1.0, 0.01]]]  # Of a code just below white, which a steep response decodes to far less
+    assert opening_of(Comparison("v", white, steep, flat), 0.5).title == "Photo and scene"
+
+
+def test_times_of_a_short_training_are_at_their_places():
+    chart = training_svg([{"psnr_ldr": 20.0 + time, "seconds": time} for time in (1.0, 10.0)])
+    assert re.findall(r">([\d.]+ s)<", chart) == ["0.0 s", "2.5 s", "5.0 s", "7.5 s", "10.0 s"]
+
+
+def test_a_phone_sees_the_whole_chart_and_all_brackets(tmp_path):
+    (tmp_path / "report.html").write_text(page(tmp_path))
+    with browser() as chromium, page_of(chromium, (tmp_path / "report.html").as_uri(), width=390) as phone:
+        for content in (".diagram text", ".strip img"):
+            ends = phone.locator(content).evaluate_all("all => all.map(each => each.getBoundingClientRect().right)")
+            assert ends and max(ends) <= 390, content

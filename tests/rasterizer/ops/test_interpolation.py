@@ -1,0 +1,52 @@
+"""Interpolation in tables: against the function itself, and the kernels against torch's own operations."""
+
+import pytest
+import torch
+
+from sehdr_warp.rasterizer.ops.interpolation import interpolate
+
+from ..scenes import relative_error
+
+
+def test_values_and_gradients_are_the_references(device):
+    generator = torch.Generator().manual_seed(0)
+    table = torch.randn(34, 3, generator=generator, dtype=torch.float64)
+    # From well below the table to well above it, and exactly on nodes and on both ends of the cells.
+    positions = torch.cat([torch.linspace(-3, 9, 1500).repeat(3, 1).T, torch.arange(-1.0, 7.0, 0.25).repeat(3, 1).T])
+    low, step = -1.0, 0.25
+    truth_table, truth_positions = table.clone().requires_grad_(), positions.double().requires_grad_()
+    weights = torch.randn(len(positions), 3, generator=generator)
+    truth = interpolate(truth_table, low, step, truth_positions)  # by torch
+    (truth * weights).sum().backward()
+    ours_table = table.float().to(device).requires_grad_()
+    ours_positions = positions.to(device).requires_grad_()
+    ours = interpolate(ours_table, low, step, ours_positions)
+    (ours * weights.to(device)).sum().backward()
+    assert relative_error(ours, truth) < 1e-6
+    assert relative_error(ours_table.grad, truth_table.grad) < 1e-5
+    assert relative_error(ours_positions.grad, truth_positions.grad) < 1e-5
+
+
+def test_a_smooth_function_is_met_between_its_nodes(device):
+    low, step, nodes = 0.0, 0.1, 64
+    grid = torch.arange(-1, nodes + 1, device=device) * step + low
+    positions = torch.linspace(0.0, 6.1, 999, device=device)[:, None]
+    values = interpolate(torch.sin(grid)[:, None], low, step, positions)
+    assert (values - torch.sin(positions)).abs().max() < 2e-4
+
+
+def test_poison_stays_where_it_is(device):
+    table = torch.linspace(0, 1, 20, device=device)[:, None].contiguous()
+    positions = torch.tensor([[float("nan")], [0.35], [float("inf")], [-float("inf")]], device=device)
+    values = interpolate(table, 0.0, 0.1, positions)
+    assert values[0].isnan()
+    assert values[1].isfinite()
+    assert values[3] == table[1, 0]
+    assert interpolate(table, 0.0, 0.1, positions[:0]).shape == (0, 1)
+
+
+def test_what_does_not_fit_is_refused(device):
+    with pytest.raises(ValueError, match="with 2 nodes at least"):
+        interpolate(torch.zeros(3, 3, device=device), 0.0, 1.0, torch.zeros(2, 3, device=device))
+    with pytest.raises(ValueError, match="positions is torch.float64"):
+        interpolate(torch.zeros(8, 3, device=device), 0.0, 1.0, torch.zeros(2, 3, dtype=torch.float64, device=device))

@@ -1,0 +1,361 @@
+"""Pixels: every format against another library's reading, damage, limits, and exact averages."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageOps
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.output.images.exr import write_radiance
+from sehdr_warp.scene.camera import limited_size
+from sehdr_warp.scene.images.exif import are_camera_jpegs
+from sehdr_warp.scene.images.hdr_files import hdr_size, read_hdr, read_light
+from sehdr_warp.scene.images.ldr_files import exif_of, has_16_bits, image_sizes, open_image, read_ldr
+from sehdr_warp.scene.lens import area_average
+from sehdr_warp.scene.masks import read_mask
+from sehdr_warp.scene.photos import photo_sizes
+from tests.make_scenes import png_of
+
+cv2 = pytest.importorskip("cv2")
+RNG = np.random.default_rng(1)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.jpg", "a.webp", "a.bmp"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_eight_bits(tmp_path, name, channels):
+    pixels = RNG.integers(0, 256, (20, 30, channels), dtype=np.uint8)
+    Image.fromarray(pixels.squeeze()).save(tmp_path / name, quality=100, lossless=True)
+    read = read_ldr(tmp_path / name)
+    assert read.levels == 255 and read.alpha is None and image_sizes(tmp_path / name) == ((30, 20), (30, 20))
+    np.testing.assert_array_equal(read.pixels, np.asarray(Image.open(tmp_path / name).convert("RGB")))
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "raw.tif"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_sixteen_bits_keep_every_bit(tmp_path, name, channels):
+    pixels = RNG.integers(0, 65536, (20, 30, channels), dtype=np.uint16)
+    cv2.imwrite(str(tmp_path / name), pixels, [cv2.IMWRITE_TIFF_COMPRESSION, 1] if name == "raw.tif" else [])
+    read = read_ldr(tmp_path / name)
+    assert read.levels == 65535
+    expected = pixels[..., [0, 0, 0]] if channels == 1 else pixels[..., 2::-1]
+    np.testing.assert_array_equal(read.pixels, expected)
+    if channels == 4:
+        np.testing.assert_allclose(read.alpha, pixels[..., 3] / 65535, atol=1e-6)
+
+
+def test_palette_with_transparency(tmp_path):
+    image = Image.new("P", (4, 2))
+    image.putpalette([10, 20, 30, 200, 100, 50])
+    image.putdata([0, 1, 0, 1, 1, 1, 0, 0])
+    image.save(tmp_path / "p.png", transparency=0)
+    read = read_ldr(tmp_path / "p.png")
+    assert read.pixels[0, 1].tolist() == [200, 100, 50] and read.alpha[0].tolist() == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_pillows(tmp_path, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)).save(tmp_path / "o.png", exif=exif)
+    expected = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "o.png")))
+    np.testing.assert_array_equal(read_ldr(tmp_path / "o.png", oriented=True).pixels, expected)
+    assert image_sizes(tmp_path / "o.png")[1] == expected.shape[1::-1]
+
+
+@pytest.mark.parametrize("width", [5, 40])
+def test_radiance_pictures(tmp_path, width):
+    """Width 40 is run-length coded, width 5 flat; the format's own precision is one part in 256 of the brightest."""
+    pixels = np.exp(RNG.normal(0, 3, (6, width, 3))).astype(np.float32)
+    pixels[2] = pixels[2, 0]
+    cv2.imwrite(str(tmp_path / "a.hdr"), pixels[..., ::-1])
+    read = read_hdr(tmp_path / "a.hdr")
+    assert np.all(np.abs(read - pixels) <= pixels.max(axis=2, keepdims=True) / 128)
+    data = (tmp_path / "a.hdr").read_bytes()
+    for end in (0, 5, 30, len(data) // 2, len(data) - 1):
+        (tmp_path / "b.hdr").write_bytes(data[:end])
+        with pytest.raises(InputError):
+            read_hdr(tmp_path / "b.hdr")
+
+
+def _exr(path, pixels, header=None):
+    import OpenEXR
+
+    with OpenEXR.File({"type": OpenEXR.scanlineimage, **(header or {})}, {"RGB": pixels}) as file:
+        file.write(str(path))
+
+
+def test_exr_negative_and_not_finite_values(tmp_path):
+    pixels = RNG.normal(0, 1, (6, 8, 3)).astype(np.float32)
+    _exr(tmp_path / "a.exr", pixels)
+    np.testing.assert_array_equal(read_hdr(tmp_path / "a.exr"), np.maximum(pixels, 0))
+    pixels[4, 5, 1] = np.nan
+    _exr(tmp_path / "a.exr", pixels)
+    with pytest.raises(InputError, match=r"G = nan at x=5, y=4"):
+        read_hdr(tmp_path / "a.exr")
+
+
+def test_exr_data_window_inside_the_display_window(tmp_path):
+    import OpenEXR
+
+    pixels = np.ones((3, 4, 3), np.float32)
+    corners = {"dataWindow": (np.array([2, 1], np.int32), np.array([5, 3], np.int32)),
+               "displayWindow": (np.array([0, 0], np.int32), np.array([9, 7], np.int32))}  # fmt: skip
+    _exr(tmp_path / "a.exr", pixels, corners)
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        assert file.header()["dataWindow"][0].tolist() == [2, 1]
+    read = read_hdr(tmp_path / "a.exr")
+    assert read.shape == (8, 10, 3) and read[1:4, 2:6].min() == 1 and read.sum() == 36
+    coverage = read_light(tmp_path / "a.exr").coverage
+    np.testing.assert_array_equal(coverage, read[..., 0])
+
+
+@pytest.mark.parametrize("name, other", [("a.hdr", "OpenEXR, not a Radiance picture; name it .exr"),
+                                         ("a.exr", "a Radiance picture, not OpenEXR; name it .hdr")])  # fmt: skip
+def test_light_under_the_other_suffix_is_named(tmp_path, name, other):
+    write_radiance(tmp_path / "b.hdr", np.ones((4, 8, 3)))
+    _exr(tmp_path / "b.exr", np.ones((4, 8, 3), np.float32), {})
+    (tmp_path / {"a.hdr": "b.exr", "a.exr": "b.hdr"}[name]).rename(tmp_path / name)
+    for read in (read_hdr, hdr_size):
+        with pytest.raises(InputError, match=f"is {other}"):
+            read(tmp_path / name)
+
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"
+RGB = Image.fromarray(RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(
+    "kind, message",
+    [
+        ("EPS", "is not a readable image, which is one of PNG"),
+        ("GIF", "is a GIF, which is not read as a photo; export it as RGB or grey"),
+        ("PPM", "is not a readable image"),
+        ("LAB", "holds CIELAB"),
+        ("CMYK", r"holds inks \(CMYK\)"),
+        ("1", "holds one bit a pixel"),
+        ("F", "holds floating-point values"),
+        ("YCbCr", "holds YCbCr, not RGB"),
+        ("animation", "holds several pictures"),
+        ("pages", "holds several pictures"),
+    ],
+)
+def test_other_formats_and_colors_are_refused_and_no_program_is_started(tmp_path, monkeypatch, kind, message):
+    """Whatever the name says. A stand-in on the PATH would tell that Ghostscript was asked for."""
+    (tmp_path / "gs").write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
+    (tmp_path / "gs").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    path = tmp_path / "photo.png"
+    if kind == "EPS":
+        path.write_bytes(EPS)
+    elif kind in ("GIF", "PPM"):
+        RGB.save(path, format=kind)
+    elif kind in ("animation", "pages"):
+        RGB.save(path, format="PNG" if kind == "animation" else "TIFF", save_all=True, append_images=[RGB.rotate(180)])
+    else:
+        image = Image.new("LAB", (8, 6)) if kind == "LAB" else RGB.convert("L").convert(kind)
+        image.save(path, format="TIFF")
+    for read in (read_ldr, image_sizes):
+        with pytest.raises(InputError, match=message):
+            read(path)
+    assert not (tmp_path / "started").exists()
+    if kind == "1":
+        assert set(np.unique(read_mask(path))) == {0.0, 1.0}
+
+
+def test_the_first_picture_of_an_mpo_is_the_photo(tmp_path):
+    RGB.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[RGB.rotate(180)])
+    RGB.save(tmp_path / "b.jpg")
+    np.testing.assert_array_equal(read_ldr(tmp_path / "a.jpg").pixels, read_ldr(tmp_path / "b.jpg").pixels)
+
+
+def test_too_many_pixels_are_refused_before_decoding(tmp_path):
+    header = struct.pack(">II5B", 60000, 60000, 8, 2, 0, 0, 0)
+    (tmp_path / "a.png").write_bytes(png_of((b"IHDR", header), (b"IDAT", b"")))
+    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n")
+    for read, name in ((read_ldr, "a.png"), (image_sizes, "a.png"), (read_hdr, "a.hdr"), (hdr_size, "a.hdr")):
+        with pytest.raises(InputError, match="60000 x 60000"):
+            read(tmp_path / name)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.data())
+def test_area_average_is_exact(width, height, data):
+    small = data.draw(st.integers(1, width)), data.draw(st.integers(1, height))
+    image = np.random.default_rng(0).random((height, width, 2))
+    # Repeating every pixel makes the exact fractional areas whole numbers of samples.
+    fine = image.repeat(small[1], axis=0).repeat(small[0], axis=1)
+    expected = fine.reshape(small[1], height, small[0], width, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(area_average(image, *small), expected, atol=1e-5)
+
+
+def test_limited_size():
+    assert limited_size(2832, 2128, 400) == (400, 301) and limited_size(30, 20, 400) == (30, 20)
+    assert limited_size(5000, 2, 100) == (100, 1) and limited_size(30, 20, None) == (30, 20)
+
+
+def test_photos_made_by_a_camera(tmp_path):
+    """JPEGs that state an exposure; neither other JPEGs nor other files, nor a minority of them."""
+    tags = Image.Exif()
+    tags.get_ifd(0x8769)[0x829D] = 8.0
+    picture = Image.fromarray(np.zeros((8, 8, 3), np.uint8))
+    picture.save(tmp_path / "camera.JPG", exif=tags)
+    picture.save(tmp_path / "plain.jpg")
+    picture.save(tmp_path / "screen.png", exif=tags)
+    camera, plain, screen = (tmp_path / name for name in ("camera.JPG", "plain.jpg", "screen.png"))
+    assert are_camera_jpegs([camera]) and are_camera_jpegs([camera, camera, plain])
+    for others in ([plain], [screen], [camera, plain], [None], [tmp_path / "gone.jpg"], []):
+        assert not are_camera_jpegs(others)
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_exif_of_a_png_is_found_without_its_pixels_or_behind_them(tmp_path, behind):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = tmp_path / "o.png"
+    Image.fromarray(RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)).save(path, exif=exif)
+    content = path.read_bytes()
+    start = content.index(b"eXIf") - 4
+    chunk = content[start : start + 12 + int.from_bytes(content[start : start + 4], "big")]
+    if behind:
+        path.write_bytes(content.replace(chunk, b"")[:-12] + chunk + content[-12:])
+    with open_image(path) as image:
+        assert exif_of(image)[0x0112] == 6
+        assert behind or image.tile, "the pixels were decoded"
+    assert image_sizes(path) == ((7, 5), (5, 7))
+
+
+@pytest.mark.parametrize("kind", ["thumbnail", "page"])
+def test_further_pictures_of_a_tiff(tmp_path, kind):
+    """A thumbnail behind the photo is not a page (NewSubfileType)."""
+    tifffile = pytest.importorskip("tifffile")
+    photo = RNG.integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(photo, photometric="rgb")
+        file.write(photo[::4, ::4], photometric="rgb", subfiletype=1 if kind == "thumbnail" else 2)
+    if kind == "page":
+        with pytest.raises(InputError, match="holds several pictures"):
+            read_ldr(tmp_path / "a.tif")
+    else:
+        np.testing.assert_array_equal(read_ldr(tmp_path / "a.tif").pixels, photo)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("options", [
+    {"planarconfig": "separate"}, {"planarconfig": "separate", "rowsperstrip": 5},
+    {"planarconfig": "separate", "compression": "deflate"}, {"extrasamples": [0]}, {"extrasamples": [2]},
+    {"compression": "lzw", "predictor": True, "tile": (16, 16)}, {"bigtiff": True},
+    {"bigtiff": True, "planarconfig": "separate"},
+], ids=str)  # fmt: skip
+def test_16_bits_of_every_kind_of_tiff(tmp_path, options, order):
+    tifffile = pytest.importorskip("tifffile")
+    pixels = RNG.integers(0, 65536, (21, 34, 4 if "extrasamples" in options else 3), dtype=np.uint16)
+    stored = np.moveaxis(pixels, 2, 0) if "planarconfig" in options else pixels
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", byteorder=order, **options)
+    if "bigtiff" in options and order == ">":
+        with pytest.raises(
+            InputError, match="BigTIFF whose bytes are in big-endian order, .*; save it as TIFF of less"
+        ):
+            read_ldr(tmp_path / "a.tif")
+        return
+    read = read_ldr(tmp_path / "a.tif")
+    np.testing.assert_array_equal(read.pixels, pixels[..., :3])
+    assert has_16_bits(tmp_path / "a.tif") and (read.alpha is not None) == (options.get("extrasamples") == [2])
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("compression", [None, "lzw"])
+def test_16_bits_of_a_tiff_whose_color_is_multiplied_by_alpha(tmp_path, order, compression):
+    tifffile = pytest.importorskip("tifffile")
+    pixels = RNG.integers(0, 65536, (21, 34, 4), dtype=np.uint16)
+    pixels[..., 3] = np.where(pixels[..., 3] < 9, 0, pixels[..., 3] | 0x4000)
+    alpha = pixels[..., 3:] / 65535
+    stored = pixels.copy()
+    stored[..., :3] = np.rint(pixels[..., :3] * alpha)
+    options = {"photometric": "rgb", "extrasamples": ["assocalpha"], "byteorder": order, "compression": compression}
+    tifffile.imwrite(tmp_path / "a.tif", stored, **options)
+    read = read_ldr(tmp_path / "a.tif")
+    assert has_16_bits(tmp_path / "a.tif") and read.alpha is not None
+    np.testing.assert_allclose(read.alpha, alpha[..., 0], atol=1e-6)
+    assert np.abs(read.pixels.astype(int) - pixels[..., :3] * (alpha > 0)).max() <= 3  # Of a quarter of the range
+
+
+@pytest.mark.parametrize("interlaced", [False, True])
+def test_16_bits_of_a_png_of_grey_and_alpha(tmp_path, interlaced):
+    pixels = RNG.integers(0, 65536, (1, 7, 2), dtype=np.uint16)
+    # Of one row in seven passes, those that hold a pixel of it start at 0, 4, 2 and 1.
+    passes = [pixels[0, 0::8], pixels[0, 4::8], pixels[0, 2::4], pixels[0, 1::2]] if interlaced else [pixels[0]]
+    rows = b"".join(b"\0" + part.astype(">u2").tobytes() for part in passes)
+    head = struct.pack(">IIBBBBB", 7, 1, 16, 4, 0, 0, interlaced)
+    (tmp_path / "a.png").write_bytes(png_of((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")))
+    read = read_ldr(tmp_path / "a.png")
+    np.testing.assert_array_equal(read.pixels, np.repeat(pixels[..., :1], 3, 2))
+    np.testing.assert_allclose(read.alpha, pixels[..., 1] / 65535, atol=1e-6)
+    assert has_16_bits(tmp_path / "a.png")
+
+
+def test_grey_tiffs_of_16_bits_whose_white_is_0_or_that_hold_12(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    grey = RNG.integers(0, 4096, (12, 16), dtype=np.uint16)
+    grey[0, :2] = 0, 4095
+    tifffile.imwrite(tmp_path / "white.tif", grey << 4, photometric="miniswhite")
+    np.testing.assert_array_equal(read_ldr(tmp_path / "white.tif").pixels[..., 0], 65535 - (grey << 4))
+    pytest.importorskip("imagecodecs")
+    tifffile.imwrite(tmp_path / "packed.tif", grey, photometric="minisblack", bitspersample=12)
+    read = read_ldr(tmp_path / "packed.tif").pixels
+    assert read.min() == 0 and read.max() == 65535
+    np.testing.assert_allclose(read[..., 1], grey * (65535 / 4095), atol=0.51)
+
+
+def test_planes_without_strips_are_told_by_their_channel(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    options = {"photometric": "rgb", "planarconfig": "separate"}
+    tifffile.imwrite(tmp_path / "a.tif", RNG.integers(0, 65536, (3, 12, 16), dtype=np.uint16), byteorder="<", **options)
+    data = (tmp_path / "a.tif").read_bytes()
+    changed = data.replace(struct.pack("<HHI", 273, 4, 3), struct.pack("<HHI", 273, 4, 1))
+    assert changed != data, "tifffile states three places of strips"
+    (tmp_path / "a.tif").write_bytes(changed)
+    with pytest.raises(InputError, match="cannot be decoded .the strips of channel 1 are damaged."):
+        read_ldr(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("stored, words", [
+    (np.zeros((8, 8, 5), np.uint16), "5 channels of 16 bits .compression 1., .*; export it as RGB or grey"),
+    (np.zeros((8, 8, 3), np.uint32), "3 channels of 32 bits"),
+    (np.ones((8, 8, 3), np.float32), "floats, .*; export it with 16 bits, or as OpenEXR"),
+])  # fmt: skip
+def test_tiffs_that_pillow_does_not_read_are_described(tmp_path, stored, words):
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb")
+    with pytest.raises(InputError, match=f"is a TIFF of {words}"):
+        read_ldr(tmp_path / "a.tif")
+
+
+CONTENTS = {
+    "is JPEG XL, which is not read as a photo; export it": b"\xff\x0a" + bytes(50),
+    "is JPEG 2000": b"\0\0\0\x0cjP  \r\n\x87\n" + bytes(50),
+    "is OpenEXR, which is not read as a photo; name it .exr": b"v/1\x01" + bytes(50),
+    "is a Git LFS pointer, .*; fetch it with `git lfs pull`": b"version https://git-lfs.github.com/spec/v1",
+    "is a web page, .*; download the photo again": b"<!DOCTYPE html><html></html>",
+    "is JPEG XR": b"II\xbc\1" + bytes(50),
+    "is a lossless JPEG": b"\xff\xd8\xff\xc3\0\x0b\x10\0\x10\0\x10\1\1\x11\0",
+    "is a JPEG of 12 bits": b"\xff\xd8\xff\xe0\0\x04\0\0\xff\xc1\0\x11\x0c\0\x10\0\x10\x03",
+}
+
+
+@pytest.mark.parametrize("words", CONTENTS)
+def test_what_a_file_is_that_is_not_read(tmp_path, words):
+    (tmp_path / "a.jpg").write_bytes(CONTENTS[words])
+    for name, expected in (("a.jpg", words), ("gone.jpg", "image file not found")):
+        with pytest.raises(InputError, match=f"{name}: {expected}"):
+            read_ldr(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.dng", "a.ARW", "a.exr", "a.hdr"])
+def test_photos_of_codes_under_other_names_are_named(tmp_path, name):
+    RGB.save(tmp_path / name, format="JPEG")
+    with pytest.raises(InputError, match="is a JPEG photo, not what its name says; name it .jpg"):
+        photo_sizes(tmp_path / name)

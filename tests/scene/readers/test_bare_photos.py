@@ -1,0 +1,255 @@
+"""Folders as phones, cameras and other programs leave them: what is read, and what is named instead."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene.load import parse_dataset
+from sehdr_warp.scene.readers.bare_photos import find_photos
+from sehdr_warp.scene.unused_files import unused_notes
+from tests.make_scenes import edited_json, load, pattern, write_blender, write_colmap, write_ply
+
+
+def photos(folder, count=4, suffix=".jpg"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        Image.fromarray(pattern(16, 12, i)).save(folder / f"IMG_{i}{suffix}")
+
+
+def files(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"x" * 64)
+
+
+NOT_PHOTOS = {
+    "a.insp": "holds 1 INSP .*; export them from the camera's program as equirectangular",
+    "a.360": "holds 1 360 .*; export them from the camera's program as equirectangular",
+    "a.GPR": "holds 1 GPR .*; give photos .JPEG",
+    "capture.zip": "no known layout; unpack capture.zip, and give the folder with its photos",
+    "walk.MOV": "holds 1 MOV .*; give the clip itself: walk.MOV",
+    "camera.dcp": "holds 1 DCP",
+}
+
+
+@pytest.mark.parametrize("name", NOT_PHOTOS)
+def test_what_to_give_in_place_of_a_folder_without_photos(tmp_path, name):
+    files(tmp_path, name)
+    with pytest.raises(InputError, match=NOT_PHOTOS[name]):
+        parse_dataset(tmp_path)
+
+
+def test_an_archive_is_to_be_unpacked(tmp_path):
+    files(tmp_path, "scan.zip")
+    with pytest.raises(InputError, match="scan.zip: is an archive; unpack it, and give the folder with its photos"):
+        parse_dataset(tmp_path / "scan.zip")
+
+
+def test_photos_deep_in_an_export_are_found_for_the_user(tmp_path):
+    """Polycam's raw export: a thumbnail beside keyframes; and a COLMAP set two folders down."""
+    photos(tmp_path / "poly" / "keyframes" / "corrected_images")
+    Image.fromarray(pattern(16, 12)).save(tmp_path / "poly" / "thumbnail.jpg")
+    files(tmp_path / "poly", "mesh_info.json")
+    remedy = "give .* with photos: keyframes/corrected_images; poses of Polycam"
+    with pytest.raises(InputError, match=f"is the only photo there; {remedy}"):
+        parse_dataset(tmp_path / "poly")
+    write_colmap(tmp_path / "work" / "dense" / "1")
+    with pytest.raises(InputError, match="give one of its folders with photos: dense/1$"):
+        parse_dataset(tmp_path / "work")
+
+
+def test_photos_as_3dgs_convert_expects_them(tmp_path):
+    photos(tmp_path / "input")
+    assert [record.image.parent.name for record in find_photos(tmp_path).records] == ["input"] * 4
+
+
+@pytest.mark.parametrize("file, tool", [
+    ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
+    ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"), ("frame_00000.json", "3D Scanner App"),
+])  # fmt: skip
+def test_poses_of_other_programs_are_named(tmp_path, file, tool):
+    photos(tmp_path)
+    (tmp_path / file).write_text('{"cameraPoseARFrame": []}')
+    assert any(f"poses of {tool} ({file}) are not read" in note for note in find_photos(tmp_path).notes)
+
+
+def test_poses_of_other_programs_are_the_remedy_if_cameras_are_not_found(tmp_path):
+    photos(tmp_path, 3)
+    files(tmp_path, "cameras.xml")
+    with pytest.raises(InputError, match=r"be placed.*; poses of Metashape \(cameras.xml\).*nerfstudio"):
+        parse_dataset(tmp_path)
+
+
+def test_exports_of_record3d_are_named(tmp_path):
+    photos(tmp_path / "rgb", 3)
+    files(tmp_path, "metadata.json")
+    with pytest.raises(InputError, match="folders with photos: rgb; poses of Record3D"):
+        parse_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["@eaDir/000.png/SYNOPHOTO_THUMB_M.jpg", "__MACOSX/000.jpg", "#recycle/1.jpg"])
+def test_folders_that_systems_keep_are_no_photos(tmp_path, place):
+    write_colmap(tmp_path)
+    files(
+        tmp_path,
+        f"images/{place}",
+        "images/._000.png",
+        "images/.DS_Store",
+        "images/Thumbs.db",
+        "images/.IMG_1.HEIC.icloud",
+    )
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6 and not any("in no view" in note or "not used" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize("change", ["null model", "text numbers", "flat pose", "mark"])
+def test_transforms_as_apps_write_them(tmp_path, change):
+    write_blender(tmp_path, 6)
+    file = tmp_path / "transforms.json"
+    before, values = load(tmp_path, holdout=0), json.loads(file.read_text())
+    if change == "null model":
+        values["camera_model"] = None
+    elif change == "text numbers":
+        values |= {"w": "40", "h": "30", "camera_angle_x": str(values["camera_angle_x"])}
+    elif change == "flat pose":
+        values["frames"] = [
+            frame | {"transform_matrix": np.ravel(frame["transform_matrix"]).tolist()} for frame in values["frames"]
+        ]
+    file.write_bytes(b"\xef\xbb\xbf" * (change == "mark") + json.dumps(values).encode())
+    scene = load(tmp_path, holdout=0)
+    for view, other in zip(scene.views, before.views, strict=True):
+        np.testing.assert_array_equal(view.camera.world_to_camera, other.camera.world_to_camera)
+        assert (view.camera.fx, view.camera.width) == (other.camera.fx, other.camera.width)
+
+
+@pytest.mark.parametrize("value", ["", "wide", "nan", "inf"])
+def test_text_that_is_no_number_is_named(tmp_path, value):
+    write_blender(tmp_path, 6, fl_x=value)
+    with pytest.raises(InputError, match=f"fl_x = '?{value}'? is not a finite number"):
+        load(tmp_path)
+
+
+def test_masks_and_points_that_are_missing_are_named(tmp_path):
+    write_blender(tmp_path, 6, ply_file_path="sparse_pc.ply")
+    file = tmp_path / "transforms.json"
+    with edited_json(file) as values:
+        values["frames"][1]["mask_path"] = "masks/r_1.png"
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6
+    assert "1 mask that a frame states is not here, and its photo counts whole: r_1.png" in scene.notes
+    assert "the points that transforms.json states are not here: 'sparse_pc.ply'" in scene.notes
+
+
+@pytest.mark.parametrize("before", ["./m/", "m\\", "/home/other/room/m/", "C:\\room\\m\\"])
+def test_masks_and_points_under_other_spellings(tmp_path, before):
+    """instant-DexNerf issue 3 and exports of Windows: photos were found by such names, masks and points were not."""
+    write_blender(tmp_path, 6, ply_file_path=f"{before}cloud.ply")
+    (tmp_path / "m").mkdir()
+    write_ply(tmp_path / "m" / "cloud.ply", [(0, 0, 0), (1, 2, 3)])
+    file = tmp_path / "transforms.json"
+    with edited_json(file) as values:
+        for i, frame in enumerate(values["frames"]):
+            frame["mask_path"] = f"{before}half_{i}.png" if i else ""
+            Image.fromarray(np.eye(30, 40, dtype=np.uint8) * 255).save(tmp_path / "m" / f"half_{i}.png")
+    scene = load(tmp_path, holdout=0)
+    assert [view.mask is None for view in scene.views] == [True] + [False] * 5
+    assert "not here" not in str(scene.notes) and len(scene.points) == 2
+
+
+def test_splits_under_other_spellings(tmp_path):
+    """nerfstudio compares its lists of names as paths: `./images/r_0` is `images/r_0`."""
+    names = [f"images/r_{i}" for i in range(6)]
+    write_blender(tmp_path, 6, train_filenames=names[:4], test_filenames=["./" + names[4], names[5].replace("/", "\\")])
+    assert [view.name for view in load(tmp_path).test_views] == ["r_4", "r_5"]
+
+
+def test_a_lens_that_is_not_supported_is_named_before_its_focal_length(tmp_path):
+    write_blender(tmp_path, 6, camera_model="VR180_L", camera_angle_x=None)
+    with pytest.raises(InputError, match="camera_model 'VR180_L' is not supported"):
+        load(tmp_path)
+
+
+def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):
+    """The kind that may hold more counts, also if a copy is turned; a photo of the same name is no copy."""
+    for i in range(5):
+        photo = Image.fromarray(pattern(96, 64, i))
+        photo.save(tmp_path / f"IMG_{i}.png")
+        turned = Image.Exif()
+        turned[0x0112] = 6
+        if i < 3:
+            Image.fromarray(np.rot90(np.asarray(photo))).resize((32, 48)).save(
+                tmp_path / f"img_{i}.JPG", quality=70, exif=turned
+            )
+    Image.fromarray(pattern(96, 64, 9)).save(tmp_path / "IMG_4.jpg")
+    (tmp_path / "IMG_3.jpg").write_bytes(b"damaged")
+    dataset = find_photos(tmp_path)
+    names = [record.image.name for record in dataset.records]
+    assert sorted(names) == ["IMG_0.png", "IMG_1.png", "IMG_2.png", "IMG_3.jpg", "IMG_3.png", "IMG_4.jpg", "IMG_4.png"]
+    assert not any("no view" in note for note in unused_notes(tmp_path, dataset.records, dataset.mentioned))
+    (note,) = dataset.notes
+    assert note.startswith("3 photos are copies of others and left out: img_0.JPG of IMG_0.png")
+
+
+def test_copies_of_the_same_bytes_are_left_out_and_named(tmp_path):
+    for i in range(4):
+        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
+    shutil.copy(tmp_path / "IMG_2.jpg", tmp_path / "IMG_2 (1).jpg")
+    dataset = find_photos(tmp_path)
+    assert [record.image.name for record in dataset.records] == [f"IMG_{i}.jpg" for i in range(4)]
+    assert dataset.notes == ("1 photo is a copy of others and left out: IMG_2 (1).jpg of IMG_2.jpg",)
+
+
+@pytest.mark.parametrize("edited", ["IMG_E{}.jpg", "img_e{}.HEIC", "IMG_{}-edited.jpg"])
+def test_edited_photos_beside_their_originals_are_left_out_and_named(tmp_path, edited):
+    """Check edited photos as phones name them: of another tone they are copies, of another picture they are photos."""
+    for i in range(4):
+        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
+        brighter = np.minimum(pattern(96, 64, i if i < 3 else 9) * 1.2, 255).astype(np.uint8)
+        Image.fromarray(brighter).save(tmp_path / edited.format(i), "PNG")
+    dataset = find_photos(tmp_path)
+    names = {record.image.name for record in dataset.records}
+    assert names == {*(f"IMG_{i}.jpg" for i in range(4)), edited.format(3)}
+    assert dataset.notes == (f"3 photos are copies of others and left out: {edited.format(0)} of IMG_0.jpg ...",)
+
+
+@pytest.mark.parametrize("suffix", [".jfif", ".jpe", ".mpo"])
+def test_jpegs_under_their_other_suffixes(tmp_path, suffix):
+    for i in range(3):
+        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"{i}{suffix}", "JPEG")
+    assert len(find_photos(tmp_path).records) == 3
+
+
+@pytest.mark.parametrize(
+    "file, content, tool",
+    [
+        ("project.xml", "<document><chunk></chunk></document>", "Metashape"),
+        ("castle.csv", "#name,x,y,alt,heading,pitch,roll,f\n", "RealityScan"),
+        ("IMG_0.xmp", '<rdf:Description xcr:Version="3"/>', "RealityScan"),
+    ],
+)
+def test_poses_of_other_programs_are_known_by_content(tmp_path, file, content, tool):
+    photos(tmp_path)
+    (tmp_path / file).write_text("<x/>")
+    assert not find_photos(tmp_path).notes
+    (tmp_path / file).write_text(content)
+    assert find_photos(tmp_path).notes[0].startswith(f"poses of {tool} ({file}) are not read")
+
+
+def test_the_folder_of_photos_in_place_of_its_set(tmp_path):
+    write_colmap(tmp_path)
+    (note,) = find_photos(tmp_path / "images").notes
+    assert note.endswith(f"sparse/0 are not used, cameras are found anew: give {tmp_path} for them")
+    with pytest.raises(InputError, match=f"known layout; give {tmp_path}"):
+        find_photos(tmp_path / "sparse")
+
+
+def test_transforms_of_any_name_are_named_in_a_folder_and_read_as_a_file(tmp_path):
+    write_blender(tmp_path)
+    file = (tmp_path / "transforms.json").rename(tmp_path / "undistorted.json")
+    assert find_photos(tmp_path).notes == ("undistorted.json states cameras: to use them, give the file itself",)
+    dataset = parse_dataset(file)
+    assert (dataset.format, dataset.folder, len(dataset.records)) == ("transforms", tmp_path, 6)

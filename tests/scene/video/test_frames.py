@@ -1,0 +1,86 @@
+"""Choosing the frames of a clip that become photos, and storing them."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.file_names import list_images
+from sehdr_warp.scene.images.ldr_files import read_ldr
+from sehdr_warp.scene.lens import Lens
+from sehdr_warp.scene.video.color import codes_in_rec709
+from sehdr_warp.scene.video.decode import open_clip
+from sehdr_warp.scene.video.frames import choose_frames, frames_folder
+
+from .clips import pan, write_clip
+
+
+def test_the_sharpest_frame_of_each_interval_of_movement(tmp_path):
+    blur = {i for i in range(60) if i % 3}
+    write_clip(tmp_path / "a.mp4", pan(60, blur=blur), codec="libx264", pixels="yuv420p")
+    choice = choose_frames(open_clip(tmp_path / "a.mp4"))
+    # 59 steps of 4 of 128 pixels are 1.84 widths.
+    assert choice.total == 60 and choice.movement == pytest.approx(59 * 4 / 128, rel=0.05)
+    assert 20 <= len(choice.numbers) <= 24
+    assert np.mean([number % 3 == 0 for number in choice.numbers]) > 0.8
+
+
+def test_a_resting_camera_gives_no_frames(tmp_path):
+    frames = list(pan(30))
+    write_clip(tmp_path / "a.mp4", frames[:15] + [frames[15]] * 60 + frames[15:], codec="libx264", pixels="yuv420p")
+    choice = choose_frames(open_clip(tmp_path / "a.mp4"))
+    assert sum(17 <= number <= 73 for number in choice.numbers) <= 2
+
+
+def test_frames_are_kept_in_the_cache(tmp_path, caplog):
+    write_clip(tmp_path / "a.mp4", pan(30), tags=(18, 9, 9))
+    clip = open_clip(tmp_path / "a.mp4")
+    folder = frames_folder(clip, tmp_path / "cache")
+    files = list_images(folder, (".png",))
+    assert len(files) == 24 and read_ldr(files[0]).pixels.dtype == np.uint16
+    with caplog.at_level(logging.INFO, "sehdr_warp.scene"):
+        assert frames_folder(clip, tmp_path / "cache") == folder
+    assert "using the cached result" in caplog.text
+    files[0].write_bytes(b"")
+    assert frames_folder(clip, tmp_path / "cache") == folder and files[0].stat().st_size > 0
+
+
+@pytest.mark.parametrize("saturated", [False, True])
+def test_a_clip_within_rec709_is_converted_and_another_keeps_its_primaries(tmp_path, monkeypatch, saturated):
+    def place(dataset, _):
+        lens = Lens("SIMPLE_PINHOLE", 128, 96, (100.0, 64.0, 48.0), dataset.folder)
+        return replace(dataset, records=tuple(replace(record, lens=lens) for record in dataset.records)), []
+
+    monkeypatch.setattr("sehdr_warp.scene.load.place_photos", place)
+    response = response_by_name("colour:ITU-R BT.2100 HLG")
+    to_rec709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
+    lights, frames = [], []
+    for codes in pan(30):
+        light = 0.6 * (0.7 * codes.mean(2, keepdims=True) + 0.3 * codes)
+        wide = light @ np.linalg.inv(to_rec709).T
+        if saturated:
+            wide[:20, :30] = [0.02, 0.4, 0.02]
+        frames.append(response.encode(wide))
+        lights.append(wide @ to_rec709.T)
+    write_clip(tmp_path / "a.mov", frames, tags=(18, 9, 9), lossless=True)
+    scene = load_scene(tmp_path / "a.mov", cache=tmp_path / "cache", max_size=64)
+    assert (scene.color_matrix is None) is not saturated and scene.light_known
+    assert any("colors: the clip's lie within Rec.709" in note for note in scene.notes) is not saturated
+    for view in scene.views[::6]:
+        decoded = response.decode(view.codes / 65535) @ (np.eye(3) if scene.color_matrix is None else to_rec709).T
+        expected = lights[int(view.name.removeprefix("frame_"))].reshape(48, 2, 64, 2, 3).mean((1, 3))
+        np.testing.assert_allclose(decoded, expected, rtol=0.03, atol=2e-3)
+        assert (decoded.min() < -0.1) is np.bool_(saturated)
+    by_another = load_scene(tmp_path / "a.mov", cache=tmp_path / "cache", max_size=64, response="camera")
+    assert by_another.color_matrix is not None and not by_another.light_known
+
+
+def test_clipped_channels_stay_clipped_in_rec709():
+    response, matrix = response_by_name("linear"), np.array([[1.5, -0.4, -0.1], [-0.1, 1.1, 0.0], [0.0, -0.1, 1.1]])
+    codes = np.array([[[65535, 65535, 65535], [65535, 20000, 20000], [30000, 30000, 30000]]], np.uint16)
+    converted = codes_in_rec709(codes, response, matrix)
+    assert (converted[0, 0] == 65535).all() and converted[0, 1, 0] == 65535
+    assert (converted[0, 1, 1:] < 40000).all() and np.abs(converted[0, 2].astype(int) - 30000).max() <= 1
