@@ -266,8 +266,6 @@ def test_exposure_times_of_zero_in_exif_count_as_none(tmp_path):
         ("--max-size", "0", "0 pixels"),
         ("--max-size", "-5", "-5"),
         ("--preset", ".", "."),
-        ("--device", "tpu", "tpu"),
-        ("--response", "kodak", "kodak"),
     ],
 )
 def test_values_that_cannot_be(data, capfd, flag, value, words):
