@@ -75,6 +75,11 @@ class Light:
     members: Tensor
 
 
+def light_name(index: int) -> str:
+    """Return the name of the light at an index of find_lights(), as files, tables, reports and the viewer have it."""
+    return f"light_{index}"
+
+
 @torch.no_grad()
 def find_lights(
     field: RadianceField,

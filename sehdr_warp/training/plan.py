@@ -43,6 +43,8 @@ MAX_EXPOSURE_RATIO = 2.0**16
 COMPENSATION = "exposure-compensation"  # Name of the decision that compensation.py adds
 LEAST_OVERLAP = 0.02
 LEAST_CONTRAST = 1 / 255
+CLIPPED = 0.002
+"""Fraction of clipped pixels from which a line says that light above white is an estimate."""
 DRIFT = 3.0  # Stops of brightness between photos that suggest an exposure that changed without being stated
 
 
@@ -108,6 +110,9 @@ class Plan:
         if code := self.facts.plateau:
             problem = f"no photo is brighter than code {code} of 255, which many pixels have: they clip there"
             lines.append(f"plan: {problem}, and that is taken for their light; export them with white at 255")
+        if self.facts.clipped >= CLIPPED:
+            estimated = f"{self.facts.clipped:.1%} of the pixels clip, and their light above white is an estimate"
+            lines.append(f"plan: {estimated}; three photos in which lamps and windows do not clip measure it")
         return lines + [f"plan: {line}, as you set it" for line in _format_fields(self.user_fields)]
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import SehdrError
-from ..model.lights import Light
+from ..model.lights import Light, light_name
 from ..output.cameras.framing import opening_facts
 from ..output.cameras.paths import facts_of_cameras
 from ..output.export.splat_edits import SplatEdits
@@ -82,7 +82,7 @@ class ViewerScene:
         """Return what the page lists of the lights, as plain values."""
         rows = [
             {
-                "shape": light.shape.kind,
+                "name": light_name(index),
                 "position": light.shape.position.tolist(),
                 "size": max(light.shape.size),
                 "radiance": float(np.mean(light.radiance)),

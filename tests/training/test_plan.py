@@ -134,6 +134,13 @@ def test_photos_that_clip_below_white_get_a_line(scene):
         assert measure_scene(with_images(scene, other)).plateau == 0
 
 
+@pytest.mark.parametrize(("clipped", "is_told"), [(0.001, False), (0.065, True)])
+def test_photos_that_clip_get_a_line_before_the_training(scene, clipped, is_told):
+    plan = make_plan(scene, config_of())
+    lines = replace(plan, facts=replace(plan.facts, clipped=clipped)).lines()
+    assert is_told == any("6.5% of the pixels clip" in line and "measure it" in line for line in lines)
+
+
 def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     shares = iter(np.linspace(0.1, 0.9, len(scene.views)))
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))

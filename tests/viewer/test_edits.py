@@ -48,7 +48,7 @@ def test_a_light_is_listed_and_made_brighter(lamps):
     before = frame(lamps, view)[0]
     light_list = json.loads(ask(lamps, "/lights", {})[2])
     assert light_list["unit"] is None and light_list["lights"][0] == {
-        "shape": "sphere",
+        "name": "light_0",
         "position": [1, 0, 0],
         "size": 0.3,
         "radiance": 8,
@@ -89,7 +89,7 @@ def test_the_page_flies_to_a_light_and_sets_its_gain(lamps):
         )
         page.wait_for_selector("#stage[data-frame=full]")
         listed = page.text_content(".light")
-        assert "lamp 1: 40 % of the light" in listed and "0.8 stops" in listed
+        assert "light_0: 40 % of the light" in listed and "0.8 stops" in listed
         page_camera = Camera.from_dict(page.evaluate("window.viewer.camera()"))
         x, y, z, _ = page_camera.world_to_camera @ np.array([1, 0, 0, 1])
         assert z > 0 and abs(x) < 1e-6 and abs(y) < 1e-6

@@ -11,7 +11,9 @@ import torch
 
 from ...errors import SehdrError, refuse_paths
 from ...files import atomic_path, check_absent
+from ...model.lights import light_name
 from ...scene.wide_camera import typical_focal_length
+from ...subsets import first_names
 from ..cameras.paths import training_cameras
 from ..images.exr import exr_header, rgb_channels, write_exr
 from ..images.ldr_files import as_array
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".usda")
 UNSEEN = ("inpaint", "black")
+UNCERTAIN = 1.0  # Stops of deviation above which a light is called uncertain
 MAP_SIZE = 1024  # Pixels across of the map of what is not a light
 _STAGE = """#usda 1.0
 (
@@ -133,7 +136,7 @@ def write_lights(
     if not lights:
         text = "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest"
         log.warning(text, run.path)
-    rows = [_describe(f"light_{index}", light, transform, factor) for index, light in enumerate(lights)]
+    rows = [_describe(light_name(index), light, transform, factor) for index, light in enumerate(lights)]
     if center is not None:
         inpainted = _write_rest(run, rest, lights, transform, center, unseen, overwrite)
         mark = "@@@" if "@" in rest.name else "@"  # USD's quotes of a path
@@ -152,7 +155,7 @@ def write_lights(
 
 
 def lights_table(lights: Sequence[Any], unit: float | None = None, transform: WorldTransform | None = None) -> str:
-    """Return lights as lines of text: shape, place, size, radiance, how sure it is, and share of the scene's light.
+    """Return lights as lines of text: name, share of the light, shape, radiance, how sure it is, place and size.
 
     Args:
         lights: As from find_lights().
@@ -162,16 +165,28 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
     if not lights:
         return "no lights: nothing that the photos clipped gives light"
     transform = transform or WorldTransform.identity()
-    lines = [f"  share  shape  {'radiance' if unit is None else 'cd/m^2':>10}  at least  stops   place, size"]
-    for light in lights:
+    unit_name = "radiance" if unit is None else "cd/m^2"
+    lines = [f"name        share  shape  {unit_name:>10}  at least  +- stops  place, size"]
+    for index, light in enumerate(lights):
         sides = light.shape.size[: 2 if light.shape.kind == "rect" else 1]
         size = " x ".join(f"{transform.scale * side:.3g}" for side in sides)
         place = ", ".join(f"{value:.3g}" for value in transform.points(light.shape.position))
-        sure = "    -" if light.deviation is None else f"{light.deviation:5.2f}"
+        sure = "-" if light.deviation is None else f"{light.deviation:.2f}"
         radiances = (unit or 1.0) * np.mean([light.radiance, light.lower_bound], axis=1)
         figures = " ".join(f"{value:9.3g}" for value in radiances)
-        lines.append(f"{100 * light.share:5.1f} %  {light.shape.kind:6} {figures}  {sure}   ({place}), {size}")
-    return "\n".join(lines)
+        name_and_share = f"{light_name(index):8} {100 * light.share:5.1f} %"
+        lines.append(f"{name_and_share}  {light.shape.kind:6} {figures}  {sure:>8}  ({place}), {size}")
+    return "\n".join([*lines, *uncertain_lights(lights)])
+
+
+def uncertain_lights(lights: Sequence[Any]) -> list[str]:
+    """Return the sentence that names lights of which photos show little, and what measures them; none without them."""
+    unsure = [light.deviation is not None and light.deviation > UNCERTAIN for light in lights]
+    if not any(unsure):
+        return []
+    names = first_names([light_name(index) for index, is_unsure in enumerate(unsure) if is_unsure], 5)
+    guess = f"{names}: uncertain by more than a factor of {2**UNCERTAIN:g}, because every photo clips there"
+    return [f"{guess}; three more photos, so dark that these lights do not clip, measure them"]
 
 
 def _describe(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:

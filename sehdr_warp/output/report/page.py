@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ... import __version__
-from ...model.lights import Light
+from ...model.lights import Light, light_name
 from ...scene import Scene
 from ...scene.camera import limited_size
 from ...scene.exposure.times import shutter
@@ -17,6 +17,7 @@ from ..html import EMPTY, duration, join, markup, page_file, whole_page, with_co
 from ..images.tonemap import display_gain, expose, fit_tone_map
 from ..images.ultra_hdr import MOST_STOPS, ultra_hdr
 from ..light_pictures import SPLIT, dial, img, jpeg, jpeg_source, photo_for_display, side_choices, simulated_photo
+from ..lighting.lights import uncertain_lights
 from ..lighting.unit import luminance_of_one, read_light_unit
 from ..world_transform import WorldTransform, world_transform
 from .comparison import Comparison, opening_of
@@ -188,16 +189,16 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
     unit: cd/m^2 of a radiance of 1, None if it is not known.
     """
     rows = []
-    for light in lights[:_MOST_LIGHTS]:
+    for index, light in enumerate(lights[:_MOST_LIGHTS]):
         radiances = (float((unit or 1.0) * np.mean(values)) for values in (light.radiance, light.lower_bound))
         sides = light.shape.size if light.shape.kind == "rect" else light.shape.size[:1]
         lengths = (f"{transform.scale * side:.3g}" for side in sides)
         size = "\N{THIN SPACE}\N{MULTIPLICATION SIGN}\N{THIN SPACE}".join(lengths)
         place = ", ".join(f"{value:.3g}" for value in transform.points(light.shape.position))
         figures = (f"{light.share:.1%}", *(f"{value:.3g}" for value in radiances), number(light.deviation, 1))
-        rows.append(("panel" if light.shape.kind == "rect" else "lamp", size, place, *figures))
+        rows.append((light_name(index), light.shape.kind, size, place, *figures))
     measure = "radiance" if unit is None else "cd/m\N{SUPERSCRIPT TWO}"
-    titles = ("", "size", "place", "share of light", measure, "certain at least", "deviation, stops")
+    titles = ("name", "shape", "size", "place", "share of light", measure, "certain at least", "deviation, stops")
     lead = (
         "Lamps, windows and other areas that photos clip, those that give most first. Their radiance is an estimate "
         "with a deviation; what photos show as white is certain. Places are upright, as in exported files. Share: of "
@@ -205,7 +206,8 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
     )
     if len(lights) > _MOST_LIGHTS:
         lead += f" The first {_MOST_LIGHTS} of {len(lights)}."
-    return _section("Lights", lead, _rows(titles, rows, first_number=3))
+    lead = " ".join([lead, *(f"{sentence}." for sentence in uncertain_lights(lights))])
+    return _section("Lights", lead, _rows(titles, rows, first_number=4))
 
 
 def _confidence(comparisons: Sequence[Comparison]) -> Markup:

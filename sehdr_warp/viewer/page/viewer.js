@@ -490,9 +490,9 @@ function listLights(told) {
   const unit = told && told.unit, value = x => unit ? `${figure(unit * x)} cd/m\u00b2` : figure(x);
   $("lightList").replaceChildren(...(told ? told.lights : []).map((lamp, i) => {
     const make = (kind, values = {}) => Object.assign(document.createElement(kind), values), row = make("div", {className: "light"});
-    const name = `${lamp.shape === "rect" ? "area" : "lamp"} ${i + 1}: ${(100 * lamp.share).toFixed(lamp.share < 0.1 ? 1 : 0)} % of the light`;
+    const name = `${lamp.name}: ${(100 * lamp.share).toFixed(lamp.share < 0.1 ? 1 : 0)} % of the light`;
     const sure = lamp.deviation === null ? "" : ` \u00b1 ${lamp.deviation.toFixed(1)} stops`, button = make("button", {textContent: name, title: "fly there"});
-    const range = make("input", {type: "range", min: -6, max: 6, step: 0.1, value: lamp.stops, ariaLabel: `gain of light ${i + 1}, stops`});
+    const range = make("input", {type: "range", min: -6, max: 6, step: 0.1, value: lamp.stops, ariaLabel: `gain of ${lamp.name}, stops`});
     const stops = make("output", {textContent: stopsText(lamp.stops)});
     const words = `${value(lamp.radiance)}${sure}, at least ${value(lamp.certain)}`, title = "radiance, the deviation of its estimate, and what the photos prove";
     row.append(button, stops, make("span", {className: "quiet", textContent: words, title}), range);

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.commands import Lights, WorldOptions, run_lights
 from sehdr_warp.output.lighting.environment_map import latlong, write_environment_map
-from sehdr_warp.output.lighting.lights import write_lights
+from sehdr_warp.output.lighting.lights import lights_table, write_lights
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
@@ -135,10 +136,20 @@ def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):
 def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
     monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
     run_lights(Lights(run=run.path, world=WorldOptions(axes="scene")))
-    assert "(1, 0.5, 2), 0.4 x 0.2" in capsys.readouterr().out
+    table = capsys.readouterr().out
+    assert "(1, 0.5, 2), 0.4 x 0.2" in table and "do not clip, measure them" not in table
+    write_lights(run, run.path.with_name("lights.json"))
+    rows = json.loads(run.path.with_name("lights.json").read_text())["lights"]
+    assert [line.split()[0] for line in table.splitlines()[1:]] == [row["name"] for row in rows]
     run_lights(Lights(run=run.path, world=WorldOptions(scale=10.0)))
     place = ", ".join(f"{value:.3g}" for value in world_transform(run, scale=10.0).points(PANEL.position))
     assert f"({place}), 4 x 2" in capsys.readouterr().out
+
+
+def test_uncertain_lights_are_named_with_their_remedy():
+    table = lights_table([replace(LIGHTS[0], deviation=1.2), LIGHTS[1], replace(LIGHTS[1], deviation=3.0)])
+    assert table.splitlines()[-1].startswith("light_0, light_2: uncertain by more than a factor of 2")
+    assert "so dark that these lights do not clip" in table
 
 
 def test_what_cannot_be_written_is_refused(tmp_path, run):

@@ -91,12 +91,13 @@ def test_lights_are_listed_with_what_is_certain_of_them(tmp_path, monkeypatch):
     place = ", ".join(f"{value:.3g}" for value in world_transform(make(tmp_path)[0]).points(LIGHTS[0].shape.position))
     assert "Lights" in headings(text) and "The first 12 of 14." in text
     cells = re.findall(r"<td[^>]*>(.*?)</td>", text[text.index("<h2>Lights") : text.index("<h2>Confidence")])
-    assert len(cells) == 12 * 7
-    assert [cell.replace("\N{THIN SPACE}", "") for cell in cells[:7]] == [
-        *("panel", "0.4\N{MULTIPLICATION SIGN}0.2", place),
+    assert len(cells) == 12 * 8
+    assert [cell.replace("\N{THIN SPACE}", "") for cell in cells[:8]] == [
+        *("light_0", "rect", "0.4\N{MULTIPLICATION SIGN}0.2", place),
         *("50.0%", "4.67", "1", "0.7"),
     ]
-    assert cells[7] == "lamp" and cells[13] == "\N{EN DASH}"
+    assert cells[8:10] == ["light_1", "sphere"] and cells[15] == "\N{EN DASH}"
+    assert "do not clip, measure them" not in text
 
 
 def test_what_is_not_known_is_left_out(tmp_path):
