@@ -45,7 +45,7 @@ def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) ->
     packed = pack_splats(RasterInputs(projected, features), ALPHA_THRESHOLD, width, height)
     depths, extents = projected.depths, projected.extents
     offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
-    lists = build_tile_lists(packed, offsets, depths, extents, width, height, keep_emit_order=False)
+    lists = build_tile_lists(packed, offsets, depths, extents, width, height)
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     image, transmittance = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
     blended = blend_on_cuda(features, lists, packed, image, transmittance, ALPHA_THRESHOLD, deterministic=False)

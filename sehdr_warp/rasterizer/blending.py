@@ -24,8 +24,9 @@ from .warp_launch.launching import launch, warp_scalar
 
 ROWS_OF_TILE = blend_cpu.HALVES * TILE_SIZE  # Of LANES pixels each
 RANGES_PER_THREAD = 16  # Ranges of tiles on the CPU: their work differs by more than their intersections.
-Backward = Callable[[Tensor, Tensor | None], Sequence[Tensor]]
-"""Maps the gradients with respect to image and transmittance (None for 0) to those of the blended tensors."""
+GradientsByTensor = Callable[[Tensor, Tensor | None], Sequence[Tensor]]
+"""Maps the gradients with respect to image and transmittance (None for 0) to those with respect to what was blended:
+columns of the gradients by Gaussian."""
 
 
 class BlendResult(NamedTuple):
@@ -39,7 +40,7 @@ class BlendResult(NamedTuple):
 
     image: Tensor
     transmittance: Tensor
-    backward: Backward
+    backward: GradientsByTensor
 
 
 def blend(

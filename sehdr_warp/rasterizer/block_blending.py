@@ -101,7 +101,7 @@ class BlockBackward:
             0,
             self.lists.gaussians,
             gradients,
-            whole=(grad_image, grad_transmittance, gradients),
+            by_address=(grad_image, grad_transmittance, gradients),
             block_dim=blend_cuda.BLOCK_DIM,
         )
         return FixedBackward(fixed, gradients)
@@ -149,7 +149,7 @@ def fixed_blend_blocks(
     """Return the launch of blend_on_cuda(), whose tensors stay where they are but for image and transmittance."""
     kernel, arguments = _forward(padded, lists, packed, image, transmittance, alpha_threshold)
     threads = block_threads(lists, blend_cuda.BLOCKS_PER_TILE)
-    return fixed_launch(kernel, threads, *arguments, whole=(image, transmittance), block_dim=blend_cuda.BLOCK_DIM)
+    return fixed_launch(kernel, threads, *arguments, by_address=(image, transmittance), block_dim=blend_cuda.BLOCK_DIM)
 
 
 def _forward(padded, lists, packed, image, transmittance, alpha_threshold) -> tuple[Any, tuple[Any, ...]]:

@@ -15,6 +15,23 @@ from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import single_range
 
 
+class RasterTensors(NamedTuple):
+    """The tensors that rasterize() takes, for one camera."""
+
+    means: Tensor
+    log_scales: Tensor
+    quaternions: Tensor
+    opacities: Tensor
+    features: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+
+    @property
+    def of_projection(self) -> tuple[Tensor, ...]:
+        """Return what project_to_camera() takes, in its order: all but the features."""
+        return *self[:4], *self[5:]
+
+
 class ProjectedGaussians(NamedTuple):
     """2D Gaussians of one camera. A culled Gaussian has extents 0 and no gradient.
 

@@ -1,6 +1,15 @@
-"""Differentiable rasterization of 3D Gaussians: project, order, list by tile, blend."""
+"""Differentiable rasterization of 3D Gaussians: project, order, list by tile, blend.
 
-from collections.abc import Callable, Sequence
+A call, from top to bottom: rasterize() checks its arguments. _begin_view() projects the Gaussians to a camera
+(projection.py); they are called splats then. _finish_view() goes on with render_projected(): list_splats() packs the
+splats, orders them by depth and lists them by tile (tile_lists.py), and blend() blends the lists (blending.py).
+
+On a GPU, a call like earlier ones is replayed as a CUDA graph instead: _begin_view() then renders all of it, and
+_finish_view() waits for the number of intersections, which tells whether the graph's memory was enough. These are two
+functions so that the GPU renders all cameras of a call while the host waits for the first one.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,9 +22,9 @@ from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
 from .checks import check_cameras, check_opacities, check_tensors
 from .cuda_graphs.cache import GraphPool, ReplayedRender, find_pool, get_or_create_pool
-from .cuda_graphs.captured_render import FEATURES, flatten
+from .cuda_graphs.captured_render import flatten
 from .memory import oom_context
-from .projection import ProjectedGaussians, RasterInputs, project_to_camera
+from .projection import ProjectedGaussians, RasterInputs, RasterTensors, project_to_camera
 from .render_options import RenderOptions
 from .tile_lists import PackedSplats, TileLists, build_tile_lists, order_intersections, pack_splats
 from .torch_contract import torch_operation
@@ -140,7 +149,7 @@ def rasterize(
     options = RenderOptions(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
-    tensors = means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics
+    tensors = RasterTensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
     # A call like an earlier one, which a CUDA graph can render, has arguments that were checked then.
     pool = find_pool(tensors, options)
     if pool is None or background is not None:
@@ -150,8 +159,8 @@ def rasterize(
         options = options.checked(means.device)
     try:
         if world_to_camera.ndim == 2:
-            begun = _begin(tensors, options, pool or get_or_create_pool(tensors, options))
-            rendering = _finish(begun, begun.means2d, tensors, options)
+            view = _begin_view(tensors, options, pool or get_or_create_pool(tensors, options))
+            rendering = _finish_view(view, view.means2d, tensors, options)
         else:
             rendering = _render_cameras(tensors, options)
         if background is not None:
@@ -200,56 +209,52 @@ def check_shapes(
         raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
 
 
-_Begun = ProjectedGaussians | ReplayedRender
-
-
-def _begin(tensors: Sequence[Tensor], options: RenderOptions, pool: GraphPool | None) -> _Begun:
-    """Project to one camera. On a GPU, a repeated call replays a CUDA graph, which renders the image as well.
+def _begin_view(
+    tensors: RasterTensors, options: RenderOptions, pool: GraphPool | None
+) -> ProjectedGaussians | ReplayedRender:
+    """Project to one camera; on a GPU, replay a CUDA graph that renders the image as well if the pool has one.
 
     pool: CUDA graphs of calls like this one (cuda_graphs/cache.py); None if it is to be launched.
     """
     graph = None if pool is None else pool.begin_render(tensors, options)
-    return _launch_projection(tensors, options) if graph is None else graph.render(tensors)
+    return project_to_camera(*tensors.of_projection, options=options) if graph is None else graph.render(tensors)
 
 
-def _launch_projection(tensors: Sequence[Tensor], options: RenderOptions) -> ProjectedGaussians:
-    means, log_scales, quaternions, opacities, _, world_to_camera, intrinsics = tensors
-    return project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
+def _finish_view(
+    view: ProjectedGaussians | ReplayedRender, means2d: Tensor, tensors: RasterTensors, options: RenderOptions
+) -> Rendering:
+    """Return the rendering of a view that _begin_view() began for these tensors, as a function of means2d [N, 2].
 
-
-def _finish(begun: _Begun, means2d: Tensor, tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
-    """Return the rendering of what _begin() returned for these tensors, as a function of means2d [N, 2].
-
-    means2d: those of `begun`; of several cameras a part of one tensor, whose gradient then holds all of theirs.
+    means2d: those of `view`; of several cameras a part of one tensor, whose gradient then holds all of theirs.
     """
-    features = tensors[FEATURES]
-    if isinstance(begun, ReplayedRender):
-        if options.depth and torch.is_grad_enabled():  # The image is there: this leads its gradients to the depths.
-            features = torch.cat([features, begun.depths[:, None]], 1)
-        image, transmittance = with_gradient(begun.blended, means2d, features, begun.conics_opacities)
-        count = begun.graph.count_intersections()  # Called last, because it waits for the GPU.
+    features = tensors.features
+    if isinstance(view, ReplayedRender):
+        if options.depth and torch.is_grad_enabled():  # The image has its depths; their gradient must go on to them.
+            features = torch.cat([features, view.depths[:, None]], 1)
+        image, transmittance = with_gradient(view.blended, means2d, features, view.conics_opacities)
+        count = view.graph.count_intersections()  # Called last, because it waits for the GPU.
         if count is not None:
-            return _rendering(options, image, transmittance, means2d, begun.depths, begun.extents, count)
-        begun = _launch_projection(tensors, options)
-    return render_projected(begun._replace(means2d=means2d), tensors[FEATURES], options, replays=False)
+            return _rendering(options, image, transmittance, means2d, view.depths, view.extents, count)
+        view = project_to_camera(*tensors.of_projection, options=options)
+    return render_projected(view._replace(means2d=means2d), tensors.features, options, replays=False)
 
 
-def _render_cameras(tensors: Sequence[Tensor], options: RenderOptions) -> Rendering:
+def _render_cameras(tensors: RasterTensors, options: RenderOptions) -> Rendering:
     """Render to several cameras; opacities and features may have an axis of cameras too."""
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
     count = len(world_to_camera)
-    each = zip(
+    of_cameras = zip(
         opacities if opacities.ndim == 2 else [opacities] * count,
         features if features.ndim == 3 else [features] * count,
         world_to_camera,
         intrinsics,
         strict=True,
     )
-    calls = [(means, log_scales, quaternions, *own) for own in each]
-    renders = [_begin(call, options, get_or_create_pool(call, options)) for call in calls]
+    calls = [RasterTensors(means, log_scales, quaternions, *each) for each in of_cameras]
+    views = [_begin_view(call, options, get_or_create_pool(call, options)) for call in calls]
     # One tensor that every image is rendered from, so that its gradient holds every camera's.
-    means2d = torch.stack([begun.means2d for begun in renders])
-    renderings = [_finish(*view, options) for view in zip(renders, means2d, calls, strict=True)]
+    means2d = torch.stack([view.means2d for view in views])
+    renderings = [_finish_view(*each, options) for each in zip(views, means2d, calls, strict=True)]
     return join_renderings(means2d, renderings)
 
 
@@ -318,10 +323,7 @@ def list_splats(inputs: RasterInputs, options: RenderOptions) -> tuple[TileLists
     packed = pack_splats(inputs, options.alpha_threshold, width, height)
     depths, extents = inputs.projected.depths, inputs.projected.extents
     offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=keep_emit_order)
-    lists = build_tile_lists(
-        packed, offsets, depths, extents, width, height, options.max_intersections, keep_emit_order=keep_emit_order
-    )
-    return lists, packed
+    return build_tile_lists(packed, offsets, depths, extents, width, height, options.max_intersections), packed
 
 
 def join_renderings(means2d: Tensor, renderings: list[Rendering]) -> Rendering:

@@ -68,10 +68,12 @@ class IntersectionOffsets(NamedTuple):
         order: [N] int32 Gaussians by depth; None for the order of their indices, after which the sort by tile also
             sorts by depth.
         cumulative_counts: [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order.
+        keep_emit_order: whether the lists get TileLists.emit_order.
     """
 
     order: Tensor | None
     cumulative_counts: Tensor
+    keep_emit_order: bool
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class TileLists:
         gaussians: [M] the Gaussian of each intersection.
         subtile_masks: [M] uint8, bit k set if the ellipse touches subtile k of its tile; None from the CPU's sort by
             counting, because only block kernels read them.
-        emit_order: of the intersections before the sort; None unless requested.
+        emit_order: of the intersections before the sort; None unless order_intersections() was told to keep it.
         width: of the image in pixels.
         height: of the image in pixels.
         overflow: scalar bool, whether max_intersections was too few; None without it.
@@ -169,7 +171,7 @@ def fixed_pack_splats(
     """Return the launch that fills `packed` anew, whose tensors stay where they are but for the features."""
     kernel = kernels.tile_kernels(warp_scalar(inputs.features.dtype)).pack_splats
     arguments = _pack_arguments(inputs, packed, alpha_threshold, width, height)
-    return fixed_launch(kernel, len(inputs.features), *arguments, whole=(inputs.features,))
+    return fixed_launch(kernel, len(inputs.features), *arguments, by_address=(inputs.features,))
 
 
 def _pack_arguments(
@@ -189,18 +191,21 @@ def order_intersections(
 ) -> IntersectionOffsets:
     """Return the order in which Gaussians emit intersections, by depth, and the running number of these.
 
+    If the order need not be kept, a sort of few Gaussians is spared: that of their intersections then sorts by depth.
+
     Args:
         counts: [N] of PackedSplats.
         depths: [N].
         extents: [N, 2]; 0 if culled.
-        keep_emit_order: as build_tile_lists() gets it.
+        keep_emit_order: let build_tile_lists() return TileLists.emit_order, which backward passes need to sum by
+            Gaussian in a fixed order.
     """
     if len(depths) <= MAX_SINGLE_SORT and not keep_emit_order and depths.dtype == torch.float32:
-        return IntersectionOffsets(None, counts.cumsum(0))
+        return IntersectionOffsets(None, counts.cumsum(0), keep_emit_order)
     order = depth_order(depths, extents)
     with torch_threads(counts.device):
         counts = counts[order]
-    return IntersectionOffsets(order, counts.cumsum(0))
+    return IntersectionOffsets(order, counts.cumsum(0), keep_emit_order)
 
 
 @torch.no_grad()
@@ -212,8 +217,6 @@ def build_tile_lists(
     width: int,
     height: int,
     max_intersections: int | None = None,
-    *,
-    keep_emit_order: bool = True,
 ) -> TileLists:
     """List for each tile the Gaussians whose ellipse touches it, nearest first.
 
@@ -226,14 +229,12 @@ def build_tile_lists(
         height: of the image, pixels.
         max_intersections: allocate memory for this many; those beyond it are left out, see TileLists.overflow. The host
             then does not wait for the device to learn how many there are.
-        keep_emit_order: also return TileLists.emit_order, which backward passes need to sum by Gaussian in a fixed
-            order.
 
     Raises:
         SehdrError: if there are more than MAX_INTERSECTIONS.
     """
     grid, count = tile_grid(width, height), len(depths)
-    order, cumulative_counts = offsets
+    order, cumulative_counts, keep_emit_order = offsets
     total = cumulative_counts[-1] if count else cumulative_counts.new_zeros(())
     overflow = None
     if max_intersections is not None:  # Written by the kernel that emits, if it is launched, which saves a launch.
@@ -293,7 +294,7 @@ def emit_intersections(
     Both are [2 * length], of which the first half is filled; the sort needs the rest. Unused intersections belong to
     tile grid.tiles. Writes to overflow, a scalar bool, whether there are more than `length`.
     """
-    order, cumulative_counts = offsets
+    order, cumulative_counts, _ = offsets
     count, device = len(depths), depths.device
     keys = torch.empty(2 * length, dtype=torch.int64 if order is None else torch.int32, device=device)
     gaussians = torch.empty(2 * length, dtype=torch.int32, device=device)
@@ -321,7 +322,8 @@ def lists_by_tile(
 ) -> SortedIntersections:
     """Sort intersections, emitted front to back, by tile, stably.
 
-    subtile_masks are None on the CPU and without packed Gaussians, emit_indices unless keep_emit_order.
+    subtile_masks are None on the CPU and without packed Gaussians (of rasterize_directions()), emit_indices unless
+    keep_emit_order.
     """
     sort = _count_by_tile if tiles.device.type == "cpu" else _sort_by_tile
     return sort(tiles, gaussians, length, packed, grid, keep_emit_order)

@@ -39,7 +39,7 @@ def counted(*scene):
 def built(splats, depths, extents, max_intersections=None, *, keep_emit_order=True):
     offsets = order_intersections(splats.counts, depths, extents, keep_emit_order=keep_emit_order)
     size = 16 * GRID.columns, 16 * GRID.rows
-    return build_tile_lists(splats, offsets, depths, extents, *size, max_intersections, keep_emit_order=keep_emit_order)
+    return build_tile_lists(splats, offsets, depths, extents, *size, max_intersections)
 
 
 def emit(arguments, counts, monkeypatch):
@@ -48,7 +48,7 @@ def emit(arguments, counts, monkeypatch):
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
     capacity = int(counts.sum())
     order, splats, *others = arguments
-    offsets = IntersectionOffsets(order, counts.cumsum(0))
+    offsets = IntersectionOffsets(order, counts.cumsum(0), False)
     tiles, gaussians = emit_intersections(splats, offsets, *others, GRID, capacity)
     monkeypatch.undo()
     return tiles[:capacity], gaussians[:capacity]
@@ -91,7 +91,7 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     depths = (depths * 4).round().clamp_min(1) / 4
     lists = built(splats, depths, extents)
     capacity = lists.intersection_count + spare
-    offsets = IntersectionOffsets(None, counts.cumsum(0))
+    offsets = IntersectionOffsets(None, counts.cumsum(0), False)
     keys, gaussians = emit_intersections(splats, offsets, depths, extents, GRID, capacity)
     sort_pairs(keys, gaussians, capacity, DEPTH_BITS + GRID.tiles.bit_length())
     keys, gaussians = keys[:capacity], gaussians[:capacity]
@@ -109,7 +109,7 @@ def test_subtiles_are_those_that_an_ellipse_touches(device):
     scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)
     splats, depths, extents = packed(scene)
     offsets = order_intersections(splats.counts, depths, extents, keep_emit_order=False)
-    lists = build_tile_lists(splats, offsets, depths, extents, 32, 32, keep_emit_order=False)
+    lists = build_tile_lists(splats, offsets, depths, extents, 32, 32)
     columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
     (x, y, *_), (a, b, c, cutoff) = (record[lists.gaussians.long()].t()[..., None, None] for record in splats[:2])
     dx, dy = columns + 0.5 - x, rows + 0.5 - y

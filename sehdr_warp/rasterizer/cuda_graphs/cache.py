@@ -25,12 +25,12 @@ from torch import Tensor
 from torch._C._dynamo.guards import TensorGuards
 
 from ..blending import BlendResult
-from ..projection import with_projection_gradient
+from ..projection import RasterTensors, with_projection_gradient
 from ..render_options import RenderOptions
 from ..tile_lists import MAX_SINGLE_SORT
 from ..warp_launch.launching import stream_handle
 from .captured_backward import GradientMemory
-from .captured_render import CapturedRender, without_features
+from .captured_render import CapturedRender
 from .runner import is_capturing, replays_are_off
 
 LOG = logging.getLogger(__name__)
@@ -160,8 +160,8 @@ class GraphInUse:
         """Return the CUDA graph to the pool."""
         self._idle.append(self._graph)
 
-    def render(self, tensors: Sequence[Tensor]) -> ReplayedRender:
-        """Render from the seven tensors of rasterize()."""
+    def render(self, tensors: RasterTensors) -> ReplayedRender:
+        """Project and render."""
         backward = self._graph.backward
         image, transmittance, (means2d, depths, extents), self._prepared = self._graph.replay(tensors)
         blended = BlendResult(image, transmittance, self.blend_backward)
@@ -169,7 +169,7 @@ class GraphInUse:
             return ReplayedRender(self, blended, means2d, depths, extents, None)
         assert backward.conics_opacities is not None, "the CUDA graph begins with 2D Gaussians"
         outputs = means2d, backward.conics_opacities.detach(), depths, extents
-        outputs = with_projection_gradient(outputs, without_features(tensors), self.project_backward)
+        outputs = with_projection_gradient(outputs, tensors.of_projection, self.project_backward)
         means2d, conics_opacities, depths, extents = outputs
         return ReplayedRender(self, blended, means2d, depths, extents, conics_opacities)
 
@@ -208,7 +208,9 @@ class GraphInUse:
         backward = self._graph.backward
         assert backward is not None
         memory, self._blended = self._blended, None
-        if memory is None or memory.zeros is not zeros:  # Passes overlap, or nothing reached the image.
+        # Autograd hands on the very tensor that blend_backward() returned, unless passes overlap or nothing reached the
+        # image.
+        if memory is None or memory.zeros is not zeros:
             memory = backward.allocate(zeros)
         return backward.project(memory, grad_means2d, grad_depths)
 
@@ -239,7 +241,7 @@ class GraphPool:
         """Return a CUDA graph for one render, or None if the call is to be launched instead.
 
         Args:
-            tensors: the seven tensors of rasterize(), or flatten() of RasterInputs.
+            tensors: RasterTensors, or flatten() of RasterInputs for a render of 2D Gaussians.
             options: of the image.
         """
         try:

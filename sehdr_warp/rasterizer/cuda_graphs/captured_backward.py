@@ -111,7 +111,7 @@ class CapturedBackward:
         if layout.copies_features:
             copy = rows.new_empty(layout.features.shape)
             kernel = copy_features_kernel(warp_scalar(rows.dtype))
-            self._copy_features = fixed_launch(kernel, copy.shape, rows, copy, whole=(rows, copy))
+            self._copy_features = fixed_launch(kernel, copy.shape, rows, copy, by_address=(rows, copy))
             self._features_offset = layout.features.begin * rows.element_size()
         if gaussians:
             of_projection = layout.conics, layout.opacities, *filter(None, layout.gaussians)
@@ -178,6 +178,6 @@ def _fixed_projection_backward(
         len(projected.depths),
         *arguments,
         gradients=gradients,
-        rows=(grad_means2d, grad_depths),
-        whole=(grad_conics, grad_opacities, *(result for result in results if result is not None)),
+        strided=(grad_means2d, grad_depths),
+        by_address=(grad_conics, grad_opacities, *(result for result in results if result is not None)),
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 from ...kernels.caller_memory import write_last
 from ...kernels.project import projection_kernel
 from ..block_blending import BlockBackward, blend_on_cuda, fixed_blend_blocks
-from ..projection import ProjectedGaussians, RasterInputs, project_to_camera, projection_parameters
+from ..projection import ProjectedGaussians, RasterInputs, RasterTensors, project_to_camera, projection_parameters
 from ..render_options import MAX_INTERSECTIONS, RenderOptions
 from ..tile_lists import (
     MAX_SINGLE_SORT,
@@ -35,12 +35,8 @@ MAX_COPIED_GAUSSIANS = MAX_SINGLE_SORT
 SPINS = 200  # Looks at the number of intersections before other threads may run in between, and from query to query.
 HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captured call.
 MIN_INTERSECTIONS = 1 << 12
-RASTERIZE_TENSORS = 7
-"""Number of tensors of a call of rasterize(). A render of 2D Gaussians has six, see flatten()."""
-FEATURES = 4
-"""Index of features among the tensors of rasterize(); those of flatten() end with them."""
-_let_others_run: Callable[[], object] = getattr(os, "sched_yield", partial(time.sleep, 0))
-"""Lets other threads run. On Linux time.sleep(0) takes 50 us, to which timers are rounded up."""
+# On Linux time.sleep(0) takes 50 us, to which timers are rounded up.
+_let_other_threads_run: Callable[[], object] = getattr(os, "sched_yield", partial(time.sleep, 0))
 
 
 class ReplayResult(NamedTuple):
@@ -67,7 +63,7 @@ class CapturedRender:
     before and after the graph.
 
     Args:
-        tensors: the seven tensors of a call of rasterize(), or flatten() of RasterInputs.
+        tensors: RasterTensors, or flatten() of RasterInputs for a render of 2D Gaussians.
         options: of the image.
         intersections: the least number to allocate memory for.
         differentiable: whether gradients by the tensors that require them are needed.
@@ -81,15 +77,15 @@ class CapturedRender:
         self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
     ) -> None:
         """Launch the render once, then capture it."""
-        self._options, self._projects = options, len(tensors) == RASTERIZE_TENSORS
-        self._are_contiguous = all(tensor.is_contiguous() for tensor in tensors)
-        many = len(tensors[0]) > MAX_COPIED_GAUSSIANS
-        self._copies = differentiable or options.depth or not self._projects or not many
+        projects, many = isinstance(tensors, RasterTensors), len(tensors[0]) > MAX_COPIED_GAUSSIANS
+        self._options, self._are_contiguous = options, all(tensor.is_contiguous() for tensor in tensors)
+        self._copies = differentiable or options.depth or not projects or not many
         self._inputs = [tensor.detach().contiguous() for tensor in tensors]
         if self._copies:
             self._inputs = [tensor.clone() for tensor in self._inputs]
-        first, features = self._inputs[0], self._inputs[FEATURES if self._projects else -1]
-        channels = features.shape[1] + (options.depth and self._projects)
+        self._to_project = RasterTensors(*self._inputs) if projects else None
+        first, features = self._inputs[0], tensors.features if isinstance(tensors, RasterTensors) else tensors[-1]
+        channels = features.shape[1] + (options.depth and projects)
         self._image = first.new_empty(options.height, options.width, channels)
         self._transmittance = first.new_empty(options.height, options.width)
         self._counter = torch.empty(1, dtype=torch.int64, device="cpu", pin_memory=True)
@@ -98,8 +94,8 @@ class CapturedRender:
         self._runner, self._callers = CudaGraphRunner(first.device), CallerMemory(first.device)
         self.backward: CapturedBackward | None = None
 
-        splats, packed = self._project_and_pack()
         # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
+        splats, packed = self._project_and_pack()
         with self._runner.on_capture_stream():
             offsets = self._order_and_count(splats, packed)
             limit = int(HEADROOM * max(intersections, int(offsets.cumulative_counts[-1])))
@@ -112,18 +108,19 @@ class CapturedRender:
                 self._write(splats)
             del offsets
         if self._copies:
-            del splats, packed
+            del splats, packed  # The captured render has its own.
             splats, blend = self._runner.capture(None, self._render)
             if differentiable:
-                gaussians = without_features(self._inputs) if self._projects else []
+                gaussians = () if self._to_project is None else self._to_project.of_projection
                 self.backward = CapturedBackward(layout, blend, gaussians, options, splats.projected)
         else:
             lists = self._runner.capture(
                 None, lambda: self._list(splats, packed, self._order_and_count(splats, packed))
             )
             self._fix_launches(splats, packed, lists)
-            self._inputs = []  # The caller's.
         self._results = [*([self._image, self._transmittance] if self._copies else ()), *self._projection_of(splats)]
+        if not self._copies:
+            self._inputs, self._to_project = [], None  # The caller's.
 
     def _render(self) -> tuple[RasterInputs, BlockBackward]:
         """Run all stages, which the methods below are, in their order."""
@@ -136,7 +133,7 @@ class CapturedRender:
 
     def _project_and_pack(self) -> tuple[RasterInputs, PackedSplats]:
         options = self._options
-        splats = _project(self._inputs, options) if self._projects else unflatten(self._inputs)
+        splats = unflatten(self._inputs) if self._to_project is None else _project(self._to_project, options)
         pads = not self._copies or self._image.shape[2] % 4 > 0
         return splats, pack_splats(splats, options.alpha_threshold, options.width, options.height, pads=pads)
 
@@ -149,7 +146,7 @@ class CapturedRender:
     def _list(self, splats: RasterInputs, packed: PackedSplats, offsets: IntersectionOffsets) -> TileLists:
         (_, _, depths, _, extents), options = splats.projected, self._options
         size = options.width, options.height
-        return build_tile_lists(packed, offsets, depths, extents, *size, self.max_intersections, keep_emit_order=False)
+        return build_tile_lists(packed, offsets, depths, extents, *size, self.max_intersections)
 
     def _blend(self, splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> BlockBackward:
         outputs, threshold = (self._image, self._transmittance), self._options.alpha_threshold
@@ -162,24 +159,24 @@ class CapturedRender:
     def _projection_of(self, splats: RasterInputs) -> list[Tensor]:
         """Return what a render returns beside image and transmittance."""
         means2d, _, depths, _, extents = splats.projected
-        return [means2d, depths, extents] if self._projects else [extents]
+        return [extents] if self._to_project is None else [means2d, depths, extents]
 
     def _layout_for(self, tensors: Sequence[Tensor], blend: BlockBackward) -> GradientLayout:
         """Return the layout of the gradients that these tensors of a call require."""
-        if not self._projects:
+        if self._to_project is None or not isinstance(tensors, RasterTensors):
             return GradientLayout(blend, [], copies_features=_is_trained(tensors[-1]))
-        inputs = zip(without_features(tensors), without_features(self._inputs), strict=True)
+        inputs = zip(tensors.of_projection, self._to_project.of_projection, strict=True)
         gaussians = [like if tensor.requires_grad else None for tensor, like in inputs]
         # Features with depths get their gradient through torch.cat().
-        copies_features = _is_trained(tensors[FEATURES]) and not self._options.depth
+        copies_features = _is_trained(tensors.features) and not self._options.depth
         return GradientLayout(blend, gaussians, copies_features=copies_features)
 
     def _fix_launches(self, splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> None:
         """Prepare the launches of _launch()."""
-        assert packed.padded is not None
+        assert packed.padded is not None and self._to_project is not None
         options, outputs = self._options, (self._image, self._transmittance)
         size = options.width, options.height
-        self._project = _fixed_projection(self._inputs, options, splats.projected)
+        self._project = _fixed_projection(self._to_project, options, splats.projected)
         self._pack = fixed_pack_splats(splats, packed, options.alpha_threshold, *size)
         self._fixed_blend = fixed_blend_blocks(packed.padded, lists, packed, *outputs, options.alpha_threshold)
 
@@ -206,11 +203,10 @@ class CapturedRender:
 
     def _launch(self, tensors: Sequence[Tensor]) -> ReplayResult:
         """Do what replay() does without copies of the features and of the image."""
-        inputs = [tensor.contiguous() for tensor in tensors]
-        features = inputs.pop(FEATURES)
-        stream = warp_stream(features.device)
-        self._project.launch((), [tensor.data_ptr() for tensor in inputs], stream)
-        self._pack.launch((), (features.data_ptr(),), stream)
+        inputs = RasterTensors(*(tensor.contiguous() for tensor in tensors))
+        stream = warp_stream(inputs.features.device)
+        self._project.launch((), [tensor.data_ptr() for tensor in inputs.of_projection], stream)
+        self._pack.launch((), (inputs.features.data_ptr(),), stream)
         self._runner.replay()
         image, transmittance = torch.empty_like(self._image), torch.empty_like(self._transmittance)
         self._fixed_blend.launch((), (image.data_ptr(), transmittance.data_ptr()), stream)
@@ -224,7 +220,7 @@ class CapturedRender:
         while count.value < 0:
             looks += 1
             if looks > SPINS:
-                _let_others_run()
+                _let_other_threads_run()
             if looks % SPINS == 0 and self._stream.query() and count.value < 0:
                 raise RuntimeError("the GPU has not counted the intersections of a render")
         return count.value
@@ -235,9 +231,8 @@ def _is_trained(tensor: Tensor) -> bool:
     return tensor.is_leaf and tensor.requires_grad
 
 
-def _project(inputs: Sequence[Tensor], options: RenderOptions) -> RasterInputs:
-    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = inputs
-    projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
+def _project(tensors: RasterTensors, options: RenderOptions) -> RasterInputs:
+    projected, features = project_to_camera(*tensors.of_projection, options=options), tensors.features
     if options.depth:
         features = torch.cat([features, projected.depths[:, None]], 1)
     return RasterInputs(projected, features)
@@ -253,14 +248,9 @@ def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
     return RasterInputs(ProjectedGaussians(*tensors[:-1]), tensors[-1])
 
 
-def _fixed_projection(inputs: Sequence[Tensor], options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
-    """Return the launch of _project() for any inputs, to the same outputs."""
-    gaussians = without_features(inputs)
+def _fixed_projection(tensors: RasterTensors, options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
+    """Return the launch of _project() for any tensors, to the same outputs."""
+    gaussians = tensors.of_projection
     kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
     arguments = *gaussians, *projection_parameters(options), None, *projected
-    return fixed_launch(kernel, len(projected.depths), *arguments, whole=gaussians)
-
-
-def without_features(tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Return the inputs of the projection among the tensors of rasterize()."""
-    return [*tensors[:FEATURES], *tensors[FEATURES + 1 :]]
+    return fixed_launch(kernel, len(projected.depths), *arguments, by_address=gaussians)

@@ -79,8 +79,8 @@ def fixed_launch(
     dim: int | Sequence[int],
     *arguments: Any,
     gradients: Sequence[Tensor | None] | None = None,
-    rows: Sequence[Tensor] = (),
-    whole: Sequence[Tensor],
+    strided: Sequence[Tensor] = (),
+    by_address: Sequence[Tensor],
     block_dim: int | None = None,
 ) -> FixedLaunch:
     """Return launch()'s launch as an object, for tensors that stay where they are but for some.
@@ -90,13 +90,13 @@ def fixed_launch(
         dim: number of threads.
         *arguments: the kernel's arguments.
         gradients: for the adjoint.
-        rows: tensors among arguments and gradients whose addresses and distances of rows each launch gives.
-        whole: those whose addresses each launch gives.
+        strided: tensors among arguments and gradients that each launch gives anew, with any distance from row to row.
+        by_address: those whose addresses each launch gives; their layout stays.
         block_dim: threads per block.
     """
     device, values = _all_values(kernel, arguments, gradients)
     packed = PackedLaunch(kernel, device, block_dim, gradients is not None, dim, values)
-    return FixedLaunch(packed, dim, values, rows, whole)
+    return FixedLaunch(packed, dim, values, strided, by_address)
 
 
 @cache

@@ -135,8 +135,8 @@ class FixedLaunch:
         packed: the kernel's launch, which nothing else uses.
         dim: number of threads.
         values: all arguments. Those that stay are kept alive.
-        rows: those of the values whose addresses, and distances of rows, each launch gives.
-        whole: those of the values whose addresses each launch gives.
+        strided: those of the values that each launch gives anew, with any distance from row to row.
+        by_address: those of the values whose addresses each launch gives; their layout stays.
     """
 
     def __init__(
@@ -144,28 +144,28 @@ class FixedLaunch:
         packed: PackedLaunch,
         dim: int | Sequence[int],
         values: list,
-        rows: Sequence[Tensor],
-        whole: Sequence[Tensor],
+        strided: Sequence[Tensor],
+        by_address: Sequence[Tensor],
     ) -> None:
         """Pack the values."""
         packed.prepare(dim, values)
-
+        moving = *strided, *by_address
         self._slots = []
-        for tensor in (*rows, *whole):
+        for tensor in moving:
             index = next(k for k, value in enumerate(values) if value is tensor)
             self._slots.append(_Slot(packed.arrays[index], tensor))
-        self._packed, self._row_slots = packed, self._slots[: len(rows)]
+        self._packed, self._strided_slots = packed, self._slots[: len(strided)]
         self._on_stream = _on_stream(packed.command) if packed.command.device.is_cuda else None
-        self._values = [value for value in values if not any(value is tensor for tensor in (*rows, *whole))]
+        self._values = [value for value in values if not any(value is tensor for tensor in moving)]
         self._addresses: Sequence[int] = ()
         self._lock = threading.Lock()  # A retained graph may be differentiated by several threads.
 
-    def launch(self, rows: Sequence[Tensor | None], addresses: Sequence[int], stream: wp.Stream | None) -> None:
+    def launch(self, strided: Sequence[Tensor | None], addresses: Sequence[int], stream: wp.Stream | None) -> None:
         """Launch on tensors with the layouts of the first ones; None and address 0 are an empty array."""
-        if rows:
-            addresses = [0 if tensor is None else tensor.data_ptr() for tensor in rows] + list(addresses)
+        if strided:
+            addresses = [0 if tensor is None else tensor.data_ptr() for tensor in strided] + list(addresses)
         with self._lock:
-            for slot, tensor in zip(self._row_slots, rows, strict=True):
+            for slot, tensor in zip(self._strided_slots, strided, strict=True):
                 if tensor is not None and (step := tensor.stride(0)) != slot.step:
                     slot.step, slot.strides[0] = step, step * slot.size
             if addresses != self._addresses:  # Torch mostly allocates where it did for the last call.
