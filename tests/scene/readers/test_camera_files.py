@@ -7,6 +7,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_cameras, look_at
 
 POSE = look_at((1.0, 2.0, 3.0), (0.0, 0.5, 0.0))
+CAMERA = {"width": 8, "height": 8, "fx": 9, "fy": 9, "cx": 4, "cy": 4, "world_to_camera": POSE.tolist()}
 
 
 def nerfstudio(folder, world_to_camera):
@@ -42,14 +43,19 @@ def test_nerfstudio_paths_come_back_from_the_dataparsers_space(tmp_path, logged)
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("width", 8.5), ("width", True), ("width", "8"), ("cx", 1e300), ("world_to_camera", 1e300)]
+    ("name", "value", "problem"),
+    [
+        *(("width", value, "cannot be used.*width") for value in (8.5, True, "8")),
+        *((name, 1e300, f"cannot be used.*{name}") for name in ("cx", "world_to_camera")),
+        ("fx", float("nan"), "cannot be used.*fx"),
+        ("name", "../../x", r"name '../../x' cannot name a file"),
+    ],
 )
-def test_numbers_that_cannot_be_are_refused(tmp_path, name, value):
+def test_values_that_cannot_be_are_refused(tmp_path, name, value, problem):
     moved = [[1, 0, 0, value], *np.eye(4).tolist()[1:]]
-    camera = {"width": 8, "height": 8, "fx": 9, "fy": 9, "cx": 4, "cy": 4, "world_to_camera": POSE.tolist()}
-    values = camera | {name: moved if name == "world_to_camera" else value}
+    values = CAMERA | {name: moved if name == "world_to_camera" else value}
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": [values]}))
-    with pytest.raises(InputError, match=f"camera 0 cannot be used.*{name}"):
+    with pytest.raises(InputError, match=f"camera .*{problem}"):
         load_cameras(tmp_path / "cameras.json")
 
 
@@ -77,3 +83,23 @@ def test_camera_files_of_other_programs_are_told_what_to_export(tmp_path, suffix
     path.write_bytes(b"Ogawa\xff\x00")
     with pytest.raises(InputError, match=f"shot{suffix}: {name} files are not read; export the camera as OpenUSD"):
         load_cameras(path)
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ("[]", "no cameras"),
+        ("{", "not valid JSON"),
+        ("[" * 100000, "not valid JSON"),
+        ("{}", "none of cameras"),
+        ('{"cameras": []}', "no cameras"),
+        ('{"cameras": [{"width": 4}]}', "has no height"),
+        ('{"cameras": [5]}', "cannot be used"),
+        (json.dumps({"cameras": [CAMERA | {"width": 65_000, "height": 65_000}]}), "is 65000 x 65000; use sizes"),
+        ('{"camera_path": [{}], "render_width": 4, "render_height": 4}', "has no fov"),
+    ],
+)
+def test_bad_camera_files_are_refused(tmp_path, content, message):
+    (tmp_path / "c.json").write_text(content)
+    with pytest.raises(InputError, match=message):
+        load_cameras(tmp_path / "c.json")

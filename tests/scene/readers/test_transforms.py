@@ -328,22 +328,3 @@ def test_cameras_from_every_kind_of_file(tmp_path):
         assert read_name == name
         np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-12)
         np.testing.assert_allclose(camera.intrinsics, expected.intrinsics, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "content, message",
-    [
-        ("[]", "no cameras"),
-        ("{", "not valid JSON"),
-        ("[" * 100000, "not valid JSON"),
-        ("{}", "none of cameras"),
-        ('{"cameras": []}', "no cameras"),
-        ('{"cameras": [{"width": 4}]}', "has no height"),
-        ('{"cameras": [5]}', "cannot be used"),
-        ('{"camera_path": [{}], "render_width": 4, "render_height": 4}', "has no fov"),
-    ],
-)
-def test_bad_camera_files_are_refused(tmp_path, content, message):
-    (tmp_path / "c.json").write_text(content)
-    with pytest.raises(InputError, match=message):
-        load_cameras(tmp_path / "c.json")
