@@ -88,7 +88,7 @@ def test_times_read_as_photographers_write_them(seconds, text):
 
 def test_one_photo_without_time_does_not_stop_a_set_and_a_list_helps(tmp_path):
     write_colmap(tmp_path, name="{:03d}.jpg", exif={i: {_TIME: 0.01} for i in range(5)})
-    assert any(note.startswith("005 states no exposure time: ") for note in load(tmp_path).notes)
+    assert any(note.startswith("005 does not state its exposure: ") for note in load(tmp_path).notes)
     (tmp_path / "exposures.json").write_text(json.dumps({"005.jpg": 0.02}))
     assert [view.exposure_time for view in load(tmp_path).views] == [0.01] * 5 + [0.02]
     (tmp_path / "exposures.json").write_text(json.dumps({f"{i:03d}.jpg": 2.0 for i in range(6)}))
@@ -111,7 +111,7 @@ def test_listed_times_of_no_photo_are_named(tmp_path):
     table.write_text(json.dumps({name.replace("5.jpg", "5x.jpg"): time for name, time in times.items()}))
     notes = load(tmp_path).notes
     assert "exposures.json: 1 of its 6 names belong to no photo: 005x.jpg" in notes
-    assert any(note.startswith("005 states no exposure time: ") for note in notes)
+    assert any(note.startswith("005 does not state its exposure: ") for note in notes)
     table.write_text(json.dumps({f"shot{i}.jpg": 0.01 for i in range(6)}))
     assert [note for note in load(tmp_path).notes if "6 of its 6 names" in note and "shot2.jpg ..." in note]
 

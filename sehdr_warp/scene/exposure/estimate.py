@@ -1,4 +1,4 @@
-"""Exposure times of photos that state none, from the light that they share with photos that do."""
+"""Exposure times of photos that do not state their exposure, from the light that they share with photos that do."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -44,10 +44,10 @@ def _note(views: list[View], source: str) -> str:
     """Return the line on views whose times were found in the same way."""
     times = [view.exposure_time for view in views]
     if len(views) == 1:
-        return f"{views[0].name} states no exposure time: {shutter(times[0])} {source}"
+        return f"{views[0].name} does not state its exposure: {shutter(times[0])} {source}"
     names = first_names([view.name for view in views])
     span = f"{shutter(min(times))} to {shutter(max(times))}".replace(" s to", " to")
-    return f"{len(views)} photos state no exposure time: {span} {source} ({names})"
+    return f"{len(views)} photos do not state their exposure: {span} {source} ({names})"
 
 
 def _factor(view: View, timed: list[View], points: np.ndarray, response: Response) -> tuple[float, int]:

@@ -217,30 +217,37 @@ def _spellings(name: str) -> list[str]:
 def _exif_times(records: list[ImageRecord], *, timeless: bool) -> tuple[list[float | None], list[str]]:
     """Return the times of photos by EXIF, and notes.
 
+    A photo with a time and without an ISO or f-number has none if most photos state it and it differs among them.
     `timeless` takes 1 s where no photo states a time: ISO and f-number still tell how their exposures differ.
     """
     exposures = [exif_exposure(record.image) for record in records]
-    timed = [exposure for exposure in exposures if exposure.time is not None]
-    timeless = timeless and not timed
+    times = [exposure.time for exposure in exposures]
+    timeless = timeless and not any(times)
     notes, factors = [], [1.0] * len(records)
     for name, field, power in (("ISO", "iso", 1.0), ("f-number", "f_number", -2.0)):
-        used = exposures if timeless else timed
-        values = [value for exposure in used if (value := getattr(exposure, field)) is not None]
-        if 0 < len(values) < len(used):
-            notes.append(f"{name} is not stated for all photos and was not counted")
-        elif len(set(values)) > 1:
-            factors = [
-                f * ((getattr(exposure, field) or values[0]) / values[0]) ** power
-                for f, exposure in zip(factors, exposures, strict=True)
-            ]
-            span = f"{min(values):g} to {max(values):g}"
-            notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}")
+        relevant = [i for i, exposure in enumerate(exposures) if timeless or exposure.time is not None]
+        values = [value for i in relevant if (value := getattr(exposures[i], field)) is not None]
+        if len(set(values)) <= 1:
+            continue
+        lacking = {i for i in relevant if getattr(exposures[i], field) is None}
+        left = [None if i in lacking else time for i, time in enumerate(times)]
+        if lacking and 2 * sum(time is not None for time in left) <= len(records):
+            notes.append(f"{name} is not stated by {len(lacking)} of {len(records)} photos and was not counted")
+            continue
+        times = left
+        factors = [
+            f * ((getattr(exposure, field) or values[0]) / values[0]) ** power
+            for f, exposure in zip(factors, exposures, strict=True)
+        ]
+        span = f"{min(values):g} to {max(values):g}"
+        without = f"; {counted(len(lacking), 'photo does', 'photos do')} not state it" if lacking else ""
+        notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}{without}")
     if flashed := [record.image.name for record, e in zip(records, exposures, strict=True) if e.flash]:
         count = f"{len(flashed)} of {len(records)} photos"
         notes.append(f"the flash fired in {count}, so their light is not the scene's: {first_names(flashed)}")
     if timeless and max(factors) > min(factors):
         return list(factors), [*notes, "photos state no exposure time, and count as 1 s at the first one's settings"]
-    return [e.time and e.time * f for e, f in zip(exposures, factors, strict=True)], notes
+    return [time and time * factor for time, factor in zip(times, factors, strict=True)], notes
 
 
 def _compared_with_exif(

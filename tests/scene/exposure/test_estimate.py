@@ -26,7 +26,7 @@ def test_views_without_a_timed_one_beside_them_keep_their_guess():
     scene = with_estimated_times(scene_of([128, 60], [0.5, 0.25]), {"0", "1"}, response_by_name("srgb"))
     assert [view.exposure_time for view in scene.views] == [0.5, 0.25]
     assert scene.notes == (
-        "2 photos state no exposure time: 1/4 to 0.5 s as a guess, because no photo beside states one (0, 1)",
+        "2 photos do not state their exposure: 1/4 to 0.5 s as a guess, because no photo beside states one (0, 1)",
     )
 
 

@@ -50,6 +50,23 @@ def test_iso_that_is_the_same_or_not_stated_for_all_tells_nothing(tmp_path, exif
     assert not dataset.times_known and seconds(dataset) == [1.0] * 5
 
 
+def test_photos_without_the_iso_that_most_state_get_their_exposure_by_light(tmp_path):
+    exif = {i: {TIME: 0.01, ISO: 100 * (1 + i % 2), NUMBER: 4} for i in range(6)}
+    del exif[5][ISO], exif[4][NUMBER]  # All f-numbers are the same, so one that is missing tells nothing.
+    write_colmap(tmp_path, 6, name="{:03d}.jpg", exif=exif)
+    dataset = parse_dataset(tmp_path)
+    assert [record.time_known for record in dataset.records] == [True] * 5 + [False]
+    np.testing.assert_allclose(seconds(dataset)[:5], [0.01, 0.02, 0.01, 0.02, 0.01])
+    note = "ISO differs (100 to 200); exposure times are relative to 100; 1 photo does not state it"
+    assert note in dataset.notes and not any("f-number" in note for note in dataset.notes)
+    for i in (3, 4):
+        del exif[i][ISO]
+    write_colmap(tmp_path / "few", 6, name="{:03d}.jpg", exif=exif)
+    dataset = parse_dataset(tmp_path / "few")
+    assert seconds(dataset) == [0.01] * 6 and all(record.time_known for record in dataset.records)
+    assert "ISO is not stated by 3 of 6 photos and was not counted" in dataset.notes
+
+
 @pytest.mark.parametrize("factor, unit", [(1e3, "milliseconds"), (1e6, "microseconds")])
 def test_times_whose_unit_exif_shows(tmp_path, factor, unit):
     write_colmap(tmp_path, 5, name="{:03d}.jpg", exif={i: {TIME: 0.01 * (i + 1), ISO: 100} for i in range(5)})

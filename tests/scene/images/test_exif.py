@@ -96,7 +96,7 @@ def test_a_photo_without_time_gets_it_from_light_that_it_shares(tmp_path, points
     scene = load(folder, response="gamma-2.2", holdout=0)
     times = [view.exposure_time for view in scene.views]
     assert times == pytest.approx([0.01, 0.02, 0.005, 0.01, 0.02, 0.01], rel=0.03)
-    (note,) = (note for note in scene.notes if note.startswith("002 states no exposure time: "))
+    (note,) = (note for note in scene.notes if note.startswith("002 does not state its exposure: "))
     assert ("points that other photos show too" in note) == bool(points)
     assert scene.exposure_times_known
 
