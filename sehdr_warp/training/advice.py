@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .trainer import Trainer
 
 STILL_RISING = 0.2  # dB that held-out photos gained in the last third of the steps, or since a resume, if too few
-UNFINISHED = 0.5  # dB gained there from which blur, and not movement, explains what differs from the photos
+UNFINISHED = 0.5  # dB gained there from which blur explains what differs from the photos, and not their exposure
 FALLING = 0.5  # dB that they lost since their best in a training that overfits; seeds differ by up to 0.3 dB
 EXPOSURE_JUMP = 0.4  # Stops between a whole photo and the scene from which its exposure is not as stated
 _FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
@@ -101,7 +101,7 @@ def advice(
             lines.append(jump)
         elif not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
             lines.append(f"{train_photos} photos are few: more from places between them would help most: {again}")
-        elif movement := _movement(summary.get("unexplained"), train_photos, again):
+        elif gain <= STILL_RISING and (movement := _movement(summary.get("unexplained"), train_photos, again)):
             lines.append(movement)
     return lines
 
@@ -152,4 +152,4 @@ def _movement(unexplained: Mapping[str, Any] | None, train_photos: int, again: s
     photos = list(dict.fromkeys(region["photo"] for region in worst))
     names = first_names(photos)
     text = "photos and scene differ in many places, as where people or leaves move"
-    return f"{text} (worst in {names}): paint these black in masks/PHOTO.png beside the photos: {again}"
+    return f"{text} (worst in {names}): make these black in the photos' masks, masks/PHOTO.png beside them: {again}"
