@@ -42,6 +42,7 @@ class ImageRecord:
         light_scale: factor from the values of a float photo to the light of the set, by the times that files state.
         time_known: False if exposure_time is only a guess, to be replaced by comparing light with other photos.
         oriented: the lens refers to the pixels after EXIF orientation; None decides by the sizes.
+        uncertain: structure from motion placed the camera by few points.
     """
 
     view: str
@@ -60,6 +61,7 @@ class ImageRecord:
     light_scale: float = 1.0
     time_known: bool = True
     oriented: bool | None = None
+    uncertain: bool = False
 
     @property
     def seconds(self) -> float:

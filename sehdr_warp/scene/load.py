@@ -231,7 +231,8 @@ def _with_splits(
     """Return the photos with a split each, and a note if the set does not state it."""
     if holdout is None and any(record.split for record in records):
         return [replace(record, split=record.split or "train") for record in records], ()
-    held_out = _held_out(len(records), holdout, dataset.holdout)
+    uncertain = {i for i, record in enumerate(records) if record.uncertain}
+    held_out = _held_out(len(records), holdout, dataset.holdout, uncertain)
     records = [replace(record, split="test" if i in held_out else "train") for i, record in enumerate(records)]
     if not held_out:
         return records, ("no views are held out for testing",)
@@ -241,15 +242,24 @@ def _with_splits(
     return records, (f"{len(names)} of {len(records)} views {are} held out for testing: {names_text}",)
 
 
-def _held_out(count: int, step: int | None, published: tuple[int, int] | None) -> set[int]:
-    """Return the indices of test views: the published protocol's, or the middle of each block, never the last view."""
+def _held_out(
+    count: int, step: int | None, published: tuple[int, int] | None, uncertain: Collection[int] = ()
+) -> set[int]:
+    """Return the indices of test views: the published protocol's, or the middle of each block, never the last view.
+
+    In place of a middle view whose camera is uncertain, the nearest other one of its block is taken, if there is one:
+    a camera that is off would count as an error of the scene.
+    """
     if step == 0 or count < _FEWEST_FOR_TEST:
         return set()
     if published is not None:
         every, offset = step or published[0], published[1]
         return set(range(min(offset, every - 1), count, every))
     step = step or _HOLDOUT
-    return set(range(step // 2, count - 1, step)) or {count // 2}
+    middles = range(step // 2, count - 1, step) or [count // 2]
+    blocks = [range(max(i - step // 2, 0), min(i - step // 2 + step, count - 1)) for i in middles]
+    certain = [[j for j in block if j not in uncertain] for block in blocks]
+    return {min(each, key=lambda j: abs(j - i), default=i) for i, each in zip(middles, certain, strict=True)}
 
 
 def is_embedded(path: Path | str) -> bool:

@@ -170,6 +170,10 @@ def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
         assert _held_out(count, None, None) == held
     assert _held_out(9, None, (8, 0)) == {0, 8} and _held_out(6, None, (2, 1)) == {1, 3, 5}
     assert not _held_out(20, 0, (8, 0))
+    # Of a block whose middle view has an uncertain camera, the nearest other view is held out.
+    assert _held_out(20, None, None, {3, 4, 5, 11}) == {2, 12}
+    assert _held_out(8, None, None, set(range(7))) == {4} and _held_out(5, None, None, {2}) == {1}
+    assert _held_out(13, 5, None, {6, 7, 8}) == {2, 5}
 
 
 def test_the_response_is_chosen_from_codes_as_photographed(monkeypatch):
@@ -299,7 +303,9 @@ def test_poor_placement_is_named_with_its_photos():
     images = tuple(ModelImage(f"{index:05d}.png", lens, np.eye(4)) for index in range(6))
     model = SparseModel(images, PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32)))
     lost, weak, error = Reconstruction(model, 1.4, (2, 4)).notes(photos)
-    assert lost == "2 of 8 photos could not be placed and were left out: 6.jpg, 7.jpg"
+    assert lost == (
+        "2 of 8 photos could not be placed and were left out: 6.jpg, 7.jpg; photos between these and the others help"
+    )
     assert weak.startswith("2 photos share few points with others, so their places are uncertain: 2.jpg, 4.jpg;")
     assert "1.4 pixels" in error
     _, weak, _ = Reconstruction(model, 1.4, (3,)).notes(photos)

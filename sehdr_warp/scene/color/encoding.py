@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from ...errors import InputError
+from ...subsets import first_names
 from ..images.heif import read_items
 from ..images.ldr_files import PILLOW_ERRORS, EncodedImage, exif_of, png_chunks
 from .icc import IccTable, KnownColors, read_profile, xyz_to_rec709
@@ -188,17 +189,21 @@ def note_of(encodings: dict[Path, ColorEncoding | None]) -> list[str]:
     Args:
         encodings: by the path of each photo, None for a photo that states nothing.
     """
-    notes: dict[str, list[Path]] = {}
+    notes: dict[tuple[str, str, str], list[Path]] = {}
     for name, encoding in encodings.items():
         if encoding is not None and encoding.problem:
-            notes.setdefault(f"count as sRGB: {encoding.problem}", []).append(name)
+            notes.setdefault(("counts", "count", f"as sRGB: {encoding.problem}"), []).append(name)
         elif encoding is not None and encoding.light:
-            notes.setdefault(f"state {encoding.light}, {encoding.name}: no response is guessed", []).append(name)
+            text = f"{encoding.light}, {encoding.name}: no response is guessed"
+            notes.setdefault(("states", "state", text), []).append(name)
         elif encoding is not None and not encoding.is_srgb:
-            notes.setdefault(f"are in {encoding.name} and are converted to Rec.709", []).append(name)
-    count = len(encodings)
-    several = {text: f"{names[0].name}{' ...' * (len(names) > 1)}" for text, names in notes.items()}
-    return [f"colors: {len(notes[text])} of {count} photos {text} ({photos})" for text, photos in several.items()]
+            text = f"in {encoding.name} and converted to Rec.709"
+            notes.setdefault(("is", "are", text), []).append(name)
+    return [
+        f"colors: {len(names)} of {len(encodings)} photos {one if len(names) == 1 else several} {text} "
+        f"({first_names([name.name for name in names], 1)})"
+        for (one, several, text), names in notes.items()
+    ]
 
 
 @lru_cache(maxsize=8)

@@ -112,7 +112,10 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
         if (image := cameras.get(i)) is None:
             unplaced.append(record.image.name)
         else:
-            placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera))
+            uncertain = i in reconstruction.weak
+            placed.append(
+                replace(record, lens=image.lens, world_to_camera=image.world_to_camera, uncertain=uncertain)
+            )
     notes = dataset.notes + reconstruction.notes(photos)
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
 

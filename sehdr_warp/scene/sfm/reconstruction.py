@@ -69,7 +69,9 @@ class Reconstruction:
         unregistered, notes = [photo.name for i, photo in enumerate(photos) if i not in registered], []
         if unregistered:
             first = first_names(unregistered, 5)
-            notes.append(f"{len(unregistered)} of {len(photos)} photos could not be placed and were left out: {first}")
+            left_out = f"could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out: {first}"
+            remedy = "photos between these and the others help"
+            notes.append(f"{len(unregistered)} of {len(photos)} photos {left_out}; {remedy}")
         if self.weak:
             first = first_names([photos[i].name for i in self.weak], 5)
             few = counted(len(self.weak), "photo shares", "photos share")

@@ -141,7 +141,7 @@ def test_patches_through_every_format(tmp_path, space, kind):
         clipped = codes == decoded.levels
         assert (error <= 0.005 * expected.max() + 1e-4)[~clipped].all(), (codes, expected, light[16, 8 * k + 4])
     words = [note for note in scene.notes if note.startswith("colors: ")]
-    line = f"colors: 6 of 6 photos are in {space} (ICC profile) and are converted to Rec.709 (000{suffix} ...)"
+    line = f"colors: 6 of 6 photos are in {space} (ICC profile) and converted to Rec.709 (000{suffix} ...)"
     assert words == ([] if space == "sRGB" else [line])
 
 
@@ -262,7 +262,7 @@ def test_photos_of_one_name_in_several_folders_are_counted_each(tmp_path):
     for path in (tmp_path / "images").rglob("*.png"):
         Image.open(path).save(path, icc_profile=icc_profile("Display P3", name="P3"))
     notes = [note for note in load(tmp_path, holdout=0).notes if note.startswith("colors")]
-    assert notes == ["colors: 6 of 6 photos are in P3 (ICC profile) and are converted to Rec.709 (0000.png ...)"]
+    assert notes == ["colors: 6 of 6 photos are in P3 (ICC profile) and converted to Rec.709 (0000.png ...)"]
 
 
 @pytest.mark.parametrize("interop", [{0xA001: 2}, {0xA001: 0xFFFF, "index": "R03"}])

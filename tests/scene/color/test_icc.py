@@ -120,7 +120,7 @@ def test_photos_with_a_table_keep_their_bits(tmp_path, kind):
     error = np.abs(light_of(scene.views[0], scene) - expected)
     assert (error <= 0.005 * expected.max(-1, keepdims=True) + 1e-4)[(photo.pixels < photo.levels).all(-1)].all()
     assert scene.views[0].codes.dtype == np.uint16
-    assert any("are in scanner (ICC profile) and are converted to Rec.709" in note for note in scene.notes)
+    assert any("are in scanner (ICC profile) and converted to Rec.709" in note for note in scene.notes)
 
 
 def test_colors_that_were_converted_before_are_the_same_again():
