@@ -1,5 +1,6 @@
 """Reader of bare photos, whose cameras structure from motion finds."""
 
+import itertools
 import logging
 import os
 from collections.abc import Sequence
@@ -44,6 +45,7 @@ _POSE_CONTENT = {
     ".xml": (b"<chunk", "Metashape"), ".csv": (b"#name,x,y", "RealityScan"), ".xmp": (b"xcr:", "RealityScan"),
     ".out": (b"Bundle file", "Bundler"), ".json": (b'"cameraPoseARFrame"', "3D Scanner App"),
 }  # fmt: skip
+_MOST_READ = 20  # Files of one suffix whose content is looked at
 _CAMERA_FILES = ("transforms.json", "reconstruction.json", "poses_bounds.npy")  # Beside a folder of photos
 
 
@@ -198,13 +200,18 @@ def _foreign_poses(folder: Path) -> list[str]:
     """Return a note on poses of other programs beside bare photos: they are not read, and cameras are found anew."""
     entries = sorted(folder.iterdir())
     tools = [f"{tool} ({file.name})" for file in entries if (tool := _POSE_FILES.get(file.name.lower()))]
-    kinds = {file.suffix.lower(): file for file in reversed(entries) if file.suffix.lower() in _POSE_CONTENT}
-    for suffix, file in sorted(kinds.items()):
-        mark, tool = _POSE_CONTENT[suffix]
-        if file.is_file() and file.name.lower() not in _POSE_FILES:
-            with suppress(OSError), file.open("rb") as opened:
-                tools += [f"{tool} ({file.name})"] if mark in opened.read(1 << 16) else []
+    for suffix, (mark, tool) in sorted(_POSE_CONTENT.items()):
+        files = (file for file in entries if file.suffix.lower() == suffix and file.name.lower() not in _POSE_FILES)
+        file = next((file for file in itertools.islice(files, _MOST_READ) if _has_near_its_start(file, mark)), None)
+        tools += [f"{tool} ({file.name})"] if file is not None else []
     remedy = "are not read, cameras are found anew: export them for COLMAP or nerfstudio"
     notes = [f"poses of {', '.join(tools)} {remedy}"] if tools else []
     frames = [file.name for file in entries if is_transforms(file)]
     return notes + [f"{name} states cameras: to use them, give the file itself" for name in frames[:1]]
+
+
+def _has_near_its_start(file: Path, mark: bytes) -> bool:
+    """Return whether a file can be read and has some bytes among its first 65,536."""
+    with suppress(OSError), file.open("rb") as opened:
+        return mark in opened.read(1 << 16)
+    return False

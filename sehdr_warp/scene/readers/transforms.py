@@ -211,11 +211,11 @@ def _without_missing_masks(records: list[ImageRecord]) -> tuple[list[ImageRecord
 def _frame_images(folder: Path, names: Sequence[str], path: Path) -> dict[str, Path | None]:
     """Return the photo of each frame, None if there is no such file.
 
-    If none is where the file says, they are looked for in the folder of images: of some sets images_4 alone is public.
+    If none is where the file says, they are looked for by find_images(), first in the folder of images: of some sets
+    images_4 alone is public, or all files lie beside each other.
     """
     images = {name: _frame_image(folder, name, path) for name in names}
-    inner = image_folder(folder)
-    return images if inner is None or any(images.values()) else find_images(inner, names, path)
+    return images if any(images.values()) else find_images(image_folder(folder) or folder, names, path)
 
 
 def _frame_image(folder: Path, name: str, path: Path) -> Path | None:

@@ -27,6 +27,9 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     fields = values | frame
     if isinstance(bent := fields.get("distortion_params"), list):  # nerfstudio's other spelling
         fields |= dict(zip(_DISTORTION, bent, strict=False))
+    with suppress(KeyError, TypeError, ValueError):  # The matrix of intrinsics, as of RealityCapture's converters
+        (fx, _, cx), (_, fy, cy), _ = fields["K"]
+        fields = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy} | fields
 
     def number(key: str, absent: Any = None) -> Any:
         value = fields.get(key)

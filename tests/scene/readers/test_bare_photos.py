@@ -73,6 +73,7 @@ def test_photos_as_3dgs_convert_expects_them(tmp_path):
 ])  # fmt: skip
 def test_poses_of_other_programs_are_named(tmp_path, file, tool):
     photos(tmp_path)
+    (tmp_path / "annotations.json").write_text("{}")  # Beside the poses of 3D Scanner App
     (tmp_path / file).write_text('{"cameraPoseARFrame": []}')
     assert any(f"poses of {tool} ({file}) are not read" in note for note in find_photos(tmp_path).notes)
 
@@ -106,7 +107,7 @@ def test_folders_that_systems_keep_are_no_photos(tmp_path, place):
     assert len(scene.views) == 6 and not any("in no view" in note or "not used" in note for note in scene.notes)
 
 
-@pytest.mark.parametrize("change", ["null model", "text numbers", "flat pose", "mark"])
+@pytest.mark.parametrize("change", ["null model", "text numbers", "flat pose", "mark", "matrix", "all in one folder"])
 def test_transforms_as_apps_write_them(tmp_path, change):
     write_blender(tmp_path, 6)
     file = tmp_path / "transforms.json"
@@ -119,10 +120,19 @@ def test_transforms_as_apps_write_them(tmp_path, change):
         values["frames"] = [
             frame | {"transform_matrix": np.ravel(frame["transform_matrix"]).tolist()} for frame in values["frames"]
         ]
+    elif change == "matrix":
+        focal = 20 / np.tan(values.pop("camera_angle_x") / 2)  # Of photos of 40 x 30 pixels
+        matrix = [[focal, 0, 20], [0, focal, 15], [0, 0, 1]]
+        values["frames"] = [frame | {"K": matrix} for frame in values["frames"]]
+    elif change == "all in one folder":
+        for photo in (tmp_path / "images").iterdir():
+            photo.rename(tmp_path / photo.name)
+        (tmp_path / "images").rmdir()
     file.write_bytes(b"\xef\xbb\xbf" * (change == "mark") + json.dumps(values).encode())
     scene = load(tmp_path, holdout=0)
     for view, other in zip(scene.views, before.views, strict=True):
         np.testing.assert_array_equal(view.camera.world_to_camera, other.camera.world_to_camera)
+        assert view.camera.intrinsics == pytest.approx(other.camera.intrinsics)
         assert (view.camera.fx, view.camera.width) == (other.camera.fx, other.camera.width)
 
 
