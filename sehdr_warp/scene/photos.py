@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import InputError
 from ..subsets import first_names
 from .color.encoding import encoding_of, note_of
@@ -24,6 +26,7 @@ from .raw.decode import read_header, read_raw
 FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_NAMED = 3
 _SMALLEST, _LARGEST = 1 / 32, 8  # Size of a photo in parts of its camera's
+_MIDTONE, _LEAST_EXPONENT = 0.3, 0.4  # As of training.matching
 _LEAST_SQUARE = 0.01  # Part by which the sides of a pixel may differ and count as equal
 _KINDS = {"encoded": "photos of codes", "raw": "RAW photos", "float": "float images"}
 _ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
@@ -182,6 +185,19 @@ def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:
     if kind == "encoded":
         return read_ldr(path, oriented=oriented)
     return read_raw(path, oriented=oriented) if kind == "raw" else EncodedImage(tone_mapped(path), None)
+
+
+def brightened_codes(codes: np.ndarray) -> np.ndarray:
+    """Return the 8-bit codes [H, W, 3] of a photo in which features are found.
+
+    A power brightens a photo with a median below _MIDTONE, because detectors have an absolute threshold of contrast.
+    """
+    levels = np.iinfo(codes.dtype).max
+    median = max(float(np.median(codes[::8, ::8])) / levels, 1e-3)
+    exponent = max(np.log(_MIDTONE) / np.log(median), _LEAST_EXPONENT) if median < _MIDTONE else 1.0
+    if codes.dtype == np.uint8 and exponent == 1:
+        return codes
+    return np.rint(255 * (np.arange(levels + 1) / levels) ** exponent).astype(np.uint8)[codes]
 
 
 def _refuse_renamed(path: Path) -> None:

@@ -18,11 +18,13 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name, selection
 from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.color.primaries import linear_to_srgb, srgb_to_linear
 from sehdr_warp.scene.dataparser import ImageRecord, PointCloud
 from sehdr_warp.scene.exposure.times import shutter
 from sehdr_warp.scene.file_names import natural_key, unique_names
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
+from sehdr_warp.scene.photos import brightened_codes
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.sfm import reconstruction as sfm
 from sehdr_warp.scene.sfm.reconstruction import MOST_ERROR, Reconstruction, image_name, reconstruct
@@ -251,6 +253,24 @@ def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
     reconstruction = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
     assert {(image.lens.width, image.lens.height) for image in reconstruction.model.images} == {(567, 426), (708, 532)}
     assert 0 < reconstruction.error < MOST_ERROR and not reconstruction.notes(photos)
+
+
+def test_dark_photos_are_placed_by_brightened_codes(tmp_path, shared):
+    for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]:
+        with Image.open(photo) as image:
+            light = srgb_to_linear(np.asarray(image.reduce(6)) / 255) / 32
+        Image.fromarray(np.rint(255 * linear_to_srgb(light)).astype(np.uint8)).save(tmp_path / f"{photo.stem}.png")
+    reconstruction = reconstruct(sorted(tmp_path.glob("*.png")), tmp_path / "cache")
+    assert len(reconstruction.model.images) == 4 and not reconstruction.weak
+    assert len(reconstruction.model.cloud.positions) > 300  # 83 without
+
+
+def test_codes_of_bright_photos_stay_and_those_of_dark_ones_reach_a_midtone():
+    bright = np.full((16, 16, 3), 100, np.uint8)
+    assert brightened_codes(bright) is bright
+    np.testing.assert_array_equal(brightened_codes(bright.astype(np.uint16) * 257), bright)
+    assert abs(int(brightened_codes(np.full((16, 16, 3), 5000, np.uint16)).mean()) - 0.3 * 255) < 1
+    assert not brightened_codes(np.zeros((16, 16, 3), np.uint8)).any()
 
 
 def test_an_object_that_turns_is_placed_by_its_masks(tmp_path, shared):

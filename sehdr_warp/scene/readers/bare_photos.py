@@ -115,9 +115,7 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
             unplaced.append(record.image.name)
         else:
             uncertain = i in reconstruction.weak
-            placed.append(
-                replace(record, lens=image.lens, world_to_camera=image.world_to_camera, uncertain=uncertain)
-            )
+            placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera, uncertain=uncertain))
     notes = dataset.notes + reconstruction.notes(photos)
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
 

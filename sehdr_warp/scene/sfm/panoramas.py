@@ -18,7 +18,7 @@ from ..dataparser import PointCloud
 from ..images.ldr_files import file_kind, open_image
 from ..images.xmp import xmp_of, xmp_values
 from ..lens import Lens
-from ..photos import photo_sizes, read_photo
+from ..photos import brightened_codes, photo_sizes, read_photo
 from ..readers.colmap_model import ModelImage, SparseModel, read_points
 from ..types import View, encoded_values
 from ..wide_camera import FACE_ANGLE, face_rotations, faces_of
@@ -144,8 +144,7 @@ def _write_faces(photos: Sequence[Path], folder: Path) -> None:
     for number in range(len(face_rotations())):
         (folder / f"face{number}").mkdir(parents=True)
     for index, photo in track_progress("cutting panoramas", photos, _log):
-        pixels = read_photo(photo, oriented=True).pixels
-        pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+        pixels = brightened_codes(read_photo(photo, oriented=True).pixels)
         height, width = pixels.shape[:2]
         lens = Lens("EQUIRECTANGULAR", width, height, (float(width), float(height)), photo)
         view = View("p", pixels, lens.camera(np.eye(4)), 1.0, "train")

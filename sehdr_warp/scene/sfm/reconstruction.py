@@ -28,7 +28,7 @@ from ...subsets import counted, first_names
 from ..cached_folder import cached_folder
 from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from ..masks import write_reduced
-from ..photos import read_photo, unusable_notes
+from ..photos import brightened_codes, read_photo, unusable_notes
 from ..readers.colmap_model import SparseModel, read_model
 from .pairs import likely_pairs, pairs_with
 from .progress import counted_rows
@@ -200,7 +200,7 @@ def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tup
             sizes.append((0, 0))
             small.append((0, 0))
             continue
-        image = Image.fromarray(codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8))
+        image = Image.fromarray(brightened_codes(codes))
         image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
         sizes.append(codes.shape[1::-1])
         small.append(image.size)
