@@ -2,16 +2,22 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.scene.dataparser import PointCloud
+from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
+from sehdr_warp.scene.readers import bare_photos
 from sehdr_warp.scene.readers.bare_photos import find_photos
+from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
+from sehdr_warp.scene.sfm.reconstruction import Reconstruction
 from sehdr_warp.scene.unused_files import unused_notes
-from tests.make_scenes import edited_json, load, pattern, write_blender, write_colmap, write_ply
+from tests.make_scenes import arc_poses, edited_json, load, pattern, write_blender, write_colmap, write_ply
 
 
 def photos(folder, count=4, suffix=".jpg"):
@@ -76,6 +82,16 @@ def test_poses_of_other_programs_are_named(tmp_path, file, tool):
     (tmp_path / "annotations.json").write_text("{}")  # Beside the poses of 3D Scanner App
     (tmp_path / file).write_text('{"cameraPoseARFrame": []}')
     assert any(f"poses of {tool} ({file}) are not read" in note for note in find_photos(tmp_path).notes)
+
+
+def test_a_photo_whose_camera_is_uncertain_is_not_held_out(tmp_path, monkeypatch):
+    photos(tmp_path, 9)
+    lens = Lens("PINHOLE", 16, 12, (14.0, 14.0, 8.0, 6.0), Path("cameras.bin"))
+    images = tuple(ModelImage(f"{i:05d}.png", lens, pose) for i, pose in enumerate(arc_poses(9)))
+    model = SparseModel(images, PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.float32)))
+    monkeypatch.setattr(bare_photos, "reconstruct", lambda *args: Reconstruction(model, 0.5, (3, 4)))
+    records = parse_dataset(tmp_path).records
+    assert [record.view for record in records if record.split == "test"] == ["IMG_5"]
 
 
 def test_poses_of_other_programs_are_the_remedy_if_cameras_are_not_found(tmp_path):
