@@ -25,10 +25,11 @@ from sehdr_warp.scene.file_names import natural_key, unique_names
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
 from sehdr_warp.scene.photos import brightened_codes
+from sehdr_warp.scene.readers import bare_photos
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.sfm import reconstruction as sfm
 from sehdr_warp.scene.sfm.reconstruction import MOST_ERROR, Reconstruction, image_name, reconstruct
-from tests.make_scenes import edited_json, load, write_blender, write_colmap, write_ply
+from tests.make_scenes import arc_poses, edited_json, load, write_blender, write_colmap, write_ply
 
 _TIME, _NUMBER, _ISO, _APEX = 33434, 33437, 34855, 37377
 
@@ -297,6 +298,32 @@ def test_masks_that_keep_too_little_are_not_used_for_placing(tmp_path, shared, c
         mask.save(tmp_path / "masks" / f"{photo.stem}.png")
     assert len(load(tmp_path, max_size=100).views) == 4
     assert "masks leave too little to place half of the photos" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "photos, weak, turn, expected", [(6, (), 0, 6), (4, (1,), 0, 6), (4, (), 0, 4), (6, (), 0.2, 4)]
+)
+def test_whole_photos_are_used_if_they_place_more_and_agree_with_masks(
+    photos, weak, turn, expected, monkeypatch, caplog
+):
+    """Masks place four photos, whole photos six, whose cameras turn otherwise if an object turns before them."""
+    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
+
+    def reconstruction(poses, weak=()):
+        images = tuple(ModelImage(image_name(i), lens, pose) for i, pose in enumerate(poses))
+        cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+        return Reconstruction(SparseModel(images, cloud), 0.5, weak)
+
+    def turned(angle):
+        sine, cosine = np.sin(angle), np.cos(angle)
+        return np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+
+    inside = reconstruction(arc_poses(6)[:4], weak)
+    whole = reconstruction([turned(i * turn) @ pose @ turned(0.7) for i, pose in enumerate(arc_poses(6))])
+    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): inside if masks else whole)
+    files = [Path(f"{i}.jpg") for i in range(photos)]
+    assert len(bare_photos._reconstruct(files, None, files).model.images) == expected
+    assert ("and cameras agree" in caplog.text) == (expected == 6)
 
 
 def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypatch, caplog):

@@ -45,6 +45,7 @@ _POSE_CONTENT = {
     ".xml": (b"<chunk", "Metashape"), ".csv": (b"#name,x,y", "RealityScan"), ".xmp": (b"xcr:", "RealityScan"),
     ".out": (b"Bundle file", "Bundler"), ".json": (b'"cameraPoseARFrame"', "3D Scanner App"),
 }  # fmt: skip
+_ALIKE = 5.0  # Degrees; 1.8 between sets of 9 photos of which one has 49 points, 8 and more if people or objects move
 _MOST_READ = 20  # Files of one suffix whose content is looked at
 _CAMERA_FILES = ("transforms.json", "reconstruction.json", "poses_bounds.npy")  # Beside a folder of photos
 
@@ -121,19 +122,46 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
 
 
 def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:
-    """Place photos by the features inside their masks, as COLMAP does, or by all if that places fewer than half.
+    """Place photos by the features inside their masks, as COLMAP does, or by all.
 
-    A still background would misplace an object that turns.
+    A still background would misplace an object that turns, and people who walk along would misplace a building. All
+    features are used if masks place fewer than half of the photos, or if they place more photos surely and turn the
+    cameras alike.
     """
-    if any(masks):
-        with suppress(InputError):
-            result = reconstruct(photos, cache, masks)
-            if 2 * len(result.model.images) >= len(photos):
-                return result
-        _log.warning(
-            "masks leave too little to place half of the photos: cameras are found from whole photos, without masks"
-        )
-    return reconstruct(photos, cache)
+    if not any(masks):
+        return reconstruct(photos, cache)
+    try:
+        inside = reconstruct(photos, cache, masks)
+    except InputError:
+        inside = None
+    if inside is not None and inside.sure == len(photos):
+        return inside
+    try:
+        whole = reconstruct(photos, cache)
+    except InputError:
+        if inside is None:
+            raise
+        return inside
+    if inside is None or 2 * len(inside.model.images) < len(photos):
+        reason = "masks leave too little to place half of the photos"
+    elif whole.sure > inside.sure and _turn_between(inside, whole) < _ALIKE:
+        reason = f"they place {whole.sure} of {len(photos)} photos surely, masks {inside.sure}, and cameras agree"
+    else:
+        return inside
+    _log.warning("cameras are found from whole photos, without masks: %s", reason)
+    return whole
+
+
+def _turn_between(first: Reconstruction, second: Reconstruction) -> float:
+    """Return the median angle in degrees by which pairs of photos are turned otherwise in two reconstructions."""
+    poses = [{image.name: image.world_to_camera[:3, :3] for image in each.model.images} for each in (first, second)]
+    names = sorted(poses[0].keys() & poses[1].keys())
+    if len(names) < 2:
+        return 180.0
+    # From one world to the other by each photo: the same rotation if both agree.
+    turns = np.stack([poses[0][name].T @ poses[1][name] for name in names]).reshape(-1, 9)
+    cosines = ((turns @ turns.T - 1) / 2)[np.triu_indices(len(names), 1)]
+    return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1))))
 
 
 def _require_photos(photos: Sequence[Path], folder: Path, copies: int = 0) -> None:

@@ -63,20 +63,24 @@ class Reconstruction:
     error: float
     weak: tuple[int, ...]
 
+    @property
+    def sure(self) -> int:
+        """Number of photos that are placed by enough points."""
+        return len(self.model.images) - len(self.weak)
+
     def notes(self, photos: Sequence[Path]) -> tuple[str, ...]:
         """Return a line for each reason not to trust the places of the cameras, with the photos concerned."""
         registered = {int(Path(image.name).stem) for image in self.model.images}
         unregistered, notes = [photo.name for i, photo in enumerate(photos) if i not in registered], []
         if unregistered:
-            first = first_names(unregistered, 5)
-            left_out = f"could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out: {first}"
-            remedy = "photos between these and the others help"
-            notes.append(f"{len(unregistered)} of {len(photos)} photos {left_out}; {remedy}")
+            were = f"could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out"
+            first = f"{first_names(unregistered, 5)}; photos between these and the others help"
+            notes.append(f"{len(unregistered)} of {len(photos)} photos {were}: {first}")
         if self.weak:
             first = first_names([photos[i].name for i in self.weak], 5)
-            few = counted(len(self.weak), "photo shares", "photos share")
-            places = "its place is" if len(self.weak) == 1 else "their places are"
-            notes.append(f"{few} few points with others, so {places} uncertain: {first}; more photos in between help")
+            shared = "few points with others, so"
+            few = f"photo shares {shared} its place is", f"photos share {shared} their places are"
+            notes.append(f"{counted(len(self.weak), *few)} uncertain: {first}; more photos in between help")
         if self.error > MOST_ERROR:
             notes.append(
                 f"the cameras' places are uncertain: points miss their photos by {self.error:.1f} pixels in the mean; "
@@ -116,9 +120,8 @@ def reconstruct(
         database = work / "database.db"
         groups: dict[tuple, list[int]] = {}  # One set of intrinsics for a size, a device and a focal length.
         for i, photo in enumerate(photos):
-            if not (work / "images" / image_name(i)).is_file():
-                continue
-            groups.setdefault((sizes[i], small[i], _device(photo)), []).append(i)
+            if all(small[i]):  # It has a copy.
+                groups.setdefault((sizes[i], small[i], _device(photo)), []).append(i)
         count = sum(len(group) for group in groups.values())
         with (
             stage("finding features in photos", count, _log) as progress,
