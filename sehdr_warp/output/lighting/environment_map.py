@@ -19,8 +19,8 @@ from ..images.exr import Part, as_data, exr_header, rgb_channels, write_multipar
 from ..images.ldr_files import as_array
 from ..images.tonemap import exposure_of_white
 from ..render_views import provenance
-from ..world_transform import AXES, stored_matrix, world_transform
-from .map_center import find_center
+from ..world_transform import AXES, WorldTransform, stored_matrix, world_transform
+from .map_center import MapCenter, find_center
 from .shares import light_shares
 from .unit import EFFICACY, luminance_of_one
 
@@ -130,18 +130,8 @@ def write_environment_map(
         absolute = 1.0 if luminance is None else EFFICACY / luminance
         write_radiance(path, hdr, exposure=exposure * absolute, colorspace=colorspace, overwrite=overwrite)
         return path
-    beyond = center.beyond * transform.scale if beyond is None else beyond
-    facts = {
-        **provenance(run),
-        "position": json.dumps(place.tolist()),
-        "axes": axes,
-        "beyond": repr(float(beyond)),
-        "lightShares": json.dumps(shares.to_dict()),
-        "worldMatrix": json.dumps(stored_matrix(run, transform).tolist()),
-    }
-    white_luminance = None if luminance is None else luminance / exposure
-    header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
-    header |= {"sehdr:mapToWorld": json.dumps(transform.rotation.T.tolist()), "envmap": envmap(layout)}
+    header = map_header(run, center, transform, axes, layout, colorspace=colorspace, exposure=exposure)
+    header["sehdr:lightShares"] = json.dumps(shares.to_dict())
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
     data = {
         "distance.Z": rendered.distance * transform.scale,
@@ -154,6 +144,41 @@ def write_environment_map(
     if pixel_type != pixel:
         log.info("%s: holds values above 65504, which half cannot; written as float", path.name)
     return path
+
+
+def map_header(
+    run: "RenderableScene",
+    center: MapCenter,
+    transform: WorldTransform,
+    axes: str,
+    layout: str,
+    *,
+    colorspace: str = "rec709",
+    exposure: float = 1.0,
+) -> dict[str, Any]:
+    """Return the OpenEXR attributes of a map: where it was taken, its axes, units and colors.
+
+    Args:
+        run: From load_run, train or load_splats.
+        center: Place of the map, scene coordinates.
+        transform: From these to the coordinates that the file states.
+        axes: Their name, as in world_transform.
+        layout: "latlong" or "cube".
+        colorspace: Primaries of the pixels.
+        exposure: Seconds that radiance was multiplied by.
+    """
+    facts = {
+        **provenance(run),
+        "position": json.dumps(transform.points(center.position).tolist()),
+        "axes": axes,
+        "beyond": repr(float(center.beyond * transform.scale)),
+        "worldMatrix": json.dumps(stored_matrix(run, transform).tolist()),
+        "mapToWorld": json.dumps(transform.rotation.T.tolist()),
+    }
+    luminance = luminance_of_one(run)
+    white_luminance = None if luminance is None else luminance / exposure
+    header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
+    return header | {"envmap": envmap(layout)}
 
 
 def check_map(path: Path, size: int, layout: str, axes: str, beyond: float | None, pixel: str) -> None:

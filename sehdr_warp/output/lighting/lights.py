@@ -15,12 +15,12 @@ from ...model.lights import light_name
 from ...scene.wide_camera import typical_focal_length
 from ...subsets import first_names
 from ..cameras.paths import training_cameras
-from ..images.exr import exr_header, rgb_channels, write_exr
+from ..images.exr import rgb_channels, write_exr
 from ..images.ldr_files import as_array
 from ..images.tonemap import exposure_of_white
 from ..render_views import provenance
 from ..world_transform import WorldTransform, world_transform
-from .environment_map import COVERED, envmap, inpainted_light, latlong, render_map, solid_angles
+from .environment_map import COVERED, inpainted_light, latlong, map_header, render_map, solid_angles
 from .map_center import MapCenter, find_center
 from .unit import luminance_of_one
 
@@ -138,7 +138,7 @@ def write_lights(
         log.warning(text, run.path)
     rows = [_describe(light_name(index), light, transform, factor) for index, light in enumerate(lights)]
     if center is not None:
-        inpainted = _write_rest(run, rest, lights, transform, center, unseen, overwrite)
+        inpainted = _write_rest(run, rest, lights, transform, axes, center, unseen, overwrite)
         mark = "@@@" if "@" in rest.name else "@"  # USD's quotes of a path
         asset = f"{mark}./{rest.name}{mark}"
         dome = _DOME.format(asset=asset, intensity=repr(float(factor)), inpainted=repr(inpainted))
@@ -239,6 +239,7 @@ def _write_rest(
     path: Path,
     lights: Sequence[Any],
     transform: WorldTransform,
+    axes: str,
     center: MapCenter,
     unseen: str,
     overwrite: bool,
@@ -262,9 +263,7 @@ def _write_rest(
         text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"
         log.info(text, path.name, share, 100 * inpainted)
         hdr = hdr + added
-    facts = provenance(run) | {"worldMatrix": json.dumps(transform.matrix.tolist())}
-    header = exr_header("rec709", 1.0, provenance=facts, white_luminance=luminance_of_one(run))
-    header["envmap"] = envmap("latlong")
+    header = map_header(run, center, transform, axes, "latlong")
     write_exr(path, rgb_channels(hdr) | {"A": rest.alpha}, header=header, overwrite=overwrite)
     return inpainted
 

@@ -116,6 +116,9 @@ def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
     rest = read_hdr(tmp_path / "lights_rest.exr")
     write_environment_map(run, tmp_path / "env.exr", size=1024, **place)
     np.testing.assert_allclose(rest, read_hdr(tmp_path / "env.exr"), rtol=2e-3, atol=1e-4)
+    headers = [read_exr_channels(tmp_path / name)[1] for name in ("lights_rest.exr", "env.exr")]
+    for key in ("position", "axes", "beyond", "mapToWorld", "worldMatrix"):
+        assert headers[0][f"sehdr:{key}"] == headers[1][f"sehdr:{key}"], key
     write_lights(run, tmp_path / "center.usda", unseen="black", axes="scene")
     assert np.abs(read_hdr(tmp_path / "center_rest.exr") - rest).max() > 1
     with pytest.raises(SehdrError, match=r"which \.json has not; write \.usda"):
