@@ -79,50 +79,29 @@ class BlockPlanValues(BaseModel):
 
 @dataclass(frozen=True)
 class Block:
-    """A block.
+    """A block."""
 
-    Attributes:
-        name: Folder of its run, below `blocks/`.
-        views: Names of its views, training and held-out.
-        fraction: Pixels of its training photos, relative to those of all.
-        cell: Its core, in the axes of the plan.
-        margin: [3] enlargement of the core.
-    """
-
-    name: str
-    views: tuple[str, ...]
-    fraction: float
-    cell: Cell
-    margin: np.ndarray
+    name: str  # Folder of its run, below `blocks/`
+    views: tuple[str, ...]  # Names of its views, training and held-out
+    fraction: float  # Pixels of its training photos, relative to those of all
+    cell: Cell  # Its core, in the axes of the plan
+    margin: np.ndarray  # [3] enlargement of the core
 
 
 @dataclass(frozen=True)
 class BlockPlan:
-    """The blocks of a set, and what they share.
+    """The blocks of a set, and what they share."""
 
-    Attributes:
-        scene: Name of the set.
-        data: Arguments of load_scene() for the whole set.
-        response: The camera response.
-        normalization: Coordinates of the merged run.
-        shared: Base time and exposure compensation.
-        exposure_times: By view, seconds, before the compensation.
-        photo_bytes: By view, size of its photo's file, by which nodes with other photos are found.
-        config: Requested options of each block, before its own plan.
-        axes: [3, 3] rows are the axes of the cells in scene coordinates.
-        blocks: The blocks.
-    """
-
-    scene: str
-    data: LoadArguments
-    response: Response
-    normalization: Normalization
-    shared: SharedDecisions
-    exposure_times: Mapping[str, float]
-    photo_bytes: Mapping[str, int]
-    config: Config
-    axes: np.ndarray
-    blocks: tuple[Block, ...]
+    scene: str  # Name of the set
+    data: LoadArguments  # Arguments of load_scene() for the whole set
+    response: Response  # The camera response
+    normalization: Normalization  # Coordinates of the merged run
+    shared: SharedDecisions  # Base time and exposure compensation
+    exposure_times: Mapping[str, float]  # By view, seconds, before the compensation
+    photo_bytes: Mapping[str, int]  # By view, size of its photo's file, by which nodes with other photos are found
+    config: Config  # Requested options of each block, before its own plan
+    axes: np.ndarray  # [3, 3] rows are the axes of the cells in scene coordinates
+    blocks: tuple[Block, ...]  # The blocks
 
     @property
     def division(self) -> Division:

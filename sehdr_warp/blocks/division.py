@@ -31,15 +31,10 @@ LEAST_PHOTOS = max(FEWEST_PHOTOS, 6)  # Photos that a block needs at least
 
 @dataclass(frozen=True)
 class Cell:
-    """An axis-aligned box in the axes of a division; bounds may be infinite.
+    """An axis-aligned box in the axes of a division; bounds may be infinite."""
 
-    Attributes:
-        low: [3] lower bounds.
-        high: [3] upper bounds.
-    """
-
-    low: np.ndarray
-    high: np.ndarray
+    low: np.ndarray  # [3] lower bounds
+    high: np.ndarray  # [3] upper bounds
 
     def contains(self, places: np.ndarray) -> np.ndarray:
         """Return whether the cell contains places [..., 3]: a bool [...]; its lower faces belong to it."""
@@ -54,19 +49,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class Division:
-    """A division of space and photos.
+    """A division of space and photos."""
 
-    Attributes:
-        axes: [3, 3] rows are the axes of the cells in scene coordinates, orthonormal.
-        cells: Cores of the blocks, in these axes.
-        margins: [B, 3] enlargement of each core.
-        photos: Indices of the photos of each block, ascending.
-    """
-
-    axes: np.ndarray
-    cells: tuple[Cell, ...]
-    margins: np.ndarray
-    photos: tuple[np.ndarray, ...]
+    axes: np.ndarray  # [3, 3] rows are the axes of the cells in scene coordinates, orthonormal
+    cells: tuple[Cell, ...]  # Cores of the blocks, in these axes
+    margins: np.ndarray  # [B, 3] enlargement of each core
+    photos: tuple[np.ndarray, ...]  # Indices of the photos of each block, ascending
 
     def block_of(self, points: np.ndarray) -> np.ndarray:
         """Return the index [N] of the block whose core contains each of the points [N, 3] of scene coordinates."""

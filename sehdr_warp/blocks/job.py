@@ -27,15 +27,10 @@ MOST_POINTS = 4  # Sparse points that are looked at, relative to the largest num
 
 
 class BlockResult(NamedTuple):
-    """Result of the training of a block.
+    """Result of the training of a block."""
 
-    Attributes:
-        error: One line, if the training cannot be done; None if it is done.
-        node: Name of the machine that it ran on.
-    """
-
-    error: str | None
-    node: str
+    error: str | None  # One line, if the training cannot be done; None if it is done
+    node: str  # Name of the machine that it ran on
 
 
 def folder_of(out: Path, plan: BlockPlan, index: int) -> Path:

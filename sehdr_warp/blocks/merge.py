@@ -36,23 +36,14 @@ MIDDLE = 0.02, 0.98  # Quantiles of the Gaussians in a core between which most o
 
 
 class TrainedBlock(NamedTuple):
-    """Parts of a block that go into the merged run.
+    """Parts of a block that go into the merged run."""
 
-    Attributes:
-        gaussians: Parameters of the Gaussians in its core, in the coordinates of the merged run.
-        evidence: Of its photos for these.
-        values: Plain values of its newest checkpoint.
-        info: Its run.json.
-        views: Its views as in scene.json.
-        summary: Its summary.json.
-    """
-
-    gaussians: dict[str, Tensor]
-    evidence: Evidence
-    values: dict[str, Any]
-    info: dict[str, Any]
-    views: list[dict[str, Any]]
-    summary: dict[str, Any]
+    gaussians: dict[str, Tensor]  # Parameters of the Gaussians in its core, in the coordinates of the merged run
+    evidence: Evidence  # Of its photos for these
+    values: dict[str, Any]  # Plain values of its newest checkpoint
+    info: dict[str, Any]  # Its run.json
+    views: list[dict[str, Any]]  # Its views as in scene.json
+    summary: dict[str, Any]  # Its summary.json
 
 
 def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage: str = "auto") -> RunWriter:

@@ -15,19 +15,12 @@ NEAR = 0.5  # Distance from a border, in mean margins of the blocks, within whic
 
 @dataclass(frozen=True)
 class SeamErrors:
-    """Errors of simulated photos, dB of PSNR over the pixels of all views; NaN without such pixels.
+    """Errors of simulated photos, dB of PSNR over the pixels of all views; NaN without such pixels."""
 
-    Attributes:
-        psnr: Mean over the views of their PSNR.
-        border: Of pixels near a border between blocks.
-        elsewhere: Of the other pixels.
-        share: Fraction of the pixels near a border.
-    """
-
-    psnr: float
-    border: float
-    elsewhere: float
-    share: float
+    psnr: float  # Mean over the views of their PSNR
+    border: float  # Of pixels near a border between blocks
+    elsewhere: float  # Of the other pixels
+    share: float  # Fraction of the pixels near a border
 
 
 @torch.no_grad()

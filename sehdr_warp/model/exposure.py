@@ -28,15 +28,10 @@ _FORMS = "seconds (1/125), stops (-2ev), multiples (1/8x) or base"
 
 @dataclass(frozen=True)
 class Exposure:
-    """One exposure.
+    """One exposure."""
 
-    Attributes:
-        time: Seconds.
-        ev: Stops above the base exposure, log2(time / base).
-    """
-
-    time: float
-    ev: float
+    time: float  # Seconds
+    ev: float  # Stops above the base exposure, log2(time / base)
 
     @property
     def label(self) -> str:

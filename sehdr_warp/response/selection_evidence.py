@@ -19,32 +19,20 @@ MOST_PIXELS, BAND_ROWS = 400_000, 32  # Photos larger than MOST_PIXELS are read 
 
 @dataclass(frozen=True)
 class Band:
-    """A photo, or a band of a large one.
+    """A photo, or a band of a large one."""
 
-    Attributes:
-        encoded: [h, W, 3] float64 encoded values.
-        clear: [h, W] bool, where no channel is black or clipped.
-    """
-
-    encoded: np.ndarray
-    clear: np.ndarray
+    encoded: np.ndarray  # [h, W, 3] float64 encoded values
+    clear: np.ndarray  # [h, W] bool, where no channel is black or clipped
 
 
 @dataclass(frozen=True)
 class PhotoEvidence:
-    """Evidence of photos of one camera about its response.
+    """Evidence of photos of one camera about its response."""
 
-    Attributes:
-        edges: [E, 3, 3] encoded colors (one side, middle, other side) of clean, colored edges.
-        shares: [256] fraction of values at each 8-bit code.
-        clearest: Bands of the photo with the most clear pixels.
-        clear_pixels: Number of its clear pixels.
-    """
-
-    edges: np.ndarray
-    shares: np.ndarray
-    clearest: list[Band]
-    clear_pixels: int
+    edges: np.ndarray  # [E, 3, 3] encoded colors (one side, middle, other side) of clean, colored edges
+    shares: np.ndarray  # [256] fraction of values at each 8-bit code
+    clearest: list[Band]  # Bands of the photo with the most clear pixels
+    clear_pixels: int  # Number of its clear pixels
 
 
 def collect_evidence(images: Iterable[np.ndarray], seed: int) -> PhotoEvidence:

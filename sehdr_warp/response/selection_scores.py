@@ -68,43 +68,25 @@ GRID = np.arange(255 * FINE + 1) / (255 * FINE)
 
 @dataclass(frozen=True)
 class ResponseScore:
-    """Score of one candidate; nats are minus log likelihoods, so that smaller is better.
+    """Score of one candidate; nats are minus log likelihoods, so that smaller is better."""
 
-    Attributes:
-        response: The candidate.
-        dynamic_range: Stops between the 0.1th and 99.9th percentile of decoded, unclipped values.
-        roughness: Mean absolute second difference of the logarithms (base 2) of decoded values.
-        paper_score: Range minus roughness, each over its median among the candidates; larger is better.
-        edges: Nats of an edge; NaN for under 50 usable ones.
-        highlights: Nats of the pixels at and below the brightest code.
-        span: Nats of the spread of log exposure.
-        density: Nats of the density of log exposure.
-        prior: Nats of the candidate before any photo.
-        posterior: The sum, with edges times edge_facts(their number).
-    """
-
-    response: Response
-    dynamic_range: float
-    roughness: float
-    paper_score: float
-    edges: float
-    highlights: float
-    span: float
-    density: float
-    prior: float
-    posterior: float
+    response: Response  # The candidate
+    dynamic_range: float  # Stops between the 0.1th and 99.9th percentile of decoded, unclipped values
+    roughness: float  # Mean absolute second difference of the logarithms (base 2) of decoded values
+    paper_score: float  # Range minus roughness, each over its median among the candidates; larger is better
+    edges: float  # Nats of an edge; NaN for under 50 usable ones
+    highlights: float  # Nats of the pixels at and below the brightest code
+    span: float  # Nats of the spread of log exposure
+    density: float  # Nats of the density of log exposure
+    prior: float  # Nats of the candidate before any photo
+    posterior: float  # The sum, with edges times edge_facts(their number)
 
 
 class CurveTables(NamedTuple):
-    """K curves on GRID.
+    """K curves on GRID."""
 
-    Attributes:
-        logs: [K, 2041] natural log exposures.
-        rises: [K, 2041] their derivatives by the encoded value.
-    """
-
-    logs: np.ndarray
-    rises: np.ndarray
+    logs: np.ndarray  # [K, 2041] natural log exposures
+    rises: np.ndarray  # [K, 2041] their derivatives by the encoded value
 
     @property
     def at_codes(self) -> np.ndarray:

@@ -86,19 +86,12 @@ def _by_solid_angle(estimates: Tensor, camera: Camera) -> Tensor:
 
 @dataclass(frozen=True)
 class _Face:
-    """A perspective view within a wide photo, and where the photo's pixels lie in it.
+    """A perspective view within a wide photo, and where the photo's pixels lie in it."""
 
-    Attributes:
-        places: [1, S, S, 2] pixels of the photo that the face shows, as grid_sample takes them.
-        visible: [S, S, 1] float32, 0 where the lens shows nothing.
-        back: [1, h, w, 2] places in the face of the photo's pixels.
-        weights: [h, w, 1] float32, 0 for pixels that the face does not show.
-    """
-
-    places: Tensor
-    visible: Tensor
-    back: Tensor
-    weights: Tensor
+    places: Tensor  # [1, S, S, 2] pixels of the photo that the face shows, as grid_sample takes them
+    visible: Tensor  # [S, S, 1] float32, 0 where the lens shows nothing
+    back: Tensor  # [1, h, w, 2] places in the face of the photo's pixels
+    weights: Tensor  # [h, w, 1] float32, 0 for pixels that the face does not show
 
 
 class WidePrior:

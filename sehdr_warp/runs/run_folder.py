@@ -40,7 +40,7 @@ from ..scene.images.ldr_files import MAX_PIXELS
 from .checkpoint import Checkpoint, read_checkpoint
 from .config import Config
 from .config_files import config_from_dict, override_config
-from .photo_signatures import changed_photos, photo_signature
+from .scene_description import describe_scene, scene_difference
 from .values import (
     FORMAT,
     LIGHT_UNIT_FILE,
@@ -76,15 +76,10 @@ class CameraEntry:
 
 
 class Confidence(NamedTuple):
-    """Measured on the training photos, for each of N Gaussians: see Evidence.
+    """Measured on the training photos, for each of N Gaussians: see Evidence."""
 
-    Attributes:
-        confidence: [N] in [0, 1], confidence in its light.
-        clipped: [N] in [0, 1], fraction of clipped values in the photos that show it.
-    """
-
-    confidence: Tensor
-    clipped: Tensor
+    confidence: Tensor  # [N] in [0, 1], confidence in its light
+    clipped: Tensor  # [N] in [0, 1], fraction of clipped values in the photos that show it
 
 
 class RunFolder:
@@ -312,51 +307,6 @@ class RunFolder:
 def confidence_metadata(checkpoint_hash: str) -> dict[str, str | int]:
     """Return the header of confidence.safetensors: its format, and the checkpoint that was measured."""
     return {"checkpoint": checkpoint_hash, "format": FORMAT}
-
-
-def describe_scene(scene: Scene) -> dict:
-    """Return what scene.json holds."""
-    views = [
-        {name: getattr(view, name) for name in ("name", "split", "exposure_time")}
-        | {
-            "camera": view.camera.to_dict(),
-            "has_hdr": view.hdr is not None,
-            "photo": photo_signature(view.codes, view.mask),
-        }
-        for view in scene.views
-    ]
-    facts = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
-    return {"format": FORMAT, "name": scene.name, "layout": scene.format, **facts, "views": views}
-
-
-class SceneDifference(NamedTuple):
-    """Difference of two scenes.
-
-    Attributes:
-        what: "layout", "views", or the names of photos.
-        photos: Whether the pictures themselves differ.
-    """
-
-    what: str
-    photos: bool
-
-
-def scene_difference(saved: dict, current: dict) -> SceneDifference | None:
-    """Return what differs between two descriptions of describe_scene(); None if they are of the same scene."""
-    saved, current = (json.loads(json.dumps(description)) for description in (saved, current))
-    photos, current_photos = _split_photos(saved), _split_photos(current)
-    for name in ("layout", "views"):
-        if saved.get(name) != current[name]:
-            return SceneDifference(name, False)
-    if changed := changed_photos(photos, current_photos):
-        return SceneDifference(f"{changed[0]} and {len(changed) - 1} more" if len(changed) > 1 else changed[0], True)
-    return None
-
-
-def _split_photos(description: dict) -> dict[str, str]:
-    """Take the photos' signatures out of a description of a scene; return those there are, by the views' names."""
-    photos = {view["name"]: view.pop("photo", None) for view in description["views"]}
-    return {name: photo for name, photo in photos.items() if isinstance(photo, str)}
 
 
 def _camera_entry(view: dict) -> CameraEntry:

@@ -26,7 +26,8 @@ from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.gravity import find_up
 from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
 from .config import Config
-from .run_folder import EVIDENCE_TENSORS, NEW, READY, RunFolder, confidence_metadata, describe_scene
+from .run_folder import EVIDENCE_TENSORS, NEW, READY, RunFolder, confidence_metadata
+from .scene_description import describe_scene
 from .values import FORMAT, LoadArguments, read_object, require_readable
 
 _LOCK = ".lock"

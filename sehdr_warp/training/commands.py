@@ -212,8 +212,12 @@ def _train(args: Train, ranks=None) -> None:
         with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
             # Iterating the trainer trains; serve_training() answers browsers between its steps.
             run_with_progress(steps, trainer.total)
-    typed = configs.named_fields(args.fields) | {"response": args.scene.response, "preset": args.training.preset}
-    options = options_of_run(trainer.run) if output.resume else typed | {"seed": args.training.seed}
+    # Options that the commands of the advice repeat
+    if output.resume:
+        options = options_of_run(trainer.run)
+    else:
+        options = configs.named_fields(args.fields) | {"response": args.scene.response, "preset": args.training.preset}
+        options |= {"seed": args.training.seed}
     options |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
     _print_result(args, trainer.run, advice_on(trainer, data, options))
 

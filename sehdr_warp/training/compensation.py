@@ -51,15 +51,10 @@ MIN_POINTS = 100  # Fewest points for a fit
 
 @dataclass(frozen=True)
 class MatchedPoints:
-    """Points that several photos show.
+    """Points that several photos show."""
 
-    Attributes:
-        points: [P, 3] world coordinates.
-        visible: [V, P] bool, which of the training and then the other views show each point.
-    """
-
-    points: np.ndarray
-    visible: np.ndarray
+    points: np.ndarray  # [P, 3] world coordinates
+    visible: np.ndarray  # [V, P] bool, which of the training and then the other views show each point
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -86,47 +81,29 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class Compensation:
-    """Result of estimate_compensation.
+    """Result of estimate_compensation."""
 
-    Attributes:
-        compensation: Correction of the photos; None if there is no drift.
-        matcher: Matcher of the training photos as they are, for use if there is no drift; else None.
-        decision: Line of the plan.
-    """
-
-    compensation: ExposureCompensation | None
-    matcher: Matcher | None
-    decision: Decision
+    compensation: ExposureCompensation | None  # Correction of the photos; None if there is no drift
+    matcher: Matcher | None  # Matcher of the training photos as they are, for use if there is no drift; else None
+    decision: Decision  # Line of the plan
 
 
 @dataclass(frozen=True)
 class PreparedPhotos:
-    """Photos to train on.
+    """Photos to train on."""
 
-    Attributes:
-        scene: The scene, with drift of exposure, white balance and vignetting taken out of its photos.
-        compensation: What was taken out; None if there is no drift.
-        get_matcher: Returns the matcher of the training photos, which is created once.
-        decision: Line of the plan; None if nothing was estimated.
-    """
-
-    scene: Scene
-    compensation: ExposureCompensation | None
-    get_matcher: Callable[[], Matcher]
-    decision: Decision | None
+    scene: Scene  # The scene, with drift of exposure, white balance and vignetting taken out of its photos
+    compensation: ExposureCompensation | None  # What was taken out; None if there is no drift
+    get_matcher: Callable[[], Matcher]  # Returns the matcher of the training photos, which is created once
+    decision: Decision | None  # Line of the plan; None if nothing was estimated
 
 
 @dataclass(frozen=True)
 class SharedDecisions:
-    """Decisions that several trainings of one set of photos share, so that their Gaussians have the same colors.
+    """Decisions that several trainings of one set of photos share, so that their Gaussians have the same colors."""
 
-    Attributes:
-        base_time: Exposure time dt_1 that colors refer to, seconds.
-        compensation: Correction of all photos; None if there is no drift.
-    """
-
-    base_time: float
-    compensation: ExposureCompensation | None
+    base_time: float  # Exposure time dt_1 that colors refer to, seconds
+    compensation: ExposureCompensation | None  # Correction of all photos; None if there is no drift
 
     def compensation_of(self, views: Sequence[View]) -> ExposureCompensation | None:
         """Return the compensation of some views alone."""

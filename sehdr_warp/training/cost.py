@@ -36,42 +36,25 @@ SAVES = 1.2  # Blocks or more GPUs are recommended if they need this many times 
 
 @dataclass(frozen=True)
 class Workload:
-    """Size of a training.
+    """Size of a training."""
 
-    Attributes:
-        photos: Number of training photos.
-        pixels: Pixels of a photo.
-        gaussians: Final number of Gaussians.
-        iterations: Photos that are trained on.
-        code_bytes: Bytes of a photo's pixel.
-    """
-
-    photos: int
-    pixels: float
-    gaussians: float
-    iterations: int
-    code_bytes: int = 3
+    photos: int  # Number of training photos
+    pixels: float  # Pixels of a photo
+    gaussians: float  # Final number of Gaussians
+    iterations: int  # Photos that are trained on
+    code_bytes: int = 3  # Bytes of a photo's pixel
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a training.
+    """Cost of a training."""
 
-    Attributes:
-        seconds: Duration from the start of its process to its end.
-        gpu_bytes: Peak memory of each GPU, without the photos.
-        network_bytes: Bytes that each node sends and receives.
-        disk_bytes: Of the run folder.
-        photo_bytes: Of the photos in memory, on each node.
-        predicted: Whether it is outside of what was measured.
-    """
-
-    seconds: float
-    gpu_bytes: float
-    network_bytes: float
-    disk_bytes: float
-    photo_bytes: float
-    predicted: bool
+    seconds: float  # Duration from the start of its process to its end
+    gpu_bytes: float  # Peak memory of each GPU, without the photos
+    network_bytes: float  # Bytes that each node sends and receives
+    disk_bytes: float  # Of the run folder
+    photo_bytes: float  # Of the photos in memory, on each node
+    predicted: bool  # Whether it is outside of what was measured
 
 
 def step_seconds(pixels: float, gaussians: float) -> float:
@@ -155,17 +138,11 @@ def cpu_cost(work: Workload, threads: int) -> Cost:
 
 @dataclass(frozen=True)
 class Choice:
-    """A way to train a set, with its cost.
+    """A way to train a set, with its cost."""
 
-    Attributes:
-        name: In words, such as "4 GPUs".
-        cost: Its cost.
-        fits: Whether it fits into the memory of a GPU.
-    """
-
-    name: str
-    cost: Cost
-    fits: bool = True
+    name: str  # In words, such as "4 GPUs"
+    cost: Cost  # Its cost
+    fits: bool = True  # Whether it fits into the memory of a GPU
 
     def line(self) -> str:
         """Return the choice and its cost in one line."""

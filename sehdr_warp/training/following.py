@@ -12,7 +12,7 @@ from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
 from ..runs.open import load_scene_and_log_notes
 from ..runs.run import exposure_compensation, field_from_checkpoint
-from ..runs.run_folder import describe_scene, scene_difference
+from ..runs.scene_description import describe_scene, scene_difference
 from ..runs.values import LoadArguments
 from ..scene import Scene
 from ..scene.exposure.compensation import ExposureCompensation
@@ -24,34 +24,21 @@ from .training_state import TrainingState, load_state, state_of
 
 @dataclass(frozen=True)
 class PhotoRequest:
-    """Arguments with which the photos of other nodes are read.
+    """Arguments with which the photos of other nodes are read."""
 
-    Attributes:
-        data: Arguments of load_scene() as a run saves them.
-        options: Further arguments of load_scene(): response, method, candidates, photo_storage.
-    """
-
-    data: LoadArguments
-    options: dict[str, Any]
+    data: LoadArguments  # Arguments of load_scene() as a run saves them
+    options: dict[str, Any]  # Further arguments of load_scene(): response, method, candidates, photo_storage
 
 
 @dataclass(frozen=True)
 class SharedTraining:
-    """Values that the other ranks need for the same training; the tensors of its state follow.
+    """Values that the other ranks need for the same training; the tensors of its state follow."""
 
-    Attributes:
-        config: Options of the training, after the plan.
-        info: Response, base time, normalization and exposure compensation, as in run.json.
-        layout: Shape and type of each tensor of its TrainingState.
-        values: Values of its TrainingState.
-        scene: Description of the training views, for nodes that read photos themselves; None on one node.
-    """
-
-    config: Config
-    info: dict[str, Any]
-    layout: dict[str, tuple[torch.Size, torch.dtype]]
-    values: dict[str, Any]
-    scene: dict | None
+    config: Config  # Options of the training, after the plan
+    info: dict[str, Any]  # Response, base time, normalization and exposure compensation, as in run.json
+    layout: dict[str, tuple[torch.Size, torch.dtype]]  # Shape and type of each tensor of its TrainingState
+    values: dict[str, Any]  # Values of its TrainingState
+    scene: dict | None  # Description of the training views, for nodes that read photos themselves; None on one node
 
 
 def send_training(ranks: Ranks, trainer: Trainer, compensation: ExposureCompensation | None) -> None:

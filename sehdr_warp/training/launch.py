@@ -30,23 +30,14 @@ GRACE = 5.0  # Seconds that other ranks have to end after one has ended, and aga
 
 @dataclass(frozen=True)
 class RankInfo:
-    """Rank and node of a process.
+    """Rank and node of a process."""
 
-    Attributes:
-        rank: Number among all processes.
-        count: Number of processes.
-        local_rank: Number among those of this node.
-        local_count: Processes of this node.
-        node: Number of this node.
-        nodes: Number of nodes.
-    """
-
-    rank: int
-    count: int
-    local_rank: int
-    local_count: int
-    node: int = 0
-    nodes: int = 1
+    rank: int  # Number among all processes
+    count: int  # Number of processes
+    local_rank: int  # Number among those of this node
+    local_count: int  # Processes of this node
+    node: int = 0  # Number of this node
+    nodes: int = 1  # Number of nodes
 
     @property
     def several_nodes(self) -> bool:

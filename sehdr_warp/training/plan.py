@@ -50,21 +50,13 @@ DRIFT = 3.0  # Stops of brightness between photos that suggest an exposure that 
 
 @dataclass(frozen=True)
 class Decision:
-    """A decision of the plan.
+    """A decision of the plan."""
 
-    Attributes:
-        fields: Fields of the config that change, with their values; of a rule, those that it asks for.
-        choice: The choice in words.
-        reason: The figures it rests on.
-        name: Name of the rule; make_plan() fills it.
-        always_log: Whether it is logged although it changes no field.
-    """
-
-    fields: dict[str, object]
-    choice: str
-    reason: str
-    name: str = ""
-    always_log: bool = False
+    fields: dict[str, object]  # Fields of the config that change, with their values; of a rule, those that it asks for
+    choice: str  # The choice in words
+    reason: str  # The figures it rests on
+    name: str = ""  # Name of the rule; make_plan() fills it
+    always_log: bool = False  # Whether it is logged although it changes no field
 
 
 @dataclass(frozen=True)

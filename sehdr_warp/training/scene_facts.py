@@ -219,7 +219,7 @@ def check_dataset_truth(data: LoadArguments, config: Config) -> None:
     from ..scene.file_names import unique_names
     from ..scene.load import parse_dataset
 
-    # A plan removes the loss between brackets and truth that is missing.
+    # The plan leaves out a linear loss without truth.
     removed = config.plan.enabled and not config.loss.hdr_weight
     if not config.loss.uses_hdr or removed:
         return

@@ -22,23 +22,14 @@ GAIN_MAP_KNEE = 0.5  # The same exposure, where codes hold four stops more
 
 @dataclass(frozen=True)
 class Target:
-    """One training photo on the device.
+    """One training photo on the device."""
 
-    Attributes:
-        codes: [H, W, 3] as from code_tensor(); or, with an index, a stack [V, H, W, 3] that contains the photo.
-        scale: Values and intervals that the codes stand for.
-        mask: [H, W, 1] in [0, 1].
-        exposure_truth: [H, W, 3] radiance of HDR truth times the base time.
-        estimates: Estimates of the light of clipped pixels, as in clipped_light_energy().
-        index: [1] int64, position of the photo in the stack.
-    """
-
-    codes: Tensor
-    scale: CodeScale
-    mask: Tensor | None = None
-    exposure_truth: Tensor | None = None
-    index: Tensor | None = None
-    estimates: Tensor | None = None
+    codes: Tensor  # [H, W, 3] as from code_tensor(); or, with an index, a stack [V, H, W, 3] that contains the photo
+    scale: CodeScale  # Values and intervals that the codes stand for
+    mask: Tensor | None = None  # [H, W, 1] in [0, 1]
+    exposure_truth: Tensor | None = None  # [H, W, 3] radiance of HDR truth times the base time
+    index: Tensor | None = None  # [1] int64, position of the photo in the stack
+    estimates: Tensor | None = None  # Estimates of the light of clipped pixels, as in clipped_light_energy()
 
     @property
     def encoded(self) -> Tensor:
@@ -115,36 +106,22 @@ def mu_law(exposure: Tensor, white: float, mu: float = MU) -> Tensor:
 
 @dataclass(frozen=True)
 class TrainingView:
-    """A photo to train on.
+    """A photo to train on."""
 
-    Attributes:
-        camera: Camera on the device.
-        exposure_time: Seconds.
-        target: The image to compare with, at the camera's size.
-    """
-
-    camera: CameraTensors
-    exposure_time: float | Tensor
-    target: Target
+    camera: CameraTensors  # Camera on the device
+    exposure_time: float | Tensor  # Seconds
+    target: Target  # The image to compare with, at the camera's size
 
 
 @dataclass(frozen=True)
 class ViewStack:
-    """V training views of one size in shared tensors: [i] is view i; at() selects by an index on the device.
+    """V training views of one size in shared tensors: [i] is view i; at() selects by an index on the device."""
 
-    Attributes:
-        width: Pixels.
-        height: Pixels.
-        cameras: [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0.
-        times: Exposure times [V] in seconds, or one float if all are equal.
-        targets: Target whose images are stacked, [V, ...].
-    """
-
-    width: int
-    height: int
-    cameras: Tensor
-    times: Tensor | float
-    targets: Target
+    width: int  # Pixels
+    height: int  # Pixels
+    cameras: Tensor  # [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0
+    times: Tensor | float  # Exposure times [V] in seconds, or one float if all are equal
+    targets: Target  # Target whose images are stacked, [V, ...]
 
     @staticmethod
     def of(views: Sequence[TrainingView]) -> "ViewStack | None":

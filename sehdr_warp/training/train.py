@@ -92,23 +92,21 @@ def create_trainer(
     """
     refuse_paths("load_scene", scene)
     states_iterations = isinstance(config, Config) or (isinstance(config, Mapping) and "schedule.iterations" in config)
-    device, folder, config = pick_device(device), RunWriter(out), as_config(config)
+    device, config = pick_device(device), as_config(config)
     if tensorboard:
         summary_writer()
+    output = RunOutput(RunWriter(out), tensorboard=tensorboard, is_block=shared is not None)
+    folder = output.folder
     with oom_context(device, lambda: sizes_of(scene), TRAINING_REMEDY):
         resumes = folder.prepare(resume=resume, overwrite=overwrite)  # Again, for those who call this function.
         try:
             if resumes:
                 if config is not None and not states_iterations:
                     config = with_iterations_of(folder.read_config(), config)
-                trainer = _resumed_trainer(
-                    scene, folder, config, device, ranks, tensorboard, is_block=shared is not None
-                )
+                trainer = _resumed_trainer(scene, config, device, ranks, output)
             else:
                 config, data = config or Config(), data or LoadArguments()
-                trainer = _new_trainer(
-                    scene, folder, config, device, ranks, tensorboard, data, shared, overwrite=overwrite
-                )
+                trainer = _new_trainer(scene, config, device, ranks, output, data, shared, overwrite=overwrite)
             if ranks is not None:
                 send_training(ranks, trainer, exposure_compensation(folder.read_info()))
         except BaseException:
@@ -123,11 +121,10 @@ def create_trainer(
 
 def _new_trainer(
     scene: Scene,
-    folder: RunWriter,
     config: Config,
     device: torch.device,
     ranks: Ranks | None,
-    tensorboard: bool,
+    output: RunOutput,
     data: LoadArguments,
     shared: SharedDecisions | None,
     *,
@@ -143,7 +140,6 @@ def _new_trainer(
     base_time = None if shared is None else shared.base_time
     field = make_field(prepared.scene, config, response, device, prepared.get_matcher, base_time)
     seconds = time.perf_counter() - started
-    output = RunOutput(folder, config, tensorboard=tensorboard, is_block=shared is not None)
     trainer = Trainer(prepared.scene, config, field, get_matcher=prepared.get_matcher, ranks=ranks, output=output)
     started = time.perf_counter()
     light = trainer.views.loss_light_estimates
@@ -154,7 +150,7 @@ def _new_trainer(
         plan = replace(plan, decisions=(*plan.decisions, prepared.decision))
     # The folder is begun last, when the scene is known to be usable.
     plan_values, state = None if plan is None else plan.to_dict(), state_of(trainer)
-    folder.begin(
+    output.folder.begin(
         scene, config, field, data, plan_values, state, compensation=prepared.compensation, overwrite=overwrite
     )
     for line in plan.lines() if plan is not None else ():
@@ -163,16 +159,10 @@ def _new_trainer(
 
 
 def _resumed_trainer(
-    scene: Scene,
-    folder: RunWriter,
-    config: Config | None,
-    device: torch.device,
-    ranks: Ranks | None,
-    tensorboard: bool,
-    *,
-    is_block: bool,
+    scene: Scene, config: Config | None, device: torch.device, ranks: Ranks | None, output: RunOutput
 ) -> Trainer:
     """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run."""
+    folder = output.folder
     folder.lock()
     info, saved = folder.read_info(), folder.read_config()
     before = saved.schedule.iterations
@@ -187,7 +177,6 @@ def _resumed_trainer(
     field = field_from_checkpoint(checkpoint, saved, info).to(device)
     compensation = exposure_compensation(info)
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
-    output = RunOutput(folder, saved, tensorboard=tensorboard, is_block=is_block)
     trainer = Trainer(scene, saved, field, ranks=ranks, output=output)
     try:
         load_state(trainer, TrainingState(checkpoint.tensors, checkpoint.values))

@@ -126,6 +126,8 @@ class Trainer:
         self._view_index = 0
         self.interrupted, self._stopped, self._all_end, self._pace = threading.Event(), False, False, Pace()
         self._finished = False
+        if output is not None:
+            output.start(config)
 
     # The loop
 

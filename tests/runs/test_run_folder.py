@@ -13,10 +13,10 @@ import torch
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.confidence import Evidence
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.runs.photo_signatures import changed_photos, photo_signature
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter, write_confidence
+from sehdr_warp.runs.scene_description import changed_photos, photo_signature
 from sehdr_warp.training.train import create_trainer, train
 from tests.fuzz.run_readers import PLAN, REGION, SUMMARY, make_confidence, make_run
 from tests.training.toy import toy_scene

@@ -15,7 +15,8 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.runs.run_folder import RunFolder, describe_scene
+from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.runs.scene_description import describe_scene
 from sehdr_warp.training.following import _check_same_photos
 from sehdr_warp.training.launch import RankInfo, open_store, rank_from_environment
 from sehdr_warp.training.ranks import rank_timeout

@@ -19,15 +19,10 @@ SEED_STRIDE = 1_000_003  # A step's random seed is that of the training times th
 
 
 class Proposals(NamedTuple):
-    """New Gaussians to place.
+    """New Gaussians to place."""
 
-    Attributes:
-        rows: Tensors [M, ...] as Gaussians.append() takes them; the first `count` rows are to be used.
-        count: int64 [] on the device.
-    """
-
-    rows: dict[str, Tensor]
-    count: Tensor
+    rows: dict[str, Tensor]  # Tensors [M, ...] as Gaussians.append() takes them; the first `count` rows are to be used
+    count: Tensor  # Int64 [] on the device
 
 
 Propose = Callable[[Tensor, int], Proposals]
@@ -68,17 +63,11 @@ class Schedule:
 
 @dataclass
 class Strategy:
-    """A densification strategy; this base class never changes the Gaussians.
+    """A densification strategy; this base class never changes the Gaussians."""
 
-    Attributes:
-        schedule: When to refine.
-        cap_max: Largest number of Gaussians.
-        prune_opacity: Gaussians below this opacity are relocated or removed.
-    """
-
-    schedule: Schedule
-    cap_max: int
-    prune_opacity: float
+    schedule: Schedule  # When to refine
+    cap_max: int  # Largest number of Gaussians
+    prune_opacity: float  # Gaussians below this opacity are relocated or removed
 
     def needs_gradients(self, iteration: int) -> bool:
         """Return whether accumulate() needs the gradients of the projected means at this iteration."""

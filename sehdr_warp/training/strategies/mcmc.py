@@ -32,21 +32,13 @@ DENSE = 300.0  # Gaussians over the square root of the photos' pixels, from whic
 
 @dataclass(frozen=True)
 class Refinement:
-    """A refinement under way. It fills slots: the rows of the dead Gaussians, then the new ones.
+    """A refinement under way. It fills slots: the rows of the dead Gaussians, then the new ones."""
 
-    Attributes:
-        gaussians: As in Strategy.refine(), with the new rows.
-        optimizer: As in Strategy.refine().
-        generator: As in Strategy.refine().
-        slot_of_row: [N] int32, negative for rows that stay.
-        changed: [N] bool, rows whose optimizer state is to be reset, see reset_moments().
-    """
-
-    gaussians: Gaussians
-    optimizer: Optimizer | None
-    generator: torch.Generator
-    slot_of_row: Tensor
-    changed: Tensor
+    gaussians: Gaussians  # As in Strategy.refine(), with the new rows
+    optimizer: Optimizer | None  # As in Strategy.refine()
+    generator: torch.Generator  # As in Strategy.refine()
+    slot_of_row: Tensor  # [N] int32, negative for rows that stay
+    changed: Tensor  # [N] bool, rows whose optimizer state is to be reset, see reset_moments()
 
 
 @dataclass
@@ -58,18 +50,12 @@ class McmcStrategy(Strategy):
     Gaussians explores. There are no gradient statistics and no opacity resets.
 
     A training that starts with more Gaussians than the cap keeps their number.
-
-    Attributes:
-        options: Options of the strategy.
-        random_seed: Seed of the training.
-        camera_positions: [V, 3] positions of the training cameras, for prune_near_angle.
-        dense: Whether copies take over the second moments of their source, see reset_moments().
     """
 
-    options: McmcConfig = field(default_factory=McmcConfig)
-    random_seed: int = 0
-    camera_positions: Tensor | None = None
-    dense: bool = False
+    options: McmcConfig = field(default_factory=McmcConfig)  # Options of the strategy
+    random_seed: int = 0  # Seed of the training
+    camera_positions: Tensor | None = None  # [V, 3] positions of the training cameras, for prune_near_angle
+    dense: bool = False  # Whether copies take over the second moments of their source, see reset_moments()
 
     @staticmethod
     def from_config(

@@ -1,0 +1,100 @@
+"""What scene.json describes of a scene, and whether a training is resumed with the scene that it began with.
+
+Photos are described by signatures: the mean of the codes in a grid of GRID x GRID cells, of 8 bits each. It survives
+another decoder, whose codes may differ by one, and changes with a photo that was edited, exchanged or developed anew.
+That of a masked photo has a second part, of the mask.
+"""
+
+import json
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ..scene import Scene
+from .values import FORMAT
+
+GRID = 8
+_MOST_ROWS = 32
+"""Rows that are read of each row of cells; more would take longer for large photos and find little more."""
+_TOLERANCE = 2
+"""Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded."""
+
+
+def describe_scene(scene: Scene) -> dict:
+    """Return what scene.json holds."""
+    views = [
+        {name: getattr(view, name) for name in ("name", "split", "exposure_time")}
+        | {
+            "camera": view.camera.to_dict(),
+            "has_hdr": view.hdr is not None,
+            "photo": photo_signature(view.codes, view.mask),
+        }
+        for view in scene.views
+    ]
+    facts = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
+    return {"format": FORMAT, "name": scene.name, "layout": scene.format, **facts, "views": views}
+
+
+class SceneDifference(NamedTuple):
+    """Difference of two scenes."""
+
+    what: str  # "layout", "views", or the names of photos
+    photos: bool  # Whether the pictures themselves differ
+
+
+def scene_difference(saved: dict, current: dict) -> SceneDifference | None:
+    """Return what differs between two descriptions of describe_scene(); None if they are of the same scene."""
+    saved, current = (json.loads(json.dumps(description)) for description in (saved, current))
+    photos, current_photos = _split_photos(saved), _split_photos(current)
+    for name in ("layout", "views"):
+        if saved.get(name) != current[name]:
+            return SceneDifference(name, False)
+    if changed := changed_photos(photos, current_photos):
+        return SceneDifference(f"{changed[0]} and {len(changed) - 1} more" if len(changed) > 1 else changed[0], True)
+    return None
+
+
+def _split_photos(description: dict) -> dict[str, str]:
+    """Take the photos' signatures out of a description of a scene; return those there are, by the views' names."""
+    photos = {view["name"]: view.pop("photo", None) for view in description["views"]}
+    return {name: photo for name, photo in photos.items() if isinstance(photo, str)}
+
+
+def photo_signature(codes: np.ndarray, mask: np.ndarray | None = None) -> str:
+    """Return hexadecimal digits of codes [H, W, 3], uint8 or uint16, and of a mask [H, W] in [0, 1]."""
+    if mask is None:
+        return _means(codes)
+    return f"{_means(codes)}/{_means(np.rint(mask * np.float32(255)).astype(np.uint8)[..., None])}"
+
+
+def _means(codes: np.ndarray) -> str:
+    height, width = codes.shape[:2]
+    means = np.zeros((GRID, GRID))
+    columns = [slice(*edge) for edge in _edges(width)]
+    for row, (top, bottom) in enumerate(_edges(height)):
+        band = np.asarray(codes[top : bottom : max(1, (bottom - top) // _MOST_ROWS)])
+        means[row] = [band[:, part].mean() for part in columns]
+    return np.rint(means * (255 / np.iinfo(codes.dtype).max)).astype(np.uint8).tobytes().hex()
+
+
+def changed_photos(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Return the names of photos whose signatures differ; a name without a signature on either side does not count."""
+    return [name for name in before if name in now and _differ(before[name], now[name])]
+
+
+def _edges(length: int) -> list[tuple[int, int]]:
+    """Return first and last pixel of each of GRID cells, which overlap if there are fewer pixels than cells."""
+    starts = [index * length // GRID for index in range(GRID)]
+    return [(start, max(start + 1, (index + 1) * length // GRID)) for index, start in enumerate(starts)]
+
+
+def _differ(first: str, second: str) -> bool:
+    """Return whether signatures have other parts, or cells that differ by more than _TOLERANCE."""
+    try:
+        one, other = ([np.frombuffer(bytes.fromhex(part), np.uint8) for part in s.split("/")] for s in (first, second))
+    except ValueError:
+        return True
+    if [cells.shape for cells in one] != [cells.shape for cells in other]:
+        return True
+    return any((np.abs(a.astype(int) - b) > _TOLERANCE).any() for a, b in zip(one, other, strict=True))
