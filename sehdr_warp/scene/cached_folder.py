@@ -1,5 +1,6 @@
 """Folders of results that take long to compute: structure from motion, and the frames of a video."""
 
+import hashlib
 import logging
 import shutil
 import tempfile
@@ -7,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..caches import cache_folder, usable
-from ..errors import SehdrError
+from ..errors import InputError, SehdrError
 from ..files import atomic_folder
 from ..own_files import is_as_listed
 
@@ -44,3 +45,12 @@ def cached_folder(cache: Path | str | None, name: str, fill: Callable[[Path], No
         if not (place.is_dir() and is_as_listed(place)):  # Else another process was first; its result is used.
             raise
     return place
+
+
+def file_digest(path: Path) -> str:
+    """Return a hash of a file's content, or raise InputError if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "blake2b").hexdigest()[:32]
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None

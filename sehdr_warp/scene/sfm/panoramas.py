@@ -14,6 +14,7 @@ from PIL import Image
 from ...errors import InputError
 from ...parallel import run_interruptibly
 from ...progress import stage, track_progress
+from ..cached_folder import file_digest
 from ..dataparser import PointCloud
 from ..images.ldr_files import file_kind, open_image
 from ..images.xmp import xmp_of, xmp_values
@@ -28,7 +29,6 @@ from .reconstruction import (
     SEED,
     Reconstruction,
     cache_key,
-    file_digest,
     image_name,
     matching_options,
     quiet_colmap,

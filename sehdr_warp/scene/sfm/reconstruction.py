@@ -25,7 +25,7 @@ from ...errors import InputError, SehdrError
 from ...parallel import preserve_signals, run_interruptibly
 from ...progress import Stage, stage, track_progress
 from ...subsets import counted, first_names
-from ..cached_folder import cached_folder
+from ..cached_folder import cached_folder, file_digest
 from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from ..masks import write_reduced
 from ..photos import brightened_codes, read_photo, unusable_notes
@@ -161,15 +161,6 @@ def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Pat
             solve(Path(work), result)
 
     return cached_folder(cache, f"sfm-{key}", fill)
-
-
-def file_digest(path: Path) -> str:
-    """Return a hash of a file's content, or raise InputError if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "blake2b").hexdigest()[:32]
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
 
 
 def cache_key(*parts) -> str:

@@ -11,12 +11,11 @@ from PIL import Image
 
 from ...errors import InputError
 from ...progress import stage
-from ..cached_folder import cached_folder
+from ..cached_folder import cached_folder, file_digest
 from ..dataparser import DataparserOutputs
 from ..file_names import list_images
 from ..images.ldr_files import png16
 from ..readers.bare_photos import find_photos
-from ..sfm.reconstruction import file_digest
 from .color import outside_rec709
 from .decode import Clip, codes, decode, grey, in_square_pixels, open_clip
 
