@@ -96,11 +96,11 @@ def panoramas(count=8):
 
 def test_held_out_panoramas_of_a_training_on_panoramas(tmp_path):
     scene = panoramas()
-    overrides = {"schedule.iterations": 120, "model.sh_degree": 1, "model.exposure_compensation": "never"}
+    overrides = {"schedule.iterations": 40, "model.sh_degree": 1, "model.exposure_compensation": "never"}
     run = train(scene, tmp_path / "run", load_config("fast", overrides), device="cpu")
     scores = evaluate(run, scene)
     assert scores["split"] == "test"
-    assert scores["ldr"]["psnr"] > 24, scores["ldr"]
+    assert scores["ldr"]["psnr"] > 27, scores["ldr"]
     assert run.render(scene.test_views[0].camera).hdr.shape == (HEIGHT, WIDTH, 3)
 
 
