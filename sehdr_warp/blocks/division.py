@@ -84,17 +84,12 @@ class Division:
 
 @dataclass(frozen=True)
 class ShownPlaces:
-    """The places that V photos show.
+    """The places that V photos show."""
 
-    Attributes:
-        points: [P, 3] points of scene coordinates.
-        parts: [V, P] sparse float32, the part of each photo that a point stands for; a row sums to 1, or to 0.
-        middles: [V, 3] mean of the points of each photo; of a photo without points, the place of its camera.
-    """
-
-    points: np.ndarray
+    points: np.ndarray  # [P, 3] points of scene coordinates
+    # [V, P] sparse float32, the part of each photo that a point stands for; a row sums to 1, or to 0
     parts: sparse.csr_array
-    middles: np.ndarray
+    middles: np.ndarray  # [V, 3] mean of the points of each photo; of a photo without points, the place of its camera
 
     @staticmethod
     def of(cameras: Sequence[Camera], points: np.ndarray) -> "ShownPlaces":

@@ -33,19 +33,13 @@ RESIDUAL_WEIGHT = 8.0  # Weight of pixels that the scene does not reproduce: wha
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence of the training photos for N Gaussians; tensors [N].
+    """Evidence of the training photos for N Gaussians; tensors [N]."""
 
-    Attributes:
-        weight_sum: Sum of blending weights over pixels, times RESIDUAL_WEIGHT where the scene does not reproduce them.
-        stops: Mean uncertainty in stops.
-        clipped: Fraction of clipped values.
-        peak: Sum of blending weights, as in weight_sum, in the photo in which it is largest.
-    """
-
+    # Sum of blending weights over pixels, times RESIDUAL_WEIGHT where the scene does not reproduce them
     weight_sum: Tensor
-    stops: Tensor
-    clipped: Tensor
-    peak: Tensor
+    stops: Tensor  # Mean uncertainty in stops
+    clipped: Tensor  # Fraction of clipped values
+    peak: Tensor  # Sum of blending weights, as in weight_sum, in the photo in which it is largest
 
     @property
     def contributes(self) -> Tensor:

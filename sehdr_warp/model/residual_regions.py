@@ -48,16 +48,11 @@ class Region:
 
 
 class PhotoComparison(NamedTuple):
-    """Difference of a scene from its photos.
+    """Difference of a scene from its photos."""
 
-    Attributes:
-        regions: Regions that the scene does not reproduce, largest area times stops first.
-        brightness_offsets: Stops by which whole photos are brighter than the scene, by the views' names: the median
-            over pixels that are neither clipped nor dark, less the median over photos. Photos with few such pixels are
-            left out.
-    """
-
-    regions: list[Region]
+    regions: list[Region]  # Regions that the scene does not reproduce, largest area times stops first
+    # Stops by which whole photos are brighter than the scene, by the views' names: the median over pixels that are
+    # neither clipped nor dark, less the median over photos. Photos with few such pixels are left out
     brightness_offsets: dict[str, float]
 
 

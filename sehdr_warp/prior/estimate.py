@@ -47,16 +47,12 @@ class LightEstimate:
 
 @dataclass(frozen=True)
 class ClippedLight:
-    """Estimates of a photo's clipped light from all sources; float16, 0 where nothing is clipped or known.
+    """Estimates of a photo's clipped light from all sources; float16, 0 where nothing is clipped or known."""
 
-    Attributes:
-        log_light: [h, w, 6], as clipped_light_energy() takes it: for each channel the natural logarithm of the expected
-            light over white, and then the root of its weight in a training.
-        certainty: [h, w, 3], 1 / the deviation of that logarithm.
-    """
-
+    # [h, w, 6], as clipped_light_energy() takes it: for each channel the natural logarithm of the expected light
+    # over white, and then the root of its weight in a training
     log_light: Tensor
-    certainty: Tensor
+    certainty: Tensor  # [h, w, 3], 1 / the deviation of that logarithm
 
 
 class LightPrior:

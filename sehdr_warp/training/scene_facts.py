@@ -33,44 +33,26 @@ of the first, maps from within a place 0.1; objects have nearly 1 of the second.
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """Figures of a scene's training views; fractions are of 1.
+    """Figures of a scene's training views; fractions are of 1."""
 
-    Attributes:
-        photos: Number of photos.
-        pixels: Pixels of all photos.
-        from_camera: Whether a camera wrote the files.
-        truths: Number of photos with HDR truth.
-        points: Number of sparse points.
-        visibility: Mean number of photos whose field of view contains a probe.
-        overlap: Fraction of the probes, or of places along the cameras' rays if that is more, that two photos contain.
-        clipped: Fraction of pixels with a channel at white.
-        black: Fraction of pixels with all channels at 0.
-        contrast: Standard deviation of all encoded values.
-        drift: Approximate stops between the darkest and the brightest photo's median if no exposure times are known;
-            else 0.
-        view_alignment: Length of the mean viewing direction: 1 if all cameras look the same way.
-        inward_fraction: Fraction of the cameras that look towards the middle of all.
-        light_known: Whether the photos hold light itself: RAW, linear, float.
-        unclipped: Whether they are float pictures without clipping.
-        plateau: Code of 255, below 255, at which the photos clip, as after an edit; 0 if they do not.
-    """
-
-    photos: int
-    pixels: int
-    from_camera: bool
-    truths: int
-    points: int
-    visibility: float
+    photos: int  # Number of photos
+    pixels: int  # Pixels of all photos
+    from_camera: bool  # Whether a camera wrote the files
+    truths: int  # Number of photos with HDR truth
+    points: int  # Number of sparse points
+    visibility: float  # Mean number of photos whose field of view contains a probe
+    # Fraction of the probes, or of places along the cameras' rays if that is more, that two photos contain
     overlap: float
-    clipped: float
-    black: float
-    contrast: float
+    clipped: float  # Fraction of pixels with a channel at white
+    black: float  # Fraction of pixels with all channels at 0
+    contrast: float  # Standard deviation of all encoded values
+    # Approximate stops between the darkest and the brightest photo's median if no exposure times are known; else 0
     drift: float
-    view_alignment: float = 1.0
-    inward_fraction: float = 1.0
-    light_known: bool = False
-    unclipped: bool = False
-    plateau: int = 0
+    view_alignment: float = 1.0  # Length of the mean viewing direction: 1 if all cameras look the same way
+    inward_fraction: float = 1.0  # Fraction of the cameras that look towards the middle of all
+    light_known: bool = False  # Whether the photos hold light itself: RAW, linear, float
+    unclipped: bool = False  # Whether they are float pictures without clipping
+    plateau: int = 0  # Code of 255, below 255, at which the photos clip, as after an edit; 0 if they do not
 
     @property
     def around(self) -> bool:

@@ -23,18 +23,13 @@ class AdcStrategy(Strategy):
 
     Small Gaussians with large image gradients are duplicated and large ones split; transparent and oversized ones are
     removed. Opacities are reset now and then, so that only what is needed becomes opaque again.
-
-    Attributes:
-        options: Thresholds; those of size are in normalized units.
-        reset_every: Iterations between resets.
-        gradient_sum: Sum of the gradients of the projected means, [rows], in normalized screen units.
-        photo_count: Number of photos in that sum, [rows].
     """
 
-    options: AdcConfig = field(default_factory=AdcConfig)
-    reset_every: int = 3000
+    options: AdcConfig = field(default_factory=AdcConfig)  # Thresholds; those of size are in normalized units
+    reset_every: int = 3000  # Iterations between resets
+    # Sum of the gradients of the projected means, [rows], in normalized screen units
     gradient_sum: Tensor | None = None
-    photo_count: Tensor | None = None
+    photo_count: Tensor | None = None  # Number of photos in that sum, [rows]
 
     @staticmethod
     def from_config(config: Config) -> "AdcStrategy":
