@@ -198,7 +198,7 @@ def test_a_preset_in_python_does_not_stretch_a_run_and_stated_iterations_do(tmp_
     file.write_text('base = "fast"\n')
     for config in ("fast", file):
         assert train(scene, tmp_path / "run", config, device="cpu", resume=True).iterations == 3
-    assert sum("the run has 3 iterations, and not the 1500 of the preset" in line for line in logged) == 2
+    assert sum("the run keeps its 3 iterations, not the preset's 1500" in line for line in logged) == 2
     longer = load_config("fast", {"schedule.iterations": 4})
     assert train(scene, tmp_path / "run", longer, device="cpu", resume=True).iterations == 4
     train(scene, tmp_path / "fields", {"schedule.iterations": 2}, device="cpu")
