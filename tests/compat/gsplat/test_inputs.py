@@ -1,9 +1,13 @@
 """Arguments of gsplat's rasterization(): misfits are named, and what is out of range changes nothing else."""
 
+import inspect
+from pathlib import Path
+
 import pytest
 import torch
 
 from sehdr_warp.compat.gsplat import rasterization
+from sehdr_warp.compat.gsplat.inputs import UNSUPPORTED
 
 from .scenes import COUNT, HEIGHT, WIDTH, gradients, scene
 
@@ -12,8 +16,6 @@ from .scenes import COUNT, HEIGHT, WIDTH, gradients, scene
     ("options", "message"),
     [
         ({"sparse_grad": True}, "sparse_grad = True is not supported, expected False"),
-        ({"with_ut": True}, "with_ut = True is not supported"),
-        ({"distributed": True}, "distributed = True is not supported"),
         ({"viewmats_rs": torch.zeros(2, 4, 4)}, r"viewmats_rs = a tensor of shape \[2, 4, 4\] is not supported"),
         ({"rolling_shutter": 0}, "rolling_shutter = 0 is not supported"),
         ({"camera_model": "ftheta"}, "camera_model 'ftheta' is none of pinhole, ortho, fisheye"),
@@ -25,7 +27,6 @@ from .scenes import COUNT, HEIGHT, WIDTH, gradients, scene
         ({"sh_degree": 4}, "sh_degree 4 is not supported, expected 0 to 3"),
         ({"sh_degree": 2}, "colors has shape .* but sh_degree 2 needs 9 coefficients"),
         ({"backgrounds": torch.zeros(2, 4)}, "backgrounds has shape"),
-        ({"global_z_order": False}, "global_z_order = False is not supported, expected True"),
         ({"rays": torch.zeros(2, 30, 40, 6)}, r"rays = a tensor of shape \[2, 30, 40, 6\] is not supported"),
         ({"extra_signals": torch.zeros(3, 1)}, r"extra_signals has shape \[3, 1\], expected \[N, E\] with N = 200"),
         ({"far": 3}, "unexpected keyword argument 'far'"),
@@ -35,6 +36,18 @@ def test_what_is_not_supported_is_named(options, message):
     leaves, place = scene(coefficients=4 if "sh_degree" in options else 0)
     with pytest.raises((ValueError, TypeError), match=message):
         rasterization(*leaves, **place._asdict(), **options)
+
+
+@pytest.mark.parametrize("name", UNSUPPORTED)
+def test_each_argument_without_effect_is_refused_by_name(name):
+    leaves, place = scene()
+    with pytest.raises(ValueError, match=f"^{name} = .* is not supported, expected {UNSUPPORTED[name]}$"):
+        rasterization(*leaves, **place._asdict(), **{name: not UNSUPPORTED[name]})
+
+
+def test_the_page_for_users_of_gsplat_has_each_argument():
+    page = (Path(__file__).parents[3] / "docs" / "gsplat.md").read_text()
+    assert not [name for name in inspect.signature(rasterization).parameters if f"`{name}" not in page]
 
 
 def test_wrong_shapes_types_and_devices_are_named():
