@@ -274,7 +274,7 @@ def render_projected(
         projected: the Gaussians.
         features: [N, C].
         options: of the image.
-        replays: on a GPU, replay calls that repeat as CUDA graphs.
+        replays: on a GPU, replay calls that repeat as CUDA graphs. Not for rasterize(), which replays projections, too.
         store_absolute: called in the backward pass with the absolute gradients of the 2D means, [N, 2]; see
             watch_absolute_gradients(). Such calls are always launched.
     """

@@ -91,8 +91,9 @@ class CapturedBackward:
         projected: outputs of the projection on the graph's memory.
 
     Attributes:
-        conics_opacities: stands for both in the autograd graph, between blend and projection: its gradient is
-            GradientMemory.zeros, and nothing reads its values. None if the CUDA graph does not project.
+        conics_opacities: a stand-in for both, without memory: an output of the projection and an input of the blend in
+            autograd's graph. Its gradient is GradientMemory.zeros, which has theirs. None if the CUDA graph does not
+            project.
     """
 
     def __init__(
