@@ -26,7 +26,6 @@ OTHER = "torch's own"
 KERNELS = {
     "projection": ("project_*_forward",),
     "harmonics": ("evaluate_*", "jacobian_backward_*"),
-    "activations": ("activate_*", "sum_opacities*"),
     "lists": ("pack_splats_*", "key_by_*", "emit_*", "find_tile_ranges_*", "*radix_sort*", "*DeviceScan*"),
     "blend": ("blend_forward_*",),
     "response and fusion": (
@@ -37,7 +36,7 @@ KERNELS = {
         "point_backward_*",
         "unit_backward_*",
     ),
-    "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*"),
+    "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*", "sum_opacities*"),
     "blend, backward": ("blend_backward_*",),
     "projection, backward": ("project_*_backward",),
     "optimizer": ("update_*", "find_nonfinite_*", "decide_step_*"),

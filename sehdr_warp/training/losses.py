@@ -5,9 +5,9 @@ from torch import Tensor
 from ..model.radiance_field import RadianceField
 from ..model.renders import TrainRender
 from ..rasterizer.losses.code_residual import code_residual
+from ..rasterizer.losses.opacity_penalty import opacity_penalty
 from ..rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
 from ..rasterizer.losses.ssim import image_distance, ssim
-from ..rasterizer.ops.activations import opacity_penalty
 from ..response import ToneMapper
 from ..runs.config import LossConfig
 from .targets import Target, mu_law

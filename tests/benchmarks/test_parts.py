@@ -18,7 +18,7 @@ from benchmarks.step import bench_step
         ("tile_ranges_kernel__locals__find_tile_ranges_64b9232b_cuda_kernel_forward", "lists"),
         ("jacobian_backward_kernel__locals__jacobian_backward_64b9232b_cuda_kernel_forward", "harmonics"),
         ("void cub::_V_3::detail::radix_sort::DeviceRadixSortOnesweepKernel<int>", "lists"),
-        ("opacity_penalty_kernel__locals__sum_opacities_3c9e86f4_cuda_kernel_forward", "activations"),
+        ("opacity_penalty_kernel__locals__sum_opacities_3c9e86f4_cuda_kernel_forward", "losses"),
         ("update_harmonics_by_adam_973af1cd_cuda_kernel_forward", "optimizer"),
         ("void at::native::vectorized_elementwise_kernel<4, at::native::exp_kernel_cuda>", parts.OTHER),
     ],

@@ -11,7 +11,6 @@ import warp as wp
 
 from sehdr_warp.kernels import (
     absolute_gradient,
-    activations,
     blend_cuda,
     blend_cuda_backward,
     caller_memory,
@@ -20,6 +19,7 @@ from sehdr_warp.kernels import (
     exposure_fusion,
     harmonics,
     interpolation,
+    opacity_penalty,
     plane_sweep,
     project,
     relocation,
@@ -51,8 +51,8 @@ KERNELS: dict[str, Callable[[], Any]] = {
     "harmonics backward": lambda: harmonics.harmonics_backward_kernel(REAL, 3, True),
     "harmonics, Adam": lambda: step_updates.harmonics_adam_kernel(4),
     "interpolation": lambda: interpolation,
-    "opacity penalty": lambda: activations.opacity_penalty_kernel(REAL),
-    "opacity penalty, backward": lambda: activations.opacity_penalty_backward_kernel(REAL),
+    "opacity penalty": lambda: opacity_penalty.opacity_penalty_kernel(REAL),
+    "opacity penalty, backward": lambda: opacity_penalty.opacity_penalty_backward_kernel(REAL),
     "plane sweep": lambda: plane_sweep,
     "projection": lambda: project.projection_kernel(REAL, False),
     "projection, antialiased": lambda: project.projection_kernel(REAL, True),

@@ -1,1 +1,1 @@
-"""Losses of images as torch operations: SSIM, and the residual against a photo's codes."""
+"""Losses as torch operations: SSIM, the residual against a photo's codes, and the penalty on opacities."""

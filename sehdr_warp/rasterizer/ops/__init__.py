@@ -1,1 +1,1 @@
-"""Torch operations of Warp kernels beside the render: harmonics, activations, plane sweep, relocation, step updates."""
+"""Torch operations of Warp kernels beside the render: harmonics, plane sweep, relocation, step updates."""

@@ -1,51 +1,13 @@
-"""Activations of a Gaussian's parameters before it is drawn, as torch operations (kernels/activations.py)."""
+"""The penalty on opacities, with its gradient (kernels/opacity_penalty.py)."""
 
 import torch
 from torch import Tensor
-from torch.nn.functional import hardtanh
 
-from ...kernels.activations import (
-    exposures_backward_kernel,
-    exposures_kernel,
-    opacity_penalty_backward_kernel,
-    opacity_penalty_kernel,
-)
+from ...kernels.opacity_penalty import opacity_penalty_backward_kernel, opacity_penalty_kernel
 from ..torch_contract import once_differentiable
 from ..warp_launch.launching import launch, warp_scalar
 
 MEAN_THREADS = 1 << 14
-
-
-def bounded_exponential(values: Tensor, bound: float) -> Tensor:
-    """Return exp of [N, C] values clamped to [-bound, bound], float32 or float64; NaN stays NaN.
-
-    Beyond the bounds the derivative is 0. Differentiable once.
-    """
-    if values.device.type == "cuda":
-        return _BoundedExponential.apply(values, bound)
-    # clamp(), but for the derivative, which is one operation in place of four.
-    return hardtanh(values, -bound, bound).exp()
-
-
-class _BoundedExponential(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values, bound):
-        values = values.detach().contiguous()
-        exponentials = torch.empty_like(values)
-        kernel = exposures_kernel(warp_scalar(values.dtype))
-        launch(kernel, values.numel(), values.view(-1), bound, exponentials.view(-1))
-        ctx.bound = bound
-        ctx.save_for_backward(values, exponentials)
-        return exponentials
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, upstream):
-        values, exponentials = ctx.saved_tensors
-        result = torch.empty_like(values)
-        kernel = exposures_backward_kernel(warp_scalar(values.dtype))
-        launch(kernel, values.numel(), values.view(-1), ctx.bound, exponentials.view(-1), upstream, result.view(-1))
-        return result, None
 
 
 def opacity_penalty(

@@ -1,49 +1,10 @@
-"""Exposures of Gaussians from their parameters, and the penalty on their opacities, in one launch each way."""
+"""The penalty on opacities, in one launch each way."""
 
 from functools import cache
 
 import warp as wp
 
 from .constants import NO_AUTODIFF
-
-
-@cache
-def exposures_kernel(dtype):
-    """Return the kernel of exp(values), values clamped to [-bound, bound]; NaN stays NaN. Launched over the numbers."""
-    real = dtype
-
-    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def activate_exposures(
-        range_start: int,
-        values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
-    ):
-        index = range_start + wp.tid()
-        value = values[index]
-        # Not clamped, which would make a number of what is none.
-        clamped = wp.where(value > bound, bound, wp.where(value < -bound, -bound, value))
-        exposures[index] = wp.exp(clamped)
-
-    return activate_exposures
-
-
-@cache
-def exposures_backward_kernel(dtype):
-    """Write grad_values [N C], flat, from exposure_gradients [N, C] of any strides; 0 from the bounds on."""
-    real = dtype
-
-    @wp.kernel(module="unique", module_options=NO_AUTODIFF)
-    def activate_exposures_backward(
-        range_start: int,
-        values: wp.array(dtype=real), bound: real, exposures: wp.array(dtype=real),
-        exposure_gradients: wp.array2d(dtype=real), grad_values: wp.array(dtype=real),
-    ):
-        index = range_start + wp.tid()
-        i = index // exposure_gradients.shape[1]
-        gradient = exposure_gradients[i, index - i * exposure_gradients.shape[1]] * exposures[index]
-        value = values[index]
-        grad_values[index] = wp.where(value >= bound or value <= -bound, real(0.0), gradient)
-
-    return activate_exposures_backward
 
 
 @cache
