@@ -13,8 +13,8 @@ from PIL import Image
 
 from sehdr_warp.scene import Camera, Scene, load_scene, look_at
 from sehdr_warp.scene.dataparser import reinhard_gamma
+from sehdr_warp.scene.images.downsampling import area_average
 from sehdr_warp.scene.images.hdr_files import read_hdr
-from sehdr_warp.scene.lens import area_average
 from sehdr_warp.synth.expose import RadianceView, write_hdr_nerf_scene
 
 

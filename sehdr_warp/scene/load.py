@@ -15,7 +15,7 @@ from .camera_checks import check_cameras
 from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
 from .exposure.times import choose_exposure, exposures_note, with_exposure_times
 from .file_names import image_folder, unique_names
-from .float_images import with_float_times
+from .float_photos import with_float_times
 from .masks import assign_masks
 from .photos import usable_photos
 from .preprocess import preprocess

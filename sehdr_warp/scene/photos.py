@@ -16,7 +16,7 @@ from ..subsets import first_names
 from .color.encoding import encoding_of, note_of
 from .dataparser import UNPLACED, ImageRecord
 from .file_names import MASK_FOLDERS
-from .float_images import tone_mapped
+from .float_photos import tone_mapped
 from .images.hdr_files import hdr_size, pixel_aspect
 from .images.heif import avif_bits
 from .images.ldr_files import EncodedImage, file_kind, image_sizes, open_image, read_ldr, require_file

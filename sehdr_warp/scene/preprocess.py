@@ -19,11 +19,12 @@ from .color.primaries import linear_to_srgb
 from .color.srgb_codes import FloatTable, bands_of
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .file_names import unique_names
-from .float_images import float_codes
+from .float_photos import float_codes
+from .images.downsampling import area_average
 from .images.gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
 from .images.hdr_files import hdr_size, read_hdr, read_light
 from .images.ldr_files import EncodedImage, file_kind
-from .lens import Lens, Undistortion, area_average
+from .lens import Lens, Undistortion
 from .masks import mask_note, read_mask
 from .photo_content import ContentCheck, unused_bits_note
 from .photo_storage import PhotoKeeper

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.camera import limited_size
 
 
 @pytest.mark.parametrize(
@@ -25,3 +26,8 @@ def test_an_impossible_camera_is_refused(values, problem):
     assert Camera(**camera).fx == 9.0
     with pytest.raises(ValueError, match=problem):
         Camera(**camera | values)
+
+
+def test_limited_size():
+    assert limited_size(2832, 2128, 400) == (400, 301) and limited_size(30, 20, 400) == (30, 20)
+    assert limited_size(5000, 2, 100) == (100, 1) and limited_size(30, 20, None) == (30, 20)

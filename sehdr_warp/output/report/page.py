@@ -12,7 +12,7 @@ from ...model.lights import Light, light_name
 from ...scene import Scene
 from ...scene.camera import limited_size
 from ...scene.exposure.times import shutter
-from ...scene.lens import area_average
+from ...scene.images.downsampling import area_average
 from ..html import EMPTY, duration, join, markup, page_file, whole_page, with_code
 from ..images.tonemap import display_gain, expose, fit_tone_map
 from ..images.ultra_hdr import MOST_STOPS, ultra_hdr

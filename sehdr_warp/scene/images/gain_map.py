@@ -20,8 +20,8 @@ from ...errors import InputError
 from ...subsets import first_names
 from ..color.encoding import ColorEncoding, encoding_of, encoding_of_boxes, encoding_of_profile
 from ..color.primaries import srgb_to_linear
-from ..lens import area_average
 from ..raw.decode import linear_codes
+from .downsampling import area_average
 from .gain_map_parameters import (
     MOST_STOPS,
     GainMapParameters,

@@ -10,9 +10,9 @@ import numpy as np
 from ...errors import InputError
 from ...subsets import counted
 from ..cached_folder import file_digest
+from ..images.downsampling import area_average
 from ..images.heif import HEIF_SUFFIXES
 from ..images.ldr_files import JPEG_SUFFIXES, LDR_SUFFIXES, PILLOW_ERRORS, open_image, orientation_of, turn_upright
-from ..lens import area_average
 
 _ALIKE = 0.97  # Correlation of two thumbnails of one picture; photos from two places have less
 _SIDE = 32  # Of a thumbnail

@@ -1,4 +1,4 @@
-"""Colors of OpenEXR and Radiance files: primaries, interop IDs, luminance and chroma, exposure times."""
+"""OpenEXR and Radiance files: values, windows, primaries, interop IDs, luminance and chroma, exposure times."""
 
 import json
 import struct
@@ -9,10 +9,12 @@ import OpenEXR
 import pytest
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.output.images.exr import write_radiance
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.images.hdr_files import exr_exposure_time, read_hdr
+from sehdr_warp.scene.images.hdr_files import exr_exposure_time, hdr_size, read_hdr, read_light
 from tests.make_scenes import edited_json, pattern, write_blender
 
+RNG = np.random.default_rng(1)
 RGB = np.array([0.8, 0.2, 0.05], np.float32)
 SPACES = {"lin_ap1_scene": "ACEScg", "lin_ap0_scene": "ACES2065-1", "lin_p3d65_scene": "Display P3",
           "lin_rec2020_scene": "ITU-R BT.2020", "lin_adobergb_scene": "Adobe RGB (1998)"}  # fmt: skip
@@ -251,3 +253,53 @@ def test_a_float_image_that_is_not_finite_is_left_out(tmp_path):
         write_exr(tmp_path / "images" / f"r_{i}.exr", bad)
     with pytest.raises(InputError, match="1200 pixels not finite"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("width", [5, 40])
+def test_radiance_pictures(tmp_path, width):
+    """Width 40 is run-length coded, width 5 flat; the format's own precision is one part in 256 of the brightest."""
+    cv2 = pytest.importorskip("cv2")
+    pixels = np.exp(RNG.normal(0, 3, (6, width, 3))).astype(np.float32)
+    pixels[2] = pixels[2, 0]
+    cv2.imwrite(str(tmp_path / "a.hdr"), pixels[..., ::-1])
+    read = read_hdr(tmp_path / "a.hdr")
+    assert np.all(np.abs(read - pixels) <= pixels.max(axis=2, keepdims=True) / 128)
+    data = (tmp_path / "a.hdr").read_bytes()
+    for end in (0, 5, 30, len(data) // 2, len(data) - 1):
+        (tmp_path / "b.hdr").write_bytes(data[:end])
+        with pytest.raises(InputError):
+            read_hdr(tmp_path / "b.hdr")
+
+
+def test_exr_negative_and_not_finite_values(tmp_path):
+    pixels = RNG.normal(0, 1, (6, 8, 3)).astype(np.float32)
+    write_exr(tmp_path / "a.exr", {"RGB": pixels})
+    np.testing.assert_array_equal(read_hdr(tmp_path / "a.exr"), np.maximum(pixels, 0))
+    pixels[4, 5, 1] = np.nan
+    write_exr(tmp_path / "a.exr", {"RGB": pixels})
+    with pytest.raises(InputError, match=r"G = nan at x=5, y=4"):
+        read_hdr(tmp_path / "a.exr")
+
+
+def test_exr_data_window_inside_the_display_window(tmp_path):
+    pixels = np.ones((3, 4, 3), np.float32)
+    corners = {"dataWindow": (np.array([2, 1], np.int32), np.array([5, 3], np.int32)),
+               "displayWindow": (np.array([0, 0], np.int32), np.array([9, 7], np.int32))}  # fmt: skip
+    write_exr(tmp_path / "a.exr", {"RGB": pixels}, **corners)
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        assert file.header()["dataWindow"][0].tolist() == [2, 1]
+    read = read_hdr(tmp_path / "a.exr")
+    assert read.shape == (8, 10, 3) and read[1:4, 2:6].min() == 1 and read.sum() == 36
+    coverage = read_light(tmp_path / "a.exr").coverage
+    np.testing.assert_array_equal(coverage, read[..., 0])
+
+
+@pytest.mark.parametrize("name, other", [("a.hdr", "OpenEXR, not a Radiance picture; name it .exr"),
+                                         ("a.exr", "a Radiance picture, not OpenEXR; name it .hdr")])  # fmt: skip
+def test_light_under_the_other_suffix_is_named(tmp_path, name, other):
+    write_radiance(tmp_path / "b.hdr", np.ones((4, 8, 3)))
+    write_exr(tmp_path / "b.exr", {"RGB": np.ones((4, 8, 3), np.float32)})
+    (tmp_path / {"a.hdr": "b.exr", "a.exr": "b.hdr"}[name]).rename(tmp_path / name)
+    for read in (read_hdr, hdr_size):
+        with pytest.raises(InputError, match=f"is {other}"):
+            read(tmp_path / name)

@@ -5,17 +5,12 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.output.images.exr import write_radiance
-from sehdr_warp.scene.camera import limited_size
 from sehdr_warp.scene.images.exif import are_camera_jpegs
-from sehdr_warp.scene.images.hdr_files import hdr_size, read_hdr, read_light
+from sehdr_warp.scene.images.hdr_files import hdr_size, read_hdr
 from sehdr_warp.scene.images.ldr_files import exif_of, has_16_bits, image_sizes, open_image, read_ldr
-from sehdr_warp.scene.lens import area_average
 from sehdr_warp.scene.masks import read_mask
 from sehdr_warp.scene.photos import photo_sizes
 from tests.make_scenes import png_of
@@ -64,64 +59,6 @@ def test_orientation_is_pillows(tmp_path, orientation):
     expected = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "o.png")))
     np.testing.assert_array_equal(read_ldr(tmp_path / "o.png", oriented=True).pixels, expected)
     assert image_sizes(tmp_path / "o.png")[1] == expected.shape[1::-1]
-
-
-@pytest.mark.parametrize("width", [5, 40])
-def test_radiance_pictures(tmp_path, width):
-    """Width 40 is run-length coded, width 5 flat; the format's own precision is one part in 256 of the brightest."""
-    pixels = np.exp(RNG.normal(0, 3, (6, width, 3))).astype(np.float32)
-    pixels[2] = pixels[2, 0]
-    cv2.imwrite(str(tmp_path / "a.hdr"), pixels[..., ::-1])
-    read = read_hdr(tmp_path / "a.hdr")
-    assert np.all(np.abs(read - pixels) <= pixels.max(axis=2, keepdims=True) / 128)
-    data = (tmp_path / "a.hdr").read_bytes()
-    for end in (0, 5, 30, len(data) // 2, len(data) - 1):
-        (tmp_path / "b.hdr").write_bytes(data[:end])
-        with pytest.raises(InputError):
-            read_hdr(tmp_path / "b.hdr")
-
-
-def _exr(path, pixels, header=None):
-    import OpenEXR
-
-    with OpenEXR.File({"type": OpenEXR.scanlineimage, **(header or {})}, {"RGB": pixels}) as file:
-        file.write(str(path))
-
-
-def test_exr_negative_and_not_finite_values(tmp_path):
-    pixels = RNG.normal(0, 1, (6, 8, 3)).astype(np.float32)
-    _exr(tmp_path / "a.exr", pixels)
-    np.testing.assert_array_equal(read_hdr(tmp_path / "a.exr"), np.maximum(pixels, 0))
-    pixels[4, 5, 1] = np.nan
-    _exr(tmp_path / "a.exr", pixels)
-    with pytest.raises(InputError, match=r"G = nan at x=5, y=4"):
-        read_hdr(tmp_path / "a.exr")
-
-
-def test_exr_data_window_inside_the_display_window(tmp_path):
-    import OpenEXR
-
-    pixels = np.ones((3, 4, 3), np.float32)
-    corners = {"dataWindow": (np.array([2, 1], np.int32), np.array([5, 3], np.int32)),
-               "displayWindow": (np.array([0, 0], np.int32), np.array([9, 7], np.int32))}  # fmt: skip
-    _exr(tmp_path / "a.exr", pixels, corners)
-    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
-        assert file.header()["dataWindow"][0].tolist() == [2, 1]
-    read = read_hdr(tmp_path / "a.exr")
-    assert read.shape == (8, 10, 3) and read[1:4, 2:6].min() == 1 and read.sum() == 36
-    coverage = read_light(tmp_path / "a.exr").coverage
-    np.testing.assert_array_equal(coverage, read[..., 0])
-
-
-@pytest.mark.parametrize("name, other", [("a.hdr", "OpenEXR, not a Radiance picture; name it .exr"),
-                                         ("a.exr", "a Radiance picture, not OpenEXR; name it .hdr")])  # fmt: skip
-def test_light_under_the_other_suffix_is_named(tmp_path, name, other):
-    write_radiance(tmp_path / "b.hdr", np.ones((4, 8, 3)))
-    _exr(tmp_path / "b.exr", np.ones((4, 8, 3), np.float32), {})
-    (tmp_path / {"a.hdr": "b.exr", "a.exr": "b.hdr"}[name]).rename(tmp_path / name)
-    for read in (read_hdr, hdr_size):
-        with pytest.raises(InputError, match=f"is {other}"):
-            read(tmp_path / name)
 
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"
@@ -179,22 +116,6 @@ def test_too_many_pixels_are_refused_before_decoding(tmp_path):
     for read, name in ((read_ldr, "a.png"), (image_sizes, "a.png"), (read_hdr, "a.hdr"), (hdr_size, "a.hdr")):
         with pytest.raises(InputError, match="60000 x 60000"):
             read(tmp_path / name)
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.integers(1, 40), st.integers(1, 40), st.data())
-def test_area_average_is_exact(width, height, data):
-    small = data.draw(st.integers(1, width)), data.draw(st.integers(1, height))
-    image = np.random.default_rng(0).random((height, width, 2))
-    # Repeating every pixel makes the exact fractional areas whole numbers of samples.
-    fine = image.repeat(small[1], axis=0).repeat(small[0], axis=1)
-    expected = fine.reshape(small[1], height, small[0], width, 2).mean(axis=(1, 3))
-    np.testing.assert_allclose(area_average(image, *small), expected, atol=1e-5)
-
-
-def test_limited_size():
-    assert limited_size(2832, 2128, 400) == (400, 301) and limited_size(30, 20, 400) == (30, 20)
-    assert limited_size(5000, 2, 100) == (100, 1) and limited_size(30, 20, None) == (30, 20)
 
 
 def test_photos_made_by_a_camera(tmp_path):
