@@ -20,6 +20,7 @@ from ..photo_names import PhotoNames, fold_name, names_below
 EXPOSURES = "exposures.json"
 _LISTS = ("exposures", "exposure_times", "exposure")  # Names under which people list times in other files
 _LIST_SUFFIXES = (".csv", ".txt", ".tsv")
+_GUESS_ERROR = 0.2  # Stops by which exposures that are found by light are off; 0.15 to 0.25 on a capture without points
 _CONTRADICTION = 0.3  # Stops by which rounded times in EXIF may differ from those that a set states
 
 
@@ -217,7 +218,8 @@ def _spellings(name: str) -> list[str]:
 def _exif_times(records: list[ImageRecord], *, timeless: bool) -> tuple[list[float | None], list[str]]:
     """Return the times of photos by EXIF, and notes.
 
-    A photo with a time and without an ISO or f-number has none if most photos state it and it differs among them.
+    If most photos with a time state an ISO or f-number, the median counts for the others, or, if it differs much among
+    photos, the others have no time. If most do not state it, it is not counted.
     `timeless` takes 1 s where no photo states a time: ISO and f-number still tell how their exposures differ.
     """
     exposures = [exif_exposure(record.image) for record in records]
@@ -230,18 +232,24 @@ def _exif_times(records: list[ImageRecord], *, timeless: bool) -> tuple[list[flo
         if len(set(values)) <= 1:
             continue
         lacking = {i for i in relevant if getattr(exposures[i], field) is None}
-        left = [None if i in lacking else time for i, time in enumerate(times)]
-        if lacking and 2 * sum(time is not None for time in left) <= len(records):
-            notes.append(f"{name} is not stated by {len(lacking)} of {len(records)} photos and was not counted")
+        if lacking and (timeless or 2 * len(lacking) >= len(relevant)):
+            notes.append(f"{name} is not stated by {len(lacking)} of {len(relevant)} photos and was not counted")
             continue
-        times = left
+        usual = median(values)
+        note = f"{name} differs ({min(values):g} to {max(values):g}); exposure times are relative to {values[0]:g}"
+        if lacking:
+            note += f"; {counted(len(lacking), 'photo does', 'photos do')} not state it"
+            without = [None if i in lacking else time for i, time in enumerate(times)]
+            deviation = sum(abs(power * math.log2(value / usual)) for value in values) / len(values)
+            if deviation > _GUESS_ERROR and 2 * sum(time is not None for time in without) > len(records):
+                times = without
+            else:
+                note += f", for which {usual:g} counts"
+        notes.append(note)
         factors = [
-            f * ((getattr(exposure, field) or values[0]) / values[0]) ** power
+            f * ((getattr(exposure, field) or usual) / values[0]) ** power
             for f, exposure in zip(factors, exposures, strict=True)
         ]
-        span = f"{min(values):g} to {max(values):g}"
-        without = f"; {counted(len(lacking), 'photo does', 'photos do')} not state it" if lacking else ""
-        notes.append(f"{name} differs ({span}); exposure times are relative to {values[0]:g}{without}")
     if flashed := [record.image.name for record, e in zip(records, exposures, strict=True) if e.flash]:
         count = f"{len(flashed)} of {len(records)} photos"
         notes.append(f"the flash fired in {count}, so their light is not the scene's: {first_names(flashed)}")

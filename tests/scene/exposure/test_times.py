@@ -50,7 +50,7 @@ def test_iso_that_is_the_same_or_not_stated_for_all_tells_nothing(tmp_path, exif
     assert not dataset.times_known and seconds(dataset) == [1.0] * 5
 
 
-def test_photos_without_the_iso_that_most_state_get_their_exposure_by_light(tmp_path):
+def test_photos_without_the_iso_that_most_state_count_as_the_median_or_by_light(tmp_path):
     exif = {i: {TIME: 0.01, ISO: 100 * (1 + i % 2), NUMBER: 4} for i in range(6)}
     del exif[5][ISO], exif[4][NUMBER]  # All f-numbers are the same, so one that is missing tells nothing.
     write_colmap(tmp_path, 6, name="{:03d}.jpg", exif=exif)
@@ -59,6 +59,12 @@ def test_photos_without_the_iso_that_most_state_get_their_exposure_by_light(tmp_
     np.testing.assert_allclose(seconds(dataset)[:5], [0.01, 0.02, 0.01, 0.02, 0.01])
     note = "ISO differs (100 to 200); exposure times are relative to 100; 1 photo does not state it"
     assert note in dataset.notes and not any("f-number" in note for note in dataset.notes)
+    alike = {i: {TIME: 0.01, ISO: 125 if i == 1 else 100} for i in range(6)}
+    del alike[5][ISO]
+    write_colmap(tmp_path / "alike", 6, name="{:03d}.jpg", exif=alike)
+    dataset = parse_dataset(tmp_path / "alike")
+    np.testing.assert_allclose(seconds(dataset), [0.01, 0.0125, 0.01, 0.01, 0.01, 0.01])
+    assert any(note.endswith("1 photo does not state it, for which 100 counts") for note in dataset.notes)
     for i in (3, 4):
         del exif[i][ISO]
     write_colmap(tmp_path / "few", 6, name="{:03d}.jpg", exif=exif)
