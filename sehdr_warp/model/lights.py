@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -59,7 +60,7 @@ class Light:
     Attributes:
         shape: its place and size.
         radiance: [3] in the field's colors; with the shape it gives the light that the training views show. If each of
-            these cuts the light off at its border, it is what reaches the middle of the training cameras.
+            these cuts the light off at its border, it is what reaches the place of the one that shows most of it.
         lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
         deviation: of log2 radiance, stops, of what photos clip, from the confidence of its Gaussians; None if that was
             not measured. Edges and colors that do not clip make a light no surer, because all its photos may err alike.
@@ -102,8 +103,14 @@ def find_lights(
     cameras = [camera for camera, _ in views]
     middle = np.mean([camera.position for camera in cameras], axis=0)
     cameras = every_nth(cameras, MOST_VIEWS)
-    panorama = _panorama(middle, typical_focal_length(cameras))
-    *sums, around = [_view_sums(field, camera, degree) for camera in [*cameras, panorama]]
+    focal = typical_focal_length(cameras)
+
+    @cache
+    def sums_around(index: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what all directions from a photo's place receive, as of _view_sums()."""
+        return _view_sums(field, _panorama(cameras[index].position, focal), degree)
+
+    sums = [_view_sums(field, camera, degree) for camera in cameras]
     pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
     mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]
     member = (clipped.to(mean.device) > CLIPPED) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
@@ -116,20 +123,26 @@ def find_lights(
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
     confidence = None if field.confidence is None else field.confidence.to(members.device)[members].cpu().numpy()
     shares = clipped.to(members.device)[members].cpu().numpy()
-    places = [camera.position for camera in cameras] + [middle]
-    covered, received = (np.stack([part[i][members].cpu().numpy() for part in [*sums, around]]) for i in (1, 2))
-    total = max(float(around[2].mean(1).sum()), 1e-30)
+    covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
+    total = max(float(_view_sums(field, _panorama(middle, focal), degree)[2].mean(1).sum()), 1e-30)
     lights = []
     for group in _groups(positions, REACH * float(np.median(widths))):
         shape = _shape(positions[group], widths[group], weights[group], middle)
         whole = [_in_frame(camera, positions[group], widths[group], weights[group]) for camera in cameras]
-        solid_angles = np.array([shape.solid_angle(place) for place in places])
-        cells = _whole_views(np.append(whole, False), (solid_angles > 0) & (covered[:, group].sum(1) > 0))
-        area = float(_fit(shape, covered[:, group].sum(1, keepdims=True), places, cells)[0])
+        angles_of_shape = np.array([shape.solid_angle(camera.position) for camera in cameras])
+        holding = np.flatnonzero(whole & (angles_of_shape > 0))
+        area_sums, light_sums = covered[:, group].sum(1, keepdims=True)[holding], received[:, group].sum(1)[holding]
+        if not len(holding):
+            # Every photo cuts the light off at its border. The one that shows most of it looks beyond that.
+            best = int(np.argmax(covered[:, group].sum(1) * (angles_of_shape > 0)))
+            part = [values[members][group].cpu().numpy().sum(0) for values in sums_around(best)[1:]]
+            holding, area_sums, light_sums = np.array([best]), part[0].reshape(1, 1), part[1][None]
+        places = [cameras[index].position for index in holding]
+        area = float(_fit(shape, area_sums, places)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
         sides = [side * min(max(area, 1e-4), 1e4) ** 0.5 for side in shape.size]
         shape = replace(shape, size=(sides[0], sides[1]))
-        radiance = _fit(shape, received[:, group].sum(1), places, cells)
+        radiance = _fit(shape, light_sums, places)
         deviation = None
         if confidence is not None:
             stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
@@ -194,31 +207,12 @@ def _shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, middl
     return LightShape("rect", position, axes, (width, height))
 
 
-def _whole_views(whole: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Return [V + 1], which views tell the size and the radiance of a light; the last one is the panorama.
-
-    They are the photos that hold all of it. If every photo cuts it off at its border, only the panorama holds all of
-    its Gaussians; if the panorama does not show it, photos that hold a part must do.
-
-    Args:
-        whole: [V + 1], whether a photo holds all of the light; False for the panorama.
-        visible: [V + 1], whether a view shows it at all.
-    """
-    photos = whole & visible
-    if photos.any():
-        return photos
-    panorama = np.zeros_like(visible)
-    panorama[-1] = visible[-1]
-    return panorama if panorama.any() else visible
-
-
-def _fit(shape: LightShape, received: np.ndarray, places: Sequence[np.ndarray], cells: np.ndarray) -> np.ndarray:
+def _fit(shape: LightShape, received: np.ndarray, places: Sequence[np.ndarray]) -> np.ndarray:
     """Return the values [C] whose products with a shape's solid angles are what views at places receive [V, C].
 
-    By least squares: the radiance of light, or the area of a solid angle as a multiple of the shape's. Only the views
-    that `cells` [V] names count.
+    By least squares: the radiance of light, or the area of a solid angle as a multiple of the shape's.
     """
-    angles = np.array([shape.solid_angle(place) for place in places]) * cells
+    angles = np.array([shape.solid_angle(place) for place in places])
     square = angles @ angles
     return angles @ received / square if square > 0 else np.zeros(received.shape[1])
 

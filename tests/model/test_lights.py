@@ -96,8 +96,8 @@ def test_a_light_that_every_photo_cuts_off_has_what_a_map_without_it_loses(targe
     ]
     angles = np.cos(np.arcsin(latlong(512)[..., 1])) * (2 * np.pi / 512) ** 2
     lost = float(((maps[0] - maps[1]) * angles).sum())
-    assert light.radiance.mean() * light.shape.solid_angle(middle) == pytest.approx(lost, rel=0.05)
-    assert light.share == pytest.approx(lost / float((maps[0] * angles).sum()), rel=0.05)
+    assert light.radiance.mean() * light.shape.solid_angle(middle) == pytest.approx(lost, rel=0.08)
+    assert light.share == pytest.approx(lost / float((maps[0] * angles).sum()), rel=0.08)
 
 
 @pytest.mark.parametrize("target", [(0, 0, 4.0), (4.0, 0, 0), (0, 0, -4.0), (0.5, -3.5, 0)])
