@@ -17,7 +17,7 @@ import torch
 
 import sehdr_warp as sw
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.cameras.paths import common_focus, evenly, training_cameras
+from sehdr_warp.output.cameras.paths import common_focus, training_cameras
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.export.proxy_mesh import proxy_mesh
 from sehdr_warp.output.scene_page import write_scene_page
@@ -25,6 +25,7 @@ from sehdr_warp.output.world_transform import WorldTransform, file_transform, re
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import load_splats
 from sehdr_warp.splats import GaussianArrays, read_gaussians
+from sehdr_warp.subsets import evenly
 
 from .results import finish, new_result
 from .study import run

@@ -1,12 +1,21 @@
 """Subsets of photos and points, small enough to look at."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
 
 
 def every_nth(items: Any, most: int) -> Any:
     """Return every n-th of a sequence or array, with the smallest n that leaves at most `most`, from 1."""
     return items[:: -(-len(items) // most) or 1]
+
+
+def evenly(items: Sequence[Item], count: int) -> list[Item]:
+    """Return at most `count` items, evenly chosen from the first to the last."""
+    import numpy as np
+
+    return [items[i] for i in sorted({round(i) for i in np.linspace(0, len(items) - 1, count)})]
 
 
 def first_names(names: Sequence[str], most: int = 3) -> str:

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...scene import Camera
+from ...subsets import evenly
 from ..images.ldr_files import as_array
 from ..world_transform import scene_up, world_transform
-from .paths import common_focus, evenly, look_at_pose, moved, orbit, surround, training_cameras, walk, walk_path
+from .paths import common_focus, look_at_pose, moved, orbit, surround, training_cameras, walk, walk_path
 
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene

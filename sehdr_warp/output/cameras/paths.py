@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ...subsets import first_names
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene
 
-Item = TypeVar("Item")
 
 # More than an hour of film at 24 views a second is a slip of the hand.
 _LONGEST = 100_000
@@ -28,11 +27,6 @@ _PARALLEL = np.sin(np.radians(6)) ** 2
 _AHEAD, _ASIDE = 0.7, 0.3
 _LEAP = 5.0  # Steps this many times as long as the median are breaks of a walk: cameras that were placed wrongly.
 _SMOOTH, _SMOOTH_UP = 1.2, 4.0  # Standard deviations, in photos, of what evens places and axes of a walk, and its up
-
-
-def evenly(items: Sequence[Item], count: int) -> list[Item]:
-    """Return at most `count` items, evenly chosen from the first to the last."""
-    return [items[i] for i in sorted({round(i) for i in np.linspace(0, len(items) - 1, count)})]
 
 
 def training_cameras(run: "RenderableScene") -> list[Camera]:

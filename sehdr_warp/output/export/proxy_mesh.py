@@ -19,7 +19,8 @@ from ...files import atomic_path, check_absent
 from ...progress import track_progress
 from ...scene import Camera
 from ...splats.usd import pxr, writing_usd
-from ..cameras.paths import evenly, training_cameras
+from ...subsets import evenly
+from ..cameras.paths import training_cameras
 from ..images.tonemap import encode_srgb
 from ..world_transform import WorldTransform, scene_up, world_transform
 from .depth_fusion import (

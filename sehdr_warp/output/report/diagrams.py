@@ -11,7 +11,7 @@ from markupsafe import Markup
 from PIL import Image
 
 from ...scene import Camera
-from ..cameras.paths import evenly
+from ...subsets import evenly
 from ..html import EMPTY, join, markup
 from ..images.ldr_files import as_array, quantize
 from .charts import PANELS, training_points

@@ -17,7 +17,7 @@ from ...progress import track_progress
 from ...scene import Scene, View
 from ...scene.exposure.times import shutter
 from ...scene.images.ldr_files import LDR_SUFFIXES, RAW_SUFFIXES
-from ..cameras.paths import evenly
+from ...subsets import evenly
 from ..images.tonemap import expose, fit_tone_map
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare, darker_stops
