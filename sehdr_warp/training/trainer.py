@@ -35,6 +35,7 @@ from .losses import INTERVALS_FROM
 from .machine import interruptible, torch_settings
 from .matching import Matcher, seed_gaussians
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
+from .photo_detail import shown_detail
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .scene_facts import is_large
@@ -241,9 +242,15 @@ class Trainer:
         """Refine the Gaussians; on several ranks, rank 0 does and the others receive the result."""
         gaussians, strategy, ranks = self.field.gaussians, self.strategy, self.ranks
         count, reallocations = gaussians.count, gaussians.reallocations
-        propose = self._propose_gaussians if self.can_seed else None
         refine = partial(
-            strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch
+            strategy.refine,
+            self.iteration,
+            gaussians,
+            self.optimizer,
+            self.generator,
+            self._propose_gaussians if self.can_seed else None,
+            self.step_batch,
+            self._measure_detail,
         )
         changed = refine() if ranks is None else ranks.refine_on_leader(refine, strategy, gaussians, self.optimizer)
         if changed:
@@ -260,6 +267,11 @@ class Trainer:
                 image = self.field.response.encode_extended(image)
             matcher, index = self._get_matcher(), self._view_index
             return seed_gaussians(self.field, matcher, image, view, index, number, bound, random_seed)
+
+    def _measure_detail(self) -> Tensor:
+        """Return how much detail of the step's photo each Gaussian shows, [N]."""
+        with self.graphs.on_capture_stream():
+            return shown_detail(self.field, self.views.source[self._view_index])
 
     @property
     def degree(self) -> int:

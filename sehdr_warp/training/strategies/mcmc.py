@@ -17,7 +17,7 @@ from ...rasterizer.ops.relocation import (
 )
 from ...rasterizer.ops.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
-from .base import SEED_STRIDE, Propose, Schedule, Strategy
+from .base import SEED_STRIDE, MeasureDetail, Propose, Schedule, Strategy
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
 DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
@@ -27,6 +27,8 @@ MAX_DISTANCE = 100.0
 """Noise moves no Gaussian farther than this from the origin, in normalized units (1.1 camera radii)."""
 SECOND_MOMENT_LEFT = 0.1  # Of a source's second moments, see reset_moments()
 SECOND_MOMENT_LEFT_WHERE_DENSE = 0.4
+DETAIL_KEPT = 0.95  # Of the sum of photo detail at each refinement, so that it comes from about the last 20 photos
+LEAST_WEIGHT = 1e-6  # Of an opacity beside detail: if photos show no Gaussian, copies are sampled by opacity
 DENSE = 300.0  # Gaussians over the square root of the photos' pixels, from which on a large scene counts as dense
 
 
@@ -49,6 +51,9 @@ class McmcStrategy(Strategy):
     the relocated and new Gaussians are seeded where photos are reproduced worst. Noise on the positions of transparent
     Gaussians explores. There are no gradient statistics and no opacity resets.
 
+    3DGS-MCMC samples the Gaussians to copy by opacity. With options.sample_by = "detail", they are sampled by the
+    detail of the photos that they show: where photos have edges, Gaussians become many and small.
+
     A training that starts with more Gaussians than the cap keeps their number.
     """
 
@@ -56,6 +61,7 @@ class McmcStrategy(Strategy):
     random_seed: int = 0  # Seed of the training
     camera_positions: Tensor | None = None  # [V, 3] positions of the training cameras, for prune_near_angle
     dense: bool = False  # Whether copies take over the second moments of their source, see reset_moments()
+    detail: Tensor | None = None  # [N] detail of photos that each Gaussian shows; None if copies are sampled by opacity
 
     @staticmethod
     def from_config(
@@ -82,6 +88,7 @@ class McmcStrategy(Strategy):
         generator: torch.Generator,
         propose: Propose | None = None,
         step_batch: int = 1,
+        measure_detail: MeasureDetail | None = None,
     ) -> bool:
         """Relocate dead Gaussians and add new ones, if this iteration is due.
 
@@ -95,12 +102,15 @@ class McmcStrategy(Strategy):
         added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
         dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
+        if self.options.sample_by == "detail" and measure_detail is not None:
+            detail = DETAIL_KEPT * self._detail_of(count, opacities) + measure_detail()
+            self.detail = detail.masked_fill(dead, 0)
         slot_of_row, dead_count = number_slots(dead, added)
         gaussians.resize(count + added, optimizer)
         changed = torch.zeros_like(slot_of_row, dtype=torch.bool)
         refinement = Refinement(gaussians, optimizer, generator, slot_of_row, changed)
         seeded = self.fill_proposals(refinement, dead_count, added, propose)
-        self.relocate(refinement, opacities.masked_fill(dead, 0), seeded, dead_count, count)
+        self.relocate(refinement, self._copy_weights(opacities).masked_fill(dead, 0), seeded, dead_count, count)
         if added > 0:
             self.sample_add(refinement, torch.maximum(dead_count, seeded), dead_count + added, added)
         left = SECOND_MOMENT_LEFT_WHERE_DENSE if self.dense else SECOND_MOMENT_LEFT
@@ -147,6 +157,9 @@ class McmcStrategy(Strategy):
         logits, log_scales = gaussians.opacity_logits.detach(), gaussians.log_scales.detach()
         share_opacities(logits, log_scales, copies, least=self.prune_opacity)
         values, changed = list(gaussians.tensors().values()), None
+        if self.detail is not None:  # A source and its copies share what it showed.
+            self.detail = self._detail_of(len(copies), logits) / (1 + copies)
+            values.append(self.detail)
         if self.dense:
             states = [moments_of(refinement.optimizer, parameter) for parameter in gaussians.parameters()]
             values += [state["exp_avg_sq"] for state in states if state]
@@ -155,9 +168,24 @@ class McmcStrategy(Strategy):
         copy_rows(values, values, refinement.slot_of_row, first, last, samples=sampled, changed=changed)
 
     def sample_add(self, refinement: Refinement, first: Tensor, last: Tensor, bound: int) -> None:
-        """Fill the slots [first, last) of new Gaussians, at most `bound`, as relocate(), sampled by opacity."""
-        weights = refinement.gaussians.opacities().masked_fill_(refinement.slot_of_row >= first, 0)
+        """Fill the slots [first, last) of new Gaussians, at most `bound`, as relocate(), by the same weights."""
+        weights = self._copy_weights(refinement.gaussians.opacities())
+        weights = weights.masked_fill(refinement.slot_of_row >= first, 0)
         self.relocate(refinement, weights, first, last, bound)
+
+    def _detail_of(self, count: int, like: Tensor) -> Tensor:
+        """Return the detail of the first `count` rows, 0 where none was measured, on the device of `like`."""
+        result = torch.zeros(count, device=like.device)
+        if self.detail is not None:
+            rows = min(count, len(self.detail))
+            result[:rows] = self.detail[:rows]
+        return result
+
+    def _copy_weights(self, opacities: Tensor) -> Tensor:
+        """Return the weights [N] by which Gaussians are sampled for copies."""
+        if self.detail is None:
+            return opacities
+        return self._detail_of(len(opacities), opacities) + LEAST_WEIGHT * opacities
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
@@ -175,6 +203,18 @@ class McmcStrategy(Strategy):
                 most_distance=MAX_DISTANCE,
                 seed=(self.random_seed * SEED_STRIDE + iteration) % 2**31,
             )
+
+    def state_dict(self, count: int) -> dict[str, Tensor]:
+        """Return the detail of `count` Gaussians, if copies are sampled by it; 0 on ranks that do not refine."""
+        if self.options.sample_by == "opacity" or self.camera_positions is None:
+            return {}
+        if self.detail is None or len(self.detail) != count:
+            self.detail = self._detail_of(count, self.camera_positions)
+        return {"detail": self.detail}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue with the detail of state_dict()."""
+        self.detail = state.get("detail")
 
     def _near_cameras(self, gaussians: Gaussians) -> Tensor:
         """Return a mask [N] of floaters: Gaussians wider than prune_near_angle times their distance to a camera."""
