@@ -211,11 +211,18 @@ def _without_missing_masks(records: list[ImageRecord]) -> tuple[list[ImageRecord
 def _frame_images(folder: Path, names: Sequence[str], path: Path) -> dict[str, Path | None]:
     """Return the photo of each frame, None if there is no such file.
 
-    If none is where the file says, they are looked for by find_images(), first in the folder of images: of some sets
-    images_4 alone is public, or all files lie beside each other.
+    If none is where the file says, they are looked for in the folder of images, because of some sets images_4 alone is
+    public. Without such a folder they may lie beside the file: no deeper, because folders of another split or of depth
+    maps hold the same names.
     """
     images = {name: _frame_image(folder, name, path) for name in names}
-    return images if any(images.values()) else find_images(image_folder(folder) or folder, names, path)
+    if any(images.values()):
+        return images
+    if inner := image_folder(folder):
+        return find_images(inner, names, path)
+    beside = {name: _frame_image(folder, PureWindowsPath(name).name, path) for name in names}
+    found = [image for image in beside.values() if image is not None]
+    return beside if len(set(found)) == len(found) else images
 
 
 def _frame_image(folder: Path, name: str, path: Path) -> Path | None:

@@ -15,6 +15,7 @@ _MODELS = "use camera_model OPENCV, OPENCV_FISHEYE, PINHOLE or EQUIRECTANGULAR"
 _FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "FISHEYE")
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")  # Of instant-ngp
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # Order of nerfstudio's distortion_params
+_FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 
 
@@ -27,9 +28,11 @@ def frame_lens(values: dict, frame: dict, image: Path | None, path: Path) -> Len
     fields = values | frame
     if isinstance(bent := fields.get("distortion_params"), list):  # nerfstudio's other spelling
         fields |= dict(zip(_DISTORTION, bent, strict=False))
-    with suppress(KeyError, TypeError, ValueError):  # The matrix of intrinsics, as of RealityCapture's converters
-        (fx, _, cx), (_, fy, cy), _ = fields["K"]
-        fields = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy} | fields
+    if all(fields.get(name) is None for name in _FOCAL):
+        with suppress(KeyError, TypeError, ValueError):  # The matrix of intrinsics, as of RealityCapture's converters
+            (fx, _, cx), (_, fy, cy), _ = fields["K"]
+            matrix = {"fl_x": float(fx), "fl_y": float(fy), "cx": float(cx), "cy": float(cy)}
+            fields |= {name: value for name, value in matrix.items() if fields.get(name) is None}
 
     def number(key: str, absent: Any = None) -> Any:
         value = fields.get(key)

@@ -115,6 +115,32 @@ def test_intrinsics_of_frames_alone_and_in_degrees(tmp_path):
     assert view.exposure_time == 0.25
 
 
+def test_a_focal_length_or_angle_counts_beside_a_matrix_of_another_size(tmp_path):
+    matrix = [[0.5, 0, 0.5], [0, 0.6, 0.5], [0, 0, 1]]
+    write_blender(tmp_path, fl_x=60.0, K=matrix)
+    assert tuple(load(tmp_path).views[0].camera.intrinsics) == (60, 60, 20, 15)
+    write_blender(tmp_path, K=matrix)
+    assert load(tmp_path).views[0].camera.fx == pytest.approx(20 / np.tan(0.4))
+    write_blender(tmp_path, camera_angle_x=None, K=[[[1], 0, 0], [0, 1, 0], [0, 0, 1]])
+    with pytest.raises(InputError, match="no focal length"):
+        load(tmp_path)
+
+
+def test_photos_of_another_folder_do_not_stand_for_missing_ones(tmp_path):
+    write_blender(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "images").rename(tmp_path / "train")
+    with pytest.raises(InputError, match="image file not found"):
+        read_transforms(tmp_path)
+    (tmp_path / "transforms.json").unlink()
+    for split in ("train", "test"):
+        frames = [frame | {"file_path": f"./{split}/r_{i}"} for i, frame in enumerate(values["frames"])]
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(values | {"frames": frames}))
+    dataset = read_transforms(tmp_path)
+    assert {record.split for record in dataset.records} == {"train"} and len(dataset.records) == 6
+    assert any(note.startswith("6 of 12 frames have no photo") for note in dataset.notes)
+
+
 def test_nerfstudio_points_move_with_the_poses(tmp_path):
     write_blender(tmp_path, applied_transform=[[0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]], applied_scale=0.5)
     write_colmap(tmp_path / "colmap")
