@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
 from tests.make_scenes import load, pattern, write_colmap
 
@@ -40,3 +41,12 @@ def test_photos_that_are_nearly_opaque_everywhere_show_something(tmp_path):
         Image.fromarray(np.concatenate([pattern(64, 48, i), alpha], 2)).save(tmp_path / "images" / f"{i:03d}.png")
     scene = load_scene(tmp_path, holdout=0)
     assert scene.views[0].codes.max() == 255 and scene.views[0].mask.min() > 0.99
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_photos_that_show_nothing_are_refused(tmp_path, value):
+    write_colmap(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        Image.new("RGB", (64, 48), (value,) * 3).save(path)
+    with pytest.raises(InputError, match=rf"black or white in 100\.0 % \(mean {value / 255:.3f}\)"):
+        load_scene(tmp_path)
