@@ -171,7 +171,7 @@ def map_header(
         **provenance(run),
         "position": json.dumps(transform.points(center.position).tolist()),
         "axes": axes,
-        "beyond": repr(float(center.beyond * transform.scale)),
+        "beyond": repr(float(f"{center.beyond * transform.scale:.15g}")),  # As stated, but for rounding
         "worldMatrix": json.dumps(stored_matrix(run, transform).tolist()),
         "mapToWorld": json.dumps(transform.rotation.T.tolist()),
     }

@@ -255,6 +255,8 @@ def test_a_walk_around_something_is_seen_from_its_middle_without_it(tmp_path, ru
     write_environment_map(scene, tmp_path / "other.exr", size=64, beyond=1.5)
     other = read(tmp_path / "other.exr")[2]
     assert other["sehdr:position"] == header["sehdr:position"] and float(other["sehdr:beyond"]) == 1.5
+    write_environment_map(scene, tmp_path / "scaled.exr", size=64, beyond=2.0, scale=1.234)
+    assert read(tmp_path / "scaled.exr")[2]["sehdr:beyond"] == "2.0" != repr(2.0 / 1.234 * 1.234)
 
 
 def test_directions_of_a_whole_map_are_computed_for_inpainting_alone(tmp_path, run, monkeypatch):
