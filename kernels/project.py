@@ -18,7 +18,7 @@ from .geometry import geometry, matrix
 
 
 @cache
-def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool = False):
+def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool):
     """Return the projection kernel for one scalar type.
 
     The kernel's `forward_extents` is the forward pass's extents in the adjoint, and None in the forward pass.

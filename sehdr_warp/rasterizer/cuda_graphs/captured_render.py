@@ -251,6 +251,6 @@ def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
 def _fixed_projection(tensors: RasterTensors, options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
     """Return the launch of _project() for any tensors, to the same outputs."""
     gaussians = tensors.of_projection
-    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased)
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased, False)
     arguments = *gaussians, *projection_parameters(options), None, *projected
     return fixed_launch(kernel, len(projected.depths), *arguments, by_address=gaussians)
