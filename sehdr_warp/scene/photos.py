@@ -27,6 +27,7 @@ FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_NAMED = 3
 _SMALLEST, _LARGEST = 1 / 32, 8  # Size of a photo in parts of its camera's
 _MIDTONE, _LEAST_EXPONENT = 0.3, 0.4  # As of training.matching
+_BLACK = 3 / 255  # Noise of a black background
 _LEAST_SQUARE = 0.01  # Part by which the sides of a pixel may differ and count as equal
 _KINDS = {"encoded": "photos of codes", "raw": "RAW photos", "float": "float images"}
 _ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
@@ -190,10 +191,13 @@ def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:
 def brightened_codes(codes: np.ndarray) -> np.ndarray:
     """Return the 8-bit codes [H, W, 3] of a photo in which features are found.
 
-    A power brightens a photo with a median below _MIDTONE, because detectors have an absolute threshold of contrast.
+    A power brightens a photo with a median below _MIDTONE, because detectors have an absolute threshold of contrast. A
+    black background beside a subject does not count.
     """
     levels = np.iinfo(codes.dtype).max
-    median = max(float(np.median(codes[::8, ::8])) / levels, 1e-3)
+    sample = codes[::8, ::8] / levels
+    shown = sample[sample > _BLACK]
+    median = max(float(np.median(shown if 10 * shown.size > sample.size else sample)), 1e-3)
     exponent = max(np.log(_MIDTONE) / np.log(median), _LEAST_EXPONENT) if median < _MIDTONE else 1.0
     if codes.dtype == np.uint8 and exponent == 1:
         return codes

@@ -272,6 +272,8 @@ def test_codes_of_bright_photos_stay_and_those_of_dark_ones_reach_a_midtone():
     np.testing.assert_array_equal(brightened_codes(bright.astype(np.uint16) * 257), bright)
     assert abs(int(brightened_codes(np.full((16, 16, 3), 5000, np.uint16)).mean()) - 0.3 * 255) < 1
     assert not brightened_codes(np.zeros((16, 16, 3), np.uint8)).any()
+    bright[:, 4:] = 1  # A black background with noise
+    assert brightened_codes(bright) is bright
 
 
 def test_an_object_that_turns_is_placed_by_its_masks(tmp_path, shared):

@@ -369,7 +369,7 @@ def run_mapper(
         if best is not None and placed(best) == count:
             return best
     if best is None or placed(best) < 2:
-        remedy = "take sharp photos that overlap by two thirds" if views == 1 else "take them closer together"
+        remedy = "take sharp, bright photos that overlap by two thirds" if views == 1 else "take them closer together"
         problem = f"none of the {count} {name}s could be placed by structure from motion"
         raise InputError(source, problem, f"{remedy}, or bring poses")
     return best
