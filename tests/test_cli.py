@@ -175,7 +175,7 @@ def test_existing_run_is_refused_and_resume_continues(run, capsys):
     assert call("train", "--resume", "--out", run, "--device", "cpu", "--seed", "4") == 1
     assert "seed = 3, but 4" in capsys.readouterr().err
     assert call("train", "--resume", "--out", run, "--device", "cpu", "--max-size", "40") == 1
-    assert "views differ" in capsys.readouterr().err
+    assert "cameras differ" in capsys.readouterr().err
 
 
 def test_train_with_a_run_in_place_of_photos_suggests_resume(run, tmp_path, capsys):

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, SehdrError, missing
+from ..subsets import first_names
 from .device import pick_device
 from .values import LOAD_OPTIONS, LoadArguments
 
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from ..scene import Scene
     from .config import Config
     from .run import Run, Splats
+    from .run_folder import CameraEntry
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +77,8 @@ def load_scene_and_log_notes(data: LoadArguments, **options: Any) -> Scene:
 def load_run_scene(run: Run, data: str | None) -> Scene:
     """Load the photos of a run in the same way as for its training; `data` says where they are now if they have moved.
 
+    Splits and exposure times are those of the training, because another version may decide them otherwise.
+
     Raises SehdrError if neither it nor the run does, or InputError if they are no longer there.
     """
     from ..scene import is_embedded
@@ -82,7 +88,22 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).exists():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    return load_scene_and_log_notes(run.data | {"path": place}, response=response_for_loading(run.config, run.response))
+    response = response_for_loading(run.config, run.response)
+    scene = with_saved_splits(load_scene_and_log_notes(run.data | {"path": place}, response=response), run.cameras)
+    times = {entry.name: entry.exposure_time for entry in run.cameras}
+    views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
+    return replace(scene, views=tuple(views))
+
+
+def with_saved_splits(scene: Scene, cameras: Iterable[CameraEntry]) -> Scene:
+    """Return a scene whose views are held out as in a run's scene.json; log that if they would be others today."""
+    splits = {entry.name: entry.split for entry in cameras}
+    views = tuple(replace(view, split=splits.get(view.name, view.split)) for view in scene.views)
+    saved = replace(scene, views=views)
+    if [view.name for view in saved.test_views] != [view.name for view in scene.test_views]:
+        names = first_names([view.name for view in saved.test_views])
+        log.info("held out, as when the training began: %s", names or "no photo")
+    return saved
 
 
 def load_run_scene_with_confidence(run: Run, data: str | None) -> Scene:

@@ -208,7 +208,9 @@ class RunFolder:
             problem = f"photos or masks were changed since the training began: {difference.what}"
             raise InputError(self.scene_file, problem, "put them back as they were, or train anew with --overwrite")
         problem = f"its {difference.what} differ from those of {scene.name}"
-        raise InputError(self.scene_file, problem, "resume with the same data, --max-size and --holdout")
+        remedy = "resume with the same data, --max-size and --holdout"
+        remedy += ", or train anew with --overwrite if another version decided these otherwise"
+        raise InputError(self.scene_file, problem, remedy)
 
     def read_decisions(self) -> list[dict]:
         """Return the decisions of the run's plan, see DecisionValues; none without a plan."""

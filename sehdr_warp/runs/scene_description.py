@@ -39,7 +39,7 @@ def describe_scene(scene: Scene) -> dict:
 class SceneDifference(NamedTuple):
     """Difference of two scenes."""
 
-    what: str  # "layout", "views", or the names of photos
+    what: str  # "layout", "views", "splits", "exposure times", "cameras", or the names of photos
     photos: bool  # Whether the pictures themselves differ
 
 
@@ -47,12 +47,23 @@ def scene_difference(saved: dict, current: dict) -> SceneDifference | None:
     """Return what differs between two descriptions of describe_scene(); None if they are of the same scene."""
     saved, current = (json.loads(json.dumps(description)) for description in (saved, current))
     photos, current_photos = _split_photos(saved), _split_photos(current)
-    for name in ("layout", "views"):
-        if saved.get(name) != current[name]:
-            return SceneDifference(name, False)
+    if saved.get("layout") != current["layout"]:
+        return SceneDifference("layout", False)
+    if saved["views"] != current["views"]:
+        return SceneDifference(_differing_part(saved["views"], current["views"]), False)
     if changed := changed_photos(photos, current_photos):
         return SceneDifference(f"{changed[0]} and {len(changed) - 1} more" if len(changed) > 1 else changed[0], True)
     return None
+
+
+def _differing_part(saved: list[dict], current: list[dict]) -> str:
+    """Return in what views of the same names differ, or "views" if these differ or something else does."""
+    parts = {"camera": "cameras", "split": "splits", "exposure_time": "exposure times"}
+    if [view["name"] for view in saved] == [view["name"] for view in current]:
+        for part, text in parts.items():
+            if any(one.get(part) != two[part] for one, two in zip(saved, current, strict=True)):
+                return text
+    return "views"
 
 
 def _split_photos(description: dict) -> dict[str, str]:

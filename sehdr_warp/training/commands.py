@@ -17,7 +17,7 @@ from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
-from ..runs.open import load_scene_and_log_notes, response_for_loading
+from ..runs.open import load_scene_and_log_notes, response_for_loading, with_saved_splits
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
@@ -191,6 +191,8 @@ def _train(args: Train, ranks=None) -> None:
 
             ranks.request_photos(PhotoRequest(data, load_options))
         scene = load_scene_and_log_notes(data, **load_options)
+        if saved is not None and args.scene.holdout is None:
+            scene = with_saved_splits(scene, folder.read_cameras())
         from ..console import run_with_progress
         from ..viewer.live import serve_training
         from .advice import advice_on, options_of_run

@@ -242,6 +242,14 @@ def test_photos_that_were_changed_are_noticed(run):
         folder.check_same_scene(replace(scene, views=views))
 
 
+@pytest.mark.parametrize("part, change", [("splits", {"split": "test"}), ("exposure times", {"exposure_time": 9.0})])
+def test_what_differs_from_the_scene_of_a_run_is_named(run, part, change):
+    scene = toy_scene(2, 8)
+    changed = replace(scene, views=(replace(scene.views[0], **change), *scene.views[1:]))
+    with pytest.raises(InputError, match=f"its {part} differ.* if another version decided"):
+        RunFolder(run).check_same_scene(changed)
+
+
 def test_masks_that_were_changed_are_noticed(run):
     scene = toy_scene(2, 8)
     mask = np.ones(scene.views[0].codes.shape[:2], np.float32)
