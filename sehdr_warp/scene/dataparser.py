@@ -115,7 +115,7 @@ class DataparserOutputs:
         within_rec709: the light of the stated response lies within Rec.709, to which photos are converted when they
             are read.
         mentioned: names of photos that a note names, and that are in no record.
-        kind: of the photos: encoded, linear, gain-map, raw or float; see images.file_kind() and response_choice.py.
+        kind: of the photos: encoded, linear, gain-map, raw or float; see ldr_files.file_kind() and response_choice.py.
     """
 
     format: str

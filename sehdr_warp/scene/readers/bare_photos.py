@@ -237,7 +237,9 @@ def _foreign_poses(folder: Path) -> list[str]:
 
 
 def _has_near_its_start(file: Path, mark: bytes) -> bool:
-    """Return whether a file can be read and has some bytes among its first 65,536."""
+    """Return whether a file can be read and has some bytes among its first 65,536; a pipe would block."""
+    if not file.is_file():
+        return False
     with suppress(OSError), file.open("rb") as opened:
         return mark in opened.read(1 << 16)
     return False
