@@ -185,8 +185,8 @@ def uncertain_lights(lights: Sequence[Any]) -> list[str]:
     if not any(unsure):
         return []
     names = first_names([light_name(index) for index, is_unsure in enumerate(unsure) if is_unsure], 5)
-    guess = f"{names}: uncertain by more than a factor of {2**UNCERTAIN:g}, because every photo clips there"
-    return [f"{guess}; three more photos, so dark that these lights do not clip, measure them"]
+    guess = f"{names}: uncertain by more than a factor of {2**UNCERTAIN:g} where photos clip"
+    return [f"{guess}; three photos so dark that these lights do not clip measure them"]
 
 
 def _describe(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:
