@@ -206,7 +206,7 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
     )
     if len(lights) > _MOST_LIGHTS:
         lead += f" The first {_MOST_LIGHTS} of {len(lights)}."
-    lead = " ".join([lead, *(f"{sentence}." for sentence in uncertain_lights(lights))])
+    lead = " ".join([lead, *(f"{sentence}." for sentence in uncertain_lights(lights[:_MOST_LIGHTS]))])
     return _section("Lights", lead, _rows(titles, rows, first_number=4))
 
 
