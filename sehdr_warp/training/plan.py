@@ -102,7 +102,8 @@ class Plan:
         if code := self.facts.plateau:
             problem = f"no photo is brighter than code {code} of 255, which many pixels have: they clip there"
             lines.append(f"plan: {problem}, and that is taken for their light; export them with white at 255")
-        if self.facts.clipped >= CLIPPED:
+        is_measured = self.facts.unclipped or (self.config.loss.uses_hdr and self.facts.truths)
+        if self.facts.clipped_when_dark >= CLIPPED and not is_measured:
             estimated = f"{self.facts.clipped:.1%} of the pixels clip, and their light above white is an estimate"
             lines.append(f"plan: {estimated}; three photos in which lamps and windows do not clip measure it")
         return lines + [f"plan: {line}, as you set it" for line in _format_fields(self.user_fields)]

@@ -53,6 +53,7 @@ class SceneFacts:
     light_known: bool = False  # Whether the photos hold light itself: RAW, linear, float
     unclipped: bool = False  # Whether they are float pictures without clipping
     plateau: int = 0  # Code of 255, below 255, at which the photos clip, as after an edit; 0 if they do not
+    clipped_when_dark: float = 0.0  # As `clipped`, of the photos with the shortest exposures, three or more
 
     @property
     def around(self) -> bool:
@@ -68,6 +69,8 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     read_views = every_nth(views, MOST_VIEWS)
     figures = np.array([_codes(view) for view in read_views])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
+    longest = 2 * sorted(view.exposure_time for view in photos)[:3][-1]
+    dark_views = every_nth([view for view in views if view.exposure_time <= longest], MOST_VIEWS)
     view_alignment, inward_fraction = _viewing_directions(np.stack([view.camera.world_to_camera for view in views]))
     return SceneFacts(
         photos=len(photos),
@@ -86,6 +89,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         light_known=scene.light_known,
         unclipped=scene.light_known and all(view.source and file_kind(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
+        clipped_when_dark=float(np.mean([_codes(view)[0] for view in dark_views])),
     )
 
 

@@ -13,7 +13,7 @@ import torch
 from ..errors import InputError, refuse_paths
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
-from ..runs.config_files import as_config, override_config, require_same_config, with_iterations_of
+from ..runs.config_files import as_config, config_fields, override_config, require_same_config, with_iterations_of
 from ..runs.device import pick_device
 from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
@@ -91,7 +91,9 @@ def create_trainer(
         SehdrError: If the disk or the memory is full.
     """
     refuse_paths("load_scene", scene)
-    states_iterations = isinstance(config, Config) or (isinstance(config, Mapping) and "schedule.iterations" in config)
+    states_iterations = isinstance(config, Config) or (
+        isinstance(config, Mapping) and not config.keys().isdisjoint(("schedule", "schedule.iterations"))
+    )
     device, config = pick_device(device), as_config(config)
     if tensorboard:
         summary_writer()
@@ -198,8 +200,10 @@ def _with_decisions(config: Config, saved: Config, folder: RunWriter) -> Config:
     """
     if not config.plan.enabled:
         return config
-    paths = {path for decision in folder.read_decisions() for path in decision["fields"]} - set(config.plan.keep)
-    return override_config(config, {path: attrgetter(path)(saved) for path in paths} | {"plan.enabled": False})
+    fields = {path: value for decision in folder.read_decisions() for path, value in decision["fields"].items()}
+    fields |= {path: attrgetter(path)(saved) for path, _ in config_fields() if path in fields}
+    decided = {path: value for path, value in fields.items() if path not in config.plan.keep}
+    return override_config(config, decided | {"plan.enabled": False}, folder.plan_file)
 
 
 def _cap_notes(trainer: Trainer) -> Iterator[str]:

@@ -137,8 +137,25 @@ def test_photos_that_clip_below_white_get_a_line(scene):
 @pytest.mark.parametrize(("clipped", "is_told"), [(0.001, False), (0.065, True)])
 def test_photos_that_clip_get_a_line_before_the_training(scene, clipped, is_told):
     plan = make_plan(scene, config_of())
-    lines = replace(plan, facts=replace(plan.facts, clipped=clipped)).lines()
-    assert is_told == any("6.5% of the pixels clip" in line and "measure it" in line for line in lines)
+    clips = {"clipped": clipped, "clipped_when_dark": clipped}
+
+    def tells(**changes):
+        lines = replace(plan, facts=replace(plan.facts, **clips | changes)).lines()
+        return any("6.5% of the pixels clip" in line and "measure it" in line for line in lines)
+
+    assert tells() == is_told
+    # Light is measured by photos with shorter exposures, and by float pictures.
+    assert not tells(clipped_when_dark=0.001) and not tells(unclipped=True)
+
+
+def test_brackets_clip_as_much_as_their_darkest_photos(scene):
+    views = [
+        replace(view, exposure_time=time, codes=codes_of(np.clip(time * view.image, 0, 1)))
+        for view, time in zip(scene.views, [0.25, 1.0, 9.0] * len(scene.views), strict=False)
+    ]
+    facts = measure_scene(replace(scene, views=tuple(views)))
+    assert facts.clipped_when_dark < 0.01 < facts.clipped
+    assert measure_scene(scene).clipped_when_dark == measure_scene(scene).clipped
 
 
 def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):

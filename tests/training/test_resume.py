@@ -204,7 +204,8 @@ def test_a_preset_in_python_does_not_stretch_a_run_and_stated_iterations_do(tmp_
     longer = load_config("fast", {"schedule.iterations": 4})
     assert train(scene, tmp_path / "run", longer, device="cpu", resume=True).iterations == 4
     train(scene, tmp_path / "fields", {"schedule.iterations": 2}, device="cpu")
-    for fields, iterations in (({"seed": 0}, 2), ({"schedule.iterations": 3}, 3)):
+    stated = (({"seed": 0}, 2), ({"schedule.iterations": 3}, 3), ({"schedule": {"iterations": 4}}, 4))
+    for fields, iterations in stated:
         assert train(scene, tmp_path / "fields", fields, device="cpu", resume=True).iterations == iterations
 
 
@@ -217,6 +218,17 @@ def test_a_planned_run_that_was_stretched_is_resumed_with_its_preset(scene, tmp_
         trainer = create_trainer(scene, tmp_path / "run", resumed, device="cpu", resume=True)
         assert trainer.total == total
         trainer.output.folder.unlock()
+
+
+def test_a_field_that_a_damaged_plan_invents_is_named_with_the_file(scene, tmp_path):
+    config = load_config("demo", {"schedule.iterations": 2, "plan.enabled": True})
+    create_trainer(scene, tmp_path / "run", config, device="cpu").output.folder.unlock()
+    file = RunFolder(tmp_path / "run").plan_file
+    plan = json.loads(file.read_text())
+    plan["decisions"][0]["fields"] = {"model.colour": 1}
+    file.write_text(json.dumps(plan))
+    with pytest.raises(InputError, match=r"plan\.json: unknown field model\.colour = 1"):
+        create_trainer(scene, tmp_path / "run", config, device="cpu", resume=True)
 
 
 def test_resuming_names_other_fields_that_have_the_same_values(scene, tmp_path):
