@@ -99,7 +99,9 @@ def find_lights(
     """
     if not views:
         return []
-    white = field.response.white / float(np.median([time for _, time in views]))
+    times = np.array([time for _, time in views])
+    white = field.response.white / float(np.median(times))
+    least_clipped = CLIPPED * float(np.mean(times > np.median(times) / 2))  # Darker photos measure lights: none clips.
     cameras = [camera for camera, _ in views]
     middle = np.mean([camera.position for camera in cameras], axis=0)
     cameras = every_nth(cameras, MOST_VIEWS)
@@ -113,7 +115,7 @@ def find_lights(
     sums = [_view_sums(field, camera, degree) for camera in cameras]
     pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
     mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]
-    member = (clipped.to(mean.device) > CLIPPED) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
+    member = (clipped.to(mean.device) > least_clipped) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
     members = member.nonzero()[:, 0]
     if not len(members):
         return []

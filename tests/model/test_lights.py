@@ -129,6 +129,15 @@ def test_a_fisheye_lens_shows_a_light_beside_it():
     assert light.radiance == pytest.approx(reference.radiance, rel=0.1)
 
 
+def test_photos_so_dark_that_lights_do_not_clip_take_none_off_the_list():
+    scene = field(panel(), RADIANCE, 0.03)
+    clipped = torch.full((scene.gaussians.count,), 0.25)
+    assert find_lights(scene, clipped, views()) == []
+    two_dark = [(camera, time / (64 if i < 2 else 1)) for i, (camera, time) in enumerate(views())]
+    (light,) = find_lights(scene, clipped, two_dark)
+    assert len(light.members) == scene.gaussians.count
+
+
 def test_deviation_follows_the_confidence():
     scene = field(panel(), RADIANCE, 0.03)
     scene.confidence = torch.full((scene.gaussians.count,), 0.5)
