@@ -1,4 +1,4 @@
-"""What scene.json describes of a scene, and whether a training is resumed with the scene that it began with.
+"""Description of a scene in scene.json, and whether a training is resumed with the scene that it began with.
 
 Photos are described by signatures: the mean of the codes in a grid of GRID x GRID cells, of 8 bits each. It survives
 another decoder, whose codes may differ by one, and changes with a photo that was edited, exchanged or developed anew.

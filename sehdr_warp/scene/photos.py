@@ -196,8 +196,8 @@ def brightened_codes(codes: np.ndarray) -> np.ndarray:
     """
     levels = np.iinfo(codes.dtype).max
     sample = codes[::8, ::8] / levels
-    shown = sample[sample > _BLACK]
-    median = max(float(np.median(shown if 10 * shown.size > sample.size else sample)), 1e-3)
+    bright = sample[sample > _BLACK]
+    median = max(float(np.median(bright if 10 * bright.size > sample.size else sample)), 1e-3)
     exponent = max(np.log(_MIDTONE) / np.log(median), _LEAST_EXPONENT) if median < _MIDTONE else 1.0
     if codes.dtype == np.uint8 and exponent == 1:
         return codes

@@ -9,7 +9,7 @@ from .targets import CODE, TrainingView
 
 
 @torch.no_grad()
-def shown_detail(field: RadianceField, view: TrainingView) -> Tensor:
+def visible_detail(field: RadianceField, view: TrainingView) -> Tensor:
     """Return [N], at least 0: for each Gaussian the sum over pixels of its blending weight times the photo's detail.
 
     The detail of a pixel is the gradient of the encoded mean of the channels, and one 8-bit code more: where a photo

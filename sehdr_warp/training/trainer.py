@@ -35,7 +35,7 @@ from .losses import INTERVALS_FROM
 from .machine import interruptible, torch_settings
 from .matching import Matcher, seed_gaussians
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
-from .photo_detail import shown_detail
+from .photo_detail import visible_detail
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .scene_facts import is_large
@@ -271,7 +271,7 @@ class Trainer:
     def _measure_detail(self) -> Tensor:
         """Return how much detail of the step's photo each Gaussian shows, [N]."""
         with self.graphs.on_capture_stream():
-            return shown_detail(self.field, self.views.source[self._view_index])
+            return visible_detail(self.field, self.views.source[self._view_index])
 
     @property
     def degree(self) -> int:

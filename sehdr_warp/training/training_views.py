@@ -202,7 +202,7 @@ class PhotoStream:
 
 
 ViewSource = ViewStack | PhotoStream | Sequence[TrainingView]
-"""What steps take views from by number: a ViewStack if all photos are on a GPU, a PhotoStream if they are streamed to
+"""Source of views by number for steps: a ViewStack if all photos are on a GPU, a PhotoStream if they are streamed to
 it, a PhotoSource on a CPU; a PhotoSource or a list on a GPU without CUDA graphs."""
 
 

@@ -85,8 +85,8 @@ def test_a_light_that_every_photo_cuts_off_has_what_a_map_without_it_loses(targe
     """Large Gaussians at the border of all photos reach beyond it, and a map of the rest lacks all of their light."""
     scene = field(panel(step=0.3), RADIANCE, 0.15)
     (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views(target))
-    shown = [float(scene.render(camera).alpha.sum()) for camera, _ in views(target)]
-    assert max(shown) < 0.9 * float(scene.render(views()[0][0]).alpha.sum())
+    alphas = [float(scene.render(camera).alpha.sum()) for camera, _ in views(target)]
+    assert max(alphas) < 0.9 * float(scene.render(views()[0][0]).alpha.sum())
     directions = torch.tensor(latlong(512), dtype=torch.float32)
     options = {"focal_length": 240.0, "pixel_angle": 2 * np.pi / 512}
     middle = np.zeros(3)

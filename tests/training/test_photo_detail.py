@@ -1,10 +1,10 @@
-"""How much of a photo's detail each Gaussian shows."""
+"""Detail of a photo that each Gaussian shows."""
 
 import numpy as np
 import torch
 
 from sehdr_warp.rasterizer import rasterize
-from sehdr_warp.training.photo_detail import edges, shown_detail
+from sehdr_warp.training.photo_detail import edges, visible_detail
 from sehdr_warp.training.targets import CODE
 
 from .toy import VARIANTS, make_trainer, toy_scene
@@ -35,11 +35,11 @@ def test_a_gaussian_counts_by_the_detail_of_the_pixels_that_it_shows():
         detail = np.hypot(*gradient) + CODE
         if weights is not None:
             detail = detail * weights[..., 0].numpy()
-        field, shown = trainer.field, shown_detail(trainer.field, view)
+        field, measured = trainer.field, visible_detail(trainer.field, view)
         g, camera, white = field.gaussians, view.camera, torch.eye(field.gaussians.count)
         with torch.no_grad():
             shapes = g.means, g.log_scales, g.quaternions, g.opacities()
             pose = camera.world_to_camera, camera.intrinsics, camera.width, camera.height
             images = torch.cat([rasterize(*shapes, part, *pose).image for part in white.split(8, dim=1)], 2)
         expected = np.einsum("hw,hwn->n", detail, images.double().numpy())
-        assert expected.max() > 0.1 and np.abs(shown.numpy() - expected).max() < 1e-4 * expected.max()
+        assert expected.max() > 0.1 and np.abs(measured.numpy() - expected).max() < 1e-4 * expected.max()

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, moments_of
 from ...rasterizer.ops.relocation import (
@@ -27,7 +28,7 @@ MAX_DISTANCE = 100.0
 """Noise moves no Gaussian farther than this from the origin, in normalized units (1.1 camera radii)."""
 SECOND_MOMENT_LEFT = 0.1  # Of a source's second moments, see reset_moments()
 SECOND_MOMENT_LEFT_WHERE_DENSE = 0.4
-DETAIL_KEPT = 0.95  # Of the sum of photo detail at each refinement, so that it comes from about the last 20 photos
+DETAIL_DECAY = 0.95  # Of the sum of photo detail at each refinement: it is that of about the last 20 photos
 LEAST_WEIGHT = 1e-6  # Of an opacity beside detail: if photos show no Gaussian, copies are sampled by opacity
 DENSE = 300.0  # Gaussians over the square root of the photos' pixels, from which on a large scene counts as dense
 
@@ -93,7 +94,7 @@ class McmcStrategy(Strategy):
         """Relocate dead Gaussians and add new ones, if this iteration is due.
 
         The slots are filled from the first on: [0, seeded) by seeding, [seeded, dead_count) by copies of living
-        Gaussians, and the new rows that are left, up to dead_count + added, by copies sampled by opacity. Only the
+        Gaussians, and the new rows that are left, up to dead_count + added, by sampled copies. Only the
         device knows how many Gaussians are dead, so these counts stay there.
         """
         if not self.is_due(iteration, step_batch):
@@ -103,7 +104,9 @@ class McmcStrategy(Strategy):
         opacities = gaussians.opacities()
         dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
         if self.options.sample_by == "detail" and measure_detail is not None:
-            detail = DETAIL_KEPT * self._detail_of(count, opacities) + measure_detail()
+            detail = measure_detail()
+            if self.detail is not None:
+                detail += DETAIL_DECAY * with_rows(self.detail, count)
             self.detail = detail.masked_fill(dead, 0)
         slot_of_row, dead_count = number_slots(dead, added)
         gaussians.resize(count + added, optimizer)
@@ -158,7 +161,7 @@ class McmcStrategy(Strategy):
         share_opacities(logits, log_scales, copies, least=self.prune_opacity)
         values, changed = list(gaussians.tensors().values()), None
         if self.detail is not None:  # A source and its copies share what it showed.
-            self.detail = self._detail_of(len(copies), logits) / (1 + copies)
+            self.detail = with_rows(self.detail, len(copies)) / (1 + copies)
             values.append(self.detail)
         if self.dense:
             states = [moments_of(refinement.optimizer, parameter) for parameter in gaussians.parameters()]
@@ -173,19 +176,11 @@ class McmcStrategy(Strategy):
         weights = weights.masked_fill(refinement.slot_of_row >= first, 0)
         self.relocate(refinement, weights, first, last, bound)
 
-    def _detail_of(self, count: int, like: Tensor) -> Tensor:
-        """Return the detail of the first `count` rows, 0 where none was measured, on the device of `like`."""
-        result = torch.zeros(count, device=like.device)
-        if self.detail is not None:
-            rows = min(count, len(self.detail))
-            result[:rows] = self.detail[:rows]
-        return result
-
     def _copy_weights(self, opacities: Tensor) -> Tensor:
         """Return the weights [N] by which Gaussians are sampled for copies."""
         if self.detail is None:
             return opacities
-        return self._detail_of(len(opacities), opacities) + LEAST_WEIGHT * opacities
+        return with_rows(self.detail, len(opacities)) + LEAST_WEIGHT * opacities
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
@@ -208,8 +203,9 @@ class McmcStrategy(Strategy):
         """Return the detail of `count` Gaussians, if copies are sampled by it; 0 on ranks that do not refine."""
         if self.options.sample_by == "opacity" or self.camera_positions is None:
             return {}
-        if self.detail is None or len(self.detail) != count:
-            self.detail = self._detail_of(count, self.camera_positions)
+        if self.detail is None:
+            self.detail = torch.zeros(count, device=self.camera_positions.device)
+        self.detail = with_rows(self.detail, count)
         return {"detail": self.detail}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -240,6 +236,11 @@ def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tens
     for name, factor in (("exp_avg", 0.0), ("exp_avg_sq", left)):
         if moments := [state[name] for state in states if name in state]:
             scale_rows(moments, which, factor)
+
+
+def with_rows(values: Tensor, count: int) -> Tensor:
+    """Return the first `count` of values [N], with zeros after them if there are fewer."""
+    return values if len(values) == count else functional.pad(values, (0, count - len(values)))
 
 
 def mcmc_cap(config: Config, pixels: int) -> int:
