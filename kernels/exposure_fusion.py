@@ -1,4 +1,4 @@
-"""Neural exposure fusion (SeHDR, section 3.3) at given encoded brackets, and its backward pass.
+"""Neural exposure fusion (SeHDR, equations 9 to 12) at given encoded brackets, and its backward pass.
 
 P brackets of M colors, Q = P M points of each of the three channels, in the order [3, P, M]. The perceptron of a
 channel has H hidden units: its terms of a point are read by all threads of a warp at once, or a warp's threads are its

@@ -28,7 +28,7 @@ PU21_PEAK = 256.0
 
 
 def mu_law(radiance: Tensor, mu: float = 5000.0) -> Tensor:
-    """Return log(1 + mu E) / log(1 + mu) (SeHDR, section 4.1; Kalantari and Ramamoorthi 2017).
+    """Return log(1 + mu E) / log(1 + mu) (SeHDR, equation 21; Kalantari and Ramamoorthi 2017).
 
     Args:
         radiance: E, of any shape; limited to [0, 1] first, as HDR-NeRF and HDR-GS do.

@@ -108,7 +108,7 @@ def _exposure(item: str | float, base_time: float | None, field: str) -> Exposur
 
 
 def bracket_log_radiance(log_base: "torch.Tensor", times: Sequence[float], base_time: float) -> "torch.Tensor":
-    """Return [n, ...] log c^{l_j} = log c^{l_1} + log dt_j - log dt_1 (SeHDR, section 3.2) for times dt_j, seconds."""
+    """Return [n, ...] log c^{l_j} = log c^{l_1} + log dt_j - log dt_1 (SeHDR, equation 8) for times dt_j, seconds."""
     shifts = tuple(math.log(time) - math.log(base_time) for time in times)
     offsets = _on_device(shifts, log_base.dtype, log_base.device)
     return log_base + offsets.reshape(-1, *[1] * log_base.dim())

@@ -1,4 +1,4 @@
-"""From base radiance to HDR radiance: neural exposure fusion (SeHDR, section 3.3).
+"""From base radiance to HDR radiance: neural exposure fusion (SeHDR, equations 9 to 12).
 
 Every bracket is the base scaled by a known ratio, so the fused value is a function of one number: the log radiance of
 the base, for each channel separately. The equations are evaluated on a table over that number and interpolated, so that

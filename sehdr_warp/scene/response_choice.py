@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..subsets import every_nth
+from ..subsets import counted, every_nth
 from .dataparser import DataparserOutputs
 from .images.exif import are_camera_jpegs
 from .images.gain_map import MOST_STOPS_IN_CODES, read_gain_map
@@ -182,5 +182,5 @@ def _sample(photos: Sequence, method: str) -> Sequence:
     sample = every_nth(photos, _MOST_SAMPLED)
     if method == "paper":
         sample = (photos[int(np.random.default_rng(0).integers(len(photos)))],)
-    _log.info("choosing the response from %d photos", len(sample))
+    _log.info("choosing the response from %s", counted(len(sample), "photo", "photos"))
     return sample

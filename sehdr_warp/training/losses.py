@@ -96,7 +96,7 @@ def anchor_loss(mapper: ToneMapper) -> Tensor:
 
 
 def linear_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor | None:
-    """Return SeHDR's L_linear: base exposure against HDR truth or the fused exposure; None without a reference."""
+    """Return L_linear (SeHDR, equation 19): base exposure against HDR truth or the fused exposure; None without one."""
     truth = target.exposure_truth if config.hdr_truth else None
     if truth is None and render.base is render.exposure:
         return None
