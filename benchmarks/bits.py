@@ -55,7 +55,6 @@ def main(
         device: cpu or cuda:N.
     """
     result = new_result("bits", torch.device(device), {"iterations": iterations, "max_size": max_size})
-    result["command"] = "python -m benchmarks.bits --json docs/reports/results/bits.json"
     measure_row = partial(row, iterations=iterations, max_size=max_size, device=device)
     # Kernels are compiled once, not by each worker.
     row((scenes[0], exposures[0], *PHOTOS[0]), iterations=30, max_size=max_size, device=device)

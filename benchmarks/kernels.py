@@ -1,4 +1,4 @@
-"""`bench kernels`: the whole differentiable splat (project, order, bin, blend; colors given), timed and checked."""
+"""`python -m benchmarks kernels`: time and check rasterize(), forward and backward, on random Gaussians."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from .timing import Variant, kernel_milliseconds, peak_memory, time_variants
 LOG = logging.getLogger(__name__)
 OURS, PLAIN_TORCH = "sehdr-warp", "plain torch"
 RECORDED = "sehdr-warp, recorded"
-"""rasterize() with room for a quarter more entries than there are, replayed as a CUDA graph, as in a training step."""
+"""rasterize() with room for a quarter more intersections, replayed as a CUDA graph, as in a training step."""
 PLAIN_TORCH_BYTES = 4 << 30
 """The plain torch rasterizer keeps about 16 numbers for each pixel-Gaussian pair; beyond this it is left out."""
 IMAGE_BOUND, GRADIENT_BOUND = 1e-4, 1e-3
@@ -114,8 +114,7 @@ def _difference(value: torch.Tensor, other: torch.Tensor) -> float:
 
 def _record(scene: SplatScene, cotangent: torch.Tensor | None) -> Callable[[], list[torch.Tensor]]:
     """Return a replay of [image], or with a cotangent of [image, gradients of the leaves]."""
-    with torch.no_grad():
-        max_intersections = rasterize(*scene.arguments).intersection_count * 5 // 4
+    max_intersections = _intersection_count(scene) * 5 // 4
 
     def forward():
         with torch.set_grad_enabled(cotangent is not None):
@@ -139,16 +138,16 @@ def _from_the_start(variant: Variant) -> Variant:
     return Variant(calls, prepare=clear_graphs)
 
 
-def _entries(scene: SplatScene) -> int:
-    with torch.no_grad():
-        return rasterize(*scene.arguments).intersection_count
+@torch.no_grad()
+def _intersection_count(scene: SplatScene) -> int:
+    return rasterize(*scene.arguments).intersection_count
 
 
 def _variants(scene: SplatScene, peer: bool, backward: bool) -> dict[str, Variant]:
     renderers = {OURS: lambda: render(scene)}
     if peer:
         renderers[GSPLAT] = gsplat_renderer(scene)
-    if scene.device.type == "cpu" and _entries(scene) * TILE_SIZE**2 * 16 * 4 <= PLAIN_TORCH_BYTES:
+    if scene.device.type == "cpu" and _intersection_count(scene) * TILE_SIZE**2 * 16 * 4 <= PLAIN_TORCH_BYTES:
         renderers[PLAIN_TORCH] = lambda: render(scene, rasterize_reference)
     variants = {key: splat_variant(call, scene, backward) for key, call in renderers.items()}
     if scene.device.type == "cuda":
@@ -167,14 +166,13 @@ def _add_device_times(rows: list[dict], scene: SplatScene, peer: bool) -> None:
 
 
 def _rows(scene: SplatScene, peer: bool, repetitions: int) -> list[dict]:
-    entries = _entries(scene)
     place = {"gaussians": scene.size.gaussians, "width": scene.size.width, "height": scene.size.height}
     rows = []
     for name, backward in PASSES.items():
         variants = _variants(scene, peer, backward)
         timings = time_variants(variants, scene.device, repetitions=repetitions, apart=True)
         for key, timing in timings.items():
-            row = place | {"channels": scene.channels, "pass": name, "implementation": key, "entries": entries}
+            row = place | {"channels": scene.channels, "pass": name, "implementation": key}
             variant = variants[key] if scene.device.type == "cpu" else _from_the_start(variants[key])
             row |= timing | {"peak_memory_bytes": peak_memory(variant, scene.device)}
             ratio = None if key == OURS else timings[OURS]["median_ms"] / timing["median_ms"]

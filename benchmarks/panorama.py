@@ -75,7 +75,6 @@ def main(
     scene = _scene(cameras, photos)
     settings = {"views": views, "size": size, "width": width, "samples": samples, "iterations": iterations}
     result = new_result("panorama", torch.device(device), settings)
-    result["command"] = "python -m benchmarks.panorama --work panorama_work --json docs/reports/results/panorama.json"
     # As the plan of photos has it where cameras look all around; on truth there is no plan.
     config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": PRUNE_NEAR_ANGLE})
     is_trained = (work / "run" / "summary.json").is_file()

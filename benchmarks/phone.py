@@ -62,7 +62,6 @@ def main(
         device: cpu or cuda:N.
     """
     result = new_result("phone", torch.device(device), {"iterations": iterations})
-    result["command"] = "python -m benchmarks.phone --json docs/reports/results/phone.json"
     measure = partial(row, iterations=iterations, device=device)
     # Kernels are compiled once, not by each worker.
     row((seeds[0], sizes[0], scenes[0], photos[0]), iterations=30, device=device)

@@ -1,4 +1,4 @@
-"""`benchmarks quality`: train and evaluate every combination of methods with scenes and exposures.
+"""`python -m benchmarks quality`: train and evaluate every combination of methods with scenes and exposures.
 
 A combination is a job with its folder and key. Several jobs run at a time, each once; their results become rows.
 """
@@ -38,8 +38,6 @@ from .timing import Variant, forget_peaks, time_variants
 LOG = logging.getLogger(__name__)
 FORMAT = 7  # Of a job and of its result; others are run again.
 RESULT, FAILURE = "result.json", "failure.json"
-TESTS, FIRST_TEST = 16, 100
-"""A training tests its held-out views this often, at iterations spaced evenly on a log scale from 1/100 of all."""
 EXPOSURES, FACTOR = 5, 4.0
 """A scene's ladder: so many exposures, each so many times longer than the last, around a well exposed one."""
 KNOWN, BLIND, LEARNED = "known", "blind", "learned"
@@ -159,11 +157,10 @@ def plan_jobs(
 
 
 def _training(method: str, iterations: int | None, seed: int) -> Config:
-    """Return the method's training by the plan, tested on a log scale of its length."""
+    """Return the method's training by the plan; held-out views are evaluated at its end alone."""
     changes = {} if iterations is None else {"schedule.iterations": iterations}
-    steps = {max(1, round(REFERENCE_ITERATIONS * FIRST_TEST ** (-k / (TESTS - 1)))) for k in range(TESTS)}
     config = load_config(method, {"seed": seed, **changes})
-    times = {"schedule.evaluate_at": sorted(steps), "schedule.checkpoint_every": REFERENCE_ITERATIONS}
+    times = {"schedule.evaluate_at": [REFERENCE_ITERATIONS], "schedule.checkpoint_every": REFERENCE_ITERATIONS}
     plan = {"plan.enabled": True, "plan.keep": sorted({*config.plan.keep, *changes, *METHOD_FIELDS})}
     return override_config(config, times | plan, method)
 
@@ -224,7 +221,7 @@ def run_jobs(
 
 
 def row_of(result: dict) -> dict:
-    """Return a result as one flat row: what was trained, its figures, and its held-out tests as [seconds, dB]."""
+    """Return a result as one flat row: what was trained, and its figures."""
     config, figures = result["config"], result["figures"]
     hdr, regions = figures["protocol"], figures["regions"]
     names = ("curve", "exposure", "method", "sees_truth", "response", "seed", "device")
@@ -245,7 +242,6 @@ def row_of(result: dict) -> dict:
         "chosen": figures["response"],
         "seconds": figures["train_seconds"],
         "shared_by": result["shared_by"],
-        "tests": [[line["seconds"], line["psnr_mu"]] for line in result["curve"] if line.get("psnr_mu") is not None],
     }
 
 
@@ -324,9 +320,8 @@ def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
     store_light(folder / LIGHT, run, *light_inputs, scale)
     figures |= {"response": run.response.name, "peak_memory_bytes": peak}
     figures["renders_per_second"] = _render_rate(run, scene)
-    curve = run.metrics()
     shutil.rmtree(out, ignore_errors=True)
-    return {"format": FORMAT, "key": job.key, "config": config, "figures": figures, "curve": curve}
+    return {"format": FORMAT, "key": job.key, "config": config, "figures": figures}
 
 
 def _warm_up(scene: Scene, config: Config, scratch: Path, device: str) -> None:

@@ -4,14 +4,14 @@ python -m benchmarks.report_pages
 """
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.files import atomic_path, read_json
 
-from . import report_plots as plots
 from .quality_tables import FIRST_TITLE, quality_tables, readme_table
+from .report_plots import plot_kernels
 from .report_tables import PAGES, TABLES
 from .results import groups, machine_line, markdown_table
 from .study import run
@@ -37,11 +37,10 @@ def write_reports(folder: Path) -> list[Path]:
             folder_of_results = " (`$out` is a folder in `measured/`)" if "$out" in result["command"] else ""
             parts += [f"Measure again: `python -m benchmarks.measure {name}`{folder_of_results}."]
         parts += [machine_line(result) + "."]
-        # Trainings whose times include compiling have no tests over time.
-        if name in PLOTS and any(row.get("tests", True) for row in result["rows"]):
-            pages.append(folder / f"{name}.png")
+        if name == "kernels":
+            pages.append(folder / "kernels.png")
             with atomic_path(pages[-1], internal=True) as temporary:
-                PLOTS[name](result, temporary)
+                plot_kernels(result, temporary)
         if "caption" in page and (folder / f"{name}.png").is_file():
             parts.append(f"![{page['caption']}]({name}.png)")
         pages.append(_write(folder / f"{name}.md", [*parts, *tables(result), *result["notes"]]))
@@ -79,9 +78,6 @@ def write_readme(path: Path, result: dict) -> None:
     start = text.index(f"| {FIRST_TITLE} |")
     with atomic_path(path, internal=True) as temporary:
         temporary.write_text(text[:start] + table + text[text.index("\n\n", start) :], encoding="utf-8")
-
-
-PLOTS: dict[str, Callable[[dict, Path], None]] = {"quality": plots.plot_quality, "kernels": plots.plot_kernels}
 
 
 def _tried_page(path: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""`bench response`: how well a camera's response is found from photos alone, on rendered truth through known curves."""
+"""`python -m benchmarks response`: choose the response from rendered photos through known curves, and compare."""
 
 import contextlib
 import logging

@@ -27,7 +27,7 @@ class Size:
     height: int
 
     def __str__(self) -> str:
-        """Return such as `100,000 at 640 x 480`."""
+        """Return such as `100000@640x480`."""
         return f"{self.gaussians}@{self.width}x{self.height}"
 
     def reduced(self, most: int) -> "Size":

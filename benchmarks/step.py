@@ -1,4 +1,4 @@
-"""`bench step`: a whole training step (photograph, losses, gradients, optimizer, densification) of a preset."""
+"""`python -m benchmarks step`: a training step of a preset, from the render to densification."""
 
 import logging
 import statistics

@@ -1,4 +1,4 @@
-"""`bench workers`: training steps on more and more threads of the CPU, or on more and more GPUs."""
+"""`python -m benchmarks workers`: training steps on more and more threads of the CPU, or on more and more GPUs."""
 
 import logging
 import os

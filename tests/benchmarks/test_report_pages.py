@@ -24,7 +24,7 @@ def quality_page(folder, rows):
     result = {"command": "-", "machine": machine, "date": "2026-01-01", "rows": rows, "notes": []}
     (folder / "results").mkdir()
     (folder / "results" / "quality.json").write_text(json.dumps(result))
-    assert {path.name for path in write_reports(folder)} == {"quality.md", "quality.png", "README.md"}
+    assert {path.name for path in write_reports(folder)} == {"quality.md", "README.md"}
     return (folder / "quality.md").read_text()
 
 
