@@ -186,7 +186,7 @@ def _trust_tables(result: dict) -> Iterable[str]:
         rows = [dict(row) for row in result["outsider"]]
         total = {"family": "all"} | {name: sum(row[name] for row in rows) for name in counts}
         yield "## Cases of an outsider"
-        yield "By somebody who had seen neither sources nor trial; *held*: at first, *failing*: after the mends."
+        yield "Written without knowledge of sources and trial. *held*: passed at first, *failing*: after corrections."
         yield markdown_table([*rows, total], {"family": "", **dict.fromkeys(counts, "d"), "found": ""})
     if "fuzz" in result:
         counts, rows = ("inputs", "findings"), []
