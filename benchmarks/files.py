@@ -17,7 +17,7 @@ import torch
 
 import sehdr_warp as sw
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.cameras.paths import common_focus, training_cameras
+from sehdr_warp.output.cameras.scene_cameras import common_focus, training_cameras
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.export.proxy_mesh import proxy_mesh
 from sehdr_warp.output.scene_page import write_scene_page

@@ -4,7 +4,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +12,7 @@ from ..model.baking import field_of, gaussians_of
 from ..runs.run import RenderableScene, on_device
 from ..splats import GaussianArrays
 from ..splats.arrays import join_gaussians
-from .cameras.paths import training_cameras
+from .cameras.scene_cameras import camera_positions, training_cameras
 from .world_transform import WorldTransform, from_photos
 
 
@@ -88,7 +87,7 @@ def _joined_gaussians(scenes: Sequence[RenderableScene], moves: Sequence[WorldTr
     time = scenes[0].base_time if color_model == "display" else None
     parts = []
     for scene, move in zip(scenes, moves, strict=True):
-        positions = np.array([camera.position for camera in training_cameras(scene)]).reshape(-1, 3)
+        positions = camera_positions(training_cameras(scene))
         gaussians = gaussians_of(scene.field, color_model, positions, time, scene.color_matrix)
         parts.append(gaussians if move.is_identity else gaussians.transformed(move.matrix))
     return join_gaussians(parts)

@@ -25,7 +25,8 @@ from .aovs import ViewImages, data_parts, read_aovs, render_images
 from .brackets import Brackets, PictureHeader, bracket_exposures, remove_earlier
 from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .cameras.framing import default_path, film_camera
-from .cameras.paths import interpolate, training_cameras
+from .cameras.paths import interpolate
+from .cameras.scene_cameras import training_cameras
 from .images.colorspace import from_rec709
 from .images.exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
 from .images.ldr_files import as_array, quantize, safe_names, write_picture

@@ -20,8 +20,8 @@ from ..model.baking import field_of, gaussians_of
 from ..runs.run import Splats
 from ..scene import Camera
 from ..splats.arrays import HARMONIC_0
-from .cameras.framing import opening_facts
-from .cameras.paths import facts_of_cameras, training_cameras
+from .cameras.opening import camera_facts, opening_facts
+from .cameras.scene_cameras import training_cameras
 from .export.splat_edits import SplatEdits, most_visible, without_strays
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
 from .images.tonemap import display_gain
@@ -83,7 +83,7 @@ def write_scene_page(
     columns |= {f"scale_{i}": column for i, column in enumerate(gaussians.log_scales.T)}
     columns |= {f"rot_{i}": column for i, column in enumerate(gaussians.unit_quaternions.T)}
     values = np.stack(list(columns.values()))
-    facts = facts_of_cameras(entries) | {
+    facts = camera_facts(entries) | {
         **opening,
         "up": transform.rotation[1].tolist(),
         "columns": list(columns),

@@ -25,7 +25,7 @@ from ..runs.values import ORIENTATION_FILE
 from ..scene import Camera
 from ..scene.gravity import is_pitch_known, typical_roll, up_direction
 from ..splats import STREAMED_SOG
-from .cameras.paths import common_focus, middle_index, training_cameras
+from .cameras.scene_cameras import common_focus, middle_index, training_cameras
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene

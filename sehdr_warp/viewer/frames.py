@@ -10,8 +10,7 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..model.lights import Light, light_name
-from ..output.cameras.framing import opening_facts
-from ..output.cameras.paths import facts_of_cameras
+from ..output.cameras.opening import camera_facts, opening_facts
 from ..output.export.splat_edits import SplatEdits
 from ..output.images.tonemap import display_gain
 from ..output.light_pictures import curve_table
@@ -212,7 +211,7 @@ class ViewerScene:
             "curve": curve_table(self.response),
             "clipped": self.clipped is not None,
         }
-        return facts | facts_of_cameras((self.reference or self).cameras) | own
+        return facts | camera_facts((self.reference or self).cameras) | own
 
 
 def camera_of(values: dict) -> Camera:

@@ -6,7 +6,8 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.cameras.paths import common_focus, interpolate, orbit
+from sehdr_warp.output.cameras.paths import interpolate, orbit
+from sehdr_warp.output.cameras.scene_cameras import common_focus
 from sehdr_warp.output.images.ldr_files import safe_names
 from sehdr_warp.output.images.tonemap import display_gain
 from sehdr_warp.output.render_views import render_views, select_cameras

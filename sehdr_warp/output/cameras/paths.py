@@ -2,63 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...errors import SehdrError, did_you_mean
+from ...errors import SehdrError
 from ...scene import Camera
 from ...scene.gravity import looks_down, up_direction
-from ...subsets import first_names
-
-if TYPE_CHECKING:
-    from ...runs.run import RenderableScene
-
+from .scene_cameras import camera_axes, camera_positions, common_focus, is_full_circle
 
 # More than an hour of film at 24 views a second is a slip of the hand.
 _LONGEST = 100_000
-# A gap in azimuth smaller than this means that the photos go round the scene.
-_ROUND_GAP = np.radians(120)
-# Mean squared sine between optical axes below which they are parallel in effect: where they meet is then chance, as of
-# photos from the air that look down (6 degrees).
-_PARALLEL = np.sin(np.radians(6)) ** 2
 # Cosine between the step from a photo to the next and their optical axes. A walk ahead has a median near 1, walks
 # around something, along it and flights 0 to 0.3.
 _AHEAD, _ASIDE = 0.7, 0.3
 _LEAP = 5.0  # Steps this many times as long as the median are breaks of a walk: cameras that were placed wrongly.
 _SMOOTH, _SMOOTH_UP = 1.2, 4.0  # Standard deviations, in photos, of what evens places and axes of a walk, and its up
-
-
-def training_cameras(run: "RenderableScene") -> list[Camera]:
-    """Return the training cameras of a scene."""
-    return [entry.camera for entry in run.cameras if entry.split == "train"]
-
-
-def camera_named(run: "RenderableScene", name: str) -> Camera:
-    """Return the camera of a view; raise SehdrError if the scene has none of this name."""
-    cameras = {entry.name: entry.camera for entry in run.cameras}
-    if name not in cameras:
-        some = first_names(list(cameras), 5) or "none"
-        hint = did_you_mean(name, cameras) or "; see scene.json of the run"
-        raise SehdrError(f"view {name!r} is not one of the scene's ({some}){hint}")
-    return cameras[name]
-
-
-def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return the point [3] nearest to all optical axes (least squares); None if they are parallel or it lies behind."""
-    positions, forward = _positions(cameras), _axes(cameras, 2)
-    off_axis = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    matrix = off_axis.mean(axis=0)
-    if np.linalg.eigvalsh(matrix)[0] < _PARALLEL:
-        return None
-    focus = np.linalg.solve(matrix, (off_axis @ positions[:, :, None]).mean(axis=0)[:, 0])
-    return focus if np.median(np.sum((focus - positions) * forward, axis=1)) > 0 else None
-
-
-def middle_index(cameras: Sequence[Camera]) -> int:
-    """Return the index of the camera nearest to the median position."""
-    positions = _positions(cameras)
-    return int(np.argmin(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
 
 
 def orbit(cameras: Sequence[Camera], count: int, focus_distance: float, up: np.ndarray | None = None) -> list[Camera]:
@@ -78,7 +36,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float, up: np.n
         SehdrError: Without cameras, or for a count outside 1 to 100 000.
     """
     _check(cameras, count)
-    positions, focus = _positions(cameras), common_focus(cameras)
+    positions, focus = camera_positions(cameras), common_focus(cameras)
     middle = cameras[int(np.argmin(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
     if focus is None:
         focus = middle.position + focus_distance * middle.world_to_camera[2, :3]
@@ -91,7 +49,7 @@ def orbit(cameras: Sequence[Camera], count: int, focus_distance: float, up: np.n
     horizontal = np.hypot(offsets @ back, offsets @ right)
     azimuths = np.arctan2(offsets @ right, offsets @ back)
     turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    if _go_round(azimuths):
+    if is_full_circle(azimuths):
         azimuth = turn
         ring, height = np.full(count, horizontal.mean()), np.full(count, (offsets @ up).mean())
     else:
@@ -116,7 +74,7 @@ def walk(cameras: Sequence[Camera]) -> list[Camera]:
     """
     if len(cameras) < 4:
         return []
-    positions, forward = _positions(cameras), _axes(cameras, 2)
+    positions, forward = camera_positions(cameras), camera_axes(cameras, 2)
     steps, axes = np.diff(positions, axis=0), forward[1:] + forward[:-1]
     lengths = np.linalg.norm(steps, axis=1)
     ahead = np.sum(steps * axes, axis=1) / np.maximum(lengths * np.linalg.norm(axes, axis=1), 1e-12)
@@ -143,7 +101,7 @@ def walk_path(cameras: Sequence[Camera], count: int) -> list[Camera]:
     from scipy.ndimage import gaussian_filter1d
 
     _check(cameras, count)
-    positions = _positions(cameras)
+    positions = camera_positions(cameras)
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
     samples = 16 * len(cameras)
     at, fine = np.linspace(0, lengths[-1], count), np.linspace(0, lengths[-1], samples)
@@ -153,23 +111,10 @@ def walk_path(cameras: Sequence[Camera], count: int) -> list[Camera]:
         sampled = gaussian_filter1d(sampled, deviation * 16, axis=0, mode="nearest")
         return np.stack([np.interp(at, fine, column) for column in sampled.T], axis=1)
 
-    places, forward = smooth(positions, _SMOOTH), smooth(_axes(cameras, 2), _SMOOTH)
-    up = smooth(-_axes(cameras, 1), _SMOOTH_UP)
+    places, forward = smooth(positions, _SMOOTH), smooth(camera_axes(cameras, 2), _SMOOTH)
+    up = smooth(-camera_axes(cameras, 1), _SMOOTH_UP)
     rows = zip(places, forward, up, strict=True)
     return [moved(cameras[0], look_at_pose(place, place + ahead, above)) for place, ahead, above in rows]
-
-
-def surround(cameras: Sequence[Camera], focus: np.ndarray, up: np.ndarray | None = None) -> bool:
-    """Return whether cameras stand all around a point, as seen from above."""
-    up = up_direction(cameras) if up is None else up
-    east = np.linalg.svd(up[None])[2][1]
-    offsets = _positions(cameras) - focus
-    return _go_round(np.arctan2(offsets @ np.cross(up, east), offsets @ east))
-
-
-def _go_round(azimuths: np.ndarray) -> bool:
-    ordered = np.sort(azimuths)
-    return bool(np.diff(ordered, append=ordered[0] + 2 * np.pi).max() < _ROUND_GAP)
 
 
 def _along(azimuths: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, float]:
@@ -196,7 +141,7 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
     from scipy.spatial.transform import Rotation, RotationSpline
 
     _check(cameras, count)
-    positions, axes = _positions(cameras), np.stack([camera.camera_to_world[:3, :3] for camera in cameras])
+    positions, axes = camera_positions(cameras), np.stack([camera.camera_to_world[:3, :3] for camera in cameras])
     rotations = Rotation.from_matrix(axes)
     size = max(float(np.ptp(positions, axis=0).max()), 1e-9)
     moves = np.linalg.norm(np.diff(positions, axis=0), axis=1) / size
@@ -212,28 +157,6 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
     return [moved(cameras[0], pose) for pose in poses]
 
 
-def facts_of_cameras(entries: Sequence[Any]) -> dict[str, Any]:
-    """Return what a page needs to fly through a scene, as plain values.
-
-    `up` and `focus` are [3] (focus may be None), `size` is the extent of the camera positions, `views` lists name,
-    split and camera, and `first` is the index of the view in the middle.
-    """
-    cameras = [entry.camera for entry in entries]
-    focus, up, size = None, np.array([0.0, -1.0, 0.0]), 0.0
-    if cameras:
-        focus, size = common_focus(cameras), float(np.linalg.norm(np.ptp(_positions(cameras), axis=0)))
-        up = up_direction(cameras)
-    return {
-        "up": up.tolist(),
-        "focus": None if focus is None else focus.tolist(),
-        "size": size or 1.0,
-        "first": middle_index(cameras) if cameras else 0,
-        "views": [
-            {"name": e.name, "split": e.split, "time": e.exposure_time, "camera": e.camera.to_dict()} for e in entries
-        ],
-    }
-
-
 def _check(cameras: Sequence[Camera], count: int) -> None:
     if not cameras:
         problem = "there are no training views, and a camera path follows theirs"
@@ -241,15 +164,6 @@ def _check(cameras: Sequence[Camera], count: int) -> None:
         raise SehdrError(f"{problem}; {remedy}")
     if not 1 <= count <= _LONGEST:
         raise SehdrError(f"a camera path cannot have {count} views; ask for a count of 1 to {_LONGEST}")
-
-
-def _positions(cameras: Sequence[Camera]) -> np.ndarray:
-    return np.stack([camera.position for camera in cameras])
-
-
-def _axes(cameras: Sequence[Camera], axis: int) -> np.ndarray:
-    """Return the cameras' x, y or z axes [n, 3] in world coordinates."""
-    return np.stack([camera.world_to_camera[axis, :3] for camera in cameras])
 
 
 def _unit(vector: np.ndarray, *, fallback: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ from ...splats import (
 )
 from ...subsets import every_nth, first_names
 from ..brackets import remove_earlier
-from ..cameras.paths import training_cameras
+from ..cameras.scene_cameras import camera_positions, training_cameras
 from ..images.tonemap import display_gain
 from ..world_transform import WorldTransform, file_transform, is_y_down, stored_matrix, world_transform
 from .splat_edits import SplatEdits, most_visible, without_strays
@@ -170,7 +170,7 @@ def _gaussians_in_colors(run: "RenderableScene", color_model: str, display_time:
     Display colors are those of a photo of `display_time` seconds.
     """
     photos = training_cameras(run)
-    positions = np.array([camera.position for camera in photos]).reshape(-1, 3)
+    positions = camera_positions(photos)
     if color_model != "display":
         return gaussians_of(run.field, color_model, positions, color_matrix=run.color_matrix)
     if run.field.color_model.name == "display" and display_time == run.base_time and run.color_matrix is None:

@@ -20,7 +20,7 @@ from ...progress import track_progress
 from ...scene import Camera
 from ...splats.usd import pxr, writing_usd
 from ...subsets import evenly
-from ..cameras.paths import training_cameras
+from ..cameras.scene_cameras import training_cameras
 from ..images.tonemap import encode_srgb
 from ..world_transform import WorldTransform, scene_up, world_transform
 from .depth_fusion import (

@@ -12,7 +12,7 @@ from ...model.visibility import contributions, count_views, mask_shares
 from ...scene import Camera, View
 from ...scene.wide_camera import painted_mask
 from ...splats import GaussianArrays
-from ..cameras.paths import common_focus, training_cameras
+from ..cameras.scene_cameras import camera_positions, common_focus, training_cameras
 
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene
@@ -195,7 +195,7 @@ def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> Gaus
     """
     if not cameras:
         return gaussians
-    positions = np.stack([camera.position for camera in cameras])
+    positions = camera_positions(cameras)
     center = np.median(positions, axis=0)
     reach = float(np.percentile(np.linalg.norm(positions - center, axis=1), 90))
     focus = common_focus(cameras)

@@ -13,7 +13,7 @@ from ...errors import SehdrError, refuse_paths
 from ...files import check_absent
 from ...scene import Camera
 from ...scene.wide_camera import typical_focal_length
-from ..cameras.paths import training_cameras
+from ..cameras.scene_cameras import training_cameras
 from ..images.colorspace import color_space, from_rec709
 from ..images.exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr, write_radiance
 from ..images.ldr_files import as_array

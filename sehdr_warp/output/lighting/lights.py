@@ -14,7 +14,7 @@ from ...files import atomic_path, check_absent
 from ...model.lights import light_name
 from ...scene.wide_camera import typical_focal_length
 from ...subsets import first_names
-from ..cameras.paths import training_cameras
+from ..cameras.scene_cameras import training_cameras
 from ..images.exr import rgb_channels, write_exr
 from ..images.ldr_files import as_array
 from ..images.tonemap import exposure_of_white

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...errors import SehdrError
 from ...scene import Camera
-from ..cameras.paths import camera_named, common_focus
+from ..cameras.scene_cameras import camera_named, common_focus
 from ..world_transform import WorldTransform
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import InputError, SehdrError
 from ...files import read_json, write_json
 from ...runs.values import LIGHT_UNIT_FILE
-from ..cameras.paths import camera_named
+from ..cameras.scene_cameras import camera_named
 from ..images.ldr_files import as_array
 from ..images.tonemap import LUMINANCE
 
