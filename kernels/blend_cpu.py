@@ -163,8 +163,8 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
             conic_cutoff = conics_cutoffs[i]
             x = xy_opacity[0] - real(x0) - real(0.5)
             y = xy_opacity[1] - real(y0) - real(0.5)
-            top = wp.max(int(wp.ceil(y - xy_opacity[3])), 0)
-            bottom = wp.min(int(wp.floor(y + xy_opacity[3])) + 1, size)
+            top = int(wp.max(wp.ceil(y - xy_opacity[3]), real(0.0)))
+            bottom = int(wp.min(wp.floor(y + xy_opacity[3]), real(wp.static(size - 1)))) + 1
             reached = halves(x, conic_cutoff)
             for half in range(reached[0], reached[1]):
                 dx = broadcast(x - real(half * lanes)) - offsets
@@ -275,8 +275,8 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
             conic_cutoff = conics_cutoffs[i]
             x = xy_opacity[0] - real(x0) - real(0.5)
             y = xy_opacity[1] - real(y0) - real(0.5)
-            top = wp.max(int(wp.ceil(y - xy_opacity[3])), 0)
-            bottom = wp.min(int(wp.floor(y + xy_opacity[3])) + 1, size)
+            top = int(wp.max(wp.ceil(y - xy_opacity[3]), real(0.0)))
+            bottom = int(wp.min(wp.floor(y + xy_opacity[3]), real(wp.static(size - 1)))) + 1
             order = broadcast(real(k - bounds[0]) + real(0.5))
             target = emit_indices[k]
             for column in range(wp.static(channels + 6)):

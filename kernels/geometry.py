@@ -44,7 +44,7 @@ def geometry(dtype) -> SimpleNamespace:
 
     @wp.func
     def rotation_from_quaternion(quaternion: vec4) -> mat33:
-        """Rotation matrix of a quaternion (w, x, y, z) of any length; zero gives the identity."""
+        """Rotation matrix of a quaternion (w, x, y, z) of any length; zero gives the identity, with gradient 0."""
         largest = wp.max(
             wp.max(wp.abs(quaternion[0]), wp.abs(quaternion[1])), wp.max(wp.abs(quaternion[2]), wp.abs(quaternion[3]))
         )
@@ -54,7 +54,7 @@ def geometry(dtype) -> SimpleNamespace:
         q = quaternion * rescale
         length_squared = wp.dot(q, q)
         is_zero = length_squared < real(1.0e-30)
-        inverse_length = real(1.0) / wp.sqrt(wp.where(is_zero, real(1.0), length_squared))
+        inverse_length = wp.where(is_zero, real(0.0), real(1.0) / wp.sqrt(wp.where(is_zero, real(1.0), length_squared)))
         w = wp.where(is_zero, real(1.0), q[0] * inverse_length)
         x = q[1] * inverse_length
         y = q[2] * inverse_length

@@ -37,9 +37,10 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
     @wp.func
     def tile_span(center: real, extent: real, tiles: int) -> wp.vec2i:
-        first = wp.clamp(int(wp.floor((center - extent) / real(size))), 0, tiles)
-        last = wp.clamp(int(wp.floor((center + extent) / real(size))) + 1, 0, tiles)
-        return wp.vec2i(first, last)
+        # Clamped before they are integers, which hold no extent of 2^31 tiles.
+        first = wp.clamp(wp.floor((center - extent) / real(size)), real(0.0), real(tiles))
+        last = wp.clamp(wp.floor((center + extent) / real(size)) + real(1.0), real(0.0), real(tiles))
+        return wp.vec2i(int(first), int(last))
 
     @wp.func
     def tile_is_touched(xy_opacity: vec4, conic_cutoff: vec4, column: int, row: int) -> bool:

@@ -142,7 +142,10 @@ def blend_on_cpu(
 ) -> "TileBackward":
     """Fill image [H, W, C] and transmittance [H, W] by tiles; sums have a fixed order, deterministic or not."""
     assert lists.emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
-    tiles, channels = _Tiles(features, lists, packed, alpha_threshold, balanced_ranges(lists)), image.shape[2]
+    highest = float(packed.means_opacities[:, 2].max()) if len(features) else 0.0
+    squarings = exp_squarings(alpha_threshold / max(highest, 1.0))
+    tiles = _Tiles(features, lists, packed, alpha_threshold, squarings, balanced_ranges(lists))
+    channels = image.shape[2]
     tile_transmittance, last_contributor = tiles.scratch(ROWS_OF_TILE), tiles.scratch(ROWS_OF_TILE)
     inputs = lists.tile_ranges, lists.gaussians, *tiles.shared_arguments()
     outputs = last_contributor, image.view(-1, channels), transmittance
@@ -160,6 +163,7 @@ class _Tiles:
         lists: to blend.
         packed: Gaussians to blend.
         alpha_threshold: contributions with a smaller alpha are left out.
+        squarings: see exp_squarings().
         ranges: of tiles, see balanced_ranges().
     """
 
@@ -167,12 +171,12 @@ class _Tiles:
     lists: TileLists
     packed: PackedSplats
     alpha_threshold: float
+    squarings: int
     ranges: Tensor
 
     def launch(self, kernel_of: Callable[..., Any], *arguments: Any) -> None:
         """Launch a kernel over the tiles; kernel_of makes it for a scalar type and a number of channels."""
-        squarings = exp_squarings(self.alpha_threshold)
-        kernel = kernel_of(warp_scalar(self.features.dtype), self.features.shape[1], squarings)
+        kernel = kernel_of(warp_scalar(self.features.dtype), self.features.shape[1], self.squarings)
         launch(kernel, self.lists.grid.tiles, *arguments, ranges=self.ranges)
 
     def scratch(self, *shape: int) -> Tensor:
@@ -221,9 +225,9 @@ class TileBackward:
         return emit_order.sum_by_gaussian(grad_intersections)
 
 
-def exp_squarings(alpha_threshold: float) -> int:
-    """Return how often the CPU's polynomial exponential is squared to reach down to log(alpha_threshold)."""
-    return max(1, math.ceil(math.log2(-math.log(alpha_threshold) / 0.7)))
+def exp_squarings(smallest: float) -> int:
+    """Return how often the CPU's polynomial exponential is squared to reach down to log(smallest)."""
+    return max(1, math.ceil(math.log2(-math.log(smallest) / 0.7)))
 
 
 def balanced_ranges(lists: TileLists) -> Tensor:

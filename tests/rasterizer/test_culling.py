@@ -69,6 +69,15 @@ def test_a_gaussian_that_is_not_finite_is_gone(place, value, dtype, device):
     assert_gone(draw, scene(device, dtype), cameras(device, dtype), place, value)
 
 
+def test_a_quaternion_of_zeros_turns_nothing_and_has_no_gradient(device):
+    gaussians, shared = scene(device, torch.float32), cameras(device, torch.float32)
+    gaussians[2][3] = 0.0
+    image, grads = gradients(lambda *tensors: rasterize(*tensors, WIDTH, HEIGHT).image, [*gaussians, *shared])
+    assert not grads[2][3].any() and grads[2].any()
+    gaussians[2][3] = torch.tensor([1.0, 0, 0, 0])
+    assert torch.equal(rasterize(*gaussians, *shared, WIDTH, HEIGHT).image, image)
+
+
 @pytest.mark.parametrize("place, value", BAD[:-1])
 def test_nor_is_it_seen_in_a_panorama(place, value, device):
     grid = torch.meshgrid(torch.linspace(-0.5, 0.5, 24), torch.linspace(-0.4, 0.4, 20), indexing="xy")

@@ -263,6 +263,6 @@ def fully_fused_projection(
             for projected, view in zip(projections, views, strict=True)
         ]
     splats = JoinedSplats.of(projections, packed, viewmats.shape[:-2])
-    means2d, conics, depths, compensations, extents = splats.all
-    values = extents.ceil().int(), means2d, depths, conics, compensations if calc_compensations else None
+    means2d, conics, depths, compensations, _ = splats.all
+    values = splats.radii, means2d, depths, conics, compensations if calc_compensations else None
     return (*splats.ids(viewmats.shape[-3]), *values) if packed else values

@@ -46,6 +46,11 @@ class JoinedSplats(NamedTuple):
         rows = [slice(*ends) for ends in pairwise(accumulate(counts, initial=0))]
         return JoinedSplats(joined, view_ids, torch.cat(visible), rows)
 
+    @property
+    def radii(self) -> Tensor:
+        """Return half-extents in whole pixels, int32; those above 2^30 as 2^30."""
+        return self.all.extents.ceil().clamp_max(1 << 30).int()
+
     def ids(self, cameras: int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
         """Return batch_ids, camera_ids and gaussian_ids, [nnz] each; None unless packed."""
         if self.view_ids is None:
@@ -105,7 +110,7 @@ def make_meta(splats: JoinedSplats, shape: tuple[int, ...], size: tuple[int, int
     cameras, images = shape[-1], math.prod(shape)
     tile_width, tile_height = -(-width // tile_size), -(-height // tile_size)
     batch_ids, camera_ids, gaussian_ids = splats.ids(cameras)
-    radii = splats.all.extents.ceil().int()
+    radii = splats.radii
 
     def compute_intersections() -> None:
         means2d, depths = splats.by_view(splats.all.means2d), splats.by_view(splats.all.depths)

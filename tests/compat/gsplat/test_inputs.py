@@ -130,3 +130,15 @@ def test_sizes_of_nothing_and_opacities_beyond_one_are_gsplats(device):
     with torch.no_grad():
         leaves[2][1] = -leaves[2][1]
     torch.testing.assert_close(rasterization(*leaves, **place._asdict())[0], colors)
+    truth, _, _ = rasterization(*(leaf.double() for leaf in leaves), *(each.double() for each in place[:2]), *place[2:])
+    torch.testing.assert_close(colors.double(), truth, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_radius_of_more_pixels_than_int32_holds_is_visible(dtype, device):
+    mean, quat = torch.tensor([[0.0, 0, 1]], dtype=dtype), torch.tensor([[1.0, 0, 0, 0]], dtype=dtype)
+    size, half = torch.full((1, 3), 2e7, dtype=dtype), torch.full((1,), 0.5, dtype=dtype)
+    pose, lens = torch.eye(4, dtype=dtype)[None], torch.diag(torch.tensor([50.0, 50, 1], dtype=dtype))[None]
+    inputs = [tensor.to(device) for tensor in (mean, quat, size, half, torch.ones(1, 1, dtype=dtype), pose, lens)]
+    colors, _, info = rasterization(*inputs, 32, 32, packed=False)
+    assert float((colors - 0.5).abs().max()) < 1e-6 and bool((info["radii"] == 1 << 30).all())
