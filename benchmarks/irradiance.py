@@ -63,8 +63,8 @@ def read_light_maps(folder: Path) -> list[LightMap]:
 
 
 @torch.no_grad()
-def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Camera], scale: float = 1.0) -> dict:
-    """Return relative errors of irradiance over all directions of all places.
+def irradiance_error(run: Any, maps: Sequence[LightMap], cameras: Sequence[Camera], scale: float = 1.0) -> float | None:
+    """Return the median relative error of irradiance over all directions of all places.
 
     Light is the mean over channels, and only that which photos show: render and truth are multiplied by `coverage`.
     Surfaces that face too little of it do not count.
@@ -76,17 +76,11 @@ def irradiance_errors(run: Any, maps: Sequence[LightMap], cameras: Sequence[Came
         scale: from the run's radiance to the truth's.
 
     Returns:
-        {"median", "percentile_90", "places": the median of each place, "directions": how many count}. Figures are None
-        without maps or directions that count.
+        The error; None without maps or directions that count.
     """
     focal = typical_focal(cameras)
-    per_map = [_errors(run, each, focal, scale) for each in maps]
-    errors = np.concatenate([*per_map, np.zeros(0)])
-    summary = {"median": None, "percentile_90": None, "places": [], "directions": len(errors)}
-    if len(errors):
-        summary |= {"median": float(np.median(errors)), "percentile_90": float(np.percentile(errors, 90))}
-        summary["places"] = [float(np.median(each)) if len(each) else None for each in per_map]
-    return summary
+    errors = np.concatenate([*(_errors(run, each, focal, scale) for each in maps), np.zeros(0)])
+    return float(np.median(errors)) if len(errors) else None
 
 
 @torch.no_grad()

@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from filelock import FileLock, Timeout
 
-from benchmarks.irradiance import LIGHT, irradiance_errors, read_light_maps, store_light
+from benchmarks.irradiance import LIGHT, irradiance_error, read_light_maps, store_light
 from sehdr_warp.blocks.jobs import local_executors, slurm_executor, visible_gpus
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.evaluation.evaluate import evaluate
@@ -36,7 +36,7 @@ from sehdr_warp.training.train import train
 from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
-FORMAT = 7  # Of a job and of its result; others are run again.
+FORMAT = 8  # Of a job and of its result; others are run again.
 RESULT, FAILURE = "result.json", "failure.json"
 EXPOSURES, FACTOR = 5, 4.0
 """A scene's ladder: so many exposures, each so many times longer than the last, around a well exposed one."""
@@ -236,7 +236,7 @@ def row_of(result: dict) -> dict:
         **{region.replace("-", "_"): regions[region]["psnr_mu"]["aligned"] for region in REGIONS},
         **{f"lights_{name}": figures["lights"][name] for name in ("count", "lost")},
         "light_energies": figures["lights"]["energies"],
-        "irradiance": figures["irradiance"]["median"],
+        "irradiance": figures["irradiance"],
         "clipped_share": regions["clipped"]["fraction"],
         "confidence": figures["confidence"]["spearman_log2"],
         "chosen": figures["response"],
@@ -316,7 +316,7 @@ def run_job(job: Job, folder: Path, device: str, lpips: str | None) -> dict:
     figures.pop("views")
     light_inputs = read_light_maps(_folder(job.place)), [view.camera for view in scene.train_views]
     scale = figures["protocol"]["aligned"]["scale"] or 1.0
-    figures["irradiance"] = irradiance_errors(run, *light_inputs, scale)
+    figures["irradiance"] = irradiance_error(run, *light_inputs, scale)
     store_light(folder / LIGHT, run, *light_inputs, scale)
     figures |= {"response": run.response.name, "peak_memory_bytes": peak}
     figures["renders_per_second"] = _render_rate(run, scene)

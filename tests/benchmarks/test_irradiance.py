@@ -1,13 +1,14 @@
 """Irradiance by direction against maps of the truth."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from benchmarks.irradiance import NORMALS, irradiance_errors, read_light_maps
+from benchmarks.irradiance import irradiance_error, read_light_maps
 from sehdr_warp.errors import InputError
 from sehdr_warp.output.images.exr import rgb_channels, write_exr
 from sehdr_warp.output.lighting.environment_map import latlong
@@ -50,12 +51,12 @@ def folder(tmp_path):
 def test_irradiance_counts_light_that_photos_show(folder):
     maps = read_light_maps(folder)
     assert [(each.position.tolist(), each.radiance.shape) for each in maps] == [(PLACE.tolist(), (32, 64, 3))]
-    same = irradiance_errors(Stub(), maps, [CAMERA])
-    assert same["median"] < 1e-5 and same["percentile_90"] < 1e-5 and len(same["places"]) == 1
-    assert NORMALS / 2 < same["directions"] < NORMALS, "surfaces that face away do not count"
-    assert irradiance_errors(Stub(behind=100.0), maps, [CAMERA])["median"] < 1e-5
-    assert irradiance_errors(Stub(1.3), maps, [CAMERA])["median"] == pytest.approx(0.3, abs=1e-4)
-    assert irradiance_errors(Stub(1.3), maps, [CAMERA], scale=1 / 1.3)["median"] < 1e-4
+    assert irradiance_error(Stub(), maps, [CAMERA]) < 1e-5
+    assert irradiance_error(Stub(behind=100.0), maps, [CAMERA]) < 1e-5
+    assert irradiance_error(Stub(1.3), maps, [CAMERA]) == pytest.approx(0.3, abs=1e-4)
+    assert irradiance_error(Stub(1.3), maps, [CAMERA], scale=1 / 1.3) < 1e-4
+    narrow = replace(maps[0], coverage=1.0 * (latlong(64)[..., 2] > 0.99))
+    assert irradiance_error(Stub(), [narrow], [CAMERA]) is None, "photos show too little of every hemisphere"
 
 
 def test_a_lamp_that_is_missing_shows_on_surfaces_that_face_it(folder):
@@ -63,13 +64,12 @@ def test_a_lamp_that_is_missing_shows_on_surfaces_that_face_it(folder):
     missing.render_directions = lambda position, directions, **_: SimpleNamespace(
         hdr=torch.tensor(np.minimum(light(directions), 1.0))
     )
-    figures = irradiance_errors(missing, read_light_maps(folder), [CAMERA])
-    assert 0.5 < figures["percentile_90"] < 1.0
+    assert 0.2 < irradiance_error(missing, read_light_maps(folder), [CAMERA]) < 1.0
 
 
 def test_sets_without_maps_have_no_figure_and_damage_is_named(folder, tmp_path):
     assert read_light_maps(tmp_path / "elsewhere") == []
-    assert irradiance_errors(Stub(), [], [])["median"] is None
+    assert irradiance_error(Stub(), [], []) is None
     write_exr(folder / "light" / "place_1.exr", {"R": np.ones((4, 8))}, header={})
     with pytest.raises(InputError, match="place_1.exr: is no lat-long map"):
         read_light_maps(folder)

@@ -37,7 +37,7 @@ def made_up(job: Job, psnr: float = 30.0) -> dict:
             name: {"fraction": 0.3, "psnr_mu": {"aligned": psnr - 3}} for name in ("clipped", "well-exposed", "dark")
         },
         "lights": {"count": 7, "lost": 0, "energies": [0.8, 1.1]},
-        "irradiance": {"median": None},
+        "irradiance": None,
         "confidence": {"spearman_log2": 0.6},
         "response": "srgb",
         **dict.fromkeys(("train_seconds", "renders_per_second"), 2.0),
