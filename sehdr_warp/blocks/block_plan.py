@@ -46,17 +46,28 @@ MOST_MATCHED = 400  # Photos that are matched for that
 _THREE = Field(min_length=3, max_length=3)
 
 
-class BlockValues(BaseModel):
-    """A block in blocks.json."""
+class Block(BaseModel):
+    """A block, as blocks.json holds it."""
 
-    model_config = ConfigDict(strict=True, allow_inf_nan=True)
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=True)
     name: Annotated[str, Field(pattern=r"^block_[0-9]{1,9}$")]
-    """A folder's name, which must not lead to another place."""
+    """Name of the folder of its run, below `blocks/`; it must not lead to another place."""
     views: list[str]
+    """Names of its views, training and held-out."""
     fraction: Annotated[float, Field(gt=0, le=1)]
+    """Pixels of its training photos, relative to those of all."""
     low: Annotated[list[float | None], _THREE]
+    """Lower bounds of its core, in the axes of the plan; None for an infinite one."""
     high: Annotated[list[float | None], _THREE]
+    """Upper bounds of its core."""
     margin: Annotated[list[FiniteFloat], _THREE]
+    """Enlargement of the core."""
+
+    @property
+    def cell(self) -> Cell:
+        """Its core."""
+        bounds = (self.low, -np.inf), (self.high, np.inf)
+        return Cell(*(np.array([end if bound is None else bound for bound in face]) for face, end in bounds))
 
 
 class BlockPlanValues(BaseModel):
@@ -74,18 +85,7 @@ class BlockPlanValues(BaseModel):
     photo_bytes: dict[str, Annotated[int, Field(ge=0)]] = {}
     config: dict[str, Any]
     axes: Annotated[list[Annotated[list[FiniteFloat], _THREE]], _THREE]
-    blocks: Annotated[list[BlockValues], Field(min_length=1)]
-
-
-@dataclass(frozen=True)
-class Block:
-    """A block."""
-
-    name: str  # Folder of its run, below `blocks/`
-    views: tuple[str, ...]  # Names of its views, training and held-out
-    fraction: float  # Pixels of its training photos, relative to those of all
-    cell: Cell  # Its core, in the axes of the plan
-    margin: np.ndarray  # [3] enlargement of the core
+    blocks: Annotated[list[Block], Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class BlockPlan:
     @property
     def division(self) -> Division:
         """The division of space, without the photos."""
-        margins = np.stack([block.margin for block in self.blocks])
+        margins = np.array([block.margin for block in self.blocks])
         return Division(self.axes, tuple(block.cell for block in self.blocks), margins, ())
 
     def config_of(self, block: Block) -> Config:
@@ -143,7 +143,7 @@ class BlockPlan:
             "photo_bytes": dict(self.photo_bytes),
             "config": self.config.model_dump(),
             "axes": self.axes.tolist(),
-            "blocks": [_block_values(block) for block in self.blocks],
+            "blocks": [block.model_dump() for block in self.blocks],
         }
         write_json(folder / FILE, values, internal=True)
 
@@ -154,9 +154,8 @@ class BlockPlan:
         refuse_links(path, folder)
         values, remedy = read_json(path, 256 << 20), "train again, with --overwrite"
         try:
-            _check_blocks(BlockPlanValues.model_validate(values))
+            blocks = _check_blocks(BlockPlanValues.model_validate(values))
             response = Response.from_dict(values["response"])
-            blocks = tuple(_block_from(each) for each in values["blocks"])
         except ValidationError as error:
             raise InputError(path, field_and_problem(error)[1], remedy) from None
         except (SehdrError, ValueError) as error:
@@ -306,28 +305,25 @@ def _blocks(scene: Scene, division: Division, points: np.ndarray) -> tuple[Block
         weights = np.bincount(owner, weights_of(view.camera, points), len(division.cells))
         names[int(weights.argmax())].append(view.name)
     digits = max(2, len(str(len(names))))
+    faces = [
+        [[float(bound) if np.isfinite(bound) else None for bound in face] for face in (cell.low, cell.high)]
+        for cell in division.cells
+    ]
     return tuple(
         Block(
-            f"block_{index + 1:0{digits}d}",
-            tuple(sorted(each)),
-            float(sizes[own].sum() / sizes.sum()),
-            division.cells[index],
-            division.margins[index],
+            name=f"block_{index + 1:0{digits}d}",
+            views=sorted(names[index]),
+            fraction=float(sizes[own].sum() / sizes.sum()),
+            low=faces[index][0],
+            high=faces[index][1],
+            margin=division.margins[index].tolist(),
         )
-        for index, (each, own) in enumerate(zip(names, division.photos, strict=True))
+        for index, own in enumerate(division.photos)
     )
 
 
-def _block_values(block: Block) -> dict[str, Any]:
-    """Return plain values of a block; an infinite bound is None."""
-    faces = block.cell.low, block.cell.high
-    low, high = ([float(bound) if np.isfinite(bound) else None for bound in face] for face in faces)
-    values = {"name": block.name, "views": list(block.views), "fraction": block.fraction, "low": low, "high": high}
-    return values | {"margin": block.margin.tolist()}
-
-
-def _check_blocks(plan: BlockPlanValues) -> None:
-    """Raise ValueError for too many blocks, two of one name, or a view without an exposure time."""
+def _check_blocks(plan: BlockPlanValues) -> tuple[Block, ...]:
+    """Return the blocks; raise ValueError for too many, two of one name, no box, or a view without exposure time."""
     if len(plan.blocks) > MOST_BLOCKS:
         raise ValueError(f"blocks has {len(plan.blocks)} entries, and at most {MOST_BLOCKS} can be")
     names = [block.name for block in plan.blocks]
@@ -335,15 +331,6 @@ def _check_blocks(plan: BlockPlanValues) -> None:
         raise ValueError("two blocks have the same name")
     if unknown := {view for block in plan.blocks for view in block.views} - plan.exposure_times.keys():
         raise ValueError(f"exposure_times lacks {min(unknown):.80}")
-
-
-def _block_from(values: dict[str, Any]) -> Block:
-    """Return the block that _block_values() described."""
-    low, high = (
-        np.array([end if bound is None else bound for bound in values[name]], np.float64)
-        for name, end in (("low", -np.inf), ("high", np.inf))
-    )
-    if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
-        raise ValueError(f"the core of {values['name']:.60} is not a box")
-    margin = np.array(values["margin"], np.float64)
-    return Block(values["name"], tuple(values["views"]), values["fraction"], Cell(low, high), margin)
+    if wrong := [block.name for block in plan.blocks if not (block.cell.low < block.cell.high).all()]:
+        raise ValueError(f"the core of {wrong[0]} is not a box")
+    return tuple(plan.blocks)

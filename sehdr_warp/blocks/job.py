@@ -85,11 +85,9 @@ def _train(
         return
     if (own := installed_versions()) != versions:
         raise SehdrError(f"it has {own}, and the command was started with {versions}; install the same on both")
-    data = plan.data | {"views": list(block.views)}
-    config = plan.config_of(block)
-    response = response_for_loading(config, plan.response)
-    scene = shared_scene(plan, index, load_scene_and_log_notes(data, response=response, photo_storage=photo_storage))
+    scene = load_block_scene(plan, index, photo_storage)
     plan.check_photos(scene.views)
+    data, config = plan.data | {"views": block.views}, plan.config_of(block)
     trainer = create_trainer(scene, folder, config, device=device, resume=True, data=data, shared=plan.shared)
     for _ in trainer:
         if is_over.is_set():
@@ -98,9 +96,11 @@ def _train(
         raise StoppedTraining(f"stopped at iteration {trainer.iteration} of {trainer.total}")
 
 
-def shared_scene(plan: BlockPlan, index: int, scene: Scene) -> Scene:
-    """Return the scene of a block with the response and exposure times of the plan, and the points that it shows."""
-    if missing := [name for name in plan.blocks[index].views if name not in {view.name for view in scene.views}]:
+def load_block_scene(plan: BlockPlan, index: int, photo_storage: str) -> Scene:
+    """Load the photos of a block, with the response and exposure times of the plan, and the points that they show."""
+    names, response = plan.blocks[index].views, response_for_loading(plan.config, plan.response)
+    scene = load_scene_and_log_notes(plan.data | {"views": names}, response=response, photo_storage=photo_storage)
+    if missing := [name for name in names if name not in {view.name for view in scene.views}]:
         raise SehdrError(f"{plan.scene}: {missing[0]} of {plan.blocks[index].name} cannot be read any more")
     options = plan.config.response
     chosen_by = scene.chosen_by if scene.light_known else (options.method, tuple(map(str, options.candidates)))

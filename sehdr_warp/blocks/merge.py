@@ -92,7 +92,7 @@ def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage
     folder = RunWriter(out)
     folder.lock()
     try:
-        folder.begin_described(description, info, config, None, state)
+        folder.replace_run(description, info, config, None, state)
         summary = _summary(blocks, iterations, seconds, len(tensors["means"]))
         folder.write_summary(summary | {"borders_refined": refines})
         assert folder.checkpoint_hash is not None

@@ -18,14 +18,13 @@ from torch import Tensor
 from ..model.gaussians import Gaussians
 from ..model.paged_field import boxes_in_view
 from ..runs.config_files import override_config
-from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.run import assemble_field
 from ..runs.run_folder import RunFolder
 from ..scene import Camera, Scene
 from ..training.initialization import response_for_training
 from ..training.trainer import Trainer
 from .block_plan import BlockPlan
-from .job import folder_of, shared_scene
+from .job import folder_of, load_block_scene
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +46,7 @@ def refine_borders(
     places = plan.normalization.scene_points(tensors["means"].numpy())
     distance = torch.from_numpy(plan.division.border_distance(places))
     for index, block in enumerate(plan.blocks):
-        near = (blocks == index) & (distance < BAND * float(block.margin.max()))
+        near = (blocks == index) & (distance < BAND * max(block.margin))
         scene = None if not near.any() else _border_photos(plan, index, places[near.numpy()], photo_storage)
         if scene is None:
             continue
@@ -63,9 +62,7 @@ def refine_borders(
 
 def _border_photos(plan: BlockPlan, index: int, points: np.ndarray, photo_storage: str) -> Scene | None:
     """Return the block's scene with the training photos that show points [M, 3] near its borders; None for none."""
-    data = plan.data | {"views": list(plan.blocks[index].views)}
-    response = response_for_loading(plan.config_of(plan.blocks[index]), plan.response)
-    scene = shared_scene(plan, index, load_scene_and_log_notes(data, response=response, photo_storage=photo_storage))
+    scene = load_block_scene(plan, index, photo_storage)
     views = tuple(
         view
         for view in scene.train_views  # Occlusion is ignored.

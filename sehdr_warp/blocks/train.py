@@ -105,15 +105,9 @@ def train_in_blocks(
 
 def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
     """Return whether the folder holds a training in blocks to continue; raise InputError if it cannot be used."""
-    if out.exists() and not out.is_dir():
-        raise InputError(out, "is a file", "choose another folder for the run")
-    if not out.exists() or not any(out.iterdir()):
-        return False
     for name in (FOLDER, FILE):
         refuse_links(out / name, out)
-    if is_in_blocks(out):
-        if not (resume or overwrite):
-            raise InputError(out, "exists and is not empty", "choose another, or use --resume or --overwrite")
+    if is_in_blocks(out) and (resume or overwrite):
         return resume
     RunWriter(out).prepare(resume=False, overwrite=overwrite)
     return False

@@ -153,9 +153,9 @@ class RunWriter(RunFolder):
         if compensation is not None:
             info["exposure_compensation"] = compensation.to_dict()
         info["up"] = find_up(scene).to_dict()
-        self.begin_described(describe_scene(scene), info, config, plan, state)
+        self.replace_run(describe_scene(scene), info, config, plan, state)
 
-    def begin_described(
+    def replace_run(
         self, scene: dict, info: dict, config: Config, plan: dict | None, state: tuple[dict[str, Tensor], dict]
     ) -> None:
         """Write the files of a new run in the locked folder, in place of those of an earlier one.

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from sehdr_warp.blocks.block_plan import FILE, MOST_BLOCKS, Block, BlockPlan
-from sehdr_warp.blocks.division import Cell
 from sehdr_warp.blocks.train import train_in_blocks
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
@@ -23,8 +22,11 @@ DATA = {"path": "photos"}
 def plan(tmp_path):
     """Two halves of space with a photo each, in tmp_path/run."""
     (tmp_path / "run").mkdir()
-    halves = Cell(np.full(3, -np.inf), np.full(3, np.inf)).halves(0, 0.0)
-    blocks = [Block(f"block_{n}", (f"photo_{n}",), 0.5, half, np.ones(3)) for n, half in enumerate(halves)]
+    halves = ([None] * 3, [0.0, None, None]), ([0.0, None, None], [None] * 3)
+    blocks = [
+        Block(name=f"block_{n}", views=[f"photo_{n}"], fraction=0.5, low=low, high=high, margin=[1.0] * 3)
+        for n, (low, high) in enumerate(halves)
+    ]
     shared, place = SharedDecisions(0.5, None), Normalization(np.zeros(3), 1.0)
     times = {"photo_0": 0.5, "photo_1": 0.25}
     response = response_by_name("srgb")
