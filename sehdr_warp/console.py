@@ -10,8 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from .errors import visible
 from .progress import LINE_INTERVAL, Stage, display_stages, format_seconds
@@ -24,20 +23,6 @@ MEAN_OF = 20
 """Readings of loss and PSNR that their running mean is over: each is of one photo, and photos differ by decibels."""
 MAX_READING_SHARE = 1 / 20
 """Part of the time that reading figures for updates may take."""
-
-
-class Progress(NamedTuple):
-    """A training's progress, as it is shown."""
-
-    iteration: int
-    rate: float
-    """Iterations a second."""
-    seconds_left: float | None
-    loss: float
-    """Running mean of the loss."""
-    psnr: float
-    """Running mean of the PSNR of the photos trained on, dB."""
-    gaussians: int
 
 
 class _LogLines(logging.Handler):
@@ -76,7 +61,7 @@ def run_with_progress(steps: Iterable[Any], total: int) -> None:
     terminal = sys.stderr.isatty()
     read_interval, read_due, show_due, start = (BAR_INTERVAL if terminal else READ_INTERVAL), 0.0, 0.0, None
     losses, psnrs = deque[float](maxlen=MEAN_OF), deque[float](maxlen=MEAN_OF)
-    with _bar(total) if terminal else nullcontext(partial(_log_line, total)) as show:
+    with _bar(total) if terminal else nullcontext(_log_line) as show:
         for step in steps:
             now = time.monotonic()
             # The rate is counted from the first step on, because that one waits for the compilation of kernels.
@@ -88,16 +73,16 @@ def run_with_progress(steps: Iterable[Any], total: int) -> None:
             if terminal or now >= show_due or step.iteration >= total:
                 rate = (step.iteration - start[0]) / max(now - start[1], 1e-9)
                 loss, psnr = sum(losses) / len(losses), sum(psnrs) / len(psnrs)
-                show(Progress(step.iteration, rate, step.seconds_left, loss, psnr, step.gaussians))
+                show(step, rate=rate, loss=loss, psnr=psnr)
                 show_due = now + LINE_INTERVAL
             reading = time.monotonic() - now
             read_due = time.monotonic() + max(read_interval, min(reading / MAX_READING_SHARE, LINE_INTERVAL))
 
 
-def _log_line(total: int, progress: Progress) -> None:
-    figures = f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, {progress.gaussians} Gaussians"
+def _log_line(step: Any, *, rate: float, loss: float, psnr: float) -> None:
     log = logging.getLogger("sehdr_warp.training")
-    log.info("iteration %d/%d, %s, %s left", progress.iteration, total, figures, format_seconds(progress.seconds_left))
+    figures = f"loss {loss:.4f}, PSNR {psnr:.2f} dB, {step.gaussians} Gaussians"
+    log.info("iteration %d/%d, %s, %s left", step.iteration, step.total, figures, format_seconds(step.seconds_left))
 
 
 @contextmanager
@@ -158,23 +143,22 @@ def _new_bar(*parts: str, width: int | None) -> Any:
 
 
 @contextmanager
-def _bar(total: int) -> Iterator[Callable[[Progress], None]]:
-    """Show a bar, and yield the function that updates it."""
+def _bar(total: int) -> Iterator[Callable[..., None]]:
+    """Show a bar, and yield the function that updates it after a step: from it and running means of its figures."""
     # rich cuts columns on the right if the terminal is narrow, so the most important ones come first.
     parts = "{task.completed}/{task.total}", "{task.fields[rate]}", "{task.fields[left]} left", "{task.fields[figures]}"
     with _new_bar(*parts, width=None) as bar:
         console, task = bar.console, bar.add_task("train", total=total, rate="", left="-:--", figures="")
 
-        def show(progress: Progress) -> None:
-            loss, psnr, gaussians = progress.loss, progress.psnr, progress.gaussians
+        def show(step: Any, *, rate: float, loss: float, psnr: float) -> None:
+            gaussians = step.gaussians
             count = f"{gaussians / 1000:.1f}k" if gaussians >= 10_000 else str(gaussians)
             figures = f"loss {loss:.3f} {psnr:.1f} dB {count}" if console.width >= 75 else f"{psnr:.1f} dB {count}"
             if console.width >= 90:
                 figures = f"loss {loss:.4f}  PSNR {psnr:.2f} dB  {count} Gaussians"
-            rate = f"{progress.rate:.3g} it/s" if progress.rate else ""
-            left = format_seconds(progress.seconds_left)
-            bar.update(task, completed=progress.iteration, rate=rate, left=left, figures=figures)
-            if progress.iteration >= total:
+            speed, left = f"{rate:.3g} it/s" if rate else "", format_seconds(step.seconds_left)
+            bar.update(task, completed=step.iteration, rate=speed, left=left, figures=figures)
+            if step.iteration >= total:
                 bar.stop()  # The stages of the end have lines of their own.
 
         yield show

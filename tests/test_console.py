@@ -20,7 +20,7 @@ class Step(SimpleNamespace):
     """A step whose figures count how often they are read."""
 
     read = 0
-    loss, gaussians, seconds_left = 0.04321, 50_123, 63.0
+    loss, gaussians, seconds_left, total = 0.04321, 50_123, 63.0, 300
 
     @property
     def psnr(self):
