@@ -54,22 +54,23 @@ def light_estimates(
     if not any(some and bool(mask.any()) for some, mask in zip(has_estimate, masks, strict=True)):
         return None
     prior = load_prior(device) if config.light_prior else None
-    result, wide = [], None
+    result, face_prior = [], None
     for view, mask in zip(views, masks, strict=True):
-        seeing = prior
+        view_prior = prior
         if prior is not None and not view.camera.is_pinhole:
-            wide = wide if wide is not None and wide.fits(view.camera) else WidePrior(prior, view.camera)
-            seeing = wide
+            if face_prior is None or not face_prior.fits(view.camera):
+                face_prior = FacePrior(prior, view.camera)
+            view_prior = face_prior
         if not bool(mask.any()):
-            size = (seeing.size if isinstance(seeing, WidePrior) else coarse_size)(*mask.shape[:2])
+            size = (view_prior.size if isinstance(view_prior, FacePrior) else coarse_size)(*mask.shape[:2])
             nothing = torch.zeros(*size, 6, dtype=torch.float16)
             result.append(ClippedLight(nothing, nothing[..., 3:]))
             continue
         exposure = response.decode(torch.from_numpy(view.image).to(device)).float() / response.white
-        stated_light = view.light_above_white
-        stated_light = None if stated_light is None else torch.from_numpy(stated_light).to(device).float()
+        file_light = view.light_above_white
+        file_light = None if file_light is None else torch.from_numpy(file_light).to(device).float()
         deviation = view.light_above_white_deviation
-        light = combined_estimates(exposure, mask.to(device), seeing, stated_light, deviation)
+        light = combined_estimates(exposure, mask.to(device), view_prior, file_light, deviation)
         result.append(ClippedLight(_by_solid_angle(light.log_light.cpu(), view.camera), light.certainty.cpu()))
     return result
 
@@ -94,7 +95,7 @@ class _Face:
     weights: Tensor  # [h, w, 1] float32, 0 for pixels that the face does not show
 
 
-class WidePrior:
+class FacePrior:
     """The prior for the photos of one camera that is not a pinhole, by perspective faces that overlap."""
 
     def __init__(self, prior: LightPrior, camera: Camera):

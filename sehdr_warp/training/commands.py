@@ -104,62 +104,59 @@ class Train:
     training: TrainingOptions = TrainingOptions()
     output: OutputOptions = OutputOptions()
     machine: MachineOptions = MachineOptions()
-    # Name and text of each field of the config whose flag was used.
+    # Text of each config field whose flag was used: {table: {path: text}}, see configs.named_fields().
     fields: Annotated[configs.flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
 
 
 def run_train(args: Train, argv: Sequence[str]) -> None:
     """Train, or print the plan, and print what was written and what to do next.
 
-    `argv` are the words of the command line, with which --gpus starts a process for each GPU: a rank, see RankInfo.
+    `argv` are the words of the command line. With --gpus, a process for each GPU runs them again, and enters this
+    function with a rank, as under torchrun.
     """
-    _require_scene(args)
+    _check_options(args)
     from .launch import device_of_rank, launch, rank_from_environment
 
     gpus, device, rank_info = args.machine.gpus, args.machine.device, rank_from_environment()
-    if gpus < 1:
-        raise UsageError(f"--gpus {gpus} is not 1 or more")
-    _refuse_run(args)
-    if args.output.resume and args.output.overwrite:
-        raise UsageError("--resume continues the run in --out, --overwrite replaces it; leave one out")
-    if args.training.plan_only and args.output.resume:
-        raise UsageError("--plan-only plans a new training; leave --resume out")
-    if args.output.out is None and not args.training.plan_only:
-        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
-    if _is_for_blocks(args):
-        if rank_info is not None:
-            raise UsageError("--blocks starts its own processes; leave torchrun out")
-        if _train_blocks(args):
-            return
-        argv = _without_blocks(argv)
+    uses_blocks = _uses_blocks(args)
     if args.training.plan_only:
         if rank_info is None or rank_info.rank == 0:
             _print_plan(args)
-    elif rank_info is None and gpus == 1:
-        _train(args)
-    elif rank_info is None:
-        device_of_rank(gpus - 1, device)
-        launch(gpus, _run_as_rank, list(argv))
-    elif gpus not in (1, rank_info.local_count):
-        raise UsageError(f"--gpus {gpus}, but {rank_info.local_count} ranks were started; leave it out")
-    else:
-        from .following import follow_leader
+        return
+    if uses_blocks:
+        if rank_info is not None:
+            raise UsageError("--blocks starts its own processes; leave torchrun out")
+        run = _train_blocks(args)
+        if run is not None:
+            _print_result(args, run)
+            return
+        # One training does for these photos, as --blocks auto found. Its processes get the words without --blocks.
+        argv = [w for w, before in zip(argv, ["", *argv], strict=False) if "--blocks" not in (w.split("=")[0], before)]
+    if rank_info is not None:
+        if gpus not in (1, rank_info.local_count):
+            raise UsageError(f"--gpus {gpus}, but {rank_info.local_count} ranks were started; leave it out")
+        from .following import train_as_worker
         from .ranks import join_ranks
 
         with join_ranks(rank_info, device_of_rank(rank_info.local_rank, device)) as ranks:
-            if ranks.leads:
+            if ranks.is_main_process:
                 _train(args, ranks)
             else:
-                follow_leader(ranks, _path_of(args))
+                train_as_worker(ranks, _path_of(args))
+    elif gpus > 1:
+        device_of_rank(gpus - 1, device)  # Raises an error if there are fewer.
+        launch(gpus, _run_in_rank, list(argv))
+    else:
+        _train(args)
 
 
-def _run_as_rank(words: list[str]) -> None:
-    """Run the same command line, and with it run_train(), in the process of a rank."""
+def _run_in_rank(argv: list[str]) -> None:
+    """Run a command line in the process of a rank."""
     from ..cli import main
     from ..process import prepare
 
     prepare()
-    main(words)
+    main(argv)
 
 
 def _train(args: Train, ranks=None) -> None:
@@ -250,58 +247,43 @@ def _print_result(args: Train, run: "Run", advice: Sequence[str] = ()) -> None:
     print(json.dumps(summary) if args.output.json else "\n".join([_ending(run.path, summary), *advice]))
 
 
-def _is_for_blocks(args: Train) -> bool:
-    """Return whether a command line trains in blocks, which --resume continues without --blocks too.
-
-    Raises UsageError or InputError for options that do not fit.
-    """
+def _uses_blocks(args: Train) -> bool:
+    """Return whether a command line trains in blocks; --resume continues such a training without --blocks too."""
     from ..blocks.block_plan import MOST_BLOCKS
     from ..blocks.train import is_in_blocks
 
-    options, output = args.training, args.output
-    if options.blocks is not None:
-        digits = options.blocks.isdecimal() and len(options.blocks) <= len(str(MOST_BLOCKS))
-        if options.blocks != "auto" and not (digits and 2 <= int(options.blocks) <= MOST_BLOCKS):
-            raise UsageError(f"--blocks {options.blocks:.60} is neither auto nor a number from 2 to {MOST_BLOCKS}")
-        if output.view or output.tensorboard:
-            raise UsageError("--view and --tensorboard are without effect with --blocks; view the run when it is done")
-        return not options.plan_only
-    if output.out is None or not is_in_blocks(output.out) or options.plan_only:
-        if args.machine.slurm is not None:
-            raise UsageError("--slurm needs --blocks")
-        return False
-    if output.overwrite:
-        raise InputError(output.out, "holds a training in blocks", "choose another folder, or add --blocks")
-    return output.resume
+    blocks, output = args.training.blocks, args.output
+    if blocks is not None:
+        digits = blocks.isdecimal() and len(blocks) <= len(str(MOST_BLOCKS))
+        if blocks != "auto" and not (digits and 2 <= int(blocks) <= MOST_BLOCKS):
+            raise UsageError(f"--blocks {blocks:.60} is neither auto nor a number from 2 to {MOST_BLOCKS}")
+        return True
+    if output.out is not None and is_in_blocks(output.out) and not args.training.plan_only:
+        if output.overwrite:
+            raise InputError(output.out, "holds a training in blocks", "choose another folder, or add --blocks")
+        return output.resume
+    if args.machine.slurm is not None:
+        raise UsageError("--slurm needs --blocks")
+    return False
 
 
-def _without_blocks(argv: Sequence[str]) -> list[str]:
-    """Return the words of a command line without --blocks and its value."""
-    words = [word for word in argv if not word.startswith("--blocks=")]
-    if "--blocks" in words:
-        at = words.index("--blocks")
-        del words[at : at + 2]
-    return words
-
-
-def _train_blocks(args: Train) -> bool:
-    """Train or resume a run in blocks; return False, having begun nothing, if `auto` finds that one training does."""
+def _train_blocks(args: Train) -> "Run | None":
+    """Train or resume a run in blocks; None if `auto` finds that one training does, of which nothing is begun."""
     from ..arguments import parse_pairs
     from ..blocks.block_plan import BlockPlan
     from ..blocks.jobs import check_devices
     from ..blocks.train import is_in_blocks, train_in_blocks
 
     output, machine = args.output, args.machine
-    assert output.out is not None, "run_train() refuses it"
+    assert output.out is not None, "_check_options() refuses it"
     device = pick_device(machine.device)
     if machine.slurm is None:
         check_devices(device, machine.gpus)
     plan = BlockPlan.read(output.out) if output.resume and is_in_blocks(output.out) else None
-    data = _load_arguments(args, None if plan is None else plan.data)
     config = _config(args, None if plan is None else plan.config)
     blocks = args.training.blocks
-    run = train_in_blocks(
-        data,
+    return train_in_blocks(
+        _load_arguments(args, None if plan is None else plan.data),
         output.out,
         config,
         int(blocks) if blocks not in (None, "auto") else None,
@@ -313,30 +295,31 @@ def _train_blocks(args: Train) -> bool:
         overwrite=output.overwrite,
         photo_storage=_load_options(config)["photo_storage"],
     )
-    if run is not None:
-        _print_result(args, run)
-    return run is not None
 
 
-def _refuse_run(args: Train) -> None:
-    """Raise UsageError if SCENE is a run, which --resume continues by the name after --out."""
-    from ..runs.run_folder import RunFolder
-
-    folder = RunFolder(args.data or "")
-    if args.data is not None and folder.config_file.is_file() and folder.info_file.is_file():
-        steps = "" if args.training.iterations is None else f" --iterations {args.training.iterations}"
-        command = f"sehdr-warp train --resume --out {shlex.quote(args.data)}{steps}"
-        raise UsageError(f"{args.data}: is a run, not photos; {command} continues it")
-
-
-def _require_scene(args: Train) -> None:
-    """Raise an error for a missing SCENE, before torch is imported, which takes seconds."""
+def _check_options(args: Train) -> None:
+    """Raise an error for a missing SCENE or options that contradict each other, before torch is imported."""
     from ..scene import is_embedded
 
-    if args.data is None and not args.output.resume:
+    data, options, output = args.data, args.training, args.output
+    if data is None and not output.resume:
         raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
-    if args.data is not None and not is_embedded(args.data) and not os.path.lexists(args.data):
-        raise missing(Path(args.data), "not found", "give a folder of photos, or 'embedded'")
+    if data is not None and not is_embedded(data) and not os.path.lexists(data):
+        raise missing(Path(data), "not found", "give a folder of photos, or 'embedded'")
+    if args.machine.gpus < 1:
+        raise UsageError(f"--gpus {args.machine.gpus} is not 1 or more")
+    if data is not None and all(Path(data, name).is_file() for name in ("config.json", "run.json")):
+        steps = "" if options.iterations is None else f" --iterations {options.iterations}"
+        command = f"sehdr-warp train --resume --out {shlex.quote(data)}{steps}"
+        raise UsageError(f"{data}: is a run, not photos; {command} continues it")
+    if output.resume and output.overwrite:
+        raise UsageError("--resume continues the run in --out, --overwrite replaces it; leave one out")
+    if options.plan_only and output.resume:
+        raise UsageError("--plan-only plans a new training; leave --resume out")
+    if output.out is None and not options.plan_only:
+        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
+    if options.blocks is not None and (output.view or output.tensorboard):
+        raise UsageError("--view and --tensorboard are without effect with --blocks; view the run when it is done")
 
 
 def _path_of(args: Train) -> str | None:

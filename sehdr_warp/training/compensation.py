@@ -1,12 +1,11 @@
 """Decide whether a camera changed exposure, white balance or vignetting between photos without stating it.
 
 The evidence is the light of points that several photos show: the gains that explain its differences are estimated by
-scene.exposure_compensation, and only the parts that clearly explain them are corrected.
+scene.exposure.compensation, and only the components that clearly explain them are corrected.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +22,6 @@ from ..scene.exposure.compensation import (
     remaining_vignetting,
     rough_gains,
 )
-from ..scene.normalization import normalization_of
 from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
 from .plan import COMPENSATION, Decision
@@ -54,15 +52,11 @@ class MatchedPoints:
     """Points that several photos show."""
 
     points: np.ndarray  # [P, 3] world coordinates
-    visible: np.ndarray  # [V, P] bool, which of the training and then the other views show each point
+    visible: np.ndarray  # [V, P] bool: which views, first the training views, show which points
 
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.points)
-
-    def subset(self, part: slice) -> "MatchedPoints":
-        """Return some of the points."""
-        return MatchedPoints(self.points[part], self.visible[:, part])
 
     def disagreement(
         self, views: Sequence[View], response: Response, gains: ExposureCompensation | None, *, colors: bool = False
@@ -71,31 +65,20 @@ class MatchedPoints:
         return disagreement(views, self.points, self.visible[: len(views)], response, gains, colors=colors)
 
 
-class Parts(NamedTuple):
-    """Parts of a compensation to apply; see ExposureCompensation.parts()."""
+class Components(NamedTuple):
+    """Components of a compensation to apply; arguments of ExposureCompensation.parts()."""
 
     exposure: bool
     white_balance: bool
     vignetting: bool
 
 
-@dataclass(frozen=True)
-class Compensation:
-    """Result of estimate_compensation."""
+class CompensationEstimate(NamedTuple):
+    """Result of estimate_compensation()."""
 
     compensation: ExposureCompensation | None  # Correction of the photos; None if there is no drift
-    matcher: Matcher | None  # Matcher of the training photos as they are, for use if there is no drift; else None
     decision: Decision  # Line of the plan
-
-
-@dataclass(frozen=True)
-class PreparedPhotos:
-    """Photos to train on."""
-
-    scene: Scene  # The scene, with drift of exposure, white balance and vignetting taken out of its photos
-    compensation: ExposureCompensation | None  # What was taken out; None if there is no drift
-    get_matcher: Callable[[], Matcher]  # Returns the matcher of the training photos, which is created once
-    decision: Decision | None  # Line of the plan; None if nothing was estimated
+    matcher: Matcher | None  # Matcher of the training photos as they are, for use if there is no drift; else None
 
 
 @dataclass(frozen=True)
@@ -116,32 +99,6 @@ class SharedDecisions:
         return ExposureCompensation(*parts)
 
 
-def prepare_photos(
-    scene: Scene,
-    config: Config,
-    response: Response,
-    device: torch.device | str,
-    shared: SharedDecisions | None = None,
-    *,
-    estimate: bool = True,
-) -> PreparedPhotos:
-    """Take drift of exposure, white balance and vignetting out of the photos of a scene, in its own coordinates.
-
-    Decisions of a larger set that the scene is part of (`shared`) replace an estimate. Without them, drift is estimated
-    if `estimate` and the config, after the plan, asks for it.
-    """
-    normalization, result = normalization_of(scene), None
-    compensation = None if shared is None else shared.compensation_of(scene.views)
-    if shared is None and estimate and estimates_compensation(scene, config, response):
-        result = estimate_compensation(normalization.scene(scene), config, response, device)
-        compensation = result.compensation
-    if compensation is not None:
-        scene = compensation.normalize_photos(scene, response)
-    matcher, decision = (None, None) if result is None else (result.matcher, result.decision)
-    get_matcher = cache(lambda: matcher or make_matcher(normalization.scene(scene), response, device))
-    return PreparedPhotos(scene, compensation, get_matcher, decision)
-
-
 def estimates_compensation(scene: Scene, config: Config, response: Response) -> bool:
     """Return whether a training estimates a compensation.
 
@@ -149,11 +106,13 @@ def estimates_compensation(scene: Scene, config: Config, response: Response) -> 
     """
     option = config.model.exposure_compensation
     allowed = option in ("auto", "always") or (option == "unstated" and not scene.exposure_times_known)
-    wide = any(not view.camera.is_pinhole for view in scene.train_views)
-    return allowed and not wide and config.model.initial_density > 0 and not response.learnable
+    pinholes = all(view.camera.is_pinhole for view in scene.train_views)
+    return allowed and pinholes and config.model.initial_density > 0 and not response.learnable
 
 
-def estimate_compensation(scene: Scene, config: Config, response: Response, device: torch.device | str) -> Compensation:
+def estimate_compensation(
+    scene: Scene, config: Config, response: Response, device: torch.device | str
+) -> CompensationEstimate:
     """Match points between the photos of a scene and estimate the compensation that explains their differences."""
     times_known = scene.exposure_times_known and config.model.exposure_compensation != "always"
     views, others = scene.train_views, scene.test_views
@@ -170,10 +129,10 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     def fit(matched: MatchedPoints) -> ExposureCompensation:
         return fit_gains(views, others, matched.points, matched.visible, response)
 
-    def no_drift(matcher: Matcher) -> Compensation:
+    def no_drift(matcher: Matcher) -> CompensationEstimate:
         least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
         reason = "do not contradict the stated times" if times_known else f"differ by less than {least}"
-        return Compensation(None, matcher, Decision({}, "none", f"matched points {reason}", COMPENSATION))
+        return CompensationEstimate(None, Decision({}, "none", f"matched points {reason}", COMPENSATION), matcher)
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=at_matching_size(views))
@@ -186,13 +145,13 @@ def estimate_compensation(scene: Scene, config: Config, response: Response, devi
     if len(matched) < MIN_POINTS:
         return no_drift(matcher)
     compensation = fit(matched)
-    parts = _explanatory_parts(compensation, views, matched, response, times_known)
-    if not any(parts):
+    components = _explanatory_components(compensation, views, matched, response, times_known)
+    if not any(components):
         return no_drift(matcher)
     # Match again in photos that are already similar: more points are found.
-    matcher = matcher_of(compensation.parts(**parts._asdict()).normalize_photos(small, response))
-    compensation = fit(match(matcher)).parts(**parts._asdict())
-    return Compensation(compensation, None, _decision(compensation, parts, times_known))
+    matcher = matcher_of(compensation.parts(**components._asdict()).normalize_photos(small, response))
+    compensation = fit(match(matcher)).parts(**components._asdict())
+    return CompensationEstimate(compensation, _decision(compensation, components, times_known), None)
 
 
 def _may_drift(views: Sequence[View], matched: MatchedPoints, response: Response) -> bool:
@@ -204,14 +163,17 @@ def _may_drift(views: Sequence[View], matched: MatchedPoints, response: Response
     return rough.corner_loss >= MIN_CORNER_LOSS and remaining < 1
 
 
-def _explanatory_parts(
+def _explanatory_components(
     compensation: ExposureCompensation,
     views: Sequence[View],
     matched: MatchedPoints,
     response: Response,
     times_known: bool,
-) -> Parts:
-    """Return the parts of gains that explain how photos differ at shared points."""
+) -> Components:
+    """Return the components of a compensation to apply: large ones that explain how photos differ at shared points.
+
+    Exposure that photos state is corrected only by what explains other points than those of its fit, too.
+    """
     before = matched.disagreement(views, response, None)
     after = matched.disagreement(views, response, compensation.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
@@ -232,7 +194,7 @@ def _explanatory_parts(
     if vignetting:
         remaining = remaining_vignetting(views, matched.points, matched.visible, response, compensation)
         vignetting = remaining <= MAX_REMAINING_VIGNETTING
-    return Parts(exposure, white_balance, vignetting)
+    return Components(exposure, white_balance, vignetting)
 
 
 def _exceeds_stated(compensation: ExposureCompensation, views: Sequence[View]) -> bool:
@@ -251,8 +213,9 @@ def _cross_validate(views: Sequence[View], matched: MatchedPoints, response: Res
     """
     halves, remaining = (slice(0, None, 2), slice(1, None, 2)), []
     for fitted, evaluated in (halves, halves[::-1]):
-        part, rest = matched.subset(fitted), matched.subset(evaluated)
-        drift = fit_gains(views, (), part.points, part.visible[: len(views)], response).parts(vignetting=False)
+        rest = MatchedPoints(matched.points[evaluated], matched.visible[:, evaluated])
+        visible = matched.visible[: len(views), fitted]
+        drift = fit_gains(views, (), matched.points[fitted], visible, response).parts(vignetting=False)
         exposure = (
             rest.disagreement(views, response, drift),
             rest.disagreement(views, response, drift.explained_part(views)),
@@ -266,15 +229,15 @@ def _cross_validate(views: Sequence[View], matched: MatchedPoints, response: Res
     return float(drift), float(colors)
 
 
-def _decision(compensation: ExposureCompensation, parts: Parts, times_known: bool) -> Decision:
+def _decision(compensation: ExposureCompensation, components: Components, times_known: bool) -> Decision:
     """Return the line of the plan for gains that are corrected."""
     figures = []
-    if parts.exposure:
+    if components.exposure:
         figures.append(f"{compensation.stops:.2f} stops between photos")
-    if parts.white_balance and compensation.white_balance >= MIN_WHITE_BALANCE:
+    if components.white_balance and compensation.white_balance >= MIN_WHITE_BALANCE:
         figures.append(f"{compensation.white_balance:.2f} stops of white balance between photos")
-    if parts.vignetting:
+    if components.vignetting:
         figures.append(f"{compensation.corner_loss:.0%} towards the corners")
-    over = ", over the times they state" if parts.exposure else ", exposures stay as stated"
+    over = ", over the times they state" if components.exposure else ", exposures stay as stated"
     choice = f"taken out of the photos{over if times_known else ''}"
     return Decision({}, choice, f"matched points differ by {', '.join(figures)}", COMPENSATION, always_log=True)

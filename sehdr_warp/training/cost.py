@@ -181,7 +181,7 @@ def choices(whole: Workload, divided: Workload, blocks: int, memory: float | Non
 
 
 def recommend(whole: Workload, blocks: int, memory: float | None, gpus: int = 1) -> str:
-    """Return which way suits a machine with so many GPUs, and why, in one line; arguments as of choices()."""
+    """Return which way suits a machine with `gpus` GPUs, and why, in one line; arguments as of choices()."""
     several = training_cost(whole, gpus)
     if blocks > 1:
         fill = "30,000 steps or of densification.cap_max Gaussians"

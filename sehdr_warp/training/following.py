@@ -1,4 +1,4 @@
-"""Train on several ranks: rank 0 sends its training to the others, which follow it step by step."""
+"""Train on several ranks: rank 0 sends its training to the others, which take the same steps."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
 from ..runs.open import load_scene_and_log_notes
@@ -15,11 +15,10 @@ from ..runs.run import exposure_compensation, field_from_checkpoint
 from ..runs.scene_description import describe_scene, scene_difference
 from ..runs.values import LoadArguments
 from ..scene import Scene
-from ..scene.exposure.compensation import ExposureCompensation
 from .cost import gain_of_ranks
 from .ranks import Ranks
 from .trainer import Trainer
-from .training_state import TrainingState, load_state, state_of
+from .training_state import load_state, state_of
 
 
 @dataclass(frozen=True)
@@ -31,34 +30,24 @@ class PhotoRequest:
 
 
 @dataclass(frozen=True)
-class SharedTraining:
-    """Values that the other ranks need for the same training; the tensors of its state follow."""
+class TrainingMessage:
+    """Message of rank 0 with which the others train alike; the tensors of its state follow."""
 
     config: Config  # Options of the training, after the plan
-    info: dict[str, Any]  # Response, base time, normalization and exposure compensation, as in run.json
+    info: dict[str, Any]  # Content of run.json
     layout: dict[str, tuple[torch.Size, torch.dtype]]  # Shape and type of each tensor of its TrainingState
     values: dict[str, Any]  # Values of its TrainingState
     scene: dict | None  # Description of the training views, for nodes that read photos themselves; None on one node
 
 
-def send_training(ranks: Ranks, trainer: Trainer, compensation: ExposureCompensation | None) -> None:
-    """Send a training from rank 0 to the others, in the form of a checkpoint.
-
-    Its photos are corrected by `compensation` already.
-    """
-    if ranks.info.several_nodes and not ranks.photos_are_requested:
-        raise SehdrError("ranks on several nodes read their own photos: train by the command line")
+def send_training(ranks: Ranks, trainer: Trainer, info: dict[str, Any]) -> None:
+    """Send a training from rank 0 to the others, in the form of a checkpoint; `info` is the content of its run.json."""
     state = state_of(trainer)
     tensors = {name: tensor.cpu().contiguous() for name, tensor in state.tensors.items()}
-    field = trainer.field
-    info = {"response": field.response.to_dict(), "base_time": field.base_time}
-    info["normalization"] = field.normalization.to_dict()
-    if compensation is not None:
-        info["exposure_compensation"] = compensation.to_dict()
     layout = {name: (tensor.shape, tensor.dtype) for name, tensor in tensors.items()}
     scene = _training_part(trainer.scene)
     description = describe_scene(scene) if ranks.info.several_nodes else None
-    ranks.broadcast_object(SharedTraining(trainer.config, info, layout, state.values, description))
+    ranks.broadcast_object(TrainingMessage(trainer.config, info, layout, state.values, description))
     ranks.broadcast_arrays(list(tensors.values()))
     ranks.share_photos(scene, _bytes_of(scene))
 
@@ -73,33 +62,33 @@ def several_ranks_notes(trainer: Trainer) -> Iterator[str]:
     yield from trainer.ranks.notes()
 
 
-def follow_leader(ranks: Ranks, path: str | None = None) -> Trainer:
+def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
     """Run the steps of rank 0's training on another rank until it ends; return the trainer.
 
     `path` says where the photos are on this node; by default they are where they are on that of rank 0.
     """
-    reads = ranks.info.node > 0 and ranks.info.leads_node
+    reads = ranks.info.node > 0 and ranks.info.is_local_main_process
     scene = None
     if reads:
         request: PhotoRequest = ranks.requested_photos()
         data = request.data if path is None else request.data | {"path": path}
         scene = load_scene_and_log_notes(data, **request.options)
-    shared: SharedTraining = ranks.broadcast_object()
-    config = shared.config
-    tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in shared.layout.items()}
+    message: TrainingMessage = ranks.broadcast_object()
+    config = message.config
+    tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in message.layout.items()}
     ranks.broadcast_arrays(list(tensors.values()))
-    checkpoint = Checkpoint(Path("rank 0"), tensors, shared.values)
-    field = field_from_checkpoint(checkpoint, config, shared.info)
+    checkpoint = Checkpoint(Path("rank 0"), tensors, message.values)
+    field = field_from_checkpoint(checkpoint, config, message.info)
     if scene is not None:
-        compensation = exposure_compensation(shared.info)
+        compensation = exposure_compensation(message.info)
         scene = _training_part(scene if compensation is None else compensation.normalize_photos(scene, field.response))
-        _check_same_photos(ranks, shared, scene)
+        _check_same_photos(ranks, message, scene)
         ranks.share_photos(scene, _bytes_of(scene))
     else:
         scene = ranks.receive_photos()
     trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks)
-    load_state(trainer, TrainingState(checkpoint.tensors, checkpoint.values))
-    del shared, checkpoint, tensors
+    load_state(trainer, checkpoint)
+    del message, checkpoint, tensors
     for _ in trainer:
         pass
     return trainer
@@ -118,11 +107,11 @@ def _bytes_of(scene: Scene) -> int:
     return sum(array.nbytes + 64 for array in arrays if array is not None)
 
 
-def _check_same_photos(ranks: Ranks, shared: SharedTraining, scene: Scene) -> None:
+def _check_same_photos(ranks: Ranks, message: TrainingMessage, scene: Scene) -> None:
     """Raise InputError if this node has read other photos than rank 0."""
-    assert shared.scene is not None
-    name = shared.scene["name"]
-    difference = scene_difference(shared.scene, describe_scene(replace(scene, name=name)))
+    assert message.scene is not None
+    name = message.scene["name"]
+    difference = scene_difference(message.scene, describe_scene(replace(scene, name=name)))
     if difference is not None:
         problem = f"{ranks.info} reads other photos than rank 0: {difference.what} differ"
         raise InputError(scene.name, problem, "copy the same set to all nodes, or use a shared file system")

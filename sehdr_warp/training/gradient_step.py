@@ -46,21 +46,17 @@ class StepOptions:
 
 
 class GraphKey(NamedTuple):
-    """Everything that changes which kernels a step launches.
+    """Everything that a CUDA graph of a step holds fixed, because it changes which kernels the step launches.
 
     Consecutive steps of one key share a CUDA graph; only one is kept, so another key is captured anew.
 
     Attributes:
-        degree: SH degree.
-        needs_means2d_grad: As in StepOptions.
-        penalizes_opacity: Whether the loss has an opacity penalty.
+        options: Options of the step.
         exact_response: Whether Gaussians are so few that a learned response encodes them exactly.
         single_sort: Whether Gaussians are so few that they are sorted in a single pass.
     """
 
-    degree: int
-    needs_means2d_grad: bool
-    penalizes_opacity: bool
+    options: StepOptions
     exact_response: bool
     single_sort: bool
 
@@ -132,7 +128,7 @@ class GradientStep:
         self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
         # They would fade before a photo shows them. Elsewhere the penalty removes copies that are not needed.
         self._spares_unseen = large_scene
-        self._flat: FlatGradients | None = None  # Buffer that ranks exchange
+        self._flat_gradients: FlatGradients | None = None  # Buffer that ranks exchange
 
     def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:
         """Return the key of a step on one of the views; None if it cannot be captured as a CUDA graph."""
@@ -140,13 +136,7 @@ class GradientStep:
         if self.field.color_model.display_referred and not isinstance(getattr(views, "times", None), float):
             return None
         rows = self.field.gaussians.row_count
-        return GraphKey(
-            options.degree,
-            options.needs_means2d_grad,
-            penalizes_opacity=options.opacity_weight > 0,
-            exact_response=rows < EXACT_BELOW,
-            single_sort=rows <= MAX_SINGLE_SORT,
-        )
+        return GraphKey(options, exact_response=rows < EXACT_BELOW, single_sort=rows <= MAX_SINGLE_SORT)
 
     def prepare(self, options: StepOptions) -> None:
         """Allocate the statistics that the next step adds to: in a capture, they would lie in the graph's memory."""
@@ -155,20 +145,23 @@ class GradientStep:
 
     def run(self, view: TrainingView, options: StepOptions, max_intersections: int | None = None) -> StepResult:
         """Take a step on a view; arguments as of compute_gradients()."""
-        with self.on_all_rows():
+        with self.reserved_memory():
             gradients = self.compute_gradients(view, options, max_intersections)
             self.average_gradients()
             loss = self.apply_gradients(gradients)
         return StepResult(loss, gradients.image, gradients.rendering.intersection_count)
 
     @contextmanager
-    def on_all_rows(self) -> Iterator[None]:
-        """Run the functions below on all reserved rows within this block, because the number of those is fixed."""
+    def reserved_memory(self) -> Iterator[None]:
+        """Use all reserved rows, whose number is fixed, and on several ranks a buffer of their gradients.
+
+        The buffer is allocated here, because in a capture it would lie in the graph's memory.
+        """
         with self.field.gaussians.all_rows(self.optimizer):
-            if self.ranks is not None and not (self._flat and self._flat.fits(self.optimizer)):
+            if self.ranks is not None and not (self._flat_gradients and self._flat_gradients.fits(self.optimizer)):
                 rank, count = self.ranks.rank, self.ranks.count
-                self._flat = None  # Freed first, because it is large. Not allocated in the memory of a CUDA graph.
-                self._flat = FlatGradients(self.optimizer, rank, count, defer_sh=self.defer_sh_gradients)
+                self._flat_gradients = None  # Frees its memory, which is large.
+                self._flat_gradients = FlatGradients(self.optimizer, rank, count, defer_sh=self.defer_sh_gradients)
             yield
 
     def compute_gradients(
@@ -212,21 +205,21 @@ class GradientStep:
         if self.defer_sh_gradients:
             values = sh_gradients[0].contiguous()
             harmonics = HarmonicsGradients(values[None], camera.position[None], field.gaussians.means, options.degree)
-        if self._flat is not None:
-            self._flat.collect(loss, rendering.overflow, harmonics)
+        if self._flat_gradients is not None:
+            self._flat_gradients.collect(loss, rendering.overflow, harmonics)
         return Gradients(loss.detach(), image.detach(), rendering, harmonics)
 
     def average_gradients(self) -> None:
         """Average the gradients over the ranks."""
-        if self.ranks is not None and self._flat is not None:
-            self.ranks.all_reduce_mean(self._flat.buffer)
+        if self.ranks is not None and self._flat_gradients is not None:
+            self.ranks.all_reduce_mean(self._flat_gradients.buffer)
 
     def apply_gradients(self, gradients: Gradients) -> Tensor:
         """Update the parameters, unless the step is not finite; return its loss. Does not wait for the device."""
         rendering, loss, harmonics = gradients.rendering, gradients.loss, gradients.harmonics
         overflow = rendering.overflow
-        if self._flat is not None:
-            loss, overflow, harmonics = self._flat.distribute()
+        if self._flat_gradients is not None:
+            loss, overflow, harmonics = self._flat_gradients.distribute()
         applied = guarded_step(
             self.optimizer,
             loss,

@@ -45,7 +45,7 @@ class RankInfo:
         return self.nodes > 1
 
     @property
-    def leads_node(self) -> bool:
+    def is_local_main_process(self) -> bool:
         """True for the process of a node that reads the photos for it."""
         return self.local_rank == 0
 

@@ -124,10 +124,10 @@ class Matcher:
         return width, height
 
     def near(self, others: Sequence[Camera]) -> np.ndarray:
-        """Return which photos are near each photo, and each of the other cameras, and look the same way.
+        """Return the neighbors of the V photos and of other cameras: photos from nearby that look the same way.
 
         Returns:
-            [V + len(others), V] bool; a photo is near itself.
+            [V + len(others), V] bool, a row for each photo and then each other camera; a photo is near itself.
         """
         neighbors = _neighbors((*self._cameras, *others), self._cameras)
         near = np.eye(len(neighbors), len(self._cameras) + 1, dtype=bool)
@@ -150,19 +150,18 @@ class Matcher:
         return self._matches(pixels, depth), depth > 0
 
     def _depths_of(self, pixels: Tensor) -> Tensor:
-        """Return the depths [N] of pixels, in chunks."""
-        parts = [self._depth(part) for part in pixels.split(max(1, CHUNK // len(self._depths)))]
-        return torch.cat(parts) if parts else self._depths[:0]
+        """Return the depths [N] of pixels, between planes; 0 if none is reliable."""
+        depths = [self._depths[:0]]
+        for part in pixels.split(max(1, CHUNK // len(self._depths))):
+            costs = matching_costs(self._photos, part, self._depths.expand(len(part), -1))
+            options = {"worst": WORST_COST, "margin": MARGIN, "few": FEW, "widest": WIDEST}
+            depths.append(trusted_depths(costs, self._depths, **options))
+        return torch.cat(depths)
 
     def _matches(self, pixels: Tensor, depth: Tensor) -> Matches:
         """Return the points of pixels [N, 3] at depths [N]."""
         points, colors, footprints = matched_points(self._photos, self._poses, pixels, depth)
         return Matches(points, colors ** (1 / self._exponent), footprints, pixels[:, 0].long())
-
-    def _depth(self, pixels: Tensor) -> Tensor:
-        """Return the depths [N] of pixels, between planes; 0 if none is reliable."""
-        costs = matching_costs(self._photos, pixels, self._depths.expand(len(pixels), -1))
-        return trusted_depths(costs, self._depths, worst=WORST_COST, margin=MARGIN, few=FEW, widest=WIDEST)
 
 
 def brightening(views: Sequence[View]) -> float:
@@ -285,7 +284,7 @@ def seed_gaussians(
     if rendered.device.type == "cuda":
         uniform = uniform.pin_memory().to(rendered.device, non_blocking=True)
     pixels, sampled = sample_residual_pixels(
-        *(rendered, target.codes, target.index, target.mask, uniform, index, matcher.size(index)), least=MIN_ERROR
+        rendered, target.codes, target.index, target.mask, uniform, index, matcher.size(index), least=MIN_ERROR
     )
     matches, valid = matcher.match_each(pixels)
     valid &= sampled & (torch.arange(bound, device=valid.device) < number)

@@ -1,8 +1,8 @@
 """Processes that train one scene together, each on its own GPU (or, with gloo, on CPUs), on one node or several.
 
 Every rank has all Gaussians and takes its own photo; all gradients, in one buffer, are averaged, so that all ranks
-apply the same step. Rank 0 leads: it densifies, evaluates, writes and prints. One rank of each node reads the photos
-and shares them with the others of its node, which only run steps.
+apply the same step. Rank 0, the main process, also densifies, evaluates, writes and prints. One rank of each node reads
+the photos and shares them with the others of its node, which only run steps.
 """
 
 import logging
@@ -55,19 +55,20 @@ class Ranks:
         rank: Number of this process.
         count: Number of processes.
         device: Device that this process trains on.
-        leads: True for rank 0.
+        is_main_process: True for rank 0.
     """
 
     def __init__(self, store: dist.Store, info: RankInfo, device: torch.device):
         """Create a rank; init() connects it."""
         self.store, self.info, self.device = store, info, device
         self.rank, self.count = info.rank, info.count
-        self.leads = info.rank == 0
+        self.is_main_process = info.rank == 0
         self._cuda = device.type == "cuda"
         self._deadline: float | None = None
         self._over = threading.Event()
         self._photos: PhotoFile | None = None
         self._timeout = rank_timeout()
+        self._log_wait = partial(log.info, "%s waits for the others", info)
 
     def init(self) -> None:
         """Connect to the other ranks; raise SehdrError if some do not come, or run other versions."""
@@ -83,10 +84,6 @@ class Ranks:
         self._check_versions()
         self._watcher = threading.Thread(target=self._watch, name="sehdr-warp ranks", daemon=True)
         self._watcher.start()
-
-    def _log_wait(self) -> None:
-        """Log that this rank waits for the others."""
-        log.info("%s waits for the others", self.info)
 
     def _await_all(self) -> None:
         """Wait until all ranks are there; raise SehdrError that names the nodes of those that do not come."""
@@ -115,7 +112,7 @@ class Ranks:
         """
         answer = torch.tensor([signal], dtype=torch.int32)
         # Rank 0 may evaluate or be paused, so only it expects answers in time.
-        self._deadline = time.monotonic() + self._timeout if self.leads else None
+        self._deadline = time.monotonic() + self._timeout if self.is_main_process else None
         with self._collective():
             dist.all_reduce(answer, dist.ReduceOp.MIN, group=self._hosts)
         agreed = int(answer)
@@ -136,12 +133,12 @@ class Ranks:
         if not self._cuda:  # gloo lacks ReduceOp.AVG.
             buffer.mul_(1 / self.count)
 
-    def reduce_to_leader(self, totals: list[Tensor]) -> None:
+    def reduce_to_main(self, totals: list[Tensor]) -> None:
         """Sum tensors on rank 0 and zero them on the others, so that a second call changes nothing."""
         for total in totals:
             with self._collective():
                 dist.reduce(total, 0)
-            if not self.leads:
+            if not self.is_main_process:
                 total.zero_()
 
     def broadcast(self, tensors: list[Tensor]) -> None:
@@ -152,7 +149,7 @@ class Ranks:
                 dist.broadcast(tensor, 0)
         self._deadline = time.monotonic() + self._timeout
 
-    def refine_on_leader(
+    def refine_on_main(
         self, refine: Callable[[], bool], strategy: Strategy, gaussians: Gaussians, optimizer: Adam
     ) -> bool:
         """Refine the Gaussians on rank 0 and send them, with their optimizer state, to the others.
@@ -160,8 +157,8 @@ class Ranks:
         Returns:
             What refine() returned on rank 0.
         """
-        self.reduce_to_leader(list(strategy.state_dict(gaussians.count).values()))
-        changed = self.leads and refine()
+        self.reduce_to_main(list(strategy.state_dict(gaussians.count).values()))
+        changed = self.is_main_process and refine()
         values = [changed, gaussians.count, bool(strategy.state_dict(gaussians.count))]
         values = torch.tensor(values, dtype=torch.int64, device=self.device)
         self.broadcast([values])
@@ -209,11 +206,6 @@ class Ranks:
         self._await_keys(["request"])
         return pickle.loads(self.store.get("request"))
 
-    @property
-    def photos_are_requested(self) -> bool:
-        """True if request_photos() was called."""
-        return self.store.check(["request"])
-
     def share_photos(self, value: Any, size: int) -> None:
         """Share a value of about `size` bytes with the other ranks of this node, which read its arrays from one file.
 
@@ -225,7 +217,7 @@ class Ranks:
             handle = self._photos.share(value)
         # The store takes bytes, although its stub says str.
         self.store.set(f"photos/{self.info.node}", pickle.dumps(handle))  # pyright: ignore[reportArgumentType]
-        if self.leads:
+        if self.is_main_process:
             self._await_keys([f"photos/{node}" for node in range(self.info.nodes)])
 
     def receive_photos(self) -> Any:
@@ -258,13 +250,13 @@ class Ranks:
 
     def close(self) -> None:
         """Disconnect at the end of a training that all ranks reached."""
-        self._over.set()
+        self.stop_watching()
         # A thread that still talks to other ranks while the interpreter ends would abort the process.
         self._watcher.join(_WATCH_END)
         self._hosts = None
         dist.destroy_process_group()
 
-    def abandon(self) -> None:
+    def stop_watching(self) -> None:
         """Stop watching the others, at the end of this rank while others may wait."""
         self._over.set()
 
@@ -301,7 +293,7 @@ class Ranks:
             if now - beat > self._timeout / 4:
                 beat = now
                 with suppress(RuntimeError):  # The store is gone: its rank will be missed otherwise.
-                    if self.leads:
+                    if self.is_main_process:
                         self.store.set("alive", str(now))
                     elif self.store.check(["alive"]) and (message := self.store.get("alive").decode()) != last_message:
                         last_message, since = message, now
@@ -346,7 +338,7 @@ def join_ranks(info: RankInfo, device: torch.device) -> Iterator[Ranks]:
         yield ranks
         ranks.close()
     except BaseException as error:
-        ranks.abandon()
+        ranks.stop_watching()
         _end_soon(error)
         first, message = ranks.ends_first(), isinstance(error, Exception) and as_user_error(error)
         if message and not first:

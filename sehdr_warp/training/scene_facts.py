@@ -18,14 +18,14 @@ from .initialization import focus_distance, points_on_rays
 
 _REMEDY = "take a scene with HDR truth, or a preset that needs none"
 
-PROBES = 2000  # Number of places at which overlap and visibility are measured
-FEWEST_POINTS = 100  # With fewer sparse points, places along the cameras' rays are the probes
+SAMPLES = 2000  # Number of points at which overlap and visibility are measured
+FEWEST_POINTS = 100  # With fewer sparse points, these are points along the cameras' rays
 MOST_PIXELS = 250_000  # Largest number of pixels that are read from a photo
 LARGE_SCENE = 0.1  # A scene is large if its photos contain less than this part of its points, in the mean
 MOST_VIEWS = 64  # Largest number of photos whose codes are read; cameras are read of all
-LOWEST_PLATEAU, PLATEAU_CODES, PLATEAU_SHARE, PLATEAU_EXCESS = 200, 3, 1e-3, 3.0
-"""Photos clip below white if the brightest code is at least the first; if so many codes, the brightest that occur, hold
-the third share of the pixels, and the fourth times what as many codes below them hold. JPEG spreads a plateau."""
+LOWEST_PLATEAU = 200  # Lowest code, of 255, that photos clip at below white, as after an edit
+PLATEAU_CODES = 3  # Brightest codes that occur, over which JPEG spreads the clipped pixels
+PLATEAU_SHARE, PLATEAU_EXCESS = 1e-3, 3.0  # Least part of the pixels that they hold, and multiple of the codes below
 MAX_ALIGNMENT, MOST_AHEAD = 0.3, 0.75
 """Cameras look all around if both figures are below these. Eight captures of objects, rooms and grounds have 0.5 to 1
 of the first, maps from within a place 0.1; objects have nearly 1 of the second."""
@@ -40,8 +40,8 @@ class SceneFacts:
     from_camera: bool  # Whether a camera wrote the files
     truths: int  # Number of photos with HDR truth
     points: int  # Number of sparse points
-    visibility: float  # Mean number of photos whose field of view contains a probe
-    # Fraction of the probes, or of places along the cameras' rays if that is more, that two photos contain
+    visibility: float  # Mean number of photos whose field of view contains a sampled point
+    # Fraction of the sampled points, or of points along the cameras' rays if that is more, that two photos contain
     overlap: float
     clipped: float  # Fraction of pixels with a channel at white
     black: float  # Fraction of pixels with all channels at 0
@@ -62,10 +62,10 @@ class SceneFacts:
 
 
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
-    """Measure a scene with at least one training view; `seed` is that of the probes."""
+    """Measure a scene with at least one training view; `seed` is that of the sampled points."""
     photos, views = scene.train_views, perspective_views(scene.train_views)
-    probes, ray_points = _probes(scene, views, seed)
-    visible, on_rays = (_in_view(views, points).sum(0) for points in (probes, ray_points))
+    samples, ray_points = _sample_points(scene, views, seed)
+    visible, on_rays = (_in_view(views, points).sum(0) for points in (samples, ray_points))
     read_views = every_nth(views, MOST_VIEWS)
     figures = np.array([_codes(view) for view in read_views])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
@@ -96,20 +96,20 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
 def is_large(scene: Scene) -> bool:
     """Return whether photos show so little of a scene that many steps pass before a Gaussian is seen again.
 
-    The figure is the mean fraction of the probes that a training photo contains, occlusion not considered.
+    The figure is the mean fraction of the sampled points that a training photo contains, occlusion not considered.
     """
     views = perspective_views(scene.train_views)
-    return float(_in_view(views, _probes(scene, views, 0)[0]).mean()) < LARGE_SCENE
+    return float(_in_view(views, _sample_points(scene, views, 0)[0]).mean()) < LARGE_SCENE
 
 
-def _probes(scene: Scene, views: tuple[View, ...], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a sample [P, 3] of the sparse points, if there are enough, and places [Q, 3] along the cameras' rays."""
+def _sample_points(scene: Scene, views: tuple[View, ...], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a sample [P, 3] of the sparse points, if there are enough, and points [Q, 3] along the cameras' rays."""
     rng = np.random.default_rng(seed)
-    probes = ray_points = points_on_rays(views, PROBES, focus_distance(views), rng)
+    samples = ray_points = points_on_rays(views, SAMPLES, focus_distance(views), rng)
     if len(scene.points) >= FEWEST_POINTS:
-        count = min(PROBES, len(scene.points))
-        probes = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
-    return probes, ray_points
+        count = min(SAMPLES, len(scene.points))
+        samples = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
+    return samples, ray_points
 
 
 def _in_view(views: Sequence[View], points: np.ndarray) -> np.ndarray:

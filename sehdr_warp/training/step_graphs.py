@@ -58,10 +58,9 @@ class StepGraphs:
             self._reserve_rows(iteration)
         step.prepare(options)
         key = step.graph_key(views, options)
-        if self._capacity.has_counts and self.can_replay(views, key):
-            return self._replay(views, index, following, options, key, iteration)
-        with self.on_capture_stream():
-            # Without a capacity, so that result.intersections is their number.
+        if self.can_replay(views, key) and (capacity := self._capacity.next()) is not None:
+            return self._replay(views, index, following, options, key, capacity, iteration)
+        with self.on_capture_stream():  # Without a capacity, so that result.intersections is their number.
             result = step.run(views[index], options)
         self._capacity.observe(result.intersections)
         if key is not None:
@@ -69,9 +68,9 @@ class StepGraphs:
         return result
 
     def can_replay(self, views: ViewSource, key: GraphKey | None) -> TypeGuard[ViewStack | PhotoStream]:
-        """Return whether a step can be a graph: its photo is selected by an index on the device, and its kernels ran.
+        """Return whether a step can be captured: an index on the device selects its photo, and its kernels are loaded.
 
-        A kernel must have been compiled before it is captured, so the first step of a key runs kernel by kernel.
+        Kernels are loaded when they first run, so the first step of a key runs without a graph.
         """
         return self._first is not None and isinstance(views, ViewStack | PhotoStream) and key in self._eager_keys
 
@@ -86,10 +85,11 @@ class StepGraphs:
         following: int | None,
         options: StepOptions,
         key: GraphKey | None,
+        capacity: int,
         iteration: int,
     ) -> StepResult:
         """Replay the graphs of a key; they are captured if there are none."""
-        step, capacity, first, second = self._step, self._capacity.capacity(), self._first, self._second
+        step, first, second = self._step, self._first, self._second
         assert first is not None
         self._index.fill_(index)
         if isinstance(views, PhotoStream):
@@ -99,7 +99,7 @@ class StepGraphs:
             if second is None:
                 result = first.run(key, lambda: step.run(views.at(self._index), options, capacity))
             else:
-                with step.on_all_rows():
+                with step.reserved_memory():
                     gradients = first.run(key, lambda: step.compute_gradients(views.at(self._index), options, capacity))
                     step.average_gradients()
                     loss = second.run(key, lambda: step.apply_gradients(gradients))
@@ -158,27 +158,26 @@ class GraphCapacity:
     def __init__(self, step_counters: Tensor):
         """Start without counts; step_counters as in GradientStep."""
         self.step_counters = step_counters
-        self._expected = 0  # Intersections of the next photos, at most
-        self._counted = 0  # The most that a step had before the last poll()
-        self._capacity = 0  # Of the captured graphs; 0 chooses anew
+        self._expected = 0  # Upper bound of the intersections of the next photos; 0 before the first step
+        self._counted = 0  # Largest number that poll() has read since the last rescale()
+        self._capacity = 0  # Of the captured graphs; 0 if the next step is captured anew
         self._host_counters, self._copied = self.step_counters, None
         if self.step_counters.device.type == "cuda":
             self._host_counters = torch.zeros(3, dtype=torch.int64, pin_memory=True)
             self._copied = torch.cuda.Event()
 
-    @property
-    def has_counts(self) -> bool:
-        """True if observe() has recorded a step."""
-        return self._expected > 0
-
     def observe(self, intersections: int) -> None:
-        """Record the exact number of intersections of a step."""
+        """Record the exact number of intersections of a step that ran without a graph."""
         self._expected = max(self._expected, intersections)
 
-    def capacity(self) -> int:
-        """Return the capacity for the step that is captured or replayed now; it stays until poll() or rescale()."""
-        self._capacity = self._capacity or max(MIN_CAPACITY, math.ceil(HEADROOM * self._expected))
-        return self._capacity
+    def next(self) -> int | None:
+        """Return the capacity of the next step, the same until poll() or rescale() asks for another; None if unknown.
+
+        It is unknown before the first observe().
+        """
+        if self._expected:
+            self._capacity = self._capacity or max(MIN_CAPACITY, math.ceil(HEADROOM * self._expected))
+        return self._capacity or None
 
     def poll(self, *, wait: bool = True) -> tuple[int, bool]:
         """Read the counts, and raise the capacity of the next capture if it was too small.
@@ -203,10 +202,10 @@ class GraphCapacity:
         return skipped, True
 
     def rescale(self, growth: float, *, same_memory: bool) -> bool:
-        """Adapt the capacity after densification changed the count by the factor `growth`.
+        """Expect `growth` times as many intersections, because densification changed the Gaussians' number by it.
 
-        Returns whether the current capacity, and with it the captured graphs, can be kept: only if the Gaussians stayed
-        in the same memory.
+        Returns whether the captured graphs can be kept: if the Gaussians stayed in the same memory, and the capacity is
+        at least MIN_HEADROOM times the expected number.
         """
         needed = self._counted or int(self.step_counters[1]) or self._expected
         # The lower bound does not grow: new Gaussians are small, so intersections grow more slowly than the count.

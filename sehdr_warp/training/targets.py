@@ -52,18 +52,18 @@ def select_view(stack: Tensor, index: Tensor | None) -> Tensor:
 def code_scale(
     largest: int, response: Response | None, device, *, clipping: bool = True, dtype: torch.dtype = torch.float32
 ) -> CodeScale:
-    """Return how photos are compared: in the mu-law of decoded exposures, or without a response as encoded values.
+    """Return the scale on which a render is compared with codes: the mu-law of exposures, or encoded values.
 
-    With `clipping`, white means at least white less half an 8-bit code, and 0 at most half a code. The half code, for
-    16 bits too, keeps a response that never quite reaches white from being pulled up.
+    A code stands for a value on this scale: its encoded value, or the middle of the exposures that round to it. With
+    `clipping`, the largest code stands for all values from white less half an 8-bit code, and 0 for all up to half a
+    code. The half code, for 16 bits too, keeps a response that never quite reaches white from being pulled up.
 
-    If exposures are compared, a code stands for the middle of the interval of exposures that round to it. Near white
-    an interval may span stops. CodeScale.use_intervals() makes all of it equally good, less the finest 8-bit step at
-    its ends, so that codes with finer intervals stay values.
+    The exposures that round to a code near white may span stops. CodeScale.use_intervals() makes all of them equally
+    good, less the finest 8-bit step at the ends, so that codes with finer intervals stay values.
 
     Args:
         largest: Largest code, 255 or 65535.
-        response: Response that decodes the codes; None to compare encoded values.
+        response: Response that decodes codes to exposures; None to compare encoded values.
         device: Torch device of the tables.
         clipping: Treat the smallest and the largest code as intervals.
         dtype: Type of the tables.
@@ -213,18 +213,22 @@ class PhotoSource(Sequence[TrainingView]):
 
     def __getitem__(self, index: int) -> TrainingView:
         """Upload a view to the device."""
+        view, tensors = self.views[index], {name: t.to(self.device) for name, t in self.tensors(index).items()}
+        camera = CameraTensors.of(view.camera, self.device)
+        return TrainingView(camera, view.exposure_time, Target(scale=self.scale, **tensors))
+
+    def tensors(self, index: int) -> dict[str, Tensor]:
+        """Return the tensors of a photo's Target on the CPU, by their names there; those that the photo has."""
         view = self.views[index]
-        mask, radiance = (
-            None
-            if array is None
-            else torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=self.device)
-            for array in ((None if view.mask is None else view.mask[..., None]), (view.hdr if self.truth else None))
-        )
-        truth = None if radiance is None else radiance * self.base_time
-        codes = code_tensor(self.codes(index), self.device)
-        estimates = None if self.estimates is None else self.estimates[index].to(self.device)
-        target = Target(codes, self.scale, mask, truth, estimates=estimates)
-        return TrainingView(CameraTensors.of(view.camera, self.device), view.exposure_time, target)
+        tensors = {"codes": code_tensor(self.codes(index), "cpu")}
+        if view.mask is not None:
+            tensors["mask"] = torch.tensor(np.ascontiguousarray(view.mask), dtype=torch.float32)[..., None]
+        if self.truth and view.hdr is not None:
+            radiance = torch.tensor(np.ascontiguousarray(view.hdr), dtype=torch.float32)
+            tensors["exposure_truth"] = radiance * self.base_time
+        if self.estimates is not None:
+            tensors["estimates"] = self.estimates[index]
+        return tensors
 
     def codes(self, index: int) -> np.ndarray:
         """Return the codes of a photo, all of one type."""

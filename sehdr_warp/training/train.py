@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import cache
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,16 @@ from ..runs.run_writer import RunWriter
 from ..runs.values import LoadArguments
 from ..scene import Scene
 from ..scene.normalization import normalization_of
-from .compensation import SharedDecisions, prepare_photos
+from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from .following import send_training, several_ranks_notes
-from .initialization import brighten_clipped, make_field, response_for_training, sizes_of
+from .initialization import brighten_clipped, make_field, make_matcher, response_for_training, sizes_of
 from .machine import summary_writer
 from .plan import apply_plan
 from .ranks import Ranks
 from .run_output import RunOutput
 from .scene_facts import check_scene_truth
 from .trainer import Trainer
-from .training_state import TrainingState, load_state, state_of
+from .training_state import load_state, state_of
 
 log = logging.getLogger(__name__)
 
@@ -83,7 +84,7 @@ def create_trainer(
         overwrite: Replace the run in `out`, once the new one has a checkpoint of its start.
         tensorboard: Write event files to out/tensorboard (needs the extra `tensorboard`).
         data: Arguments with which the scene was loaded, saved to load its photos again.
-        ranks: Processes that train together, of which this one leads.
+        ranks: Processes that train together, of which this one is the main process.
         shared: Decisions of a larger set that this scene is part of; by default they are made for this scene.
 
     Raises:
@@ -100,9 +101,9 @@ def create_trainer(
     output = RunOutput(RunWriter(out), tensorboard=tensorboard, is_block=shared is not None)
     folder = output.folder
     with oom_context(device, lambda: sizes_of(scene), TRAINING_REMEDY):
-        resumes = folder.prepare(resume=resume, overwrite=overwrite)  # Again, for those who call this function.
+        has_run = folder.prepare(resume=resume, overwrite=overwrite)  # Again, for those who call this function.
         try:
-            if resumes:
+            if has_run:
                 if config is not None and not states_iterations:
                     config = with_iterations_of(folder.read_config(), config)
                 trainer = _resumed_trainer(scene, config, device, ranks, output)
@@ -110,7 +111,7 @@ def create_trainer(
                 config, data = config or Config(), data or LoadArguments()
                 trainer = _new_trainer(scene, config, device, ranks, output, data, shared, overwrite=overwrite)
             if ranks is not None:
-                send_training(ranks, trainer, exposure_compensation(folder.read_info()))
+                send_training(ranks, trainer, folder.read_info())
         except BaseException:
             folder.unlock()
             raise
@@ -138,23 +139,22 @@ def _new_trainer(
     check_scene_truth(scene, config.loss)  # Here, before the photos are matched; GradientStep repeats it.
     response = response_for_training(scene, config)
     started = time.perf_counter()
-    prepared = prepare_photos(scene, config, response, device, shared, estimate=plan is not None)
-    base_time = None if shared is None else shared.base_time
-    field = make_field(prepared.scene, config, response, device, prepared.get_matcher, base_time)
-    seconds = time.perf_counter() - started
-    trainer = Trainer(prepared.scene, config, field, get_matcher=prepared.get_matcher, ranks=ranks, output=output)
-    started = time.perf_counter()
-    light = trainer.views.loss_light_estimates
+    compensation, matcher = None if shared is None else shared.compensation_of(scene.views), None
+    if shared is None and plan is not None and estimates_compensation(scene, config, response):
+        estimate = estimate_compensation(normalization.scene(scene), config, response, device)
+        compensation, matcher = estimate.compensation, estimate.matcher
+        plan = replace(plan, decisions=(*plan.decisions, estimate.decision))
+    photos = scene if compensation is None else compensation.normalize_photos(scene, response)
+    get_matcher = cache(lambda: matcher or make_matcher(normalization.scene(photos), response, device))
+    field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
+    trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks, output=output)
+    light = trainer.views.clipped_light_targets  # Estimated once, for this and for the loss.
     if light is not None and not config.model.init_file:
-        brighten_clipped(field, normalization.scene(prepared.scene).train_views, light)
-    trainer.seconds = seconds + time.perf_counter() - started
-    if plan is not None and prepared.decision is not None:
-        plan = replace(plan, decisions=(*plan.decisions, prepared.decision))
+        brighten_clipped(field, normalization.scene(photos).train_views, light)
+    trainer.seconds = time.perf_counter() - started
     # The folder is begun last, when the scene is known to be usable.
     plan_values, state = None if plan is None else plan.to_dict(), state_of(trainer)
-    output.folder.begin(
-        scene, config, field, data, plan_values, state, compensation=prepared.compensation, overwrite=overwrite
-    )
+    output.folder.begin(scene, config, field, data, plan_values, state, compensation=compensation, overwrite=overwrite)
     for line in plan.lines() if plan is not None else ():
         log.info("%s", line)
     return trainer
@@ -181,7 +181,7 @@ def _resumed_trainer(
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     trainer = Trainer(scene, saved, field, ranks=ranks, output=output)
     try:
-        load_state(trainer, TrainingState(checkpoint.tensors, checkpoint.values))
+        load_state(trainer, checkpoint)
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
         problem = f"its state does not fit ({error!r:.120})"
         raise InputError(checkpoint.path, problem, "remove it, or train again") from None

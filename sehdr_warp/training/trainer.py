@@ -41,8 +41,8 @@ from .run_output import RunOutput
 from .scene_facts import is_large
 from .step_graphs import StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
-from .training_state import Pace, TrainingProgress
-from .training_views import PhotoOrder, TrainingViews, check_projections, first_wide_view
+from .training_state import TrainingProgress
+from .training_views import PhotoOrder, TrainingViews, check_projections, first_non_pinhole
 
 log = logging.getLogger(__name__)
 
@@ -114,7 +114,7 @@ class Trainer:
         self.order = PhotoOrder(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         check_projections(normalized, config)
-        self.can_seed = first_wide_view(normalized) is None  # Seeding samples pixels of pinhole photos.
+        self.can_seed = first_non_pinhole(normalized) is None  # Seeding samples pixels of pinhole photos.
         make = cache(partial(make_matcher, normalized, field.response, self.device))
         self._get_matcher: Callable[[], Matcher] | None = get_matcher or make
 
@@ -125,8 +125,8 @@ class Trainer:
         self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
         self._result: StepResult | None = None
         self._view_index = 0
-        self.interrupted, self._stopped, self._all_end, self._pace = threading.Event(), False, False, Pace()
-        self._finished = False
+        self.interrupted, self._stopped, self._ranks_ended, self._finished = threading.Event(), False, False, False
+        self._seconds_per_iteration = 0.0  # Smoothed
         if output is not None:
             output.start(config)
 
@@ -153,7 +153,7 @@ class Trainer:
                     self.run_timed(self.step)
                     if self.output is not None:  # Evaluation, checkpoint, log.
                         self.output.after_step(self)
-                    yield TrainingProgress(self, self._pace.seconds_left(self, self.seconds - before))
+                    yield TrainingProgress(self, self._estimate_seconds_left(self.seconds - before))
             except GeneratorExit:  # The caller left the loop.
                 self.stop()
                 self._agree_to_continue()
@@ -182,12 +182,24 @@ class Trainer:
 
         Other ranks repeat the exchange while rank 0 is in pause(); without ranks there is no exchange.
         """
-        agreed = END if self._all_end else WAIT
+        agreed = END if self._ranks_ended else WAIT
         while agreed == WAIT:
             agreed = GO if self.iteration < self.total and not self.ending else END
             if self.ranks is not None:
                 agreed = self.ranks.all_reduce_min(agreed)
         return agreed == GO
+
+    def _estimate_seconds_left(self, step_seconds: float) -> float | None:
+        """Return the estimated time to the end after a step; None after the first, because that compiles kernels."""
+        steps_before = self.iteration - self.first_iteration - self.step_batch
+        if steps_before == 0:
+            return None
+        per_iteration = step_seconds / self.step_batch
+        self._seconds_per_iteration += (per_iteration - self._seconds_per_iteration) / min(steps_before, 100)
+        # With the largest number of Gaussians, a step takes about twice as long as at the start.
+        growing = self.field.gaussians.count < self.strategy.cap_max
+        growth = max(0.0, 1 - self.iteration / self.strategy.schedule.stop) if growing else 0.0
+        return self._seconds_per_iteration * (1 + growth) * (self.total - self.iteration)
 
     def _finish(self) -> None:
         """Save the end of the training; after the last step, also measure the scene on the training photos."""
@@ -252,7 +264,7 @@ class Trainer:
             self.step_batch,
             self._measure_detail,
         )
-        changed = refine() if ranks is None else ranks.refine_on_leader(refine, strategy, gaussians, self.optimizer)
+        changed = refine() if ranks is None else ranks.refine_on_main(refine, strategy, gaussians, self.optimizer)
         if changed:
             self.graphs.adapt(count, reallocations, self.iteration)
 
@@ -296,7 +308,7 @@ class Trainer:
     def gather(self) -> None:
         """Gather statistics on rank 0 for a checkpoint; raise SehdrError if the ranks' Gaussians differ."""
         if self.ranks is not None:
-            self.ranks.reduce_to_leader(list(self.strategy.state_dict(self.field.gaussians.count).values()))
+            self.ranks.reduce_to_main(list(self.strategy.state_dict(self.field.gaussians.count).values()))
             self.ranks.check_equal(self.field.gaussians.tensors(), self.iteration)
 
     def run_timed(self, function: Callable[[], T]) -> T:
@@ -319,7 +331,7 @@ class Trainer:
 
     @torch.no_grad()
     def psnr(self) -> float:
-        """Return the PSNR of the last step's photo inside the mask, dB; its render is no time of the training."""
+        """Return the PSNR of the last step's photo inside the mask, dB; rendering it does not count as training."""
         self.synchronize()
         view = self.views.source[self._view_index]
         with self.graphs.on_capture_stream():
@@ -355,7 +367,7 @@ class Trainer:
     def pause(self) -> None:
         """Keep other ranks waiting for the next step; call it now and then between steps."""
         if self.ranks is not None and self.ranks.all_reduce_min(WAIT) == END:
-            self._all_end = True
+            self._ranks_ended = True
             self.stop()
 
     def render(self, camera: Camera) -> RenderedView:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..runs.checkpoint import under
+from ..runs.checkpoint import Checkpoint, under
 from .optimizer import load_optimizer_tensors, optimizer_tensors
 
 if TYPE_CHECKING:
@@ -44,14 +44,14 @@ def state_of(trainer: Trainer) -> TrainingState:
     return TrainingState(tensors, values)
 
 
-def load_state(trainer: Trainer, state: TrainingState) -> None:
+def load_state(trainer: Trainer, state: TrainingState | Checkpoint) -> None:
     """Continue from a state; the Gaussians of the trainer's field must already be those of the state."""
     tensors, values, device = state.tensors, state.values, trainer.device
     load_optimizer_tensors(trainer.optimizer, under(tensors, "optimizer."), trainer.batch)
     statistics = {name: value.to(device) for name, value in under(tensors, "densification.").items()}
     trainer.strategy.load_state_dict(statistics)
     trainer.average.means = {name: value.to(device) for name, value in under(tensors, "average.").items()}
-    if trainer.ranks is not None and not trainer.ranks.leads:  # The sum over the ranks counts them once.
+    if trainer.ranks is not None and not trainer.ranks.is_main_process:  # The sum over the ranks counts them once.
         for total in statistics.values():
             total.zero_()
     generators = under(tensors, "generators.")
@@ -100,26 +100,3 @@ class TrainingProgress:
     def gaussians(self) -> int:
         """Number of Gaussians."""
         return self._trainer.field.gaussians.count
-
-
-class Pace:
-    """Seconds per iteration, smoothed, from which the time left is estimated."""
-
-    def __init__(self) -> None:
-        """Start without a measurement."""
-        self._seconds_per_iteration = 0.0
-
-    def seconds_left(self, trainer: Trainer, step_seconds: float) -> float | None:
-        """Return the estimated time to the end of a training after a step; None after its first step.
-
-        The first step compiles kernels, so that its duration says nothing.
-        """
-        steps_before = trainer.iteration - trainer.first_iteration - trainer.step_batch
-        if steps_before == 0:
-            return None
-        per_iteration = step_seconds / trainer.step_batch
-        self._seconds_per_iteration += (per_iteration - self._seconds_per_iteration) / min(steps_before, 100)
-        # With the largest number of Gaussians, a step takes about twice as long as at the start.
-        growing = trainer.field.gaussians.count < trainer.strategy.cap_max
-        growth = max(0.0, 1 - trainer.iteration / trainer.strategy.schedule.stop) if growing else 0.0
-        return self._seconds_per_iteration * (1 + growth) * (trainer.total - trainer.iteration)

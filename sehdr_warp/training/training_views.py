@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,16 +30,16 @@ SLOTS = 3  # One is read, one is filled, and one may still be read by a step tha
 MAX_MEMORY_PART = 0.4  # Of the device's free memory for photos; stacking them takes as much again for a while
 
 
-def first_wide_view(scene: Scene) -> View | None:
-    """Return the first training view that is not a pinhole, None if all are."""
+def first_non_pinhole(scene: Scene) -> View | None:
+    """Return the first training view whose camera is not a pinhole, None if all are."""
     return next((view for view in scene.train_views if not view.camera.is_pinhole), None)
 
 
 def check_projections(scene: Scene, config: Config) -> None:
     """Raise InputError if the densification needs projected centers, which only pinholes have, and a view is none."""
-    wide = first_wide_view(scene)
-    if wide is not None and config.densification.strategy != "mcmc":
-        problem = f"view {wide.name} is {wide.camera.projection}, for which densification.strategy = "
+    view = first_non_pinhole(scene)
+    if view is not None and config.densification.strategy != "mcmc":
+        problem = f"view {view.name} is {view.camera.projection}, for which densification.strategy = "
         problem += f"{config.densification.strategy!r} has no projected centers"
         raise InputError(scene.name, problem, "use densification.strategy=mcmc")
 
@@ -89,26 +87,21 @@ class PhotoStream:
 
     def __init__(self, source: PhotoSource):
         """Allocate the slots; raises ValueError if views differ in size, or only some have HDR truth."""
-        views, self._source = source.views, source
-        first = source[0]
-        kinds = {(v.camera.width, v.camera.height, source.truth and v.hdr is not None) for v in views}
-        if len(kinds) > 1 or first.camera.directions is not None:
+        views, self._source, self._device = source.views, source, torch.device(source.device)
+        sizes = {(v.camera.width, v.camera.height, source.truth and v.hdr is not None) for v in views}
+        if len(sizes) > 1 or not all(view.camera.is_pinhole for view in views):
             raise ValueError(
                 "photos differ in size, only some have HDR truth, or some are panoramas: no stack holds them"
             )
-        self._device = first.target.codes.device
         self._cuda = self._device.type == "cuda"
-        masked = any(view.mask is not None for view in views)
-        shapes = {"codes": first.target.codes, "exposure_truth": first.target.exposure_truth}
-        shapes["estimates"] = first.target.estimates
-        shapes["mask"] = torch.empty(first.camera.height, first.camera.width, 1) if masked else None
-        self._parts = {name: like for name, like in shapes.items() if like is not None}
-        self._slots = {name: self._allocate(like, SLOTS, self._device) for name, like in self._parts.items()}
-        self._pinned = (
-            {name: self._allocate(like, SLOTS, "cpu") for name, like in self._parts.items()} if self._cuda else {}
-        )
+        examples = source.tensors(0)
+        if any(view.mask is not None for view in views):  # A view without a mask counts everywhere.
+            examples.setdefault("mask", torch.ones(*views[0].codes.shape[:2], 1))
+        self._slots = {name: t.new_zeros((SLOTS, *t.shape), device=self._device) for name, t in examples.items()}
+        pinned = self._slots if self._cuda else {}
+        self._pinned = {name: torch.zeros_like(t, device="cpu", pin_memory=True) for name, t in pinned.items()}
         # Cameras of all views, without photos.
-        blank = Target(first.target.codes[:0, :0], first.target.scale)
+        blank = Target(self._slots["codes"][0, :0, :0], source.scale)
         cameras = [TrainingView(CameraTensors.of(v.camera, self._device), v.exposure_time, blank) for v in views]
         stack = ViewStack.of(cameras)
         assert stack is not None
@@ -121,11 +114,6 @@ class PhotoStream:
         if self._cuda:
             self._stream = torch.cuda.Stream(self._device)
             self._filled, self._free = ([torch.cuda.Event() for _ in range(SLOTS)] for _ in range(2))
-
-    def _allocate(self, like: Tensor, count: int, device: Any) -> Tensor:
-        """Allocate `count` slots like a tensor."""
-        pinned = self._cuda and torch.device(device).type == "cpu"
-        return torch.zeros((count, *like.shape), dtype=like.dtype, device=device, pin_memory=pinned)
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -173,32 +161,17 @@ class PhotoStream:
 
     def _fill(self, slot: int, index: int) -> None:
         """Copy a view to its slot; runs on the thread."""
-        for name, array in self._arrays(index).items():
-            if not self._cuda:
-                self._slots[name][slot].copy_(array)
-                continue
+        if self._cuda:
             self._filled[slot].synchronize()  # The previous copy from pinned memory is done.
-            self._pinned[name][slot].copy_(array)
+        tensors = {"mask": torch.ones(())} | self._source.tensors(index)
+        for name, slots in (self._pinned or self._slots).items():
+            slots[slot].copy_(tensors[name])
         if self._cuda:
             with torch.cuda.stream(self._stream):
                 self._stream.wait_event(self._free[slot])
                 for name, slots in self._slots.items():
                     slots[slot].copy_(self._pinned[name][slot], non_blocking=True)
                 self._filled[slot].record(self._stream)
-
-    def _arrays(self, index: int) -> dict[str, Tensor]:
-        """Return a photo's codes, HDR truth as exposure, and mask, on the CPU."""
-        view, codes = self._source.views[index], self._source.codes(index)
-        arrays = {"codes": torch.from_numpy(codes.view(np.int16) if codes.dtype == np.uint16 else codes)}
-        if "exposure_truth" in self._parts:
-            assert view.hdr is not None
-            arrays["exposure_truth"] = torch.from_numpy(np.asarray(view.hdr, np.float32)) * self._source.base_time
-        if self._source.estimates is not None:
-            arrays["estimates"] = self._source.estimates[index]
-        if "mask" in self._parts:  # A view without a mask counts everywhere.
-            whole = np.ones(view.codes.shape[:2], np.float32) if view.mask is None else view.mask
-            arrays["mask"] = torch.from_numpy(np.asarray(whole, np.float32))[..., None]
-        return arrays
 
 
 ViewSource = ViewStack | PhotoStream | Sequence[TrainingView]
@@ -225,8 +198,8 @@ class TrainingViews:
         return light_estimates(self._views, response, self._config.loss, field.gaussians.means.device)
 
     @property
-    def loss_light_estimates(self) -> list[Tensor] | None:
-        """The estimates [h, w, 6] that the loss pulls clipped light towards; None if it compares no exposures."""
+    def clipped_light_targets(self) -> list[Tensor] | None:
+        """Estimates [h, w, 6] of each view's log light, to which the loss pulls clipped pixels; None if it does not."""
         estimates = self.light_estimates if compares_exposures(self._config.loss, self._field) else None
         return None if estimates is None else [estimate.log_light for estimate in estimates]
 
@@ -266,6 +239,6 @@ class TrainingViews:
             device,
             clipping=loss.clipping,
             compare_by=response,
-            estimates=self.loss_light_estimates,
+            estimates=self.clipped_light_targets,
             truth=loss.uses_hdr,
         )

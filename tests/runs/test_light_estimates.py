@@ -10,7 +10,7 @@ from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.estimate import LARGEST, LightEstimate
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import LossConfig
-from sehdr_warp.runs.light_estimates import WidePrior, light_estimates
+from sehdr_warp.runs.light_estimates import FacePrior, light_estimates
 from sehdr_warp.scene import Camera, View
 from sehdr_warp.scene.wide_camera import pixel_directions, solid_angles
 from sehdr_warp.training.targets import PhotoSource
@@ -115,7 +115,7 @@ def fisheye(size=120):
 def test_faces_lie_where_the_photo_shows_them(camera):
     directions = np.nan_to_num(pixel_directions(camera))
     smooth = torch.tensor(0.5 + 0.3 * directions, dtype=torch.float32)
-    result = WidePrior(Echo(), camera).estimate(smooth, torch.ones_like(smooth, dtype=torch.bool))
+    result = FacePrior(Echo(), camera).estimate(smooth, torch.ones_like(smooth, dtype=torch.bool))
     has_direction = torch.tensor(np.isfinite(pixel_directions(camera)).all(axis=2))
     if camera.projection != "equirectangular":  # The border is blurred with the black around a picture
         has_direction[:6], has_direction[-6:], has_direction[:, :6], has_direction[:, -6:] = False, False, False, False
@@ -130,7 +130,7 @@ def test_large_panoramas_are_seen_by_small_faces_and_dark_faces_not_at_all():
     exposure = torch.full((1024, 2048, 3), 0.25)
     clipped = torch.zeros(1024, 2048, 3, dtype=torch.bool)
     clipped[500:520, 1000:1040] = True  # In front
-    prior = WidePrior(echo, camera)
+    prior = FacePrior(echo, camera)
     estimate = prior.estimate(exposure, clipped)
     assert estimate.mean.shape == (*prior.size(1024, 2048), 3) == (251, 503, 3)
     assert len(echo.sizes) == 3, "the face in front and its two neighbors"
@@ -144,10 +144,10 @@ def test_a_lamp_is_estimated_alike_all_around_and_across_the_seam():
     clipped = torch.zeros(128, 256, 3, dtype=torch.bool)
     clipped[50:58, 124:132] = True
     exposure = torch.where(clipped, 1.0, exposure)
-    wide = WidePrior(prior, camera)
-    first = wide.estimate(exposure, clipped).mean[50:58, 124:132]
+    face_prior = FacePrior(prior, camera)
+    first = face_prior.estimate(exposure, clipped).mean[50:58, 124:132]
     for shift in (32, 128):  # By 45 degrees, and onto the seam
-        moved = wide.estimate(exposure.roll(shift, 1), clipped.roll(shift, 1)).mean.roll(-shift, 1)
+        moved = face_prior.estimate(exposure.roll(shift, 1), clipped.roll(shift, 1)).mean.roll(-shift, 1)
         assert torch.allclose(moved[50:58, 124:132], first, atol=0.05)
     assert first.mean() > 0.3
 
@@ -155,6 +155,6 @@ def test_a_lamp_is_estimated_alike_all_around_and_across_the_seam():
 def test_cameras_of_another_pose_share_faces():
     moved = np.eye(4)
     moved[:3, 3] = 1, 2, 3
-    prior = WidePrior(Echo(), panorama())
+    prior = FacePrior(Echo(), panorama())
     assert prior.fits(Camera(128, 64, 128 / (2 * np.pi), 128 / (2 * np.pi), 64, 32, moved, "equirectangular"))
     assert not prior.fits(panorama(256)) and not prior.fits(fisheye())

@@ -28,14 +28,14 @@ def _rank(rank: int, work, folder: Path, arguments: tuple) -> None:
 
 def train_together(ranks, folder: Path, strategies: list[str], iterations: int) -> None:
     """Trains the toy scene with each strategy; each rank saves its state as <strategy>.<rank>."""
-    from sehdr_warp.training.following import follow_leader
+    from sehdr_warp.training.following import train_as_worker
     from sehdr_warp.training.train import create_trainer
     from sehdr_warp.training.training_state import state_of
 
     from .toy import VARIANTS, toy_scene
 
     for strategy in strategies:
-        if ranks.leads:
+        if ranks.is_main_process:
             training = create_trainer(toy_scene(), folder / strategy, VARIANTS[strategy], device="cpu", ranks=ranks)
             for step in training:
                 if step.iteration >= iterations:
@@ -43,7 +43,7 @@ def train_together(ranks, folder: Path, strategies: list[str], iterations: int) 
             trainer = training
             ranks.store.delete_key("photos/0")
         else:
-            trainer = follow_leader(ranks)
+            trainer = train_as_worker(ranks)
         ranks.all_reduce_min(2)
         assert "torch._dynamo" not in sys.modules, "two seconds of every start"
         torch.save(tuple(state_of(trainer)), folder / f"{strategy}.{ranks.rank}")
@@ -74,7 +74,7 @@ def mixed(ranks, folder: Path) -> None:
 
 def fall_silent(ranks, folder: Path) -> None:
     """Rank 1 no longer answers, and rank 0 ends; what it says is kept."""
-    if ranks.leads:
+    if ranks.is_main_process:
         ranks._timeout = 2.0
         logging.getLogger("sehdr_warp").addHandler(logging.FileHandler(folder / "silent"))
         ranks.all_reduce_min(2)

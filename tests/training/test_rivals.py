@@ -84,7 +84,7 @@ def test_photos_of_no_weight_teach_nothing(scene):
 
 @pytest.mark.parametrize("preset", ["truth", "hdr-gs-truth", "paper-truth"])
 def test_a_scene_without_truth_is_refused_by_name_and_field(scene, tmp_path, preset, monkeypatch):
-    for work in ("response_for_training", "prepare_photos", "make_field"):
+    for work in ("response_for_training", "estimate_compensation", "make_field"):
         monkeypatch.setattr(f"sehdr_warp.training.train.{work}", lambda *_: pytest.fail("worked for nothing"))
     field = "loss.hdr_truth = true" if preset == "paper-truth" else "loss.hdr_weight = "
     with pytest.raises(InputError, match=f"^toy: no training view has the HDR truth that {field}"):
