@@ -89,14 +89,13 @@ class SharedDecisions:
     compensation: ExposureCompensation | None  # Correction of all photos; None if there is no drift
 
     def compensation_of(self, views: Sequence[View]) -> ExposureCompensation | None:
-        """Return the compensation of some views alone."""
+        """Return the entries of some views of the compensation."""
         if self.compensation is None:
             return None
-        names = {view.name for view in views}
-        parts = (
-            {name: value for name, value in part.items() if name in names} for part in vars(self.compensation).values()
-        )
-        return ExposureCompensation(*parts)
+        names, whole = {view.name for view in views}, self.compensation
+        gains = {name: gain for name, gain in whole.gains.items() if name in names}
+        vignetting = {name: terms for name, terms in whole.vignetting.items() if name in names}
+        return ExposureCompensation(gains, vignetting)
 
 
 def estimates_compensation(scene: Scene, config: Config, response: Response) -> bool:

@@ -205,10 +205,8 @@ def check_dataset_truth(data: LoadArguments, config: Config) -> None:
     from ..scene.file_names import unique_names
     from ..scene.load import parse_dataset
 
-    # The plan leaves out a linear loss without truth.
-    removed = config.plan.enabled and not config.loss.hdr_weight
-    if not config.loss.uses_hdr or removed:
-        return
+    if not config.loss.uses_hdr or (config.plan.enabled and config.loss.hdr_weight == 0):
+        return  # A plan leaves out a linear loss without truth.
     path = data.get("path")
     assert path is not None, "the caller checks the path"
     dataset = parse_dataset(path, exposure_index=data.get("exposure_index"), holdout=data.get("holdout"))
