@@ -6,7 +6,7 @@ chooses.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,8 @@ class ResponseSelection:
     """The chosen response, by which score, and every candidate's scores, best first.
 
     uncertainty: stops; by how much curves that explain the photos as well differ from the chosen one: the root mean
-    square over codes 10 to 245 and over the posterior, after one scale for each curve. NaN by "paper".
+    square over codes 10 to 245 and over the posterior, after one scale for each curve. For a camera's own JPEGs, the
+    curves are those of measured cameras, and edges do not count. NaN by "paper".
     """
 
     response: Response
@@ -45,8 +46,8 @@ class ResponseSelection:
             return None
         return (
             f"the response {self.response.name} is a guess: curves that explain the photos as well differ from it by "
-            f"{self.uncertainty:.1f} stops between dark and bright; name it with --response, or measure it with "
-            "`sehdr-warp calibrate`"
+            f"{self.uncertainty:.1f} stops between dark and bright; use RAW photos, measure it with "
+            "`sehdr-warp calibrate`, or name it with --response"
         )
 
 
@@ -70,7 +71,7 @@ def select_response(
             else the posterior's mean of log exposure at each code, a table beside the candidates.
             "paper" is SeHDR, section 3.3: the curve that does best on one photo "by dynamic range and smoothness"; the
             paper gives no formula, ours is ResponseScore.paper_score.
-        from_camera: the photos are a camera's own JPEGs, with the prior of cameras.
+        from_camera: the photos are a camera's own JPEGs: nearly always `camera` or `rec709`, by their prior.
         seed: of the sample of edges where there are more than 4000.
 
     Raises:
@@ -79,7 +80,8 @@ def select_response(
     """
     if method not in ("posterior", "paper"):
         raise SehdrError(f"select_response: method = {method!r} is neither posterior nor paper")
-    with_family = candidates is None and method == "posterior" and not from_camera
+    by_default = candidates is None and method == "posterior"
+    with_family = by_default and not from_camera
     candidates = [analytic_response(name) for name in DESCRIPTIONS] if candidates is None else candidates
     if not candidates:
         raise SehdrError("select_response: there are no candidates; give at least one response")
@@ -103,6 +105,9 @@ def select_response(
         formula_costs = posteriors + np.log(np.exp(-priors).sum() / (1 - NO_FORMULA))
         family_costs = likely.total(len(evidence.edges))[count:] + np.log((len(logs) - count) / NO_FORMULA)
         costs = np.concatenate([formula_costs, family_costs])
+    elif by_default:  # Edges of a camera's own JPEGs are sharpened: they would make the family sure of a wrong curve.
+        logs = family_curves().at_codes
+        costs = likelihoods(replace(evidence, edges=evidence.edges[:0]), family_curves()).total(0)
     chances = np.exp(costs.min() - costs)
     chances /= chances.sum()
     takes_mean = with_family and chances[order[0]] < DECISIVE

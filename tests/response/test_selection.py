@@ -195,6 +195,16 @@ def stops_off(response, truth) -> float:
     return float(np.std(np.log2(response.decode(CODES[10:246])) - np.log2(truth.decode(CODES[10:246]))))
 
 
+def test_cameras_own_jpegs_state_by_how_much_cameras_differ():
+    """Their curve is taken by prior: their edges, which are sharpened, must not make it look sure."""
+    for truth in (response_by_name("camera"), *map(family_curve, (3, 40, 77))):
+        photos = [photograph(truth, truth.clip_exposure * mosaic(seed)) for seed in range(4)]
+        selection = select_response(photos, from_camera=True)
+        assert selection.response.name in ("camera", "rec709")
+        assert stops_off(selection.response, truth) < 2 * selection.uncertainty < 1.2
+        assert "use RAW photos" in selection.note
+
+
 def test_curve_that_is_no_formula_is_met_by_the_posteriors_mean():
     off_mean, off_formula = [], []
     for draw in (3, 40, 77):
