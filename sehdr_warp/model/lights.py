@@ -20,7 +20,8 @@ REACH = 3.0  # Gaussians join one light if they are nearer than this many median
 FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras
-MOST_LIGHTS, MOST_VIEWS = 64, 24
+MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
+MOST_LIGHTS, MOST_VIEWS = 64, 24  # MOST_VIEWS of the usual exposure, and of the darker ones
 LEAST_ROWS, MOST_ROWS = 128, 724
 """Rows of the map in which the light at a point is measured: as fine as the photos' pixels, within these bounds. In
 coarser pixels small Gaussians would no longer hide each other."""
@@ -63,7 +64,8 @@ class Light:
             these cuts the light off at its border, it is what reaches the place of the one that shows most of it.
         lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
         deviation: of log2 radiance, stops, of what photos clip, from the confidence of its Gaussians; None if that was
-            not measured. Edges and colors that do not clip make a light no surer, because all its photos may err alike.
+            not measured. Edges and colors that do not clip make a light no surer, because all its photos may err alike;
+            where photos of half the exposure or less do not clip, it is at most MEASURED_STOPS.
         share: of the light that reaches the middle of the training cameras.
         members: [K] int64, its Gaussians.
     """
@@ -101,10 +103,13 @@ def find_lights(
         return []
     times = np.array([time for _, time in views])
     white = field.response.white / float(np.median(times))
-    least_clipped = CLIPPED * float(np.mean(times > np.median(times) / 2))  # Darker photos measure lights: none clips.
-    cameras = [camera for camera, _ in views]
-    middle = np.mean([camera.position for camera in cameras], axis=0)
-    cameras = every_nth(cameras, MOST_VIEWS)
+    dark = times <= np.median(times) / 2
+    least_clipped = CLIPPED * float(np.mean(~dark))  # Darker photos measure lights: none clips.
+    middle = np.mean([camera.position for camera, _ in views], axis=0)
+    sample = [index for part in (~dark, dark) for index in every_nth(part.nonzero()[0], MOST_VIEWS)]
+    cameras = [views[index][0] for index in sample]
+    # Radiance up to which each photo measures what the others clip.
+    measurable = np.where(dark, field.response.white / times, 0.0)[sample]
     focal = typical_focal_length(cameras)
 
     @cache
@@ -123,6 +128,7 @@ def find_lights(
     positions = field.normalization.scene_points(gaussians.means[members].cpu().numpy())
     widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
+    brightness = mean.amax(1)[members].cpu().numpy()
     confidence = None if field.confidence is None else field.confidence.to(members.device)[members].cpu().numpy()
     shares = clipped.to(members.device)[members].cpu().numpy()
     covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
@@ -148,6 +154,9 @@ def find_lights(
         deviation = None
         if confidence is not None:
             stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
+            shown = area_sums[:, 0] > 0.5 * area * angles_of_shape[holding]  # Else something hides the light.
+            measured = brightness[group] < measurable[holding][shown].max(initial=0.0)
+            stops[measured] = np.minimum(stops, MEASURED_STOPS * shares[group])[measured]
             deviation = float(weights[group] @ stops / (weights[group] @ shares[group]))
         share = float(radiance.mean() * shape.solid_angle(middle)) / total
         if share >= LEAST_SHARE:

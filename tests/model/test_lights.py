@@ -138,6 +138,19 @@ def test_photos_so_dark_that_lights_do_not_clip_take_none_off_the_list():
     assert len(light.members) == scene.gaussians.count
 
 
+@pytest.mark.parametrize(
+    "darker, direction, stops", [(64, 1, 0.25), (8, 1, 1.6), (64, -1, 1.6)], ids=["clear", "still clipped", "elsewhere"]
+)
+def test_a_light_is_sure_if_a_darker_photo_shows_it_unclipped(darker, direction, stops):
+    scene = field(panel(), RADIANCE, 0.03)
+    scene.confidence = torch.full((scene.gaussians.count,), 2.0**-1.2)
+    (camera, time), *others = views()
+    turned = look_at(camera.position, np.add(camera.position, (0, 0, direction)), up=(0, -1, 0))
+    dark = (Camera(256, 192, 240.0, 240.0, 128.0, 96.0, turned), time / darker)
+    (light,) = find_lights(scene, torch.full((scene.gaussians.count,), 0.75), [*others, dark])
+    assert light.deviation == pytest.approx(stops, rel=0.01)
+
+
 def test_deviation_follows_the_confidence():
     scene = field(panel(), RADIANCE, 0.03)
     scene.confidence = torch.full((scene.gaussians.count,), 0.5)
