@@ -151,7 +151,7 @@ def write_proxy_mesh(
         text = "%s: coordinates up to %.4g are too large for its numbers, which move vertices by about %.2g; %s"
         log.warning(text, path.name, far, step, "use --axes upright, which puts the scene at the origin")
     if mesh.ground is not None:
-        log.info("%s", _ground_line(mesh.ground, transform))
+        log.info("%s", _ground_line(mesh.ground, transform, scene_up(run)))
     _log_agreement(mesh, run, transform)
     return path
 
@@ -268,6 +268,8 @@ def find_ground(vertices: np.ndarray, faces: np.ndarray, cameras: np.ndarray, vo
     slope_x, slope_z, height = np.linalg.lstsq(matrix * root[:, None], points[:, 1] * root, rcond=None)[0]
     normal = np.array([-slope_x, 1.0, -slope_z])
     normal /= np.linalg.norm(normal)
+    if normal[1] < _UPRIGHT:  # Level pieces at several heights, as of stairs
+        return None
     return Ground(float(height), normal, float(areas[near_peak].sum() / areas.sum()))
 
 
@@ -308,12 +310,17 @@ def _log_agreement(mesh: ProxyMesh, run: "RenderableScene", transform: WorldTran
         log.info(text, len(cameras), 100 * float(np.median(values)), 100 * close, 100 * (1 - len(values) / total))
 
 
-def _ground_line(ground: Ground, transform: WorldTransform) -> str:
-    """Return a line about a floor, with the option that makes it level for all files."""
+def _ground_line(ground: Ground, transform: WorldTransform, up_of_photos: np.ndarray) -> str:
+    """Return a line about a floor, with the option that makes it level for all files, unless it may be a wall."""
     line = f"ground: at y = {ground.height:.3g}, {ground.tilt:.1f} degrees off level, {ground.share:.0%} of the surface"
+    normal = transform.rotation.T @ ground.normal
+    cosine = float(normal @ up_of_photos)
+    if cosine < _UPRIGHT:
+        degrees = np.degrees(np.arccos(max(cosine, -1.0)))
+        return f"{line}; {degrees:.0f} degrees from up by the photos: if this is a wall or a ceiling, leave --up out"
     if ground.tilt < _LEVEL:
         return line
-    up = ",".join(f"{value:.4f}" for value in transform.rotation.T @ ground.normal)
+    up = ",".join(f"{value:.4f}" for value in normal)
     return f"{line}; --up={up} levels it, here and for render, export and envmap"
 
 

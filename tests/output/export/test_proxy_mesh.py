@@ -160,6 +160,27 @@ def test_a_floor_that_is_not_level_comes_with_the_option_that_levels_it(tmp_path
     assert "--up" not in line
 
 
+def test_a_floor_far_from_up_by_the_photos_is_not_levelled(tmp_path, logged):
+    """Where --up is wrong, a wall counts as the floor, and what levels the wall is wrong, too."""
+    run, turn = BallOnFloor(), np.radians(6)
+    run.up = UpDirection(np.array([1.0, 0.0, 0.0]), "gps")
+    write_proxy_mesh(run, tmp_path / "wall.obj", resolution=48, up=f"{np.sin(turn):.6f},{np.cos(turn):.6f},0")
+    [line] = [line for line in logged if line.startswith("ground")]
+    assert "--up=" not in line
+    assert "90 degrees from up by the photos: if this is a wall or a ceiling, leave --up out" in line
+
+
+def test_stairs_are_no_floor():
+    """Their steps are level, and a plane through them is not."""
+    corners = [(0.0, 0, 0), (0, 0, 1), (0.2, 0, 1), (0.2, 0, 0)]
+    steps = np.concatenate([np.add(corners, (0.2 * i, 0.1 * i, 0)) for i in range(5)])
+    faces = np.concatenate([4 * i + np.array([(0, 1, 2), (0, 2, 3)]) for i in range(5)])
+    cameras = np.array([[0.0, 5, 0]])
+    assert find_ground(steps, faces, cameras, 0.1) is None
+    floor = find_ground(steps * (1, 0.1, 1), faces, cameras, 0.01)
+    assert floor is not None and floor.tilt == pytest.approx(2.9, abs=0.3)
+
+
 class LampOnFloor(BallOnFloor):
     """The same, whose ball is a lamp: Gaussians on its surface are a light."""
 
