@@ -63,7 +63,7 @@ def main(
 
 
 def row(job: tuple[str, int, int, str, str], *, iterations: int, max_size: int | None, device: str) -> dict:
-    """Held-out figures of one training."""
+    """Train one kind of photos of a scene and return the held-out figures."""
     name, exposure, bits, kind, noise = job
     curve = response_by_name("srgb")
     truth = load_scene(f"embedded:{name}", max_size=max_size, response="srgb")
@@ -92,7 +92,7 @@ def photograph(truth: Scene, curve: Response, time: float, bits: int, kind: str,
             codes = linear_codes(np.rint(np.clip(light, 0, 1) * levels) / levels)
         else:
             codes = codes_of(np.rint(np.asarray(curve.encode(light)) * levels) / levels, 16)
-        # Of no file: a picture of light, as the truth is, would be learned from as it is.
+        # Without a source: views of an OpenEXR file are trained on as light, not as codes.
         views.append(replace(view, codes=codes, exposure_time=time, source=None))
     return replace(truth, views=tuple(views), response=curve, light_known=True)
 

@@ -53,8 +53,8 @@ AT_ONCE = 2  # Blocks that train at once
 WARM_UP = 100  # Steps of a training before the first that is timed; it has refinements, whose kernels are compiled
 FRAMES = 20
 SIZE = 1920, 1080  # Pixels of the pictures of copies
-DRAFT = 480, 270  # Of the page's pictures while it moves
-COPY_SECONDS, VIEW_SECONDS = 30.0, 22.0  # That must be left for them
+DRAFT = 480, 270  # Pixels of the viewer's pictures while the camera moves
+COPY_SECONDS, VIEW_SECONDS = 30.0, 22.0  # Time that each of both parts needs; without it the part is left out
 
 
 @dataclass(frozen=True)
@@ -360,7 +360,7 @@ def _milliseconds(times: Sequence[float]) -> dict[str, float]:
 
 def main(study: Study) -> None:
     """Run the study."""
-    calm_threads()  # For the processes that this one starts
+    calm_threads()  # The processes that this one starts inherit it.
     study.out.mkdir(parents=True, exist_ok=True)
     settings = {"views": study.views, "size": study.size, "gaussians": study.gaussians, "steps": study.steps}
     settings |= {"blocks": study.count, "GPUs": len(study.devices) if study.device.type == "cuda" else 0}

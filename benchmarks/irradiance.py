@@ -20,7 +20,7 @@ FOLDER = "light"
 LIGHT = "light.npz"
 """File of a job's folder."""
 NORMALS = 200  # Directions that surfaces face, evenly over the sphere
-LEAST_SEEN = 0.1  # Of the hemisphere before a surface, weighted by the cosine, that photos must show for it to count
+LEAST_SEEN = 0.1  # A surface counts if photos show this part of its hemisphere, weighted by the cosine
 FINER, FINEST = 4, 32
 """Least and most pixels of a render, across, for one of the truth's. Pixels as fine as the photos' are needed: in
 larger ones small Gaussians no longer hide each other, and a small lamp of several came out twice as bright."""

@@ -34,9 +34,9 @@ from .timing import forget_peaks, held_memory, wait
 LOG = logging.getLogger("large")
 RESPONSE = "srgb"
 WARM_UP = 5
-"""The first of so many parts of a training does not count for the time: kernels load, photos are matched."""
+"""The first 1 / WARM_UP of a training is not timed, because kernels load and photos are matched."""
 HELD_OUT = 8
-"""Of so many photos one is held out."""
+"""One of HELD_OUT photos is held out."""
 
 
 def main(sizes: tuple[str, ...], /, json: Path, photos: int = 24, iterations: int = 1000) -> None:

@@ -38,7 +38,7 @@ PLACE, SPREAD = np.array([0.0, -0.8, 1.3]), np.array([0.6, 0.5, 0.35])
 """Meters, in the room: where the map is seen from, and how far from there cameras stand."""
 DEPTH, BATCH = 4, 1 << 21
 POLE, EDGE = np.radians(15), 8
-"""From a pole, and columns at either end of the map: where a projection would show."""
+"""Radians around a pole, and columns at either end of the map, where errors of a projection would show."""
 
 
 def main(

@@ -15,12 +15,12 @@ from .timing import Variant
 from .workload import count_blended_pairs
 
 STEPS = 20
-"""Steps that are looked at."""
+"""Number of profiled steps."""
 COPIED = 1 << 28
-"""Bytes that are copied to learn what the memory gives."""
+"""Bytes of the copy that measures the bandwidth of the memory."""
 CYCLES = 20_000_000
-"""That a kernel idles to learn what the clock gives."""
-SCHEDULERS = 4  # Of a multiprocessor, each of which issues one instruction of a warp in a cycle
+"""Cycles that a kernel idles to measure the clock."""
+SCHEDULERS = 4  # In a multiprocessor; each issues one instruction of a warp in a cycle
 OTHER = "torch's own"
 
 KERNELS = {
@@ -43,7 +43,7 @@ KERNELS = {
     "densification": ("add_position_noise_*", "add_gradient_statistics_*"),
     OTHER: ("*",),
 }
-"""The kernels of each part, by patterns; the first that fits has a kernel."""
+"""Patterns of the kernels of each part; a kernel belongs to the first part with a pattern that fits."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ BYTES: dict[str, Callable[[Work], float]] = {
     # Parameters and both moments, read and written; the harmonics' gradients are made of three numbers.
     "optimizer": lambda w: FLOAT * w.gaussians * (6 * (GEOMETRY + w.harmonics) + GEOMETRY + 3),
 }
-"""The fewest bytes that each part must move, were nothing read twice."""
+"""Fewest bytes that each part moves if it reads nothing twice."""
 
 INSTRUCTIONS: dict[str, Callable[[Work], float]] = {
     "blend": lambda w: w.warp_pairs * (28 + 1.25 * (w.channels - 3)),
     "blend, backward": lambda w: w.warp_pairs * (49 + 2.25 * (w.channels - 3)),
 }
-"""That warps issue, at least: what sm_90's code of three channels has for a Gaussian in a warp, and one multiply-add
-and a fourth of a load for each more; the backward pass sums once more."""
+"""Fewest instructions that warps issue: those of sm_90's code for a Gaussian in a warp with three channels, and one
+multiply-add and a fourth of a load for each further channel; the backward pass sums once more."""
 
 
 def part_of(kernel: str) -> str:

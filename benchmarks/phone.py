@@ -69,7 +69,7 @@ def main(
 
 
 def row(job: tuple[int, int, str, str], *, iterations: int, device: str) -> dict:
-    """Held-out figures of one training."""
+    """Train one kind of photos of a scene and return the held-out figures."""
     seed, size, name, photos = job
     response = "srgb" if KINDS[photos].stops else "auto"  # Files with gain maps state theirs.
     config = load_config("default", {"schedule.iterations": iterations, "seed": seed, "response.name": response})

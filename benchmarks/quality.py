@@ -36,12 +36,12 @@ from sehdr_warp.training.train import train
 from .timing import Variant, forget_peaks, time_variants
 
 LOG = logging.getLogger(__name__)
-FORMAT = 8  # Of a job and of its result; others are run again.
+FORMAT = 8  # Version of jobs and results; jobs of other versions run again.
 RESULT, FAILURE = "result.json", "failure.json"
 EXPOSURES, FACTOR = 5, 4.0
-"""A scene's ladder: so many exposures, each so many times longer than the last, around a well exposed one."""
+"""Exposures of a scene, each FACTOR times longer than the last, around a well exposed one."""
 KNOWN, BLIND, LEARNED = "known", "blind", "learned"
-"""Whether a method is told the curve, chooses one, or learns it: then known and blind are one training."""
+"""A method gets the curve, chooses one, or learns it; if it learns it, known and blind are one training."""
 UPPER_BOUND = "truth"
 """3DGS trained on the HDR truth, which every method is compared with."""
 METHOD_FIELDS = (
@@ -51,7 +51,7 @@ METHOD_FIELDS = (
 """Fields that make a method: its plan does not change them. Steps, learning rates and the largest number of Gaussians
 are planned for every method alike, also where its preset has no plan."""
 WARM_UP_ITERATIONS = 30
-"""Of a training that is thrown away before the first of its kind in a process: kernels are compiled, steps recorded.
+"""Length of a training before the first of its kind in a process, for compiling kernels and capturing CUDA graphs.
 All schedules scale with the length, so every part of a training is in it."""
 _warm: set[str] = set()
 
@@ -69,13 +69,13 @@ class Job:
 
     @property
     def key(self) -> str:
-        """The hash of all that decides the job's result."""
+        """Return a hash of everything that decides the job's result."""
         text = json.dumps(self.config, sort_keys=True, ensure_ascii=False)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def label(self) -> str:
-        """The job in words."""
+        """Return the job in words."""
         config = self.config
         where = f"{config['scene']['name']} {config['curve']} exposure {config['exposure']}"
         return f"{where} {config['method']} {config['response']} seed {config['seed']}"
@@ -246,7 +246,7 @@ def row_of(result: dict) -> dict:
 
 
 def _submit(jobs, out: Path, device: str, at_once: int, slurm: dict | None, lpips: str | None) -> None:
-    """Workers by submitit, each taking job after job; returns when all have ended."""
+    """Start workers by submitit, each of which runs job after job; return when all have ended."""
     logs, count = out / "logs", torch.cuda.device_count() if device == "cuda" and slurm is None else 0
     shared = -(-at_once // count) if count else at_once if slurm is None else 1
     if slurm is None:

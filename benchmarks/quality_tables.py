@@ -8,8 +8,11 @@ from .quality import EXPOSURES, KNOWN, LEARNED, UPPER_BOUND
 from .report_tables import PAGES, pivot
 from .results import groups, markdown_table, parted
 
-FIRST_TITLE, ENERGY_TITLE = "trained by", "light energy: median, 5th to 95th percentile"  # Of the README's table
-NOTHING_CLIPS = 0.001  # Of the pixels
+FIRST_TITLE, ENERGY_TITLE = (
+    "trained by",
+    "light energy: median, 5th to 95th percentile",
+)  # Columns of the README's table
+NOTHING_CLIPS = 0.001  # Largest share of clipped pixels at which nothing counts as clipped
 
 
 def quality_tables(result: dict) -> Iterable[str]:

@@ -226,4 +226,4 @@ TABLES: dict[str, Callable[[dict], Iterable[str]]] = {
     "stability": _stability_tables,
     "trust": _trust_tables,
 }
-"""Paragraphs of a page below its plot, by the page's name, from its result."""
+"""Functions by the name of a page: each returns the paragraphs below the plot, from the result."""

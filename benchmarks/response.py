@@ -27,7 +27,7 @@ GOOD = 0.35
 
 
 def response_error(response: Response, truth: Response) -> float:
-    """RMS over codes 10 to 245 of log2(decoded exposure / true one), best scale removed, stops."""
+    """Return the RMS over codes 10 to 245 of log2(decoded / true exposure), in stops, after the best scale."""
     return float(np.std(np.log2(response.decode(CODES / 255.0)) - np.log2(truth.decode(CODES / 255.0))))
 
 

@@ -14,7 +14,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.files import write_json
 
 COLUMNS: dict[str, dict[str, str]] = tomllib.loads(Path(__file__).with_name("columns.toml").read_text(encoding="utf-8"))
-"""The columns of each benchmark's table, as markdown_table's."""
+"""Columns of each benchmark's table, as markdown_table() takes them."""
 
 
 def new_result(benchmark: str, device: torch.device, settings: dict) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def machine_line(result: dict) -> str:
 
 
 def check(what: str, against: str, difference: float, bound: float) -> dict:
-    """One comparison of a result; a difference that is not a number counts as infinite."""
+    """Return one comparison of a result; a difference that is not a number counts as infinite."""
     difference = difference if math.isfinite(difference) else math.inf
     values = {"what": what, "against": against, "difference": difference, "bound": bound}
     return values | {"passed": difference <= bound}
@@ -61,7 +61,7 @@ def finish(result: dict, json: Path | None = None, overwrite: bool = False) -> N
 
 
 def groups(rows: Iterable[Mapping], *fields: str) -> dict[tuple, list[Mapping]]:
-    """Rows by the values of these fields, in the order of their first."""
+    """Group rows by the values of fields, in the order of the first row of each group."""
     result: dict[tuple, list[Mapping]] = {}
     for row in rows:
         result.setdefault(tuple(row[field] for field in fields), []).append(row)

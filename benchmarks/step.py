@@ -107,7 +107,7 @@ def step_variant(trainer: Trainer) -> Variant:
 
 
 def time_step(trainer: Trainer, repetitions: int) -> dict:
-    """With memory: on a GPU all that is held, on the CPU what the step adds."""
+    """Time a step and its memory: on a GPU all that is held, on the CPU what the step adds."""
     variant, device = step_variant(trainer), trainer.device
     with torch_settings(trainer.config.deterministic):
         timing = time_variants({"step": variant}, device, repetitions=repetitions)["step"]

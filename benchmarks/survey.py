@@ -26,7 +26,7 @@ from .study import run
 
 TIME = 1 / 500  # Exposure time of the photos, seconds
 ASPECT = 0.75
-HEIGHT = 4.0  # Of the flight above the ground
+HEIGHT = 4.0  # Height of the flight above the ground
 BUILDING, STREET = 1.6, 0.7  # Sizes of the town's grid
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

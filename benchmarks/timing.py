@@ -1,4 +1,4 @@
-"""Times and memory of a call, fair to all that are compared: variants take turns, so that a machine's moods hit all."""
+"""Time and memory of calls. Variants take turns, so that changes of the machine's speed affect all of them alike."""
 
 import gc
 import math
@@ -20,7 +20,7 @@ LEAST_REPETITIONS = 3
 BUDGET = 10.0
 """Seconds that one variant may take on the CPU; a slow one runs less often."""
 TURNS = 3
-"""Each variant's repetitions come in so many turns, between the others'."""
+"""Number of turns into which the repetitions of each variant are divided."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def held_memory(device: torch.device) -> int | None:
 
 
 def peak_memory(variant: Variant, device: torch.device) -> int:
-    """Largest memory of torch's allocator during one run above what was in use before it, bytes."""
+    """Return the largest memory of torch's allocator during one run above what was in use before it, bytes."""
     variant.prepare()
     if device.type == "cuda":
         wait(device)

@@ -29,11 +29,11 @@ from .timing import time_variants, wait
 LOG = logging.getLogger(__name__)
 PRESET, PHOTOS = "default", 8
 WARM_UP = 20
-"""Steps of GPUs that are not timed: launched, recorded, and some replayed."""
+"""Steps on GPUs before the timed ones: launched, captured, and some replayed."""
 STEPS = 10
-"""For each repetition asked for, of GPUs: one after the other without a pause, as in a training."""
+"""Steps on GPUs for each repetition, one after the other without a pause, as in a training."""
 BOUND = 1e-12
-"""Of what losses on threads may differ: by less than float32 can tell."""
+"""Largest difference of losses between numbers of threads: less than float32 resolves."""
 
 
 def bench_workers(sizes: Sequence[Size], device: torch.device, *, repetitions: int) -> dict:
