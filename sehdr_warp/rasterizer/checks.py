@@ -138,7 +138,7 @@ def check_directions(directions: Tensor) -> None:
 
 
 def check_cameras(world_to_camera: Tensor, intrinsics: Tensor) -> None:
-    """Raise ValueError for a camera on the CPU that is not finite or invertible or has no positive focal length."""
+    """Raise ValueError for a CPU camera that is not finite or invertible, is transposed, or has no focal length."""
     if world_to_camera.device.type != "cpu":
         return
     lenses, poses = intrinsics.detach().reshape(-1, 4).tolist(), world_to_camera.detach().reshape(-1, 16).tolist()
@@ -150,10 +150,12 @@ def check_cameras(world_to_camera: Tensor, intrinsics: Tensor) -> None:
     for pose in poses:
         if not all(map(math.isfinite, pose)):
             raise ValueError("world_to_camera has a number that is not finite, expected a rigid transformation")
-        a, b, c, _, d, e, f, _, g, h, i, *_ = pose
+        a, b, c, _, d, e, f, _, g, h, i, _, *last = pose
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         if abs(determinant) <= SINGULAR * max(map(abs, (a, b, c, d, e, f, g, h, i))) ** 3:
             raise ValueError(
                 f"world_to_camera has a 3 x 3 part of determinant {determinant:g}, expected a rotation; "
                 "is it the matrix from world to camera?"
             )
+        if math.dist(last, (0.0, 0.0, 0.0, 1.0)) > 1e-3:
+            raise ValueError(f"world_to_camera has the last row {last}, expected [0, 0, 0, 1]; is it transposed?")

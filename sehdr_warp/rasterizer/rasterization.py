@@ -141,7 +141,8 @@ def rasterize(
     Raises:
         TypeError: if an argument is not a tensor or not an integer.
         ValueError: if a shape, dtype, device or option does not fit; on the CPU also for opacities outside of [0, 1]
-            and for a camera that is not finite, cannot be inverted or has a focal length that is not positive.
+            and for a camera that is not finite, cannot be inverted, is transposed or has a focal length that is not
+            positive.
         NotImplementedError: within torch.func and for forward-mode differentiation.
         RuntimeError: while a CUDA graph is captured without max_intersections.
         OutOfMemory: (a SehdrError) with the sizes, if memory does not suffice.

@@ -42,6 +42,7 @@ def with_nan_and_logits(opacities):
         ("world_to_camera", lambda t: t * NAN, ValueError, "world_to_camera has a number that is not finite"),
         ("world_to_camera", lambda t: t * 0, ValueError, "world_to_camera has .* determinant 0, expected"),
         ("world_to_camera", lambda t: torch.ones_like(t), ValueError, "world_to_camera has .* determinant 0, expected"),
+        ("world_to_camera", lambda t: t.mT, ValueError, r"world_to_camera has the last row .* is it transposed"),
         ("means", lambda t: t.detach().to_sparse(), ValueError, "means is .* layout torch.sparse_coo, expected"),
         ("width", lambda _: 1 << 21, ValueError, "width 2097152 is not in 1..1048576"),
         ("width", lambda _: 70.0, TypeError, "width is 70.0, expected a whole number"),

@@ -250,7 +250,7 @@ def fully_fused_projection(
     options = ProjectionOptions(
         *(width, height, near_plane, far_plane, radius_clip, eps2d, calc_compensations, camera_model)
     ).checked()
-    if isinstance(covars, Tensor) and covars.shape[-1] == 6:
+    if isinstance(covars, Tensor) and covars.shape[-1:] == (6,):
         covars = covars[..., (0, 1, 2, 1, 3, 4, 2, 4, 5)].unflatten(-1, (3, 3))
     if opacities is None:
         check_tensors(means=(means, (*means.shape[:-1], 3) if isinstance(means, Tensor) else ("N", 3)))

@@ -108,6 +108,7 @@ def test_projections_of_batches_are_those_of_each_scene(packed, device):
     ("options", "message"),
     [
         ({"camera_model": "ftheta"}, "camera_model 'ftheta' is none of pinhole, ortho, fisheye"),
+        ({"covars": torch.tensor(1.0)}, r"covars has shape \[\], expected \[N, 3, 3\]"),
         ({"sparse_grad": True}, "sparse_grad = True is not supported"),
         ({"quats": None}, r"quats is a NoneType, expected a torch tensor \[N, 4\]"),
         ({"scales": torch.ones(3, 3)}, r"scales has shape \[3, 3\], expected \[N, 3\]"),
