@@ -37,15 +37,15 @@ def film_size(photos: Sequence[Camera]) -> tuple[int, int]:
 
 
 def film_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:
-    """Return a camera of a path in film_size that shows no more at the sides than the photos do."""
+    """Return a camera of a path in film_size, with square pixels, that shows no more at the sides than photos do."""
     width, height = film_size(photos)
     if not camera.is_pinhole:
         focal = height / 2 / math.tan(_WIDEST / 2)
         return Camera(width, height, focal, focal, width / 2, height / 2, camera.world_to_camera)
-    scale = max(width / camera.width, height / camera.height)
-    shift = np.array([camera.cx / camera.width - 0.5, camera.cy / camera.height - 0.5])
-    cx, cy = width / 2 + shift[0] * camera.width * scale, height / 2 + shift[1] * camera.height * scale
-    return replace(camera, width=width, height=height, fx=camera.fx * scale, fy=camera.fy * scale, cx=cx, cy=cy)
+    focal = max(width / camera.width * camera.fx, height / camera.height * camera.fy)
+    cx = width / 2 + (camera.cx - camera.width / 2) / camera.fx * focal
+    cy = height / 2 + (camera.cy - camera.height / 2) / camera.fy * focal
+    return replace(camera, width=width, height=height, fx=focal, fy=focal, cx=cx, cy=cy)
 
 
 def default_path(run: "RenderableScene", count: int, up: str | Sequence[float] | None = None) -> list[Camera]:

@@ -84,6 +84,18 @@ def test_sizes_of_films(short, size):
     assert film_size([camera(width=short * 2, height=short)]) == size
 
 
+@pytest.mark.parametrize("width, fx", [(32, 40.0), (64, 40.0), (32, 60.0)])
+def test_a_path_has_square_pixels_and_shows_no_more_than_photos_that_have_not(width, fx):
+    """Camera paths of Nuke and nerfstudio state one focal length, and films have no pixel aspect ratio."""
+    photo = Camera(width, 24, fx, 44.0, width / 2 + 1, 10.0, np.eye(4))
+    film = film_camera(photo, [photo])
+    assert film.fx == film.fy
+    sides = [side / focal for side, focal in ((film.width, film.fx), (film.height, film.fy))]
+    assert sides == pytest.approx([min(sides[0], width / fx), min(sides[1], 24 / 44)])
+    center, photo_center = ((each.cx - each.width / 2) / each.fx for each in (film, photo))
+    assert center == pytest.approx(photo_center)
+
+
 def street(count=12, bend=0.0, leap=None):
     """Cameras of somebody who walks ahead along +Z with -Y up, sways, and may be placed wrongly from `leap` on."""
     random, cameras = np.random.default_rng(0), []
