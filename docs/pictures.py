@@ -67,12 +67,10 @@ def photographed(photos: str, folder: str, view: str) -> None:
 
 def _beside(run: sw.Run, photo_view: sw.View, scene: sw.Scene) -> Image.Image:
     """The photo, and photo, scene and truth some stops darker; below each the part that differs most, enlarged."""
-    comparison, time = compare(run, photo_view, scene.views), photo_view.exposure_time
+    comparison = compare(run, photo_view, scene.views)
     assert comparison.truth is not None
-    darker = darker_stops([comparison], time)
-    dark = [
-        expose_light(light, darker, scale=time) for light in (comparison.from_photo, comparison.hdr, comparison.truth)
-    ]
+    darker, lights = darker_stops([comparison]), (comparison.from_photo, comparison.hdr, comparison.truth)
+    dark = [expose_light(light, darker, scale=comparison.scale) for light in lights]
     height, width = dark[0].shape[:2]
     side = round(CROPPED * min(height, width))
     gain = uniform_filter(np.abs(dark[1] - dark[0]).mean(2), side, mode="constant")

@@ -143,14 +143,14 @@ def test_words_that_people_type_find_what_they_mean(tmp_path):
         parse_command(["resume", str(tmp_path)])
     with pytest.raises(SehdrError, match="cameras 'orbt' are neither .*, did you mean orbit"):
         run_render(Render(run=tmp_path, out=tmp_path / "out", cameras="orbt", count=1))
-    with pytest.raises(UsageError, match="pages are written by sehdr-warp export head.ply --out x.html"):
-        run_convert(Convert(source=Path("head.ply"), out=Path("x.html")))
+    with pytest.raises(UsageError, match="pages are written by sehdr-warp export 'my head.ply' --out x.html"):
+        run_convert(Convert(source=Path("my head.ply"), out=Path("x.html")))
     with pytest.raises(UsageError, match="is a folder; runs are written by sehdr-warp export"):
         run_convert(Convert(source=tmp_path, out=tmp_path / "x.ply"))
     with pytest.raises(SehdrError, match="'srgb' is an encoding"):
         color_space("sRGB")
-    with pytest.raises(UsageError, match="meshes are written by sehdr-warp mesh runs/a --out x.usdc"):
-        run_export(Export(run=Path("runs/a"), out=Path("x.obj")))
+    with pytest.raises(UsageError, match="meshes are written by sehdr-warp mesh 'my runs/a' --out files/x.usdc"):
+        run_export(Export(run=Path("my runs/a"), out=Path("files/x.obj")))
 
 
 def test_old_flags_name_the_new_ones(tmp_path):

@@ -1,5 +1,6 @@
 """Command lines of `sehdr-warp export`, `mesh` and `convert`. torch is imported when they run."""
 
+import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -124,7 +125,8 @@ def run_export(args: Export) -> None:
     from .splat_edits import SplatEdits
 
     if args.out.suffix.lower() in _MESH_SUFFIXES:
-        raise UsageError(f"{args.out}: meshes are written by sehdr-warp mesh {args.run} --out {args.out.stem}.usdc")
+        command = shlex.join(["sehdr-warp", "mesh", str(args.run), "--out", str(args.out.with_suffix(".usdc"))])
+        raise UsageError(f"{args.out}: meshes are written by {command}")
     is_page = check_suffix(args.out, ".html") == ".html"
     flags = [*changed_flags(args.world), *changed_flags(args.file), *["--cameras"] * args.cameras]
     if is_page and flags:
@@ -158,10 +160,10 @@ def run_convert(args: Convert) -> None:
     """Run `sehdr-warp convert`."""
     from ...splats import check_new_file, check_suffix
 
+    command = shlex.join(["sehdr-warp", "export", str(args.source), "--out", str(args.out)])
     if args.out.suffix.lower() == ".html":
-        raise UsageError(f"{args.out}: pages are written by sehdr-warp export {args.source} --out {args.out}")
+        raise UsageError(f"{args.out}: pages are written by {command}")
     if args.source.is_dir():
-        command = f"sehdr-warp export {args.source} --out {args.out}"
         raise UsageError(f"{args.source}: is a folder; runs are written by {command}")
     check_suffix(args.source)
     check_suffix(args.out)

@@ -105,5 +105,5 @@ def exposure_of_white(run: "RenderableScene", white: float | None) -> float:
     """
     exposure = 1.0 if white is None else white * run.base_time * display_gain(run.response)
     if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
-        raise SehdrError(f"white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
+        raise SehdrError(f"reference white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")
     return exposure

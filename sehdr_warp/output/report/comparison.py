@@ -9,6 +9,7 @@ import numpy as np
 from ...scene import View
 from ..cameras.paths import interpolate
 from ..images.ldr_files import as_array
+from ..images.tonemap import display_gain
 from ..light_pictures import photo_for_display, photo_light
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ class Comparison:
         photo: Encoded values in [0, 1].
         from_photo: Radiance that the photo alone gives, its response inverted.
         hdr: Rendered radiance.
+        exposure_time: Seconds of the photo.
+        gain: Of its response, see display_gain.
         truth: HDR truth, if the scene has it.
         confidence: [H, W] in [0, 1] of the render, if it was measured.
         new: Rendered half-way to the nearest other view, if there is one.
@@ -37,9 +40,16 @@ class Comparison:
     photo: np.ndarray
     from_photo: np.ndarray
     hdr: np.ndarray
+    exposure_time: float
+    gain: float
     truth: np.ndarray | None = None
     confidence: np.ndarray | None = None
     new: np.ndarray | None = None
+
+    @property
+    def scale(self) -> float:
+        """Factor from radiance to display light at the exposure of the photo."""
+        return self.exposure_time * self.gain
 
     @property
     def light_above_white(self) -> float:
@@ -47,13 +57,15 @@ class Comparison:
         return float(((self.photo > _CLIPPED) & (self.hdr > _BRIGHTER * self.from_photo.max())).mean())
 
 
-def darker_stops(comparisons: Sequence[Comparison], exposure_time: float, gain: float = 1.0) -> int:
+def darker_stops(comparisons: Sequence[Comparison]) -> int:
     """Return the stops, from _DARKEST to -1, at which pictures show best what photo and scene hold above white.
 
     The brightest light that a photo can hold is then a middle grey, and brighter light of the scene stands out from it.
-    Exposures of exposure_time seconds are at 0 EV; for `gain` see display_gain().
+    Scenes with next to no light above white are shown at 0.
     """
-    white = max(float(np.max(each.from_photo)) for each in comparisons) * exposure_time * gain
+    if max(each.light_above_white for each in comparisons) < _LEAST_BRIGHTER:
+        return 0
+    white = max(float(np.max(each.from_photo)) * each.scale for each in comparisons)
     return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), _DARKEST, -1))
 
 
@@ -65,15 +77,12 @@ class Opening(NamedTuple):
     lead: str
 
 
-def opening_of(comparison: Comparison, exposure_time: float, gain: float = 1.0) -> Opening:
-    """Return how a report opens: as dark as shows the light above white, or as the photo was taken if there is none.
-
-    Arguments as in darker_stops().
-    """
-    if comparison.light_above_white < _LEAST_BRIGHTER:
+def opening_of(comparison: Comparison) -> Opening:
+    """Return how a report opens: as dark as shows the light above white, or as the photo was taken if there is none."""
+    stops = darker_stops([comparison])
+    if not stops:
         lead = f"View {comparison.name}, in which the scene shows next to no light above the photo's white."
         return Opening(0, "Photo and scene", lead)
-    stops = darker_stops([comparison], exposure_time, gain)
     darker = f"{-stops} stop{'s' * (stops < -1)} darker"
     lead = f"View {comparison.name}, {darker}. What the photo clipped stays flat."
     return Opening(stops, "Light above white", lead)
@@ -87,4 +96,6 @@ def compare(run: "RenderableScene", view: View, views: Sequence[View]) -> Compar
         nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
         new = as_array(run.render(interpolate([view.camera, nearest], 3)[1]).hdr)
     confidence = None if confidence is None else as_array(confidence)
-    return Comparison(view.name, photo_for_display(run, view), photo_light(run, view), hdr, view.hdr, confidence, new)
+    pictures = photo_for_display(run, view), photo_light(run, view), hdr
+    gain = display_gain(run.response)
+    return Comparison(view.name, *pictures, view.exposure_time, gain, view.hdr, confidence, new)

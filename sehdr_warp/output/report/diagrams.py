@@ -2,7 +2,6 @@
 
 import base64
 import io
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -26,29 +25,26 @@ _MAP_VIEWS, _MAP_SIZE, _SAMPLES = 12, 640, 200
 
 def training_svg(metrics: Sequence[Mapping]) -> Markup:
     """Plot held-out PSNR in dB against training seconds, a line for each of PANELS; empty without figures."""
+    from matplotlib.ticker import MaxNLocator
+
     lines = {title: points for key, title in PANELS.items() if (points := training_points(metrics, key))}
     if not lines:
         return EMPTY
-    points = [point for line in lines.values() for point in line]
-    longest = max(seconds for seconds, _ in points) or 1.0
-    low = math.floor(min(decibels for _, decibels in points))
-    step = max(1, math.ceil((max(decibels for _, decibels in points) - low) / 5))
-    high = low + 5 * step
+    seconds, decibels = zip(*(point for line in lines.values() for point in line))
+    ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
+    times, levels = ticks.tick_values(0, max(seconds) or 1.0), ticks.tick_values(min(decibels), max(decibels))
 
     def place(seconds: float, decibels: float) -> tuple[float, float]:
-        return 40 + 440 * seconds / longest, 250 - 215 * (decibels - low) / (high - low)
+        return 40 + 440 * seconds / times[-1], 250 - 215 * (decibels - levels[0]) / (levels[-1] - levels[0])
 
     elements = []
-    for decibels in range(low, high + 1, step):
-        y = place(0, decibels)[1]
-        grid = '<path d="M40 {:.1f}H480" stroke="{}"/><text x="0" y="{:.1f}">{} dB</text>'
-        elements.append(markup(grid, y, LINE, y + 4, decibels))
-    digits = 0 if longest >= 20 else 1
-    for seconds in np.linspace(0, longest, 5):
-        x, anchor = place(seconds, low)[0], "middle" if 0 < seconds < longest else "start" if not seconds else "end"
-        elements.append(
-            markup('<text x="{:.1f}" y="272" text-anchor="{}">{} s</text>', x, anchor, f"{seconds:.{digits}f}")
-        )
+    for level in levels:
+        y = place(0, level)[1]
+        grid = '<path d="M40 {:.1f}H480" stroke="{}"/><text x="0" y="{:.1f}">{:g} dB</text>'
+        elements.append(markup(grid, y, LINE, y + 4, level))
+    for time in times:
+        x, anchor = place(time, levels[0])[0], "start" if time == 0 else "end" if time == times[-1] else "middle"
+        elements.append(markup('<text x="{:.1f}" y="272" text-anchor="{}">{:g} s</text>', x, anchor, time))
     for left, color, (title, line) in zip((40, 200), COLORS, lines.items()):
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in line))
         elements.append(markup('<polyline points="{}" fill="none" stroke="{}" stroke-width="2"/>', path, color))

@@ -14,7 +14,7 @@ from ...scene.camera import limited_size
 from ...scene.exposure.times import shutter
 from ...scene.images.downsampling import area_average
 from ..html import EMPTY, duration, join, markup, page_file, whole_page, with_code
-from ..images.tonemap import display_gain, expose, fit_tone_map
+from ..images.tonemap import expose, fit_tone_map
 from ..images.ultra_hdr import MOST_STOPS, ultra_hdr
 from ..light_pictures import SPLIT, dial, img, jpeg, jpeg_source, photo_for_display, side_choices, simulated_photo
 from ..lighting.lights import uncertain_lights
@@ -54,12 +54,10 @@ def report_page(
         evaluation: Result of evaluate(), for the table of held-out views.
         lights: The lights of the scene, as from run.find_lights().
     """
-    gain = display_gain(run.response)
-    times = {view.name: view.exposure_time for view in scene.views}
     sections = [
-        _header(run, scene, _opening(brightest, times[brightest.name], gain)),
-        _pictures(run, comparisons, times, held_out),
-        _brackets(brightest, times[brightest.name], gain),
+        _header(run, scene, _opening(brightest)),
+        _pictures(run, comparisons, held_out),
+        _brackets(brightest),
         _lights(lights, luminance_of_one(run), world_transform(run)) if lights else EMPTY,
         _confidence(comparisons),
         _unexplained_regions(run, scene),
@@ -100,7 +98,9 @@ def _header(run: "Run", scene: Scene, opening: Markup) -> Markup:
         "photos trained on": len(scene.train_views),
         "photos held out": len(scene.test_views),
         "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
-        "exposure" if run.exposure_compensation is None else "exposure, compensated": span.replace(" s to", " to"),
+        "exposure" if run.exposure_compensation is None else "exposure, compensated": span.replace(
+            " s to", " to"
+        ).replace(" s", "\N{NO-BREAK SPACE}s"),
         "response": run.response.name,
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,
@@ -124,9 +124,9 @@ def _header(run: "Run", scene: Scene, opening: Markup) -> Markup:
     )
 
 
-def _pictures(run: "Run", comparisons: Sequence[Comparison], times: Mapping[str, float], held_out: bool) -> Markup:
+def _pictures(run: "Run", comparisons: Sequence[Comparison], held_out: bool) -> Markup:
     """Photo, scene and truth, two at a time with a slider between them."""
-    figures, gain = [], display_gain(run.response)
+    figures = []
     for each in comparisons:
         lights = {"Photo": None, "Scene": each.hdr, "Truth": each.truth}
         lights = {name: light for name, light in lights.items() if name == "Photo" or light is not None}
@@ -135,8 +135,8 @@ def _pictures(run: "Run", comparisons: Sequence[Comparison], times: Mapping[str,
             if light is None:
                 data = jpeg(smaller(each.photo, _PICTURE))
             else:
-                exposure = smaller(light * times[each.name], _PICTURE)
-                data = ultra_hdr(exposure * gain, simulated_photo(run, exposure))
+                exposure = smaller(light * each.exposure_time, _PICTURE)
+                data = ultra_hdr(exposure * each.gain, simulated_photo(run, exposure))
             tags.append(img(data, f"{name} of {each.name}", size, data_name=name))
         pair = '<div class="pair" style="aspect-ratio: {} / {}" tabindex="0" role="group">{}{}</div>'
         choices = side_choices(list(lights), "Photo", "Scene")
@@ -152,19 +152,20 @@ def _pictures(run: "Run", comparisons: Sequence[Comparison], times: Mapping[str,
     return _section("Photo, scene, truth" if has_truth else "Photo and scene", lead, _views(figures))
 
 
-def _opening(comparison: Comparison, time: float, gain: float) -> Markup:
+def _opening(comparison: Comparison) -> Markup:
     """Return the picture that a reader sees first: photo and scene side by side, as dark as shows their difference."""
-    stops, title, lead = opening_of(comparison, time, gain)
+    stops, title, lead = opening_of(comparison)
     figures = []
     for name, light in (("Photo", comparison.from_photo), ("Scene", comparison.hdr)):
         small = smaller(light, _PICTURE)
-        picture = jpeg(expose(small, stops, scale=time * gain))
+        picture = jpeg(expose(small, stops, scale=comparison.scale))
         caption = f"{name} at {stops_text(stops)}"
         figures.append(_figure(img(picture, caption, (small.shape[1], small.shape[0])), caption))
     return _section(title, lead, _views(figures))
 
 
-def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:
+def _brackets(comparison: Comparison) -> Markup:
+    time = comparison.exposure_time
     sources = {"Photo alone": comparison.from_photo, "Scene": comparison.hdr, "Truth": comparison.truth}
     present = {name: light for name, light in sources.items() if light is not None}
     lights = {name: smaller(light * time, _DIAL) for name, light in present.items()}
@@ -173,13 +174,15 @@ def _brackets(comparison: Comparison, time: float, gain: float) -> Markup:
         small = smaller(light, _STRIP)
         cells.append(markup('<span class="name">{}</span>', name))
         for stop in STOPS:
-            picture = jpeg(expose(small, stop, scale=time * gain), 82)
+            picture = jpeg(expose(small, stop, scale=comparison.scale), 82)
             cells.append(img(picture, f"{name} at {stops_text(stop)}", (small.shape[1], small.shape[0])))
     lead = (
         f"View {comparison.name}, re-exposed from {shutter(time)} (0 EV) and shown as a plain display does. "
         "What the photo clipped stays flat; the scene keeps its light."
     )
-    body = _figure(dial(lights, time, gain, "Scene")) + _figure(markup('<div class="strip">{}</div>', join(cells)))
+    body = _figure(dial(lights, time, comparison.gain, "Scene")) + _figure(
+        markup('<div class="strip">{}</div>', join(cells))
+    )
     return _section("Brackets", lead, body)
 
 
@@ -192,10 +195,9 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
     for index, light in enumerate(lights[:_MOST_LIGHTS]):
         radiances = (float((unit or 1.0) * np.mean(values)) for values in (light.radiance, light.lower_bound))
         sides = light.shape.size if light.shape.kind == "rect" else light.shape.size[:1]
-        lengths = (f"{transform.scale * side:.3g}" for side in sides)
-        size = "\N{THIN SPACE}\N{MULTIPLICATION SIGN}\N{THIN SPACE}".join(lengths)
-        place = ", ".join(f"{value:.3g}" for value in transform.points(light.shape.position))
-        figures = (f"{light.share:.1%}", *(f"{value:.3g}" for value in radiances), number(light.deviation, 1))
+        size = f"{SPACE}\N{MULTIPLICATION SIGN}{SPACE}".join(_rounded(transform.scale * side) for side in sides)
+        place = ",\N{NO-BREAK SPACE}".join(map(_rounded, transform.points(light.shape.position)))
+        figures = (f"{light.share:.1%}", *map(_rounded, radiances), number(light.deviation, 1))
         rows.append((light_name(index), light.shape.kind, size, place, *figures))
     measure = "radiance" if unit is None else "cd/m\N{SUPERSCRIPT TWO}"
     titles = ("name", "shape", "size", "place", "share of light", measure, "certain at least", "deviation, stops")
@@ -267,8 +269,8 @@ def _boxed_photo(image: np.ndarray, name: str, regions: Sequence[Mapping]) -> Ma
             '<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="none" stroke="{}" stroke-width="{:.2f}"/>'
         )
         boxes.append(markup(rect, x, y, w, h, color, 1.6 * unit))
-        text = '<text x="{:.1f}" y="{:.1f}" style="fill:{};font-size:{:.1f}px;paint-order:stroke;stroke:#000;'
-        text += 'stroke-width:{:.2f}px">{}</text>'
+        text = '<text x="{:.1f}" y="{:.1f}" style="fill:{};font-size:{:.1f}px;font-weight:600;paint-order:stroke;'
+        text += 'stroke:#000;stroke-width:{:.2f}px">{}</text>'
         baseline = y + h + 14 * unit if y < 16 * unit else y - 5 * unit
         stops = stops_text(region["stops"]).removesuffix(" EV")
         boxes.append(markup(text, min(x, width - 60 * unit), baseline, color, 15 * unit, 2.4 * unit, stops))
@@ -375,6 +377,12 @@ def stops_text(stops: float) -> str:
 def number(value: float | None, digits: int) -> str:
     """Format a figure, or a dash if there is none."""
     return "\N{EN DASH}" if value is None else f"{value:.{digits}f}"
+
+
+def _rounded(value: float) -> str:
+    """Format a figure with three digits, without powers of ten from 0.0001 on."""
+    rounded = float(f"{value:.3g}")
+    return f"{rounded:,.0f}".replace(",", SPACE) if abs(rounded) >= 1000 else f"{rounded:g}"
 
 
 def _decibels(line: Mapping[str, Any], key: str) -> str | None:

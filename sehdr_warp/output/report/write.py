@@ -87,9 +87,8 @@ def write_report(
     views = evenly(candidates, max(view_count, 1))
     comparisons = [compare(run, view, scene.views) for _, view in track_progress("comparing views", views, log)]
     brightest = max(comparisons, key=lambda comparison: comparison.light_above_white)
-    time = views[0].exposure_time
-    compared = comparison_figure(comparisons, time, _caption(views, metrics, held_out), held_out=held_out)
-    figures = [compared, stops_figure(brightest, time)] + [training_chart({scene.name: [metrics]})] * charted
+    compared = comparison_figure(comparisons, _caption(views, metrics, held_out), held_out=held_out)
+    figures = [compared, stops_figure(brightest)] + [training_chart({scene.name: [metrics]})] * charted
     lights = run.find_lights() if run.clipped_share() is not None else []
     page = report_page(run, scene, comparisons, brightest, held_out=held_out, evaluation=evaluation, lights=lights)
     with ExitStack() as stack:
@@ -100,24 +99,23 @@ def write_report(
     return paths
 
 
-def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, caption: str, *, held_out: bool = True):
+def comparison_figure(comparisons: Sequence[Comparison], caption: str, *, held_out: bool = True):
     """Draw photos, what photo and scene hold some stops darker, and a new view, one row for each comparison.
 
     Args:
-        comparisons: The rows. New views are tone-mapped by one map.
-        exposure_time: Seconds at 0 EV.
+        comparisons: The rows, each at the exposure of its photo. New views are tone-mapped by one map.
         caption: Text below the figure.
         held_out: Whether the photos were not trained on.
 
     Returns:
         A matplotlib Figure.
     """
-    darker = darker_stops(comparisons, exposure_time)
+    darker = darker_stops(comparisons)
     columns = {"Held-out photo" if held_out else "Training photo": [c.photo for c in comparisons]}
     for name, key in (("Photo", "from_photo"), ("HDR scene", "hdr"), ("Truth", "truth")):
-        radiances = [getattr(c, key) for c in comparisons]
-        if all(radiance is not None for radiance in radiances):
-            columns[f"{name} at {stops_text(darker)}"] = [expose(r, darker, scale=exposure_time) for r in radiances]
+        lights = [(getattr(c, key), c.scale) for c in comparisons]
+        if all(radiance is not None for radiance, _ in lights):
+            columns[f"{name} at {stops_text(darker)}"] = [expose(r, darker, scale=scale) for r, scale in lights]
     new = [c.new for c in comparisons if c.new is not None]
     if len(new) == len(comparisons):
         columns["New view, tone-mapped"] = list(map(fit_tone_map(new), new))
@@ -125,31 +123,35 @@ def comparison_figure(comparisons: Sequence[Comparison], exposure_time: float, c
     return _grid(rows, list(columns), [c.name for c in comparisons], caption, cell=2.6)
 
 
-def stops_figure(comparison: Comparison, exposure_time: float):
+def stops_figure(comparison: Comparison):
     """Draw one view for a plain sRGB display: the photo alone, the HDR scene with its confidence, and the truth.
 
-    Each is shown at several exposures around exposure_time, seconds, which is 0 EV.
+    Each is shown at several exposures around that of the photo, which is 0 EV.
     """
     sources = {"Photo alone": comparison.from_photo, "HDR scene": comparison.hdr, "Truth": comparison.truth}
     sources = {name: radiance for name, radiance in sources.items() if radiance is not None}
-    rows = [[None, *(expose(radiance, stop, scale=exposure_time) for stop in STOPS)] for radiance in sources.values()]
+    rows = [[None, *(expose(light, stop, scale=comparison.scale) for stop in STOPS)] for light in sources.values()]
     rows[0][0] = comparison.photo
     titles = ["Photo", *map(stops_text, STOPS)]
     caption = (
-        f"View {comparison.name}, re-exposed from {shutter(exposure_time)} (0 EV) and shown on a plain sRGB display. "
-        "What the photo clipped stays flat."
+        f"View {comparison.name}, re-exposed from {shutter(comparison.exposure_time)} (0 EV) and shown on a plain "
+        "sRGB display. What the photo clipped stays flat."
     )
     if comparison.confidence is not None:
-        rows[1].append(np.repeat(comparison.confidence[..., None], 3, axis=2))
-        titles.append("Confidence")
-        caption += " Confidence: white where photos show the light and agree, black where none shows it."
-    return _grid(rows, titles, list(sources), caption, cell=1.9)
+        rows[1][0] = np.repeat(comparison.confidence[..., None], 3, axis=2)
+        caption += " Confidence: white where photos show the light and agree, black where none does."
+    figure = _grid(rows, titles, list(sources), caption, cell=1.9, name_column=1)
+    if comparison.confidence is not None:
+        box = {"facecolor": "black", "alpha": 0.7, "linewidth": 0, "pad": 2}
+        axes = figure.axes[len(titles)]  # The first of the second row
+        axes.text(0.04, 0.05, "Confidence", transform=axes.transAxes, fontsize=8, color="white", bbox=box)
+    return figure
 
 
-def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, cell: float):
-    """Arrange pictures [H, W, 3] with titles above, names at the left and a caption below.
+def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, cell: float, name_column: int = 0):
+    """Arrange pictures [H, W, 3] with titles above, names at the left of a column and a caption below.
 
-    None and the end of a shorter row leave a place empty. `cell` is the width of a picture in inches.
+    None leaves a place empty. `cell` is the width of a picture in inches.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -157,19 +159,19 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
 
     shapes = [next(picture.shape for picture in row if picture is not None) for row in rows]
     heights, width = [cell * shape[0] / shape[1] for shape in shapes], 0.4 + len(titles) * cell
-    untitled = dict(enumerate(titles))
     with rc_context(STYLE):
         layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
         figure = Figure(figsize=(width, 0.9 + sum(heights)), layout=layout)
         grid = figure.add_gridspec(len(rows), len(titles), height_ratios=heights)
         for row, (pictures, name) in enumerate(zip(rows, names, strict=True)):
-            places = [column for column, picture in enumerate(pictures) if picture is not None]
-            for column in places:
+            for column, picture in enumerate(pictures):
+                if picture is None:
+                    continue
                 axes = figure.add_subplot(grid[row, column])
-                axes.imshow(np.clip(pictures[column], 0, 1), interpolation="lanczos")
-                axes.set(xticks=[], yticks=[], frame_on=False)
-                axes.set_title(untitled.pop(column, ""), fontsize=9.5, fontweight="bold")
-                axes.set_ylabel(name if column == places[0] else "", fontsize=8.5)
+                axes.imshow(np.clip(picture, 0, 1), interpolation="lanczos")
+                axes.set(xticks=[], yticks=[])  # A frame shows where a white picture ends.
+                axes.set_title(titles[column] if row == 0 else "", fontsize=9.5, fontweight="bold")
+                axes.set_ylabel(name if column == name_column else "", fontsize=8.5)
         figure.supxlabel(textwrap.fill(caption, round(16 * width)), x=0.02, ha="left", fontsize=8.5, color=QUIET)
         return figure
 

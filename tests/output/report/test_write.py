@@ -1,11 +1,14 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.images.tonemap import display_gain, encode_srgb
+from sehdr_warp.output.images.tonemap import display_gain, encode_srgb, expose
 from sehdr_warp.output.report.charts import training_chart
-from sehdr_warp.output.report.comparison import Comparison, compare
+from sehdr_warp.output.report.comparison import Comparison, compare, darker_stops
 from sehdr_warp.output.report.write import check_report_folder, comparison_figure, stops_figure, write_report
 from sehdr_warp.scene import Scene, View, codes_of
 
@@ -72,8 +75,9 @@ def test_stops_show_what_the_photo_lost(tmp_path):
     run, scene = make(tmp_path)
     view = scene.views[1]
     from_photo = run.response.decode(view.image) / view.exposure_time
-    comparison = Comparison(view.name, view.image, from_photo, run.render(view.camera).hdr, view.hdr)
-    figure = stops_figure(comparison, 0.5)
+    confidence = np.full(view.image.shape[:2], 0.25, np.float32)
+    comparison = Comparison(view.name, view.image, from_photo, run.render(view.camera).hdr, 0.5, 1.0, view.hdr)
+    figure = stops_figure(comparison)
     pictures = [axes.get_images()[0].get_array() for axes in figure.axes]
     np.testing.assert_array_equal(pictures[0], view.image)
     photo, hdr, truth = pictures[1:6], pictures[6:11], pictures[11:]
@@ -82,6 +86,25 @@ def test_stops_show_what_the_photo_lost(tmp_path):
     assert np.ptp(photo[0][clipped]) < 1e-6
     assert np.ptp(hdr[0][clipped]) > 0.01
     np.testing.assert_array_equal(hdr, truth)
+    trusted = stops_figure(replace(comparison, confidence=confidence)).axes[6]
+    assert trusted.texts[0].get_text() == "Confidence" and np.all(trusted.get_images()[0].get_array() == 0.25)
+
+
+def test_each_photo_is_re_exposed_from_its_own_exposure(tmp_path):
+    """Photos of auto exposure, developed by a response that is not sRGB: 0 EV shows middle grey as the photo does."""
+    run, scene = make(tmp_path)
+    run.response = SimpleNamespace(name="bright", decode=lambda value: 8 * value**2.2)
+    views = [replace(view, exposure_time=view.exposure_time * factor) for view, factor in zip(scene.views, (1, 1, 4))]
+    comparisons = [compare(run, view, views) for view in views[1:]]
+    figures = [stops_figure(each) for each in comparisons]
+    for view, figure in zip(views[1:], figures, strict=True):
+        photo, at_zero = (figure.axes[index].get_images()[0].get_array() for index in (0, 3))
+        grey = np.abs(photo - 0.46) < 0.1
+        assert grey.any() and np.abs(photo - at_zero)[grey].max() < 0.02, view.name
+    pictures = [axes.get_images()[0].get_array() for axes in comparison_figure(comparisons, "").axes[1::5]]
+    for each, picture in zip(comparisons, pictures, strict=True):
+        expected = expose(each.from_photo, darker_stops(comparisons), scale=each.scale)
+        np.testing.assert_array_equal(picture, expected)
 
 
 def test_photos_in_a_sensors_colors_are_shown_as_the_scene_is(tmp_path):
@@ -97,9 +120,11 @@ def test_photos_in_a_sensors_colors_are_shown_as_the_scene_is(tmp_path):
 
 @pytest.mark.parametrize("caption", ["", "Several lines of text. " * 20])
 def test_pictures_keep_their_shape(caption):
-    figure = comparison_figure([Comparison("v", *[np.ones((20, 30, 3), np.float32)] * 4)], 0.5, caption)
+    picture = np.ones((20, 30, 3), np.float32)
+    figure = comparison_figure([Comparison("v", *[picture] * 3, 0.5, 1.0, picture)], caption)
     figure.draw_without_rendering()
     boxes = [axes.get_window_extent() for axes in figure.axes]
+    assert figure.axes[1].get_title() == "Photo at 0 EV"  # Nothing is above the photo's white.
     assert len(boxes) == 4 and all(box.width / box.height == pytest.approx(1.5, rel=0.02) for box in boxes)
 
 
