@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,11 +26,20 @@ from .raw.decode import read_header, read_raw
 FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_NAMED = 3
 _SMALLEST, _LARGEST = 1 / 32, 8  # Size of a photo in parts of its camera's
-_MIDTONE, _LEAST_EXPONENT = 0.3, 0.4  # As of training.matching
-_BLACK = 3 / 255  # Noise of a black background
 _LEAST_SQUARE = 0.01  # Part by which the sides of a pixel may differ and count as equal
 _KINDS = {"encoded": "photos of codes", "raw": "RAW photos", "float": "float images"}
 _ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
+
+
+class Brightening(NamedTuple):
+    """Constants of brightened_codes()."""
+
+    midtone: float = 0.3  # As of training.matching
+    least_exponent: float = 0.4  # As of training.matching
+    black: float = 3 / 255  # Noise of a black background
+
+
+BRIGHTENING = Brightening()
 
 
 def usable_photos(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], str, list[str]]:
@@ -191,14 +200,15 @@ def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:
 def brightened_codes(codes: np.ndarray) -> np.ndarray:
     """Return the 8-bit codes [H, W, 3] of a photo in which features are found.
 
-    A power brightens a photo with a median below _MIDTONE, because detectors have an absolute threshold of contrast. A
-    black background beside a subject does not count.
+    A power brightens a photo with a median below the midtone, because detectors have an absolute threshold of contrast.
+    A black background beside a subject does not count.
     """
+    midtone, least_exponent, black = BRIGHTENING
     levels = np.iinfo(codes.dtype).max
     sample = codes[::8, ::8] / levels
-    bright = sample[sample > _BLACK]
+    bright = sample[sample > black]
     median = max(float(np.median(bright if 10 * bright.size > sample.size else sample)), 1e-3)
-    exponent = max(np.log(_MIDTONE) / np.log(median), _LEAST_EXPONENT) if median < _MIDTONE else 1.0
+    exponent = max(np.log(midtone) / np.log(median), least_exponent) if median < midtone else 1.0
     if codes.dtype == np.uint8 and exponent == 1:
         return codes
     return np.rint(255 * (np.arange(levels + 1) / levels) ** exponent).astype(np.uint8)[codes]

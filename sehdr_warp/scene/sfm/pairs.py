@@ -12,19 +12,19 @@ import numpy as np
 from ...progress import track_progress
 
 _log = logging.getLogger("sehdr_warp.scene")
-_FEATURES = 512  # The largest ones of each photo, of 4,000 to 10,000
-_PARTNERS = 12  # Photos that each one is matched with at least, unless they share nothing at all
-_RATIO = 0.8  # Largest ratio of the angles to the best and to the second best match, as COLMAP has it
+FEATURES = 512  # The largest ones of each photo, of 4,000 to 10,000
+PARTNERS = 12  # Photos that each one is matched with at least, unless they share nothing at all
+RATIO = 0.8  # Largest ratio of the angles to the best and to the second best match, as COLMAP has it
 
 
 def likely_pairs(database: Path) -> list[tuple[str, str]]:
-    """Return pairs of image names of COLMAP's database: for each image the _PARTNERS images that match it best."""
+    """Return pairs of image names of COLMAP's database: for each image the PARTNERS images that match it best."""
     names, features = _coarse_features(database)
     scores = np.zeros((len(names), len(names)), int)
     for _, i in track_progress("comparing photos", range(len(names)), _log):
         for j in range(i + 1, len(names)):
             scores[i, j] = scores[j, i] = _match_count(features[i], features[j])
-    best = np.argsort(-scores, axis=1, kind="stable")[:, :_PARTNERS]
+    best = np.argsort(-scores, axis=1, kind="stable")[:, :PARTNERS]
     pairs = {(min(i, j), max(i, j)) for i, row in enumerate(best.tolist()) for j in row if scores[i, j]}
     return [(names[i], names[j]) for i, j in sorted(pairs)]
 
@@ -47,7 +47,7 @@ def _coarse_features(database: Path) -> tuple[list[str], list[np.ndarray]]:
         features = []
         for image in images:
             a, b, c, d = np.asarray(opened.read_keypoints(image.image_id))[:, 2:6].T  # Columns of the affine shape
-            largest = np.argsort(-np.abs(a * d - b * c), kind="stable")[:_FEATURES]
+            largest = np.argsort(-np.abs(a * d - b * c), kind="stable")[:FEATURES]
             values = np.asarray(opened.read_descriptors(image.image_id).data)[largest].astype(np.float32)
             features.append(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12))
     return [image.name for image in images], features
@@ -64,4 +64,4 @@ def _match_count(first: np.ndarray, second: np.ndarray) -> int:
     best = np.take_along_axis(rows, partners, 1)[:, 0]
     np.put_along_axis(rows, partners, -1.0, 1)
     angle, next_angle = (np.arccos(np.clip(cosine, -1, 1)) for cosine in (best, rows.max(1, initial=-1.0)))
-    return int((angle < _RATIO * next_angle).sum())
+    return int((angle < RATIO * next_angle).sum())

@@ -26,7 +26,6 @@ from ..wide_camera import FACE_ANGLE, face_rotations, faces_of
 from .progress import counted_rows
 from .reconstruction import (
     EXHAUSTIVE_LIMIT,
-    SEED,
     Reconstruction,
     cache_key,
     image_name,
@@ -110,7 +109,7 @@ def _seam(photo: Path) -> tuple[float, float]:
 def reconstruct_panoramas(photos: Sequence[Path], cache: Path | str | None = None) -> Reconstruction:
     """Find poses and points of equirectangular panoramas; arguments, result and errors as of reconstruct()."""
     digests = [(photo.name, file_digest(photo)) for photo in photos]
-    key = cache_key("panoramas", _FACE_SIDE, FACE_ANGLE, SEED, digests)
+    key = cache_key("panoramas", _FACE_SIDE, FACE_ANGLE, digests)
 
     def solve(work: Path, result: Path) -> None:
         database = work / "database.db"

@@ -1,7 +1,7 @@
 """Structure from motion through pycolmap: poses and points of bare photos.
 
 pycolmap reads only images that this module writes under its own names, and its models are read by the package's own
-reader. Results are cached under a key of everything that they depend on.
+reader. Results are cached under a key of everything that they depend on: see cache_key().
 """
 
 import contextlib
@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,9 @@ from ...subsets import counted, first_names
 from ..cached_folder import cached_folder, file_digest
 from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from ..masks import write_reduced
-from ..photos import brightened_codes, read_photo, unusable_notes
+from ..photos import BRIGHTENING, brightened_codes, read_photo, unusable_notes
 from ..readers.colmap_model import SparseModel, read_model
-from .pairs import likely_pairs, pairs_with
+from .pairs import FEATURES, PARTNERS, RATIO, likely_pairs, pairs_with
 from .progress import counted_rows
 
 _log = logging.getLogger("sehdr_warp.scene")
@@ -40,7 +41,7 @@ MAX_SIDE = 1200
 SEED = 0
 FEWEST_SHARED = 60  # Points of a photo with fewer shared ones place it badly; sound photos have hundreds
 MOST_ERROR = 1.0  # Pixels; sound sets have 0.2 to 0.8
-_VERSION = 4
+_VERSION = 5  # Raised with every change of results that no constant of cache_key() states
 # Up to so many photos every pair is matched; in larger sets those that are likely to share points, and in still larger
 # ones each photo is matched with its neighbors by name.
 EXHAUSTIVE_LIMIT, COMPARED_LIMIT = 30, 150
@@ -105,10 +106,8 @@ def reconstruct(
     Raises:
         InputError: if fewer than two photos can be placed.
     """
-    rule = ["likely pairs"] * (EXHAUSTIVE_LIMIT < len(photos) <= COMPARED_LIMIT)
-    key = cache_key("photos", MAX_SIDE, SEED, [(photo.name, file_digest(photo)) for photo in photos], *rule)
-    if any(masks):
-        key = cache_key(key, [mask and file_digest(mask) for mask in masks])
+    digests = [(photo.name, file_digest(photo)) for photo in photos]
+    key = cache_key("photos", digests, [mask and file_digest(mask) for mask in masks if any(masks)])
 
     def solve(work: Path, result: Path) -> None:
         sizes, small = _write_photos(photos, work / "images")
@@ -135,7 +134,8 @@ def reconstruct(
             progress.update(count)
         _match(database, count, photo_seconds)
         names = {image_name(i) for i in range(len(photos)) if (work / "images" / image_name(i)).is_file()}
-        again = partial(_match_missing, database, names) if rule else None
+        some = EXHAUSTIVE_LIMIT < len(photos) <= COMPARED_LIMIT
+        again = partial(_match_missing, database, names) if some else None
         model = run_mapper(database, work, len(photos), photos[0].parent, before_again=again)
         model.write_binary(result)
         placed = [model.images[i] for i in model.reg_image_ids()]
@@ -164,8 +164,13 @@ def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Pat
 
 
 def cache_key(*parts) -> str:
-    """Return a name for a result made of everything that it depends on; the parts go through JSON."""
-    return hashlib.sha256(json.dumps([_VERSION, *parts]).encode()).hexdigest()[:16]
+    """Return a name for a result made of everything that it depends on; the parts go through JSON.
+
+    Beside the parts, these are the constants of this module, pairs and brightened_codes(), and pycolmap's version.
+    """
+    pairing = (EXHAUSTIVE_LIMIT, COMPARED_LIMIT, OVERLAP, FEATURES, PARTNERS, RATIO)
+    key = [_VERSION, version("pycolmap"), MAX_SIDE, SEED, FEWEST_SHARED, pairing, BRIGHTENING, *parts]
+    return hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
 
 
 def image_name(index: int) -> str:

@@ -51,11 +51,11 @@ def database(tmp_path):
 
 
 def test_each_photo_is_paired_with_those_that_match_it_best(database, monkeypatch):
-    monkeypatch.setattr(sfm_pairs, "_FEATURES", 60)
+    monkeypatch.setattr(sfm_pairs, "FEATURES", 60)
     pairs = {tuple(int(Path(name).stem) for name in pair) for pair in likely_pairs(database)}
     assert pairs >= {(i, i + 1) for i in range(6)} | {(0, 6)}
     assert not any(second - first in (2, 3, 4) for first, second in pairs if second < 7)
-    monkeypatch.setattr(sfm_pairs, "_PARTNERS", 1)
+    monkeypatch.setattr(sfm_pairs, "PARTNERS", 1)
     assert len(likely_pairs(database)) < len(pairs)
 
 

@@ -1,0 +1,59 @@
+"""The cache of structure from motion: its key holds whatever changes a result."""
+
+import pytest
+
+from sehdr_warp.scene.sfm import pairs, reconstruction
+
+WITHOUT_EFFECT = {"MOST_ERROR", "_PAIR_COST", "_PLACE_COST"}  # Of a message and of estimates of time
+CONSTANTS = {
+    name
+    for module in (pairs, reconstruction)
+    for name, value in vars(module).items()
+    if name.isupper() and isinstance(value, int | float) and name not in WITHOUT_EFFECT
+}
+
+
+@pytest.fixture
+def key(monkeypatch, tmp_path):
+    """Return a function that returns the key under which photos are cached."""
+    photos = [tmp_path / "a.jpg", tmp_path / "b.jpg"]
+    for photo in photos:
+        photo.write_bytes(photo.name.encode())
+
+    def stop(cache, key, solve):
+        raise InterruptedError(key)
+
+    def compute(masks=()):
+        with pytest.raises(InterruptedError) as stopped:
+            reconstruction.reconstruct(photos, None, masks)
+        return str(stopped.value)
+
+    monkeypatch.setattr(reconstruction, "solved_folder", stop)
+    return compute
+
+
+@pytest.mark.parametrize("name", sorted(CONSTANTS))
+def test_a_constant_that_changes_the_result_finds_cameras_anew(name, key, monkeypatch):
+    before = key()
+    assert key() == before
+    monkeypatch.setattr(reconstruction, name, getattr(reconstruction, name) + 1)
+    assert key() != before
+
+
+@pytest.mark.parametrize("field", reconstruction.BRIGHTENING._fields)
+def test_another_brightening_finds_cameras_anew(field, key, monkeypatch):
+    before, brightening = key(), reconstruction.BRIGHTENING
+    monkeypatch.setattr(reconstruction, "BRIGHTENING", brightening._replace(**{field: 0.1}))
+    assert key() != before
+
+
+def test_photos_masks_and_another_pycolmap_find_cameras_anew(key, monkeypatch, tmp_path):
+    before, mask = key(), tmp_path / "mask.png"
+    mask.write_bytes(b"1")
+    masked = key([mask, None])
+    mask.write_bytes(b"2")
+    assert key([None, None]) == before and len({before, masked, key([mask, None]), key([None, mask])}) == 4
+    monkeypatch.setattr(reconstruction, "version", lambda name: f"{name} 0")
+    assert key() != before
+    monkeypatch.undo()
+    assert reconstruction.cache_key("photos") != reconstruction.cache_key("panoramas")
