@@ -20,12 +20,16 @@ from .values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     from ..response import Response
-    from ..scene import Scene
+    from ..scene import Camera, Scene
+    from ..scene.readers.colmap_model import ModelImage
     from .config import Config
     from .run import Run, Splats
     from .run_folder import CameraEntry
 
 log = logging.getLogger(__name__)
+
+# Cameras that differ less than this count as the same: 0.5 degrees, and parts of the cameras' radius and focal length.
+_LEAST_COSINE, _MOST_MOVED, _MOST_ZOOMED = 0.99996, 0.01, 0.01
 
 
 def open_run(path: Path, device: str | None) -> Run:
@@ -77,9 +81,10 @@ def load_scene_and_log_notes(data: LoadArguments, **options: Any) -> Scene:
 def load_run_scene(run: Run, data: str | None) -> Scene:
     """Load the photos of a run in the same way as for its training; `data` says where they are now if they have moved.
 
-    Splits and exposure times are those of the training, because another version may decide them otherwise.
+    Cameras of bare photos, splits and exposure times are those of the training, because another version, or more photos
+    in the folder, may decide them otherwise.
 
-    Raises SehdrError if neither it nor the run does, or InputError if they are no longer there.
+    Raises SehdrError if neither it nor the run does, or InputError if they are no longer there, or have other cameras.
     """
     from ..scene import is_embedded
 
@@ -89,10 +94,38 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
     if data is None and not is_embedded(place) and not Path(place).exists():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
     response = response_for_loading(run.config, run.response)
-    scene = with_saved_splits(load_scene_and_log_notes(run.data | {"path": place}, response=response), run.cameras)
+    cameras = known_cameras(run.cameras)
+    scene = load_scene_and_log_notes(run.data | {"path": place}, response=response, cameras=cameras)
+    _require_same_cameras(scene, run, place)
+    scene = with_saved_splits(scene, run.cameras)
     times = {entry.name: entry.exposure_time for entry in run.cameras}
     views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
     return replace(scene, views=tuple(views))
+
+
+def known_cameras(entries: Iterable[CameraEntry]) -> list[ModelImage]:
+    """Return the cameras of a run that structure from motion found, for load_scene(); older runs keep none."""
+    return [entry.placed for entry in entries if entry.placed is not None]
+
+
+def _require_same_cameras(scene: Scene, run: Run, place: str) -> None:
+    """Raise InputError if views have other cameras than the views of these names that a run was trained with."""
+    saved, unit = {entry.name: entry.camera for entry in run.cameras}, run.field.normalization.unit
+    views = [view for view in scene.views if view.name in saved]
+    others = [view.name for view in views if not _alike(view.camera, saved[view.name], unit)]
+    if others:
+        problem = f"{len(others)} of {len(views)} photos have other cameras than {run.path} was trained with"
+        remedy = "put photos and cameras back as they were then, or train again"
+        raise InputError(place, f"{problem}: {first_names(others)}", remedy)
+
+
+def _alike(first: Camera, second: Camera, unit: float) -> bool:
+    """Return whether two cameras differ too little to change figures; `unit` is about the radius of all cameras."""
+    relative = first.world_to_camera[:3, :3] @ second.world_to_camera[:3, :3].T
+    cosine = (relative.trace() - 1) / 2
+    distance = ((first.position - second.position) ** 2).sum() ** 0.5
+    focal = first.fx / first.width * second.width / second.fx
+    return cosine > _LEAST_COSINE and distance < _MOST_MOVED * unit and abs(focal - 1) < _MOST_ZOOMED
 
 
 def with_saved_splits(scene: Scene, cameras: Iterable[CameraEntry]) -> Scene:

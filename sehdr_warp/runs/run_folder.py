@@ -37,6 +37,8 @@ from ..model.confidence import Evidence
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.images.ldr_files import MAX_PIXELS
+from ..scene.lens import Lens
+from ..scene.readers.colmap_model import ModelImage
 from .checkpoint import Checkpoint, read_checkpoint
 from .config import Config
 from .config_files import config_from_dict, override_config
@@ -67,12 +69,16 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True)
 class CameraEntry:
-    """A view of the scene that a run was trained on. exposure_time: seconds; split: "train" or "test"."""
+    """A view of the scene that a run was trained on. exposure_time: seconds; split: "train" or "test".
+
+    placed: file name, lens and pose of a photo whose camera structure from motion found.
+    """
 
     name: str
     split: str
     camera: Camera
     exposure_time: float
+    placed: ModelImage | None = None
 
 
 class Confidence(NamedTuple):
@@ -195,7 +201,7 @@ class RunFolder:
         """Return the views of the scene, in its order."""
         views = self.read_scene()["views"]
         try:
-            return tuple(_camera_entry(view) for view in views)
+            return tuple(_camera_entry(view, self.scene_file) for view in views)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(self.scene_file, f"a view is damaged ({error!r:.200})", REMEDY) from None
 
@@ -311,8 +317,12 @@ def confidence_metadata(checkpoint_hash: str) -> dict[str, str | int]:
     return {"checkpoint": checkpoint_hash, "format": FORMAT}
 
 
-def _camera_entry(view: dict) -> CameraEntry:
+def _camera_entry(view: dict, source: Path) -> CameraEntry:
     camera = Camera.from_dict(view["camera"])
     if camera.width * camera.height > MAX_PIXELS:
         raise ValueError(f"{camera.width} x {camera.height} is more than {MAX_PIXELS} pixels")
-    return CameraEntry(view["name"], view["split"], camera, float(view["exposure_time"]))
+    placed = None
+    if values := view.get("lens"):
+        lens = Lens(values["model"], values["width"], values["height"], tuple(values["params"]), source)
+        placed = ModelImage(values["file"], lens, camera.world_to_camera)
+    return CameraEntry(view["name"], view["split"], camera, float(view["exposure_time"]), placed)

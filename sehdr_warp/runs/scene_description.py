@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..scene import Scene
+from ..scene import Scene, View
 from .values import FORMAT
 
 GRID = 8
@@ -23,6 +23,7 @@ _TOLERANCE = 2
 
 def describe_scene(scene: Scene) -> dict:
     """Return what scene.json holds."""
+    found = scene.format in ("photos", "video")  # Cameras that structure from motion found
     views = [
         {name: getattr(view, name) for name in ("name", "split", "exposure_time")}
         | {
@@ -30,10 +31,19 @@ def describe_scene(scene: Scene) -> dict:
             "has_hdr": view.hdr is not None,
             "photo": photo_signature(view.codes, view.mask),
         }
+        | (_lens_values(view) if found else {})
         for view in scene.views
     ]
     facts = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
     return {"format": FORMAT, "name": scene.name, "layout": scene.format, **facts, "views": views}
+
+
+def _lens_values(view: View) -> dict:
+    """Return file name and lens of a photo, with which it is read again without structure from motion."""
+    if view.lens is None or view.source is None:
+        return {}
+    lens = {name: getattr(view.lens, name) for name in ("model", "width", "height", "params")}
+    return {"lens": lens | {"file": view.source.name}}
 
 
 class SceneDifference(NamedTuple):
@@ -67,7 +77,12 @@ def _differing_part(saved: list[dict], current: list[dict]) -> str:
 
 
 def _split_photos(description: dict) -> dict[str, str]:
-    """Take the photos' signatures out of a description of a scene; return those there are, by the views' names."""
+    """Take the photos' signatures out of a description of a scene; return those there are, by the views' names.
+
+    Lenses are taken out, too: older runs have none, and cameras tell of them.
+    """
+    for view in description["views"]:
+        view.pop("lens", None)
     photos = {view["name"]: view.pop("photo", None) for view in description["views"]}
     return {name: photo for name, photo in photos.items() if isinstance(photo, str)}
 

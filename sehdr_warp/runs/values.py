@@ -183,6 +183,16 @@ class MetricsValues(Values):
     gaussians: Count | None = None
 
 
+class LensValues(Values):
+    """Lens of a photo whose camera structure from motion found, and the photo's file name."""
+
+    file: Text
+    model: Text
+    width: Count
+    height: Count
+    params: Annotated[list[FiniteFloat], Field(max_length=16)]
+
+
 class ViewValues(Values):
     """A view of scene.json."""
 
@@ -190,6 +200,7 @@ class ViewValues(Values):
     split: Literal["train", "test"]
     exposure_time: Annotated[float, Field(gt=0)]
     camera: dict[str, Any]
+    lens: LensValues | None = None
 
 
 class SceneValues(Values):

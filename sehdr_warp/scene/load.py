@@ -19,9 +19,9 @@ from .float_photos import with_float_times
 from .masks import assign_masks
 from .photos import usable_photos
 from .preprocess import preprocess
-from .readers.bare_photos import find_photos, place_photos
+from .readers.bare_photos import find_photos, place_photos, with_cameras
 from .readers.colmap import model_fits, read_colmap
-from .readers.colmap_model import find_model, has_images
+from .readers.colmap_model import ModelImage, find_model, has_images
 from .readers.hdr_sets import is_hdr_gs, read_hdr_gs, read_hdr_nerf, read_hdr_nerf_real
 from .readers.llff import read_llff
 from .readers.opensfm import find_reconstruction, read_opensfm
@@ -54,6 +54,7 @@ def load_scene(
     cache: Path | str | None = None,
     photo_storage: str = "auto",
     views: Collection[str] | None = None,
+    cameras: Sequence[ModelImage] = (),
 ) -> Scene:
     """Read a folder of posed or bare photos, whatever its layout.
 
@@ -78,6 +79,8 @@ def load_scene(
         photo_storage: where photos are stored: "memory", "disk" (in a nameless file beside the cache, removed with the
             process), or "auto" for the disk if they would take more than half of the free memory.
         views: names of the views to read; None reads all. Response, splits and colors are those of the whole set.
+        cameras: of bare photos by their file names, as a run keeps them; photos without one are left out. Structure
+            from motion finds them if there are none.
 
     Returns:
         A Scene in the set's own world coordinates, with the points that the set has.
@@ -95,7 +98,9 @@ def load_scene(
         response_by_name(response)  # An unknown name is refused before the photos are read.
     for candidate in candidates:
         responses_named(candidate)
-    dataset = parse_dataset(path, response=response, exposure_index=exposure_index, holdout=holdout, cache=cache)
+    dataset = parse_dataset(
+        path, response=response, exposure_index=exposure_index, holdout=holdout, cache=cache, cameras=cameras
+    )
     choice = choose_response(dataset, response, method, candidates)
     dataset, curve = choice.dataset, choice.response
     names = unique_names(dataset.records)
@@ -127,6 +132,7 @@ def parse_dataset(
     exposure_index: int | None = None,
     holdout: int | None = None,
     cache: Path | str | None = None,
+    cameras: Sequence[ModelImage] = (),
 ) -> DataparserOutputs:
     """Parse cameras, files, exposure times and splits of a data folder; of photos only headers are read.
 
@@ -152,7 +158,7 @@ def parse_dataset(
     check_response(dataset, response, path)
     unplaced: list[str] = []
     if records and records[0].lens is UNPLACED:
-        dataset, unplaced = place_photos(dataset, cache)
+        dataset, unplaced = with_cameras(dataset, cameras) if cameras else place_photos(dataset, cache)
         records = list(dataset.records)
         if unplaced:  # Their times are not to be told of, nor the others' relative to theirs.
             untimed = [replace(record, exposure_time=None, time_known=True) for record in records]

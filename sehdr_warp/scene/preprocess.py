@@ -220,7 +220,7 @@ class _Preprocessor:
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         above = {"light_above_white": photo.above_white, "light_above_white_deviation": photo.above_white_deviation}
-        return View(name, photo.pixels, camera, time, split, mask, hdr, record.image, **above)
+        return View(name, photo.pixels, camera, time, split, mask, hdr, record.image, **above, lens=record.lens)
 
     def _truth(self, record: ImageRecord, lens: Lens, resample: _Resampler) -> np.ndarray | None:
         """Return the truth of a photo at the size of its view; None without a file, or with one that cannot be used."""

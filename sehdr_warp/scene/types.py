@@ -10,6 +10,7 @@ from .camera import Camera
 
 if TYPE_CHECKING:
     from ..response import Response
+    from .lens import Lens
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,6 +31,7 @@ class View:
             (by a gain map, for example), as a multiple of the exposure that the code of white stands for; at least 1
             where it is known, 0 elsewhere. None if the file states none.
         light_above_white_deviation: standard deviation of the natural logarithm of light_above_white.
+        lens: of the photo, before it was undistorted; None for a view built in code.
 
     Raises:
         ValueError: if codes have another type or shape; codes_of returns codes for encoded values.
@@ -45,6 +47,7 @@ class View:
     source: Path | None = None
     light_above_white: np.ndarray | None = None
     light_above_white_deviation: float = 0.0
+    lens: "Lens | None" = None
 
     def __post_init__(self):
         """Check the types and shapes."""

@@ -17,7 +17,7 @@ from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
-from ..runs.open import load_scene_and_log_notes, response_for_loading, with_saved_splits
+from ..runs.open import known_cameras, load_scene_and_log_notes, response_for_loading, with_saved_splits
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
@@ -178,18 +178,19 @@ def _train(args: Train, ranks=None) -> None:
         log.info("%s holds no run yet: a training begins there", out)
     data, config = _load_arguments(args, info.get("data")), _config(args, saved)
     device = pick_device(args.machine.device) if ranks is None else ranks.device
-    load_options = _load_options(config)
+    load_options, cameras = _load_options(config), ()
     if saved is not None:  # Its response need not be chosen again; create_trainer() refuses another --response.
         load_options["response"] = response_for_loading(saved, Response.from_dict(info["response"]))
+        saved_cameras = folder.read_cameras()
+        load_options["cameras"] = known_cameras(saved_cameras)
+        cameras = saved_cameras if args.scene.holdout is None else ()
     check_dataset_truth(data, config)
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
             from .following import PhotoRequest
 
-            ranks.request_photos(PhotoRequest(data, load_options))
-        scene = load_scene_and_log_notes(data, **load_options)
-        if saved is not None and args.scene.holdout is None:
-            scene = with_saved_splits(scene, folder.read_cameras())
+            ranks.request_photos(PhotoRequest(data, load_options, cameras))
+        scene = with_saved_splits(load_scene_and_log_notes(data, **load_options), cameras)
         from ..console import run_with_progress
         from ..viewer.live import serve_training
         from .advice import advice_on, options_of_run

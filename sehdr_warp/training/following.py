@@ -10,8 +10,9 @@ import torch
 from ..errors import InputError
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
-from ..runs.open import load_scene_and_log_notes
+from ..runs.open import load_scene_and_log_notes, with_saved_splits
 from ..runs.run import exposure_compensation, field_from_checkpoint
+from ..runs.run_folder import CameraEntry
 from ..runs.scene_description import describe_scene, scene_difference
 from ..runs.values import LoadArguments
 from ..scene import Scene
@@ -26,7 +27,8 @@ class PhotoRequest:
     """Arguments with which the photos of other nodes are read."""
 
     data: LoadArguments  # Arguments of load_scene() as a run saves them
-    options: dict[str, Any]  # Further arguments of load_scene(): response, method, candidates, photo_storage
+    options: dict[str, Any]  # Further arguments of load_scene(): response, method, candidates, cameras, photo_storage
+    cameras: tuple[CameraEntry, ...]  # Of the run that is resumed, whose splits count
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
     if reads:
         request: PhotoRequest = ranks.requested_photos()
         data = request.data if path is None else request.data | {"path": path}
-        scene = load_scene_and_log_notes(data, **request.options)
+        scene = with_saved_splits(load_scene_and_log_notes(data, **request.options), request.cameras)
     message: TrainingMessage = ranks.broadcast_object()
     config = message.config
     tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in message.layout.items()}

@@ -1,15 +1,27 @@
-"""Photos of a run are found again where the run says that they are: a folder, or the file of a video."""
+"""Photos of a run are found again where the run says that they are, with the cameras that it was trained with."""
 
+import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.runs import open as opening
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.runs.run_folder import CameraEntry
+from sehdr_warp.runs.run_folder import CameraEntry, RunFolder
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.dataparser import PointCloud
+from sehdr_warp.scene.lens import Lens
+from sehdr_warp.scene.normalization import Normalization
+from sehdr_warp.scene.readers import bare_photos
+from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
+from sehdr_warp.scene.sfm.reconstruction import Reconstruction
+from tests.refusals import call, refused
 from tests.training.toy import toy_scene
 
 
@@ -21,6 +33,7 @@ def test_photos_of_a_folder_and_of_a_video_are_loaded_again(monkeypatch, tmp_pat
     run = SimpleNamespace(
         data={"path": str(place)}, path=tmp_path / "run", config=Config(), response=None, cameras=cameras
     )
+    run.field = SimpleNamespace(normalization=Normalization())
     with pytest.raises(InputError, match="no longer there|no longer here"):
         opening.load_run_scene(run, None)
     if name == "clip.mp4":
@@ -34,6 +47,109 @@ def test_photos_of_a_folder_and_of_a_video_are_loaded_again(monkeypatch, tmp_pat
     first, second = scene.views[:2]
     assert [view.name for view in loaded.test_views] == [first.name] and loaded.views[0].exposure_time == 0.25
     assert loaded.views[1].exposure_time == second.exposure_time and loaded.views[1].split == second.split
+
+
+def find_cameras(monkeypatch, cameras, k1=0.02):
+    """Let structure from motion find these cameras, by the photos' stems, with a lens that is not a pinhole."""
+
+    def reconstruct(photos, *_):
+        images = []
+        for index, photo in enumerate(photos):
+            if camera := cameras.get(photo.stem):
+                params = (camera.fx, camera.cx, camera.cy, k1)
+                lens = Lens("SIMPLE_RADIAL", camera.width, camera.height, params, photo)
+                images.append(ModelImage(f"{index:05d}.png", lens, camera.world_to_camera))
+        points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+        return Reconstruction(SparseModel(tuple(images), PointCloud(points, np.ones((50, 3), np.float32))), 0.5, ())
+
+    monkeypatch.setattr(bare_photos, "reconstruct", reconstruct)
+
+
+TRAIN = "--preset demo --max-size 40 --response srgb --device cpu --mcmc.seed-fraction 0 --model.initial-density 0"
+
+
+@pytest.fixture
+def bare_run(monkeypatch, tmp_path):
+    """Photos without poses, and a run of them that ended after 20 of 40 steps."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    views = load_scene("embedded", max_size=48, response="srgb").views[:10]
+    for view in views:
+        Image.fromarray((view.image * 255).astype(np.uint8)).save(folder / f"{view.name}.png")
+    shutil.copy(folder / f"{views[0].name}.png", tmp_path / "other.png")
+    cameras = {view.name: view.camera for view in views[:9]}
+    find_cameras(monkeypatch, cameras)
+    assert call("train", folder, "--out", tmp_path / "run", *TRAIN.split(), "--iterations", 20) == 0
+    return folder, tmp_path / "run", cameras
+
+
+def figures(run, file):
+    assert call("eval", run, "--device", "cpu", "--json", file, "--overwrite") == 0
+    return json.loads(file.read_text())
+
+
+def test_cameras_of_a_run_are_not_found_anew(bare_run, monkeypatch, tmp_path):
+    """Even if structure from motion would fail today, the folder holds more photos, or one less."""
+    folder, run, _ = bare_run
+    before, cameras = figures(run, tmp_path / "figures.json"), RunFolder(run).read_cameras()
+    find_cameras(monkeypatch, {})
+    Image.open(tmp_path / "other.png").transpose(Image.Transpose.ROTATE_180).save(folder / "a.png")
+    assert figures(run, tmp_path / "figures.json") == before
+    scene = opening.load_run_scene(load_run(run), None)
+    assert [view.camera.to_dict() for view in scene.views] == [entry.camera.to_dict() for entry in cameras]
+    assert any("2 photos are not in the run and are left out: a.png, " in note for note in scene.notes)
+    assert call("train", "--resume", "--out", run, "--iterations", 40, "--device", "cpu") == 0
+    name = next(entry.name for entry in cameras if entry.split == "train")
+    (folder / f"{name}.png").unlink()
+    notes = opening.load_run_scene(load_run(run), None).notes
+    assert f"1 photo of the run is missing: {name}.png" in notes
+
+
+def test_photos_of_another_place_are_refused(bare_run, tmp_path, capfd):
+    (tmp_path / "others").mkdir()
+    for index in range(4):
+        shutil.copy(tmp_path / "other.png", tmp_path / "others" / f"{index}.png")
+        with (tmp_path / "others" / f"{index}.png").open("ab") as file:
+            file.write(bytes([index]))
+    error = refused(capfd, "eval", bare_run[1], "--data", tmp_path / "others")
+    assert "holds none of the 9 photos that the run was trained with" in error
+
+
+def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, monkeypatch, capfd):
+    """Of a run whose scene.json has no lenses, cameras are found anew."""
+    _, run, cameras = bare_run
+    scene_file, checkpoints = run / "scene.json", run / "checkpoints"
+    scene = json.loads(scene_file.read_text())
+    for view in scene["views"]:
+        assert view.pop("lens")
+    scene_file.write_text(json.dumps(scene))
+    for file in checkpoints.glob("*/checkpoint.json"):
+        values = json.loads(file.read_text())
+        values["run"]["scene.json"] = RunFolder(run).hashes()["scene.json"]
+        file.write_text(json.dumps(values))
+    assert call("eval", run, "--device", "cpu", "-q") == 0
+    moved = {}
+    for name, camera in cameras.items():
+        pose = camera.world_to_camera.copy()
+        pose[:3, 3] *= 1.1
+        moved[name] = replace(camera, world_to_camera=pose)
+    find_cameras(monkeypatch, moved)
+    error = refused(capfd, "eval", run, "--device", "cpu")
+    assert "9 of 9 photos have other cameras than" in error
+    assert "its cameras differ" in refused(capfd, "train", "--resume", "--out", run, "--iterations", 40)
+
+
+def test_small_differences_of_cameras_count_as_none():
+    camera = toy_scene(1, 8).views[0].camera
+    pose = camera.world_to_camera.copy()
+    pose[:3, 3] += 0.005
+    assert opening._alike(camera, replace(camera, world_to_camera=pose, fx=camera.fx * 1.005), 1.0)
+    assert not opening._alike(camera, replace(camera, world_to_camera=pose), 0.1)
+    assert not opening._alike(camera, replace(camera, fx=camera.fx * 1.02), 1.0)
+    angle = np.radians(1)
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    assert not opening._alike(camera, replace(camera, world_to_camera=pose @ camera.world_to_camera), 1e9)
 
 
 @pytest.mark.parametrize("name", ["gpu", "mps", "cuda:99"])

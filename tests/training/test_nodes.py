@@ -15,9 +15,10 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.runs.run_folder import CameraEntry, RunFolder
 from sehdr_warp.runs.scene_description import describe_scene
-from sehdr_warp.training.following import _check_same_photos
+from sehdr_warp.training import following
+from sehdr_warp.training.following import PhotoRequest, _check_same_photos
 from sehdr_warp.training.launch import RankInfo, open_store, rank_from_environment
 from sehdr_warp.training.ranks import rank_timeout
 
@@ -139,6 +140,26 @@ def test_nodes_must_have_the_same_photos():
         _check_same_photos(ranks, shared, replace(scene, views=(first, *scene.views[1:])))
     with pytest.raises(InputError, match="views differ"):
         _check_same_photos(ranks, shared, replace(scene, views=scene.views[:-1]))
+
+
+def test_other_nodes_hold_out_what_a_resumed_run_does(monkeypatch):
+    scene = toy_scene(6)
+    saved = tuple(CameraEntry(view.name, "train", view.camera, 1.0) for view in scene.views)
+    loaded, request = [], PhotoRequest({"path": "town"}, {"response": "srgb"}, saved)
+
+    def check(ranks, shared, scene):
+        loaded.append(scene)
+        raise InterruptedError
+
+    monkeypatch.setattr(following, "load_scene_and_log_notes", lambda data, **options: scene)
+    monkeypatch.setattr(following, "_check_same_photos", check)
+    monkeypatch.setattr(following, "field_from_checkpoint", lambda *_: None)
+    shared = SimpleNamespace(config=None, layout={}, values={}, info={})
+    ranks = SimpleNamespace(info=RankInfo(1, 2, 0, 1, 1, 2), requested_photos=lambda: request)
+    ranks.broadcast_object, ranks.broadcast_arrays = lambda: shared, lambda arrays: None
+    with pytest.raises(InterruptedError):
+        following.train_as_worker(ranks)
+    assert len(scene.train_views) == 5 and len(loaded[0].views) == 6
 
 
 def test_nodes_start_as_many_processes_each(monkeypatch):

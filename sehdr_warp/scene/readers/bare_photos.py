@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
-from ...subsets import first_names
+from ...subsets import counted, first_names
 from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord
 from ..exposure.stack import refuse_stack
 from ..file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
@@ -25,7 +25,7 @@ from ..sfm.reconstruction import Reconstruction, reconstruct
 from ..unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from ..video.decode import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
 from .colmap import INPUT
-from .colmap_model import find_model
+from .colmap_model import ModelImage, find_model
 from .photo_copies import copies_note, find_copies
 from .transforms import is_transforms
 
@@ -119,6 +119,32 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
             placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera, uncertain=uncertain))
     notes = dataset.notes + reconstruction.notes(photos)
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
+
+
+def with_cameras(dataset: DataparserOutputs, cameras: Sequence[ModelImage]) -> tuple[DataparserOutputs, list[str]]:
+    """Return bare photos with the cameras of their file names, and the names of photos without one.
+
+    Raises:
+        InputError: if no photo has a camera.
+    """
+    by_name = {camera.name: camera for camera in cameras}
+    placed, others = [], []
+    for record in dataset.records:
+        if (camera := by_name.pop(record.image.name, None)) is None:
+            others.append(record.image.name)
+        else:
+            placed.append(replace(record, lens=camera.lens, world_to_camera=camera.world_to_camera))
+    if not placed:
+        problem = f"holds none of the {len(cameras)} photos that the run was trained with, but {first_names(others, 5)}"
+        raise InputError(dataset.folder, problem, "say where they are")
+    notes = ["cameras are those of the run"]
+    if others:
+        count = counted(len(others), "photo is not in the run and is", "photos are not in the run and are")
+        notes.append(f"{count} left out: {first_names(others, 5)}")
+    if by_name:
+        count = counted(len(by_name), "photo of the run is", "photos of the run are")
+        notes.append(f"{count} missing: {first_names(list(by_name), 5)}")
+    return replace(dataset, records=tuple(placed), notes=(*dataset.notes, *notes)), others
 
 
 def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:
