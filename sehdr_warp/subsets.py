@@ -1,6 +1,6 @@
 """Subsets of photos and points, small enough to look at."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
@@ -21,6 +21,20 @@ def evenly(items: Sequence[Item], count: int) -> list[Item]:
 def first_names(names: Sequence[str], most: int = 3) -> str:
     """Return "a, b, c" or, of more than `most` names, "a, b, c ..."."""
     return ", ".join(names[:most]) + " ..." * (len(names) > most)
+
+
+def all_names(names: Sequence[str], indices: Iterable[int]) -> str:
+    """Return all names at ascending indices: "a, c to f", with rows of three or more neighbors in short."""
+    rows: list[list[int]] = []
+    for index in indices:
+        if rows and rows[-1][-1] == index - 1:
+            rows[-1].append(index)
+        else:
+            rows.append([index])
+    texts = (
+        f"{names[row[0]]} to {names[row[-1]]}" if len(row) > 2 else ", ".join(names[i] for i in row) for row in rows
+    )
+    return ", ".join(texts)
 
 
 def counted(count: int, one: str, several: str) -> str:

@@ -24,7 +24,7 @@ from .lens import Lens
 from .raw.decode import read_header, read_raw
 
 FEWEST_PHOTOS = 3  # A training needs at least as many
-_MOST_NAMED = 3
+_MOST_EXPLAINED = 3  # Photos of which a note says why they cannot be used
 _SMALLEST, _LARGEST = 1 / 32, 8  # Size of a photo in parts of its camera's
 _LEAST_SQUARE = 0.01  # Part by which the sides of a pixel may differ and count as equal
 _KINDS = {"encoded": "photos of codes", "raw": "RAW photos", "float": "float images"}
@@ -119,10 +119,10 @@ def unusable_notes(problems: Sequence[InputError], count: int, *, truth: bool = 
     if 2 * len(problems) > count or (not truth and count - len(problems) < min(FEWEST_PHOTOS, count)):
         raise problems[0]
     # A mask may have the name of its photo, so its folder is named too.
-    paths = [Path(error.path) for error in problems[:_MOST_NAMED]]
+    paths = [Path(error.path) for error in problems]
     names = [f"{p.parent.name}/" * (p.parent.name.lower() in MASK_FOLDERS) + p.name for p in paths]
-    reasons = "; ".join(f"{name}: {error.problem}" for name, error in zip(names, problems))
-    more = " ..." if len(problems) > _MOST_NAMED else ""
+    reasons = "; ".join(f"{name}: {error.problem}" for name, error in zip(names[:_MOST_EXPLAINED], problems))
+    more = "; and " * (len(names) > _MOST_EXPLAINED) + ", ".join(names[_MOST_EXPLAINED:])
     files = "files of truth" if truth else "photos"
     return [f"{len(problems)} of {count} {files} cannot be used and were left out ({reasons}{more})"]
 

@@ -349,14 +349,16 @@ def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypa
 def test_poor_placement_is_named_with_its_photos():
     photos = [Path(f"{index}.jpg") for index in range(8)]
     lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
-    images = tuple(ModelImage(f"{index:05d}.png", lens, np.eye(4)) for index in range(6))
+    images = tuple(ModelImage(f"{index:05d}.png", lens, np.eye(4)) for index in (0, 1, 2, 3, 4, 6))
     model = SparseModel(images, PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32)))
     lost, weak, error = Reconstruction(model, 1.4, (2, 4)).notes(photos)
     assert lost == (
-        "2 of 8 photos could not be placed and were left out: 6.jpg, 7.jpg; photos between these and the others help"
+        "2 of 8 photos could not be placed and were left out: 5.jpg, 7.jpg; photos between these and the others help"
     )
     assert weak.startswith("2 photos share few points with others, so their places are uncertain: 2.jpg, 4.jpg;")
     assert "1.4 pixels" in error
+    lost, _ = Reconstruction(SparseModel(images[:1], model.cloud), 0.5, (0,)).notes(photos)
+    assert "7 of 8 photos could not be placed and were left out: 1.jpg to 7.jpg;" in lost
     _, weak, _ = Reconstruction(model, 1.4, (3,)).notes(photos)
     assert weak.startswith("1 photo shares few points with others, so its place is uncertain: 3.jpg;")
 

@@ -46,3 +46,11 @@ def test_pixels_that_are_not_square(tmp_path, suffix):
         InputError, match=r"0\..*: states pixels that are not square \(.*\); resample it to square pixels"
     ):
         usable_photos(find_photos(tmp_path).records)
+
+
+def test_all_photos_that_cannot_be_used_are_named(tmp_path):
+    for i in range(11):
+        write(tmp_path / f"{i}.png", (2 if i < 5 else 1, 1), i)
+    _, _, notes = usable_photos(find_photos(tmp_path).records)
+    assert "5 of 11 photos" in notes[0] and notes[0].count("not square") == 3
+    assert notes[0].endswith("; and 3.png, 4.png)")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
-from ...subsets import counted, first_names
+from ...subsets import all_names, counted, first_names
 from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord
 from ..exposure.stack import refuse_stack
 from ..file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
@@ -128,23 +128,23 @@ def with_cameras(dataset: DataparserOutputs, cameras: Sequence[ModelImage]) -> t
         InputError: if no photo has a camera.
     """
     by_name = {camera.name: camera for camera in cameras}
-    placed, others = [], []
-    for record in dataset.records:
+    placed, others, names = [], [], [record.image.name for record in dataset.records]
+    for index, record in enumerate(dataset.records):
         if (camera := by_name.pop(record.image.name, None)) is None:
-            others.append(record.image.name)
+            others.append(index)
         else:
             placed.append(replace(record, lens=camera.lens, world_to_camera=camera.world_to_camera))
     if not placed:
-        problem = f"holds none of the {len(cameras)} photos that the run was trained with, but {first_names(others, 5)}"
+        problem = f"holds none of the {len(cameras)} photos that the run was trained with, but {first_names(names)}"
         raise InputError(dataset.folder, problem, "say where they are")
-    notes = ["cameras are those of the run"]
+    notes = []
     if others:
         count = counted(len(others), "photo is not in the run and is", "photos are not in the run and are")
-        notes.append(f"{count} left out: {first_names(others, 5)}")
+        notes.append(f"{count} left out: {all_names(names, others)}")
     if by_name:
         count = counted(len(by_name), "photo of the run is", "photos of the run are")
-        notes.append(f"{count} missing: {first_names(list(by_name), 5)}")
-    return replace(dataset, records=tuple(placed), notes=(*dataset.notes, *notes)), others
+        notes.append(f"{count} missing: {', '.join(by_name)}")
+    return replace(dataset, records=tuple(placed), notes=(*dataset.notes, *notes)), [names[i] for i in others]
 
 
 def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:

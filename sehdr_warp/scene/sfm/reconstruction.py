@@ -25,7 +25,7 @@ from PIL import Image
 from ...errors import InputError, SehdrError
 from ...parallel import preserve_signals, run_interruptibly
 from ...progress import Stage, stage, track_progress
-from ...subsets import counted, first_names
+from ...subsets import all_names, counted
 from ..cached_folder import cached_folder, file_digest
 from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from ..masks import write_reduced
@@ -72,16 +72,20 @@ class Reconstruction:
     def notes(self, photos: Sequence[Path]) -> tuple[str, ...]:
         """Return a line for each reason not to trust the places of the cameras, with the photos concerned."""
         registered = {int(Path(image.name).stem) for image in self.model.images}
-        unregistered, notes = [photo.name for i, photo in enumerate(photos) if i not in registered], []
+        unregistered, notes = [i for i in range(len(photos)) if i not in registered], []
+        names = [photo.name for photo in photos]
         if unregistered:
             were = f"could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out"
-            first = f"{first_names(unregistered, 5)}; photos between these and the others help"
-            notes.append(f"{len(unregistered)} of {len(photos)} photos {were}: {first}")
+            advice = "photos between these and the others help"
+            notes.append(
+                f"{len(unregistered)} of {len(photos)} photos {were}: {all_names(names, unregistered)}; {advice}"
+            )
         if self.weak:
-            first = first_names([photos[i].name for i in self.weak], 5)
             shared = "few points with others, so"
             few = f"photo shares {shared} its place is", f"photos share {shared} their places are"
-            notes.append(f"{counted(len(self.weak), *few)} uncertain: {first}; more photos in between help")
+            notes.append(
+                f"{counted(len(self.weak), *few)} uncertain: {all_names(names, self.weak)}; more photos in between help"
+            )
         if self.error > MOST_ERROR:
             notes.append(
                 f"the cameras' places are uncertain: points miss their photos by {self.error:.1f} pixels in the mean; "
