@@ -79,7 +79,7 @@ def with_exposure_times(records: list[ImageRecord], source: Path) -> tuple[list[
         InputError: if exposures.json is damaged or states an impossible time.
     """
     times, notes = stated_times(records, source)
-    by_exif, exif_notes = _exif_times(records, timeless=not any(times))
+    by_exif, exif_notes = _exif_times(records, times)
     times, contradictions = _compared_with_exif(times, by_exif)
     notes = [*notes, *contradictions, *(exif_notes if None in times else ())]
     times = [other if time is None else time for time, other in zip(times, by_exif, strict=True)]
@@ -215,18 +215,21 @@ def _spellings(name: str) -> list[str]:
     return [*ends, *stems]
 
 
-def _exif_times(records: list[ImageRecord], *, timeless: bool) -> tuple[list[float | None], list[str]]:
+def _exif_times(records: Sequence[ImageRecord], stated: Sequence[float | None]) -> tuple[list[float | None], list[str]]:
     """Return the times of photos by EXIF, and notes.
 
     If most photos with a time state an ISO or f-number, the median counts for the others, or, if it differs much among
     photos, the others have no time. If most do not state it, it is not counted.
-    `timeless` takes 1 s where no photo states a time: ISO and f-number still tell how their exposures differ.
+    If no photo has a time, `stated` by the set or in EXIF, each has 1 s: ISO and f-number still tell how their
+    exposures differ. If half of the photos or more have none, no times count, so ISO and f-number do not, either.
     """
     exposures = [exif_exposure(record.image) for record in records]
     times = [exposure.time for exposure in exposures]
-    timeless = timeless and not any(times)
+    known = sum(time is not None or own is not None for time, own in zip(stated, times, strict=True))
+    timeless = known == 0
     notes, factors = [], [1.0] * len(records)
-    for name, field, power in (("ISO", "iso", 1.0), ("f-number", "f_number", -2.0)):
+    settings = (("ISO", "iso", 1.0), ("f-number", "f_number", -2.0))
+    for name, field, power in settings if timeless or 2 * known > len(records) else ():
         relevant = [i for i, exposure in enumerate(exposures) if timeless or exposure.time is not None]
         values = [value for i in relevant if (value := getattr(exposures[i], field)) is not None]
         if len(set(values)) <= 1:

@@ -110,8 +110,9 @@ def test_photos_with_flash_are_named(tmp_path):
 
 
 def test_few_times_among_many_photos_are_not_counted(tmp_path):
-    write_colmap(tmp_path, 6, name="{:03d}.jpg", exif={0: {TIME: 0.01}, 1: {TIME: 0.02}})
+    write_colmap(tmp_path, 6, name="{:03d}.jpg", exif={0: {TIME: 0.01, ISO: 100}, 1: {TIME: 0.02, ISO: 200}})
     scene = load(tmp_path)
     assert not scene.exposure_times_known and {view.exposure_time for view in scene.views} == {1.0}
     text = " ".join(scene.notes)
     assert "most photos state no exposure time" in text and "times of 2 are not counted" in text
+    assert "ISO" not in text
