@@ -115,6 +115,7 @@ class DataparserOutputs:
         within_rec709: the light of the stated response lies within Rec.709, to which photos are converted when they
             are read.
         mentioned: names of photos that a note names, and that are in no record.
+        unplaced: number of photos that structure from motion could not place, which are in no record.
         kind: of the photos: encoded, linear, gain-map, raw or float; see ldr_files.file_kind() and response_choice.py.
     """
 
@@ -132,6 +133,7 @@ class DataparserOutputs:
     color_matrix: np.ndarray | None = None
     within_rec709: bool = False
     mentioned: tuple[str, ...] = ()
+    unplaced: int = 0
 
     @property
     def training(self) -> tuple[ImageRecord, ...]:

@@ -122,7 +122,8 @@ def load_scene(
         used = {view.name for view in scene.views}
         records = [record for name, record in zip(names, dataset.records, strict=True) if name in used]
         scene = replace(scene, notes=(*scene.notes, *exposures_note(records)))
-    return replace(scene, chosen_by=choice.chosen_by, color_matrix=choice.color_matrix, light_known=light_known)
+    facts = {"color_matrix": choice.color_matrix, "light_known": light_known, "unplaced": dataset.unplaced}
+    return replace(scene, chosen_by=choice.chosen_by, **facts)
 
 
 def parse_dataset(
@@ -174,7 +175,7 @@ def parse_dataset(
     notes = (*notes, *camera_notes, *split_notes)
     if not is_embedded(path) and dataset.format != "video":
         notes = (*notes, *unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]))
-    return replace(dataset, records=tuple(records), notes=notes, name=name)
+    return replace(dataset, records=tuple(records), notes=notes, name=name, unplaced=len(unplaced))
 
 
 def _folder(path: Path | str) -> Path:

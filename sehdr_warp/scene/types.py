@@ -94,6 +94,7 @@ class Scene:
             photos, and those whose files state their transfer function.
         photos_normalized: True if the photos were normalized; see ExposureCompensation.normalize_photos.
         color_matrix: [3, 3] from the primaries of the codes' light to linear Rec.709; None if these are Rec.709.
+        unplaced: number of photos without a camera, which are in no view.
     """
 
     name: str
@@ -108,6 +109,7 @@ class Scene:
     color_matrix: np.ndarray | None = None
     light_known: bool = False
     photos_normalized: bool = False
+    unplaced: int = 0
 
     def __repr__(self) -> str:
         """Return name, format, number of views and their size in one line."""

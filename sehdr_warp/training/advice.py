@@ -49,7 +49,8 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
         return []
     words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
     summary = run.summary() | {"metrics": run.metrics()}
-    return advice(run.path, summary, photos, data.get("path") or "SCENE", words, trainer.first_iteration)
+    scene, unplaced = data.get("path") or "SCENE", trainer.scene.unplaced
+    return advice(run.path, summary, photos, scene, words, trainer.first_iteration, unplaced)
 
 
 def advice(
@@ -59,6 +60,7 @@ def advice(
     scene: str = "SCENE",
     options: Sequence[str] = (),
     resumed_at: int = 0,
+    unplaced: int = 0,
 ) -> list[str]:
     """Return lines of advice on a finished training; none if nothing stands out.
 
@@ -70,10 +72,17 @@ def advice(
         options: Words of the command line that the training had, such as --max-size 240, for the commands.
         resumed_at: Iteration at which the training was resumed, 0 if it was not. If held-out photos were evaluated
             there, as at the end of a run that is given more steps, gains before it do not count.
+        unplaced: Number of photos without a camera.
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
     again = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
     points, lines, gain = evaluations(summary["metrics"]), [], 0.0
+    few_placed = 2 * unplaced >= train_photos
+    if few_placed:
+        lines.append(
+            f"{unplaced} photos have no camera and are not in the scene; photos from places between them and the "
+            f"{train_photos} others would help most: {again}"
+        )
     if len(points) >= 3:
         since = iterations * 2 / 3 + 1
         if any(point.iteration == resumed_at for point in points):  # Its schedule had ended there.
@@ -92,14 +101,14 @@ def advice(
                 f"{train_photos} photos hold no more; add photos from other places, or stop there: "
                 f"{again} --iterations {best.iteration}"
             )
-        elif train_photos < _FEW_PHOTOS and points[-1].psnr < 25:
+        elif not few_placed and train_photos < _FEW_PHOTOS and points[-1].psnr < 25:
             lines.append(
                 f"{train_photos} photos are few: more from places between them, and nearer, would help most: {again}"
             )
     if gain < UNFINISHED:
         if jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
             lines.append(jump)
-        elif not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
+        elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
             lines.append(f"{train_photos} photos are few: more from places between them would help most: {again}")
         elif gain <= STILL_RISING and (movement := _movement(summary.get("unexplained"), train_photos, again)):
             lines.append(movement)

@@ -30,6 +30,14 @@ def test_gains_before_a_resume_do_not_count():
     assert advice(Path("r"), figures, 50, resumed_at=75) == advice(Path("r"), figures, 50)
 
 
+def test_many_photos_without_a_camera_are_the_first_advice():
+    lines = advice(Path("r"), summary([20, 22, 23, 24]), 8, "photos", unplaced=20)
+    assert len(lines) == 2 and lines[0].startswith("20 photos have no camera and are not in the scene;")
+    assert len(advice(Path("r"), summary([20, 22, 23, 24]), 12, unplaced=5)) == 1
+    assert len(advice(Path("r"), summary([0]) | {"metrics": []}, 4, unplaced=9)) == 1
+    assert len(advice(Path("r"), summary([22, 22, 22]), 9, unplaced=9)) == 1
+
+
 def test_photos_that_hold_no_more_are_named():
     [line] = advice(Path("r"), summary([20, 26, 25, 24]), 12)
     assert "2.0 dB better at iteration 44" in line and "12 photos" in line
