@@ -328,6 +328,16 @@ def test_whole_photos_are_used_if_they_place_more_and_agree_with_masks(
     assert ("and cameras agree" in caplog.text) == (expected == 6)
 
 
+def test_masks_count_if_whole_photos_place_no_more_than_they(monkeypatch, caplog):
+    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
+    images = tuple(ModelImage(image_name(i), lens, np.eye(4)) for i in range(4))
+    cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    found = {masked: Reconstruction(SparseModel(images, cloud), 0.5, ()) for masked in (True, False)}
+    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): found[bool(masks)])
+    files = [Path(f"{i}.jpg") for i in range(12)]
+    assert bare_photos._reconstruct(files, None, files) is found[True] and not caplog.text
+
+
 def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypatch, caplog):
     """And a photo that none is likely for is matched with all others before the second try."""
     monkeypatch.setattr(sfm, "EXHAUSTIVE_LIMIT", 3)

@@ -152,7 +152,7 @@ def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequen
 
     A still background would misplace an object that turns, and people who walk along would misplace a building. All
     features are used if masks place fewer than half of the photos, or if they place more photos surely and turn the
-    cameras alike.
+    cameras alike. In both cases whole photos must place more.
     """
     if not any(masks):
         return reconstruct(photos, cache)
@@ -168,7 +168,8 @@ def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequen
         if inside is None:
             raise
         return inside
-    if inside is None or 2 * len(inside.model.images) < len(photos):
+    placed, placed_whole = 0 if inside is None else len(inside.model.images), len(whole.model.images)
+    if inside is None or (2 * placed < len(photos) and placed < placed_whole):
         reason = "masks leave too little to place half of the photos"
     elif whole.sure > inside.sure and _turn_between(inside, whole) < _ALIKE:
         reason = f"they place {whole.sure} of {len(photos)} photos surely, masks {inside.sure}, and cameras agree"
@@ -208,7 +209,8 @@ def _remedy_without_photos(folder: Path) -> str:
             return f"give {above}"
         if inner := _folders_with_photos(folder):
             poses = "".join(f"; {note}" for note in _foreign_poses(folder))
-            return f"give one of its folders with photos: {first_names(inner, 5)}{poses}"
+            together = "; or put photos of one scene into one folder" * (len(inner) > 1)
+            return f"give one of its folders with photos: {first_names(inner, 5)}{together}{poses}"
         for file in sorted(folder.iterdir()):
             suffix = file.suffix.lower()
             if suffix in VIDEO_SUFFIXES:

@@ -69,6 +69,13 @@ def test_photos_deep_in_an_export_are_found_for_the_user(tmp_path):
         parse_dataset(tmp_path / "work")
 
 
+def test_photos_in_several_folders_belong_into_one(tmp_path):
+    photos(tmp_path / "left")
+    photos(tmp_path / "right")
+    with pytest.raises(InputError, match="photos: left, right; or put photos of one scene into one folder$"):
+        parse_dataset(tmp_path)
+
+
 def test_photos_as_3dgs_convert_expects_them(tmp_path):
     photos(tmp_path / "input")
     assert [record.image.parent.name for record in find_photos(tmp_path).records] == ["input"] * 4
@@ -92,6 +99,7 @@ def test_a_photo_whose_camera_is_uncertain_is_not_held_out(tmp_path, monkeypatch
     images = tuple(ModelImage(f"{i:05d}.png", lens, pose) for i, pose in enumerate(arc_poses(9)))
     model = SparseModel(images, PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.float32)))
     monkeypatch.setattr(bare_photos, "reconstruct", lambda *args: Reconstruction(model, 0.5, (3, 4)))
+    assert parse_dataset(tmp_path).unplaced == 0
     records = parse_dataset(tmp_path).records
     assert [record.view for record in records if record.split == "test"] == ["IMG_5"]
 
