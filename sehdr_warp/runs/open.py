@@ -21,7 +21,7 @@ from .values import LOAD_OPTIONS, LoadArguments
 if TYPE_CHECKING:
     from ..response import Response
     from ..scene import Camera, Scene
-    from ..scene.readers.colmap_model import ModelImage
+    from ..scene.dataparser import PlacedPhoto
     from .config import Config
     from .run import Run, Splats
     from .run_folder import CameraEntry
@@ -103,7 +103,7 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
     return replace(scene, views=tuple(views))
 
 
-def known_cameras(entries: Iterable[CameraEntry]) -> list[ModelImage]:
+def known_cameras(entries: Iterable[CameraEntry]) -> list[PlacedPhoto]:
     """Return the cameras of a run that structure from motion found, for load_scene(); older runs keep none."""
     return [entry.placed for entry in entries if entry.placed is not None]
 

@@ -36,9 +36,9 @@ from ..files import UnreadableError, has_file, refuse_links
 from ..model.confidence import Evidence
 from ..response import Response
 from ..scene import Camera, Scene
+from ..scene.dataparser import PlacedPhoto
 from ..scene.images.ldr_files import MAX_PIXELS
 from ..scene.lens import Lens
-from ..scene.readers.colmap_model import ModelImage
 from .checkpoint import Checkpoint, read_checkpoint
 from .config import Config
 from .config_files import config_from_dict, override_config
@@ -71,14 +71,14 @@ _Value = TypeVar("_Value")
 class CameraEntry:
     """A view of the scene that a run was trained on. exposure_time: seconds; split: "train" or "test".
 
-    placed: file name, lens and pose of a photo whose camera structure from motion found.
+    placed: its photo, if structure from motion found the camera.
     """
 
     name: str
     split: str
     camera: Camera
     exposure_time: float
-    placed: ModelImage | None = None
+    placed: PlacedPhoto | None = None
 
 
 class Confidence(NamedTuple):
@@ -324,5 +324,5 @@ def _camera_entry(view: dict, source: Path) -> CameraEntry:
     placed = None
     if values := view.get("lens"):
         lens = Lens(values["model"], values["width"], values["height"], tuple(values["params"]), source)
-        placed = ModelImage(values["file"], lens, camera.world_to_camera)
+        placed = PlacedPhoto(values["file"], lens, camera.world_to_camera, view["split"])
     return CameraEntry(view["name"], view["split"], camera, float(view["exposure_time"]), placed)

@@ -75,6 +75,15 @@ class ImageRecord:
         return self.hdr == self.image
 
 
+class PlacedPhoto(NamedTuple):
+    """A photo of a run whose camera structure from motion found."""
+
+    file: str  # Its name
+    lens: Lens
+    world_to_camera: np.ndarray
+    split: str
+
+
 UNPLACED = Lens("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5), Path("photos without cameras"))
 """The lens of photos before structure from motion."""
 

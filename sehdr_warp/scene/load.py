@@ -12,7 +12,7 @@ from ..errors import InputError, did_you_mean, missing
 from ..files import has_file
 from ..subsets import first_names
 from .camera_checks import check_cameras
-from .dataparser import UNPLACED, DataparserOutputs, ImageRecord
+from .dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto
 from .exposure.times import choose_exposure, exposures_note, with_exposure_times
 from .file_names import image_folder, unique_names
 from .float_photos import with_float_times
@@ -21,7 +21,7 @@ from .photos import usable_photos
 from .preprocess import preprocess
 from .readers.bare_photos import find_photos, place_photos, with_cameras
 from .readers.colmap import model_fits, read_colmap
-from .readers.colmap_model import ModelImage, find_model, has_images
+from .readers.colmap_model import find_model, has_images
 from .readers.hdr_sets import is_hdr_gs, read_hdr_gs, read_hdr_nerf, read_hdr_nerf_real
 from .readers.llff import read_llff
 from .readers.opensfm import find_reconstruction, read_opensfm
@@ -54,7 +54,7 @@ def load_scene(
     cache: Path | str | None = None,
     photo_storage: str = "auto",
     views: Collection[str] | None = None,
-    cameras: Sequence[ModelImage] = (),
+    cameras: Sequence[PlacedPhoto] = (),
 ) -> Scene:
     """Read a folder of posed or bare photos, whatever its layout.
 
@@ -79,8 +79,8 @@ def load_scene(
         photo_storage: where photos are stored: "memory", "disk" (in a nameless file beside the cache, removed with the
             process), or "auto" for the disk if they would take more than half of the free memory.
         views: names of the views to read; None reads all. Response, splits and colors are those of the whole set.
-        cameras: of bare photos by their file names, as a run keeps them; photos without one are left out. Structure
-            from motion finds them if there are none.
+        cameras: of bare photos, and their splits, as a run keeps them; other photos are left out. Structure from motion
+            finds them if there are none.
 
     Returns:
         A Scene in the set's own world coordinates, with the points that the set has.
@@ -133,7 +133,7 @@ def parse_dataset(
     exposure_index: int | None = None,
     holdout: int | None = None,
     cache: Path | str | None = None,
-    cameras: Sequence[ModelImage] = (),
+    cameras: Sequence[PlacedPhoto] = (),
 ) -> DataparserOutputs:
     """Parse cameras, files, exposure times and splits of a data folder; of photos only headers are read.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...subsets import all_names, counted, first_names
-from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord
+from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto
 from ..exposure.stack import refuse_stack
 from ..file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
 from ..images.heif import HEIF_SUFFIXES, register_heif
@@ -25,7 +25,7 @@ from ..sfm.reconstruction import Reconstruction, reconstruct
 from ..unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from ..video.decode import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
 from .colmap import INPUT
-from .colmap_model import ModelImage, find_model
+from .colmap_model import find_model
 from .photo_copies import copies_note, find_copies
 from .transforms import is_transforms
 
@@ -121,19 +121,20 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
 
 
-def with_cameras(dataset: DataparserOutputs, cameras: Sequence[ModelImage]) -> tuple[DataparserOutputs, list[str]]:
-    """Return bare photos with the cameras of their file names, and the names of photos without one.
+def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> tuple[DataparserOutputs, list[str]]:
+    """Return bare photos with the cameras and splits of their file names, and the names of photos without one.
 
     Raises:
         InputError: if no photo has a camera.
     """
-    by_name = {camera.name: camera for camera in cameras}
+    by_name = {camera.file: camera for camera in cameras}
     placed, others, names = [], [], [record.image.name for record in dataset.records]
     for index, record in enumerate(dataset.records):
         if (camera := by_name.pop(record.image.name, None)) is None:
             others.append(index)
         else:
-            placed.append(replace(record, lens=camera.lens, world_to_camera=camera.world_to_camera))
+            _, lens, pose, split = camera
+            placed.append(replace(record, lens=lens, world_to_camera=pose, split=split))
     if not placed:
         problem = f"holds none of the {len(cameras)} photos that the run was trained with, but {first_names(names)}"
         raise InputError(dataset.folder, problem, "say where they are")
