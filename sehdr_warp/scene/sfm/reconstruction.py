@@ -157,11 +157,11 @@ def reconstruct(
 def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Path], None]) -> Path:
     """Return the cached folder of a result, as cached_folder() does; solve(work, result) writes it.
 
-    `work` is a temporary folder beside the result.
+    `work` is a temporary folder in that of the result, whose leftovers after a kill are removed by the next call.
     """
 
     def fill(result: Path) -> None:
-        with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=result.parent) as work:
+        with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=result) as work:
             solve(Path(work), result)
 
     return cached_folder(cache, f"sfm-{key}", fill)

@@ -32,6 +32,18 @@ def key(monkeypatch, tmp_path):
     return compute
 
 
+def test_a_killed_process_leaves_no_copies_of_photos_in_the_cache(tmp_path):
+    """The temporary folder is in that of the result, which the next process removes."""
+    places = []
+
+    def solve(work, result):
+        places.append((work, result))
+        (result / "facts.json").write_text("{}")
+
+    folder = reconstruction.solved_folder(tmp_path / "cache", "k", solve)
+    assert places[0][0].parent == places[0][1] and [file.name for file in folder.iterdir() if file.is_dir()] == []
+
+
 @pytest.mark.parametrize("name", sorted(CONSTANTS))
 def test_a_constant_that_changes_the_result_finds_cameras_anew(name, key, monkeypatch):
     before = key()
