@@ -26,8 +26,9 @@ def fuse_exposures(
 
     gamma = exp(-d^2 / 2), d = (encoded - 0.5) / exp(log_sigma), with log_sigma [3] and d held within their limits. The
     perceptrons, one a channel: inner [3, 2, H], inner_bias [3, 1, H], ReLU, outer [3, H, 1], outer_bias [3, 1, 1].
-    Differentiable once, with respect to all tensors. By kernels, or by torch's own operations where the brackets ask
-    for a gradient, or on a GPU for a fixed order of sums (torch.use_deterministic_algorithms).
+    Differentiable once, with respect to all tensors. On a GPU by kernels, or by torch's own operations if the brackets
+    require a gradient or sums need a fixed order (torch.use_deterministic_algorithms); on the CPU by torch, in a third
+    of the kernels' time.
     All contiguous, of one type, float32 or float64, and on one device; raises ValueError otherwise.
     """
     check_tensors(
@@ -39,7 +40,7 @@ def fuse_exposures(
         outer_bias=(outer_bias, (3, 1, 1)),
     )
     learned = log_sigma, inner, inner_bias, outer, outer_bias
-    if encoded.requires_grad or requires_ordered_sums(encoded.device):
+    if encoded.is_cpu or encoded.requires_grad or requires_ordered_sums(encoded.device):
         return scale * (fusion_weights(encoded, *learned) * encoded).sum(dim=0)
     return _Fusion.apply(encoded, *learned, scale)
 
@@ -49,10 +50,10 @@ def fusion_weights(encoded, log_sigma, inner, inner_bias, outer, outer_bias) -> 
     deviation = (encoded - 0.5) / log_sigma.clamp(-MAX_LOG_SIGMA, MAX_LOG_SIGMA).exp()
     exposedness = (-0.5 * deviation.clamp(-MAX_DEVIATION, MAX_DEVIATION).square()).exp()
     # One product for each channel and bracket: the weights' gradients are sums over many points, which a GPU makes in
-    # parallel only across products.
-    points = torch.stack([exposedness, encoded], dim=-1).permute(2, 0, 1, 3)
-    units = torch.matmul(points, inner[:, None]) + inner_bias[:, None]
-    logits = (torch.matmul(units.relu(), outer[:, None]) + outer_bias[:, None])[..., 0].permute(1, 2, 0)
+    # parallel only across products. Points are the last axis, which halves the time on the CPU.
+    points = torch.stack([exposedness, encoded]).permute(3, 1, 0, 2)
+    units = inner.mT[:, None] @ points + inner_bias.mT[:, None]
+    logits = (outer.mT[:, None] @ units.relu() + outer_bias[:, None])[:, :, 0].permute(1, 2, 0)
     return (logits * exposedness).softmax(dim=0)
 
 

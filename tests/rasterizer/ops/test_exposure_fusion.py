@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sehdr_warp.model.fusion import NeuralExposureFusion
-from sehdr_warp.rasterizer.ops.exposure_fusion import fuse_exposures, fusion_weights
+from sehdr_warp.rasterizer.ops.exposure_fusion import _Fusion, fuse_exposures, fusion_weights
 from sehdr_warp.response import response_by_name
 
 from ..scenes import relative_error
@@ -29,13 +29,15 @@ def brackets(count=200):
 # The last: within the limits' reach, where deviations are held and pull no longer.
 @pytest.mark.parametrize("sigmas", [(-1.6, -0.4, 0.5), (-4.0, 31.0, -31.0)])
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5), (torch.float64, 1e-12)])
-def test_values_and_gradients_are_those_of_torch(device, dtype, bound, sigmas):
+@pytest.mark.parametrize("by_kernels", [False, True])
+def test_values_and_gradients_are_those_of_torch_in_float64(device, by_kernels, dtype, bound, sigmas):
     encoded = brackets()
     upstream = torch.randn(200, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     plain, ours = learned(torch.float64, sigmas=sigmas), learned(dtype, device, sigmas=sigmas)
     truth = 2.5 * (fusion_weights(encoded, *parts(plain)) * encoded).sum(0)
     (truth * upstream).sum().backward()
-    value = fuse_exposures(encoded.to(device, dtype), *parts(ours), scale=2.5)
+    fuse = _Fusion.apply if by_kernels else lambda *tensors: fuse_exposures(*tensors[:-1], scale=tensors[-1])
+    value = fuse(encoded.to(device, dtype), *parts(ours), 2.5)
     (value * upstream.to(device, dtype)).sum().backward()
     assert relative_error(value, truth) < bound
     for name, mine, true in zip(("sigma", "W", "b", "V", "c"), parts(ours), parts(plain), strict=True):
