@@ -24,7 +24,7 @@ def test_two_trainings_are_the_same_bits(scene, tmp_path, device, preset):
     config = load_unscaled(preset, overrides)
     runs = [train(scene, tmp_path / name, config, device=device) for name in "ab"]
     assert not torch.are_deterministic_algorithms_enabled()
-    assert runs[0].model.deterministic
+    assert runs[0].field.deterministic
     first, second = (run.field.gaussians.tensors() for run in runs)
     assert first["means"].shape == second["means"].shape
     for name, values in first.items():
