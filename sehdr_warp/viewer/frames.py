@@ -1,6 +1,7 @@
 """Answers of a run to the page: float frames of a camera, and the facts that it draws with."""
 
 import json
+import shlex
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
@@ -199,6 +200,7 @@ class ViewerScene:
             own = {"up": transform.rotation[1].tolist(), "upright": transform.matrix.tolist(), **self._opening()}
         facts = {
             "name": self.name,
+            "argument": shlex.quote(self.name),
             "version": self.version,
             "scene": self.scene_name,
             "gaussians": self.gaussian_count if self.visible_count is None else self.visible_count,

@@ -285,6 +285,7 @@ def test_gains_end_where_a_run_is_merged(two_runs, tmp_path):
 
 
 def test_the_page_merges_shares_and_undoes(two_runs, tmp_path):
+    two_runs.viewer.runs[1].name = "runs/the south"  # Commands are to be pasted into a shell.
     with browser() as chromium, page_of(chromium, two_runs.url) as page:
         page.wait_for_selector("#stage[data-frame=full]")
 
@@ -292,17 +293,17 @@ def test_the_page_merges_shares_and_undoes(two_runs, tmp_path):
             until(page, f"facts.gaussians === {count} && $('edited').textContent.includes({words!r})")
 
         page.select_option("#merge", "1")
-        until_told(3, "part.ply --merge runs/south")
+        until_told(3, "part.ply --merge 'runs/the south'")
         assert page.evaluate("$('merge').value") == "" and page.locator("#merge option:disabled").count() == 2
         page.click("#floaters")
-        until_told(3, "--merge runs/south --min-views 2")
+        until_told(3, "--merge 'runs/the south' --min-views 2")
         with page.expect_download() as download:
             page.click("#share")
         download.value.save_as(tmp_path / "both.html")
         page.click("#undo")
-        until_told(3, "part.ply --merge runs/south")
+        until_told(3, "part.ply --merge 'runs/the south'")
         page.select_option("#run", "1")  # Edits are those of a run.
-        until(page, "facts.name === 'runs/south' && !facts.edited && $('undo').disabled")
+        until(page, "facts.name === 'runs/the south' && !facts.edited && $('undo').disabled")
         page.select_option("#run", "0")
         page.click("#undo")
         until_told(2, "all of it is shown")

@@ -479,9 +479,9 @@ $("undo").addEventListener("click", () => queued(() => {
 }));
 function edit() {
   const edits = Object.fromEntries(Object.entries(regions().at(-1)).map(([name, value]) => [name, value.points ? region(value) : value]));
-  const words = value => value === true ? "" : " " + (Array.isArray(value) ? value.map(i => runs[i].name).join(" ") : value);
+  const words = value => value === true ? "" : " " + (Array.isArray(value) ? value.map(i => runs[i].argument).join(" ") : value);
   const flags = Object.entries(edits).map(([name, value]) => ` --${name.replace("_", "-")}` + words(value)).join("");
-  return change("edit", edits, () => flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.name} --out part.ply${flags}` : "all of it is shown");
+  return change("edit", edits, () => flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.argument} --out part.ply${flags}` : "all of it is shown");
 }
 measured();
 
