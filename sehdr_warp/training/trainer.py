@@ -125,8 +125,9 @@ class Trainer:
         self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
         self._result: StepResult | None = None
         self._view_index = 0
-        self.interrupted, self._stopped, self._ranks_ended, self._finished = threading.Event(), False, False, False
-        self._seconds_per_iteration = 0.0  # Smoothed
+        # Why no further step follows: a signal, stop(), another rank that has ended
+        self.interrupted, self._stopped, self._ranks_ended = threading.Event(), False, False
+        self._finished, self._seconds_per_iteration = False, 0.0  # The second is a running mean.
         if output is not None:
             output.start(config)
 
