@@ -158,8 +158,6 @@ class McmcConfig(_Table):
     seed_fraction: Fraction = 0.2
     """fraction of the relocated and new Gaussians that is placed where a photo is reproduced worst, at depths on which
     photos agree; 0 disables"""
-    sample_by: Literal["opacity", "detail"] = "opacity"
-    """which Gaussians are copied: opaque ones, as published (opacity), or those that show edges of photos (detail)"""
     noise_lr: Annotated[float, Field(ge=0.0, le=1e12)] = 5e5
     """strength of the noise on positions, in units of their learning rate; 0 disables"""
     prune_near_angle: Weight = 0.0

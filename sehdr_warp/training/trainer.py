@@ -35,7 +35,6 @@ from .losses import INTERVALS_FROM
 from .machine import interruptible, torch_settings
 from .matching import Matcher, seed_gaussians
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
-from .photo_detail import visible_detail
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .scene_facts import is_large
@@ -255,15 +254,9 @@ class Trainer:
         """Refine the Gaussians; on several ranks, rank 0 does and the others receive the result."""
         gaussians, strategy, ranks = self.field.gaussians, self.strategy, self.ranks
         count, reallocations = gaussians.count, gaussians.reallocations
+        propose = self._propose_gaussians if self.can_seed else None
         refine = partial(
-            strategy.refine,
-            self.iteration,
-            gaussians,
-            self.optimizer,
-            self.generator,
-            self._propose_gaussians if self.can_seed else None,
-            self.step_batch,
-            self._measure_detail,
+            strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch
         )
         changed = refine() if ranks is None else ranks.refine_on_main(refine, strategy, gaussians, self.optimizer)
         if changed:
@@ -280,11 +273,6 @@ class Trainer:
                 image = self.field.response.encode_extended(image)
             matcher, index = self._get_matcher(), self._view_index
             return seed_gaussians(self.field, matcher, image, view, index, number, bound, random_seed)
-
-    def _measure_detail(self) -> Tensor:
-        """Return how much detail of the step's photo each Gaussian shows, [N]."""
-        with self.graphs.on_capture_stream():
-            return visible_detail(self.field, self.views.source[self._view_index])
 
     @property
     def degree(self) -> int:

@@ -24,7 +24,7 @@ from ..refusals import call
 from .toy import VARIANTS, make_trainer, quick, toy_scene, without_truth
 
 
-@pytest.mark.parametrize("variant", ["adc", "default", "detail", "paper"])
+@pytest.mark.parametrize("variant", ["adc", "default", "paper"])
 def test_resume_is_exact(scene, trained, tmp_path, variant):
     blind = without_truth(scene)
     shutil.copytree(trained(variant).parent / "killed", tmp_path / "killed")
@@ -112,7 +112,7 @@ def test_a_run_is_replaced_whole_or_not_at_all(scene, trained, tmp_path, monkeyp
     assert ends == sorted(ends) and {(0, 90), (5, 0)} < {*ends} and len({*ends[5::12]}) > 1
 
 
-@pytest.mark.parametrize("variant", ["adc", "detail", "hdr-gs"])
+@pytest.mark.parametrize("variant", ["adc", "hdr-gs"])
 def test_a_trainer_continues_from_its_state(scene, variant):
     config = VARIANTS[variant]
     threads = torch.get_num_threads()
@@ -138,17 +138,15 @@ def test_a_trainer_continues_from_its_state(scene, variant):
     assert resumed.overflowed_steps == 3, "overflows are summed over all sessions, as skipped steps are"
 
 
-@pytest.mark.parametrize("variant", ["adc", "detail"])
-def test_statistics_of_gaussians_do_not_outlive_the_removal_of_some(scene, variant):
-    trainer = make_trainer(scene, VARIANTS[variant])
+def test_statistics_of_gaussians_do_not_outlive_the_removal_of_some(scene):
+    trainer = make_trainer(scene, VARIANTS["adc"])
     _steps(trainer, 30)
     count = trainer.field.gaussians.count
     assert trainer.strategy.state_dict(count)
     with torch.no_grad():
         trainer.field.gaussians.opacity_logits[0] = -20.0
     remove_unseen(trainer)
-    state = trainer.strategy.state_dict(count - 1)
-    assert trainer.field.gaussians.count < count and not any(values.any() for values in state.values())
+    assert trainer.field.gaussians.count < count and not trainer.strategy.state_dict(count - 1)
     _steps(trainer, 25)  # Over a refinement.
 
 

@@ -1,7 +1,6 @@
 """Adaptive density control and MCMC relocation: who grows, who goes, and what stays the same."""
 
 import math
-from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -227,41 +226,6 @@ def test_relocation_moves_the_dead_and_keeps_the_image(rooms):
     assert len(positions) == 5, "the three dead ones are where living ones are"
     # Plain copies would brighten the image by a quarter.
     assert (after - before).abs().mean() < 0.05 * before.abs().mean()
-
-
-def by_detail(**options):
-    values = {"densification.strategy": "mcmc", "mcmc.sample_by": "detail", "mcmc.seed_fraction": 0.0}
-    values |= {f"mcmc.{name}": value for name, value in options.items()}
-    return make_strategy(load_config("default", values), 10**6, torch.zeros(1, 3))
-
-
-def test_copies_are_sampled_by_the_detail_that_photos_showed(rooms):
-    gaussians = cloud(10)
-    optimizer = adam(gaussians)
-    gaussians.overwrite({"opacity_logits": torch.tensor([-8.0] * 4 + [3.0] * 3 + [-1.0] * 3)})
-    means, detail = gaussians.means.detach().clone(), torch.zeros(10)
-    detail[[1, 8]] = 5.0  # A dead one and a faint one.
-    strategy = by_detail(growth_rate=0.2)
-    refine = partial(strategy.refine, propose=None, step_batch=1)
-    refine(600, gaussians, optimizer, torch.Generator().manual_seed(0), measure_detail=lambda: detail)
-    copies = [*range(4), 10, 11]
-    assert (gaussians.means.detach()[copies] == means[8]).all()
-    assert torch.equal(gaussians.means.detach()[4:10], means[4:])
-    # Six copies and their source share what it showed; another photo adds to 0.95 of that.
-    shared = strategy.state_dict(12)["detail"]
-    assert shared[[*copies, 8]].sum() == pytest.approx(5.0) and not shared[[4, 5, 6, 7, 9]].any()
-    refine(700, gaussians, optimizer, torch.Generator().manual_seed(0), measure_detail=lambda: torch.ones(12))
-    assert strategy.state_dict(gaussians.count)["detail"].sum() == pytest.approx(0.95 * 5 + 12, rel=1e-5)
-
-
-def test_copies_are_sampled_by_opacity_if_photos_show_nothing(rooms):
-    gaussians = cloud(6)
-    gaussians.overwrite({"opacity_logits": torch.tensor([-8.0] * 3 + [-4.0, 3.0, -4.0])})
-    means = gaussians.means.detach().clone()
-    strategy = by_detail(growth_rate=0.0)
-    generator = torch.Generator().manual_seed(0)
-    strategy.refine(600, gaussians, None, generator, measure_detail=lambda: torch.zeros(6))
-    assert (gaussians.means.detach()[:3] == means[4]).all()
 
 
 @pytest.mark.parametrize("cap", [40, 400])

@@ -105,7 +105,6 @@ def quick(preset: str = "default", length: int = 90, **options) -> Config:
 
 VARIANTS = {
     "default": quick(),
-    "detail": quick(**{"mcmc.sample_by": "detail"}),
     "adc": quick(**{"densification.strategy": "adc", "loss.opacity_weight": 0.0}),
     "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
     "paper": quick("paper", 130, **PAPER),

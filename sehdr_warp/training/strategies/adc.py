@@ -10,7 +10,7 @@ from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer
 from ...rasterizer import Rendering
 from ...rasterizer.ops.step_updates import add_gradient_statistics
 from ...runs.config import AdcConfig, Config
-from .base import MeasureDetail, Propose, Schedule, Strategy
+from .base import Propose, Schedule, Strategy
 
 SPLIT_SHRINK = 1.6  # Factor by which the two halves of a split are smaller (3DGS: 0.8 times the number of halves)
 MIN_RESET_INTERVAL = 300
@@ -68,7 +68,6 @@ class AdcStrategy(Strategy):
         generator: torch.Generator,
         propose: Propose | None = None,
         step_batch: int = 1,
-        measure_detail: MeasureDetail | None = None,
     ) -> bool:
         """Duplicate, split and remove Gaussians, and reset opacities, if this iteration is due."""
         changed = False

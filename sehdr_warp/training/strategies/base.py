@@ -27,8 +27,6 @@ class Proposals(NamedTuple):
 
 Propose = Callable[[Tensor, int], Proposals]
 """Returns up to a number of new Gaussians: int64 [] on the device, and its upper bound on the host."""
-MeasureDetail = Callable[[], Tensor]
-"""Returns [N]: how much detail of the step's photo each Gaussian shows, see training/photo_detail.py."""
 
 
 @dataclass
@@ -100,7 +98,6 @@ class Strategy:
         generator: torch.Generator,
         propose: Propose | None = None,
         step_batch: int = 1,
-        measure_detail: MeasureDetail | None = None,
     ) -> bool:
         """Change the Gaussians and their optimizer state if this iteration is due.
 
@@ -111,7 +108,6 @@ class Strategy:
             generator: Source of random numbers, on the Gaussians' device.
             propose: Returns new Gaussians where photos are reproduced worst.
             step_batch: Photos of the step, one for each rank; each counts as an iteration.
-            measure_detail: Returns the detail of the step's photo that each Gaussian shows.
 
         Returns:
             True if Gaussians were added or removed; False if at most their values changed in place, as by relocation.

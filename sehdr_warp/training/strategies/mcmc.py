@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, moments_of
 from ...rasterizer.ops.relocation import (
@@ -18,7 +17,7 @@ from ...rasterizer.ops.relocation import (
 )
 from ...rasterizer.ops.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
-from .base import SEED_STRIDE, MeasureDetail, Propose, Schedule, Strategy
+from .base import SEED_STRIDE, Propose, Schedule, Strategy
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
 DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
@@ -28,8 +27,6 @@ MAX_DISTANCE = 100.0
 """Noise moves no Gaussian farther than this from the origin, in normalized units (1.1 camera radii)."""
 SECOND_MOMENT_LEFT = 0.1  # Of a source's second moments, see reset_moments()
 SECOND_MOMENT_LEFT_WHERE_DENSE = 0.4
-DETAIL_DECAY = 0.95  # Of the sum of photo detail at each refinement: it is that of about the last 20 photos
-LEAST_WEIGHT = 1e-6  # Of an opacity beside detail: if photos show no Gaussian, copies are sampled by opacity
 DENSE = 300.0  # Gaussians over the square root of the photos' pixels, from which on a large scene counts as dense
 
 
@@ -52,9 +49,6 @@ class McmcStrategy(Strategy):
     the relocated and new Gaussians are seeded where photos are reproduced worst. Noise on the positions of transparent
     Gaussians explores. There are no gradient statistics and no opacity resets.
 
-    3DGS-MCMC samples the Gaussians to copy by opacity. With options.sample_by = "detail", they are sampled by the
-    detail of the photos that they show: where photos have edges, Gaussians become many and small.
-
     A training that starts with more Gaussians than the cap keeps their number.
     """
 
@@ -62,7 +56,6 @@ class McmcStrategy(Strategy):
     random_seed: int = 0  # Seed of the training
     camera_positions: Tensor | None = None  # [V, 3] positions of the training cameras, for prune_near_angle
     dense: bool = False  # Whether copies take over the second moments of their source, see reset_moments()
-    detail: Tensor | None = None  # [N] detail of photos that each Gaussian shows; None if copies are sampled by opacity
 
     @staticmethod
     def from_config(
@@ -89,12 +82,11 @@ class McmcStrategy(Strategy):
         generator: torch.Generator,
         propose: Propose | None = None,
         step_batch: int = 1,
-        measure_detail: MeasureDetail | None = None,
     ) -> bool:
         """Relocate dead Gaussians and add new ones, if this iteration is due.
 
         The slots are filled from the first on: [0, seeded) by seeding, [seeded, dead_count) by copies of living
-        Gaussians, and the new rows that are left, up to dead_count + added, by sampled copies. Only the
+        Gaussians, and the new rows that are left, up to dead_count + added, by copies sampled by opacity. Only the
         device knows how many Gaussians are dead, so these counts stay there.
         """
         if not self.is_due(iteration, step_batch):
@@ -103,17 +95,12 @@ class McmcStrategy(Strategy):
         added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
         dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
-        if self.options.sample_by == "detail" and measure_detail is not None:
-            detail = measure_detail()
-            if self.detail is not None:
-                detail += DETAIL_DECAY * with_rows(self.detail, count)
-            self.detail = detail.masked_fill(dead, 0)
         slot_of_row, dead_count = number_slots(dead, added)
         gaussians.resize(count + added, optimizer)
         changed = torch.zeros_like(slot_of_row, dtype=torch.bool)
         refinement = Refinement(gaussians, optimizer, generator, slot_of_row, changed)
         seeded = self.fill_proposals(refinement, dead_count, added, propose)
-        self.relocate(refinement, self._copy_weights(opacities).masked_fill(dead, 0), seeded, dead_count, count)
+        self.relocate(refinement, opacities.masked_fill(dead, 0), seeded, dead_count, count)
         if added > 0:
             self.sample_add(refinement, torch.maximum(dead_count, seeded), dead_count + added, added)
         left = SECOND_MOMENT_LEFT_WHERE_DENSE if self.dense else SECOND_MOMENT_LEFT
@@ -160,9 +147,6 @@ class McmcStrategy(Strategy):
         logits, log_scales = gaussians.opacity_logits.detach(), gaussians.log_scales.detach()
         share_opacities(logits, log_scales, copies, least=self.prune_opacity)
         values, changed = list(gaussians.tensors().values()), None
-        if self.detail is not None:  # A source and its copies share what it showed.
-            self.detail = with_rows(self.detail, len(copies)) / (1 + copies)
-            values.append(self.detail)
         if self.dense:
             states = [moments_of(refinement.optimizer, parameter) for parameter in gaussians.parameters()]
             values += [state["exp_avg_sq"] for state in states if state]
@@ -171,16 +155,9 @@ class McmcStrategy(Strategy):
         copy_rows(values, values, refinement.slot_of_row, first, last, samples=sampled, changed=changed)
 
     def sample_add(self, refinement: Refinement, first: Tensor, last: Tensor, bound: int) -> None:
-        """Fill the slots [first, last) of new Gaussians, at most `bound`, as relocate(), by the same weights."""
-        weights = self._copy_weights(refinement.gaussians.opacities())
-        weights = weights.masked_fill(refinement.slot_of_row >= first, 0)
+        """Fill the slots [first, last) of new Gaussians, at most `bound`, as relocate(), sampled by opacity."""
+        weights = refinement.gaussians.opacities().masked_fill_(refinement.slot_of_row >= first, 0)
         self.relocate(refinement, weights, first, last, bound)
-
-    def _copy_weights(self, opacities: Tensor) -> Tensor:
-        """Return the weights [N] by which Gaussians are sampled for copies."""
-        if self.detail is None:
-            return opacities
-        return with_rows(self.detail, len(opacities)) + LEAST_WEIGHT * opacities
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
@@ -198,19 +175,6 @@ class McmcStrategy(Strategy):
                 most_distance=MAX_DISTANCE,
                 seed=(self.random_seed * SEED_STRIDE + iteration) % 2**31,
             )
-
-    def state_dict(self, count: int) -> dict[str, Tensor]:
-        """Return the detail of `count` Gaussians, if copies are sampled by it; 0 on ranks that do not refine."""
-        if self.options.sample_by == "opacity" or self.camera_positions is None:
-            return {}
-        if self.detail is None:
-            self.detail = torch.zeros(count, device=self.camera_positions.device)
-        self.detail = with_rows(self.detail, count)
-        return {"detail": self.detail}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue with the detail of state_dict()."""
-        self.detail = state.get("detail")
 
     def _near_cameras(self, gaussians: Gaussians) -> Tensor:
         """Return a mask [N] of floaters: Gaussians wider than prune_near_angle times their distance to a camera."""
@@ -236,11 +200,6 @@ def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tens
     for name, factor in (("exp_avg", 0.0), ("exp_avg_sq", left)):
         if moments := [state[name] for state in states if name in state]:
             scale_rows(moments, which, factor)
-
-
-def with_rows(values: Tensor, count: int) -> Tensor:
-    """Return the first `count` of values [N], with zeros after them if there are fewer."""
-    return values if len(values) == count else functional.pad(values, (0, count - len(values)))
 
 
 def mcmc_cap(config: Config, pixels: int) -> int:
