@@ -233,6 +233,16 @@ def test_a_cpu_short_of_time_gets_half_the_gaussians_unless_steps_are_asked_for(
         assert rule(case, config, device).fields == {}
 
 
+def test_a_gpu_gets_twice_the_gaussians_for_many_photos_of_one_place(facts):
+    many, rule = replace(facts, photos=21, visibility=9.0), RULES["densification"]
+    assert rule(many, config_of(), GPU).fields == {"mcmc.cap_density": 240.0}
+    few, survey = replace(many, photos=20), replace(many, visibility=2.0)
+    others = ({"mcmc__cap_density": 60.0}, {"plan__keep": ["mcmc.cap_density"]}, {"densification__strategy": "adc"})
+    cases = [(few, config_of(), GPU), (survey, config_of(), GPU), *((many, config_of(**each), GPU) for each in others)]
+    for case, config, device in cases:
+        assert "mcmc.cap_density" not in rule(case, config, device).fields
+
+
 def test_brackets_of_one_base_become_a_scaling(scene):
     untrue = replace(scene, views=tuple(replace(view, hdr=None) for view in scene.views))
     plan = make_plan(untrue, load_config("paper", {"response.name": "srgb", "plan.enabled": True}))

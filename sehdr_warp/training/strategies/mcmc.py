@@ -21,6 +21,9 @@ from .base import SEED_STRIDE, Propose, Schedule, Strategy
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
 DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
+LEAST_MEAN_OPACITY = 0.02
+"""New Gaussians are added only while the mean opacity stays above this. Copies share the opacity of their source. Where
+photos contradict each other, growth would make all Gaussians fainter until they are dead and the scene is lost."""
 MAX_NOISE_SIZES = 0.05
 """Noise moves a Gaussian by at most this many of its standard deviations per step (times a normal number)."""
 MAX_DISTANCE = 100.0
@@ -49,7 +52,8 @@ class McmcStrategy(Strategy):
     the relocated and new Gaussians are seeded where photos are reproduced worst. Noise on the positions of transparent
     Gaussians explores. There are no gradient statistics and no opacity resets.
 
-    A training that starts with more Gaussians than the cap keeps their number.
+    A training that starts with more Gaussians than the cap keeps their number. The number stays while they are faint,
+    see LEAST_MEAN_OPACITY.
     """
 
     options: McmcConfig = field(default_factory=McmcConfig)  # Options of the strategy
@@ -92,8 +96,10 @@ class McmcStrategy(Strategy):
         if not self.is_due(iteration, step_batch):
             return False
         count = gaussians.count
-        added = self.next_count(iteration, count) - count
         opacities = gaussians.opacities()
+        added = self.next_count(iteration, count) - count
+        if added > 0:  # The only value that the host waits for
+            added = min(added, max(0, int(opacities.sum() / LEAST_MEAN_OPACITY) - count))
         dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
         slot_of_row, dead_count = number_slots(dead, added)
         gaussians.resize(count + added, optimizer)
