@@ -28,7 +28,7 @@ def run(trained, tmp_path):
 
 
 def test_a_training_leaves_its_confidence(trained, scene):
-    confidence = load_run(trained.path).model.confidence
+    confidence = load_run(trained.path).field.confidence
     assert torch.equal(confidence, trained.field.confidence)
     assert confidence.shape == (trained.gaussian_count,) and 0 <= confidence.min() < confidence.max() <= 1
     saved = load_file(trained.folder.confidence)
@@ -45,7 +45,7 @@ def test_an_older_run_gets_it_on_demand(run, scene, caplog):
     caplog.set_level("INFO")
     ensure_confidence(run, scene)
     torch.testing.assert_close(run.field.confidence, expected)
-    torch.testing.assert_close(load_run(run.path).model.confidence, expected)
+    torch.testing.assert_close(load_run(run.path).field.confidence, expected)
     assert torch.equal(run.clipped_share(), load_run(run.path).clipped_share())
     ensure_confidence(run, scene)
     assert caplog.text.count("measuring confidence") == 1
@@ -64,7 +64,7 @@ def test_that_of_another_checkpoint_does_not_count(run):
     metadata = {"sehdr_warp": json.dumps(confidence_metadata("0" * 64))}
     save_file({"confidence": run.field.confidence}, run.folder.confidence, metadata)
     other = load_run(run.path)
-    assert other.model.confidence is None and other.clipped_share() is None
+    assert other.field.confidence is None and other.clipped_share() is None
 
 
 @pytest.mark.parametrize(
