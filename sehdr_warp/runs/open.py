@@ -20,7 +20,7 @@ from .values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     from ..response import Response
-    from ..scene import Camera, Scene
+    from ..scene import Scene, View
     from ..scene.dataparser import PlacedPhoto
     from .config import Config
     from .run import Run, Splats
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Cameras that differ less than this count as the same: 0.5 degrees, and parts of the cameras' radius and focal length.
-_LEAST_COSINE, _MOST_MOVED, _MOST_ZOOMED = 0.99996, 0.01, 0.01
+# Cameras that differ less than this count as the same: 0.25 degrees, and parts of the cameras' radius and focal length.
+_LEAST_COSINE, _MOST_MOVED, _MOST_ZOOMED = 0.99999, 0.01, 0.005
 
 
 def open_run(path: Path, device: str | None) -> Run:
@@ -96,8 +96,7 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
     response = response_for_loading(run.config, run.response)
     cameras = known_cameras(run.cameras)
     scene = load_scene_and_log_notes(run.data | {"path": place}, response=response, cameras=cameras)
-    _require_same_cameras(scene, run, place)
-    scene = with_saved_splits(scene, run.cameras)
+    scene = with_saved_splits(_with_saved_poses(scene, run, place), run.cameras)
     times = {entry.name: entry.exposure_time for entry in run.cameras}
     views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
     return replace(scene, views=tuple(views))
@@ -108,24 +107,41 @@ def known_cameras(entries: Iterable[CameraEntry]) -> list[PlacedPhoto]:
     return [entry.placed for entry in entries if entry.placed is not None]
 
 
-def _require_same_cameras(scene: Scene, run: Run, place: str) -> None:
-    """Raise InputError if views have other cameras than the views of these names that a run was trained with."""
-    saved, unit = {entry.name: entry.camera for entry in run.cameras}, run.field.normalization.unit
+def _with_saved_poses(scene: Scene, run: Run, place: str) -> Scene:
+    """Return a scene with the poses that a run was trained with.
+
+    Poses that are found anew are turned, moved and scaled as a whole by chance.
+
+    Raises InputError if views differ otherwise from those of their names in the run.
+    """
+    import numpy as np
+
+    saved = {entry.name: entry.camera for entry in run.cameras}
     views = [view for view in scene.views if view.name in saved]
-    others = [view.name for view in views if not _alike(view.camera, saved[view.name], unit)]
-    if others:
-        problem = f"{len(others)} of {len(views)} photos have other cameras than {run.path} was trained with"
+    if not views:
+        return scene
+    pairs = [(view.camera, saved[view.name]) for view in views]
+    turns = np.stack([old.world_to_camera[:3, :3].T @ new.world_to_camera[:3, :3] for new, old in pairs])
+    u, _, vt = np.linalg.svd(turns.sum(0))
+    cosines = (np.einsum("nij,ij->n", turns, u @ vt) - 1) / 2
+    found, known = np.stack([(u @ vt @ new.position, old.position) for new, old in pairs], axis=1)
+    found, known = found - found.mean(0), known - known.mean(0)
+    scale = np.linalg.norm(known) / max(float(np.linalg.norm(found)), 1e-12)
+    distances = np.linalg.norm(scale * found - known, axis=1) / run.field.normalization.unit
+    zooms = np.array([new.fx / new.width * old.width / old.fx for new, old in pairs])
+    unlike = (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED) | (np.abs(zooms - 1) > _MOST_ZOOMED)
+    if unlike.any():
+        problem = f"{unlike.sum()} of {len(views)} photos have other cameras than {run.path} was trained with"
         remedy = "put photos and cameras back as they were then, or train again"
-        raise InputError(place, f"{problem}: {first_names(others)}", remedy)
+        names = first_names([view.name for view, is_other in zip(views, unlike, strict=True) if is_other])
+        raise InputError(place, f"{problem}: {names}", remedy)
+    poses = {name: camera.world_to_camera for name, camera in saved.items()}
 
+    def with_pose(view: View) -> View:
+        pose = poses.get(view.name, view.camera.world_to_camera)
+        return replace(view, camera=replace(view.camera, world_to_camera=pose))
 
-def _alike(first: Camera, second: Camera, unit: float) -> bool:
-    """Return whether two cameras differ too little to change figures; `unit` is about the radius of all cameras."""
-    relative = first.world_to_camera[:3, :3] @ second.world_to_camera[:3, :3].T
-    cosine = (relative.trace() - 1) / 2
-    distance = ((first.position - second.position) ** 2).sum() ** 0.5
-    focal = first.fx / first.width * second.width / second.fx
-    return cosine > _LEAST_COSINE and distance < _MOST_MOVED * unit and abs(focal - 1) < _MOST_ZOOMED
+    return replace(scene, views=tuple(map(with_pose, scene.views)))
 
 
 def with_saved_splits(scene: Scene, cameras: Iterable[CameraEntry]) -> Scene:

@@ -132,7 +132,7 @@ def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, mo
     moved = {}
     for name, camera in cameras.items():
         pose = camera.world_to_camera.copy()
-        pose[:3, 3] *= 1.1
+        pose[:3, 3] *= 1 + 0.2 * len(moved)
         moved[name] = replace(camera, world_to_camera=pose)
     find_cameras(monkeypatch, moved)
     error = refused(capfd, "eval", run, "--device", "cpu")
@@ -140,17 +140,31 @@ def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, mo
     assert "its cameras differ" in refused(capfd, "train", "--resume", "--out", run, "--iterations", 40)
 
 
-def test_small_differences_of_cameras_count_as_none():
-    camera = toy_scene(1, 8).views[0].camera
-    pose = camera.world_to_camera.copy()
-    pose[:3, 3] += 0.005
-    assert opening._alike(camera, replace(camera, world_to_camera=pose, fx=camera.fx * 1.005), 1.0)
-    assert not opening._alike(camera, replace(camera, world_to_camera=pose), 0.1)
-    assert not opening._alike(camera, replace(camera, fx=camera.fx * 1.02), 1.0)
-    angle = np.radians(1)
-    pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    assert not opening._alike(camera, replace(camera, world_to_camera=pose @ camera.world_to_camera), 1e9)
+def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_the_run():
+    """As structure from motion does by chance; one camera that moved, turned or zoomed is named."""
+    scene = toy_scene(6, 8)
+    run = SimpleNamespace(path="run", field=SimpleNamespace(normalization=Normalization(unit=4.0)))
+    run.cameras = [CameraEntry(view.name, "train", view.camera, 1.0) for view in scene.views]
+    angle, views = np.radians(20), []
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    for view in scene.views:
+        pose = view.camera.world_to_camera.copy()
+        pose[:3, :3] = pose[:3, :3] @ turn.T
+        pose[:3, 3] = -pose[:3, :3] @ (3 * turn @ view.camera.position + [1, 2, 3])
+        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    aligned = opening._with_saved_poses(replace(scene, views=tuple(views)), run, "photos")
+    for view, entry in zip(aligned.views, run.cameras, strict=True):
+        np.testing.assert_array_equal(view.camera.world_to_camera, entry.camera.world_to_camera)
+    first = views[0].camera
+    moved, turned = first.world_to_camera.copy(), first.world_to_camera.copy()
+    moved[:3, 3] += 0.5
+    turned[:3, :3] = turned[:3, :3] @ turn
+    turned[:3, 3] = -turned[:3, :3] @ first.position
+    changes = [{"world_to_camera": moved}, {"world_to_camera": turned}, {"fx": 1.01 * first.fx, "fy": 1.01 * first.fy}]
+    for change in changes:
+        other = replace(views[0], camera=replace(first, **change))
+        with pytest.raises(InputError, match="of 6 photos have other cameras than run was trained with: v_0"):
+            opening._with_saved_poses(replace(scene, views=(other, *views[1:])), run, "photos")
 
 
 @pytest.mark.parametrize("name", ["gpu", "mps", "cuda:99"])
