@@ -7,7 +7,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..parallel import preserve_signals
-from .camera import FISHEYES, Camera
+from .camera import FISHEYES, MAX_FOCAL, Camera
 from .wide_camera import WIDEST_PINHOLE, fisheye_angles
 
 # COLMAP's camera models by their number in binary files: name, number of parameters (src/colmap/sensor/models.h).
@@ -68,6 +68,8 @@ class Lens:
             remedy = "export whole panoramas (360 x 180 degrees)"
         elif min(self.focal) <= 0:
             problem = f"focal lengths {self.focal} are not positive"
+        elif max(self.focal) > MAX_FOCAL:
+            problem = f"focal lengths {self.focal} are longer than {MAX_FOCAL:g} pixels"
         elif max(self.focal) < _LEAST_FOCAL * max(self.width, self.height):
             problem = f"focal lengths {self.focal} are too short for {self.width} x {self.height} pixels"
             remedy = "state focal lengths and principal point in pixels"

@@ -202,6 +202,7 @@ def test_fields_that_are_not_read_are_named(tmp_path):
     [
         ({"orthographic": True}, "states a lens by orthographic"),
         ({"fl_x": 0.6, "fl_y": 0.6}, "too short for 40 x 30 pixels; state focal lengths and principal point in pixels"),
+        ({"fl_x": 1e12, "fl_y": 1e12}, "are longer than 1e\\+09 pixels"),
         ({"camera_angle_x": "wide"}, "camera_angle_x = 'wide'"),
         ({"camera_angle_x": 4.0}, "no focal length"),
         ({"camera_model": "EQUIRECTANGULAR"}, "equirectangular photos are 40 x 30"),
