@@ -321,8 +321,8 @@ def _camera_entry(view: dict, source: Path) -> CameraEntry:
     camera = Camera.from_dict(view["camera"])
     if camera.width * camera.height > MAX_PIXELS:
         raise ValueError(f"{camera.width} x {camera.height} is more than {MAX_PIXELS} pixels")
-    placed = None
+    placed, time = None, float(view["exposure_time"])
     if values := view.get("lens"):
         lens = Lens(values["model"], values["width"], values["height"], tuple(values["params"]), source)
-        placed = PlacedPhoto(values["file"], lens, camera.world_to_camera, view["split"])
-    return CameraEntry(view["name"], view["split"], camera, float(view["exposure_time"]), placed)
+        placed = PlacedPhoto(values["file"], lens, camera.world_to_camera, view["split"], time)
+    return CameraEntry(view["name"], view["split"], camera, time, placed)

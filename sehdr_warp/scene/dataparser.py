@@ -82,6 +82,7 @@ class PlacedPhoto(NamedTuple):
     lens: Lens
     world_to_camera: np.ndarray
     split: str
+    exposure_time: float  # Seconds
 
 
 UNPLACED = Lens("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5), Path("photos without cameras"))

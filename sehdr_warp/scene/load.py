@@ -79,8 +79,8 @@ def load_scene(
         photo_storage: where photos are stored: "memory", "disk" (in a nameless file beside the cache, removed with the
             process), or "auto" for the disk if they would take more than half of the free memory.
         views: names of the views to read; None reads all. Response, splits and colors are those of the whole set.
-        cameras: of bare photos, and their splits, as a run keeps them; other photos are left out. Structure from motion
-            finds them if there are none.
+        cameras: of bare photos, with their splits and estimated exposure times, as a run keeps them; other photos are
+            left out. Structure from motion finds them if there are none.
 
     Returns:
         A Scene in the set's own world coordinates, with the points that the set has.
@@ -113,7 +113,13 @@ def load_scene(
         dataset = replace(dataset, records=tuple(dataset.records[index] for index in indices))
     scene = preprocess(dataset, curve, max_size, photo_storage, names)
     named_views = zip(names, dataset.records, strict=True)
-    if guessed := {name for name, record in named_views if not record.time_known}:
+    guessed = {name: record.image.name for name, record in named_views if not record.time_known}
+    if guessed and cameras:  # The training estimated them by points of structure from motion, which are not here.
+        kept = {camera.file: camera.exposure_time for camera in cameras}
+        times = {name: kept[file] for name, file in guessed.items() if file in kept}
+        views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
+        scene = replace(scene, views=tuple(views))
+    elif guessed:
         from .exposure.estimate import with_estimated_times
 
         scene = with_estimated_times(scene, guessed, curve)

@@ -106,6 +106,17 @@ def test_cameras_of_a_run_are_not_found_anew(bare_run, monkeypatch, tmp_path):
     assert f"1 photo of the run is missing: {name}.png" in notes
 
 
+def test_a_time_that_was_estimated_by_points_is_the_same_when_a_training_goes_on(bare_run, tmp_path):
+    """Points come from structure from motion, which a run with cameras does without."""
+    folder, run, cameras = bare_run
+    times = {f"{name}.png": 0.01 for name in sorted(cameras)[1:]}
+    (folder / "exposures.json").write_text(json.dumps(times))
+    assert call("train", folder, "--out", run, *TRAIN.split(), "--iterations", 20, "--overwrite") == 0
+    before = RunFolder(run).read_cameras()
+    assert call("train", "--resume", "--out", run, "--iterations", 40, "--device", "cpu") == 0
+    assert [entry.exposure_time for entry in RunFolder(run).read_cameras()] == [entry.exposure_time for entry in before]
+
+
 def test_photos_of_another_place_are_refused(bare_run, tmp_path, capfd):
     (tmp_path / "others").mkdir()
     for index in range(4):

@@ -133,8 +133,7 @@ def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> 
         if (camera := by_name.pop(record.image.name, None)) is None:
             others.append(index)
         else:
-            _, lens, pose, split = camera
-            placed.append(replace(record, lens=lens, world_to_camera=pose, split=split))
+            placed.append(replace(record, lens=camera.lens, world_to_camera=camera.world_to_camera, split=camera.split))
     if not placed:
         problem = f"holds none of the {len(cameras)} photos that the run was trained with, but {first_names(names)}"
         raise InputError(dataset.folder, problem, "say where they are")
