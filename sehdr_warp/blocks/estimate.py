@@ -6,27 +6,30 @@ from dataclasses import replace
 import torch
 
 from ..parallel import thread_count
+from ..runs.config import Config
+from ..runs.config_files import override_config
 from ..training.cost import Choice, Workload, choices, cpu_cost, recommend
 from ..training.initialization import start_count
 from ..training.plan import STEPS_PER_PHOTO, Plan
+from ..training.scene_facts import SceneFacts
 from ..training.strategies import mcmc_cap
 from .block_plan import blocks_for
 
 
-def estimate(plan: Plan, device: torch.device, gpus: int = 1) -> tuple[list[Choice], str]:
+def estimate(plan: Plan, requested: Config, device: torch.device, gpus: int = 1) -> tuple[list[Choice], str]:
     """Return ways to train a set with their cost, and which of them is recommended.
 
-    On the CPU, figures for H100 follow those of this machine.
+    Blocks share the cap_density of the `requested` config, see BlockPlan.config_of(), and not that of the plan. On the
+    CPU, figures for H100 follow those of this machine.
     """
     facts, config = plan.facts, plan.config
-    cap = mcmc_cap(config, facts.pixels) if config.densification.strategy == "mcmc" else config.densification.cap_max
-    gaussians = max(min(facts.points, config.densification.cap_max), start_count(config, facts.pixels), cap)
-    whole = Workload(facts.photos, facts.pixels / facts.photos, gaussians, config.schedule.iterations)
-    blocks = blocks_for(facts.photos, facts.pixels, config)
-    gaussians_needed = config.mcmc.cap_density * math.sqrt(facts.pixels) if blocks > 1 else 0.0
+    whole = Workload(facts.photos, facts.pixels / facts.photos, _final_count(facts, config), config.schedule.iterations)
+    divided_config = override_config(config, {"mcmc.cap_density": requested.mcmc.cap_density}, "plan")
+    blocks = blocks_for(facts.photos, facts.pixels, divided_config)
+    gaussians_needed = divided_config.mcmc.cap_density * math.sqrt(facts.pixels) if blocks > 1 else 0.0
     divided = replace(
         whole,
-        gaussians=max(whole.gaussians, gaussians_needed),
+        gaussians=max(_final_count(facts, divided_config), gaussians_needed),
         iterations=max(whole.iterations, STEPS_PER_PHOTO * facts.photos),
     )
     if device.type == "cuda":
@@ -37,3 +40,9 @@ def estimate(plan: Plan, device: torch.device, gpus: int = 1) -> tuple[list[Choi
     others = [replace(each, name=f"{each.name} (H100)") for each in choices(whole, divided, blocks, None, gpus)]
     recommended = recommend(whole, blocks, None) if blocks > 1 else "this machine, or one GPU if that takes too long"
     return [here, *others], recommended
+
+
+def _final_count(facts: SceneFacts, config: Config) -> float:
+    """Return the number of Gaussians at the end of one training."""
+    cap = mcmc_cap(config, facts.pixels) if config.densification.strategy == "mcmc" else config.densification.cap_max
+    return max(min(facts.points, config.densification.cap_max), start_count(config, facts.pixels), cap)

@@ -229,7 +229,7 @@ def _print_plan(args: Train) -> None:
 
     data, config, device = _load_arguments(args, None), _config(args, None), pick_device(args.machine.device)
     plan = make_plan(load_scene_and_log_notes(data, **_load_options(config)), config, device)
-    choices, recommended = estimate(plan, device, args.machine.gpus)
+    choices, recommended = estimate(plan, config, device, args.machine.gpus)
     cost = {"choices": [choice.to_dict() for choice in choices], "recommended": recommended}
     lines = plan.table(), "estimated cost", *(choice.line() for choice in choices), f"recommended: {recommended}"
     print(json.dumps(plan.to_dict() | {"cost": cost}) if args.output.json else "\n".join(lines))

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,15 @@ import torch
 from benchmarks.survey import write_survey
 from sehdr_warp.blocks import jobs
 from sehdr_warp.blocks.block_plan import BlockPlan, blocks_for, make_block_plan
+from sehdr_warp.blocks.estimate import estimate
 from sehdr_warp.blocks.job import folder_of
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.scene import load_scene
 from sehdr_warp.splats import read_gaussians
+from sehdr_warp.training.plan import make_plan
 
 from ..refusals import call, refused
 
@@ -236,6 +240,19 @@ def test_the_number_of_blocks_follows_photos_and_gaussians():
     assert blocks_for(300, 300 * 100e6, config) == 9, "3 million Gaussians for each"
     named = override_config(config, {"densification.cap_max": 10**6, "plan.keep": ["densification.cap_max"]})
     assert blocks_for(300, 300 * 100e6, named) == 1
+
+
+def test_the_estimate_has_the_blocks_of_auto_and_their_gaussians(survey):
+    """A plan may give a single training more Gaussians, which blocks do not get."""
+    plan = make_plan(load_scene(survey), override_config(Config(), {"response.name": "srgb"}), "cpu")
+    dense = override_config(plan.config, {"mcmc.cap_density": 240.0})
+    for photos, blocks in ((400, 1), (1200, 4)):
+        many = replace(plan, config=dense, facts=replace(plan.facts, photos=photos, pixels=photos * 10**6))
+        choices, recommended = estimate(many, Config(), torch.device("cpu"))
+        assert (f"--blocks {blocks}:" in recommended) == (blocks > 1)
+        assert {choice.name.startswith(f"{blocks} blocks") for choice in choices if "block" in choice.name} <= {True}
+    cost = next(choice.cost for choice in choices if choice.name.startswith("4 blocks"))
+    assert cost.disk_bytes == pytest.approx((4 * 1.3 / 4 + 1 / 4) * 940 * 120 * (1200e6) ** 0.5)
 
 
 def test_a_block_that_cannot_be_trained_does_not_end_the_others(tmp_path, survey, capfd):
