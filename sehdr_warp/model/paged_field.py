@@ -247,4 +247,5 @@ def _options(field: RadianceField) -> dict[str, Any]:
         "antialiased": field.antialiased,
         "deterministic": field.deterministic,
         "normalization": field.normalization,
+        "photo_focals": field.photo_focals,
     }

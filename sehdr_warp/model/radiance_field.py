@@ -18,6 +18,7 @@ from ..scene.normalization import Normalization
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
+from .pixel_filter import EPS2D, FocalRange, keep_light
 from .renders import CameraTensors, DirectionalRender, RenderedView, TrainRender
 
 _DECODED_AT_ONCE = 1 << 19  # Pixels
@@ -28,6 +29,8 @@ class RadianceField(nn.Module):
 
     Attributes:
         confidence: [N] in [0, 1], confidence in each Gaussian's light; None if it was not measured.
+        photo_focals: Focal lengths of the photos, with which renders of another resolution keep the light of small
+            Gaussians; None in a training, and if they are not known.
         rasterizer: rasterize(); benchmarks set a function with the same arguments.
     """
 
@@ -46,6 +49,7 @@ class RadianceField(nn.Module):
         antialiased: bool = False,
         deterministic: bool = False,
         normalization: Normalization | None = None,
+        photo_focals: FocalRange | None = None,
     ):
         """Assemble a field.
 
@@ -61,8 +65,10 @@ class RadianceField(nn.Module):
             deterministic: Use kernels whose sums have a fixed order.
             normalization: Map between scene coordinates, of cameras and returned distances, and those of the
                 Gaussians; by default the identity.
+            photo_focals: As in the attributes.
         """
         super().__init__()
+        self.photo_focals = photo_focals
         self.normalization = normalization or Normalization()
         self.gaussians, self.fusion = gaussians, fusion
         self.response, self.base_time = response, base_time
@@ -311,6 +317,11 @@ class RadianceField(nn.Module):
             opacities = gaussians.opacities().detach()
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities)
+        variance = EPS2D
+        if self.photo_focals is not None and not self.antialiased:  # Which keeps the light at every resolution.
+            variance = self.photo_focals.variance(float(camera.intrinsics[0]))
+            if variance < EPS2D:
+                opacities = keep_light(opacities, *shapes, camera, variance)
         return self.rasterizer(  # rasterize(), see the class
             *shapes,
             opacities,
@@ -319,6 +330,7 @@ class RadianceField(nn.Module):
             camera.intrinsics,
             camera.width,
             camera.height,
+            eps2d=max(variance, EPS2D),
             antialiased=self.antialiased,
             max_intersections=max_intersections,
             deterministic=self.deterministic,
@@ -343,7 +355,7 @@ class RadianceField(nn.Module):
             features,
             camera.position,
             directions,
-            focal_length=focal,
+            focal_length=focal if self.photo_focals is None else self.photo_focals.nearest(focal),
             pixel_angle=1 / focal,
             antialiased=self.antialiased,
         )

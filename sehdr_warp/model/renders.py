@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from ..rasterizer import Rendering
 from ..scene import Camera
@@ -46,6 +47,14 @@ class RenderedView:
     hdr: Tensor
     alpha: Tensor
     depth: Tensor
+
+    def reduced(self, factor: int) -> "RenderedView":
+        """Return the view at a size that is smaller by an integer factor: the mean of each factor x factor pixels."""
+        covered = torch.stack([self.alpha, self.alpha * self.depth])
+        images = avg_pool2d(torch.cat([self.hdr.permute(2, 0, 1), covered]), factor)
+        alpha = images[3]
+        depth = (images[4] / alpha.clamp_min(1e-3)).masked_fill(alpha <= 1e-3, 0)
+        return RenderedView(images[:3].permute(1, 2, 0).contiguous(), alpha, depth)
 
 
 @dataclass(frozen=True)

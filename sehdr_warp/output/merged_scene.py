@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import SehdrError, refuse_paths
 from ..model.baking import field_of, gaussians_of
-from ..runs.run import RenderableScene, on_device
+from ..runs.run import RenderableScene, on_device, photo_focals
 from ..splats import GaussianArrays
 from ..splats.arrays import join_gaussians
 from .cameras.scene_cameras import camera_positions, training_cameras
@@ -37,6 +37,8 @@ class MergedScene(RenderableScene):
         field = field_of(_joined_gaussians(scenes, moves))
         field.response, field.deterministic = first.field.response, first.field.deterministic
         field.confidence = _joined([scene.field.confidence for scene in scenes])
+        if all(scene.field.photo_focals for scene in scenes):
+            field.photo_focals = photo_focals(self.cameras)
         self.field = on_device(field, first.device)
         self.degree = self.field.gaussians.degree
         self._clipped = _joined([scene.clipped_share() for scene in scenes])

@@ -18,6 +18,7 @@ from ..model.fusion import NeuralExposureFusion
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.lights import Light, find_lights
 from ..model.paged_field import PagedField
+from ..model.pixel_filter import FocalRange
 from ..model.radiance_field import RadianceField
 from ..model.renders import DirectionalRender, RenderedView
 from ..response import Response
@@ -106,7 +107,11 @@ class RenderableScene:
         return self.field.gaussians.count
 
     def render(self, camera: Camera) -> RenderedView:
-        """Render HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera."""
+        """Render HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera.
+
+        In a view that is coarser than the photos, lamps smaller than a pixel get up to a third too much light;
+        output.averaging.render_averaged() is slower and exact.
+        """
         return as_rec709(self.field.render(camera, degree=self.degree), self.color_matrix, self.field)
 
     def render_directions(
@@ -227,6 +232,7 @@ class Run(RenderableScene):
         self.response: Response = field.response
         self.base_time = field.base_time
         self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
+        field.photo_focals = photo_focals(self.cameras)
         self.iterations: int = values["iteration"]
         self.degree = config.degree_at(self.iterations)
         self.train_seconds: float = values["seconds"]
@@ -303,6 +309,11 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     field = field_from_checkpoint(checkpoint, config, info).requires_grad_(False)
     field.confidence, clipped = folder.read_confidence(checkpoint) or (None, None)
     return Run(folder, config, on_device(field, pick_device(device)), info, checkpoint.values, clipped)
+
+
+def photo_focals(cameras: tuple[CameraEntry, ...]) -> FocalRange | None:
+    """Return the focal lengths of the training photos; None without any."""
+    return FocalRange.of(entry.camera for entry in cameras if entry.split == "train")
 
 
 def on_device(field: RadianceField, device: torch.device, budget: int | None = None) -> RadianceField:

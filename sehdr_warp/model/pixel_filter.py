@@ -1,0 +1,85 @@
+"""The rasterizer's low-pass filter in renders of another resolution than the photos.
+
+The rasterizer adds a variance of EPS2D square pixels to each projected Gaussian. In a training these are pixels of the
+photos, and Gaussians are fitted with it. With a longer focal length in pixels, the same variance is less of the scene:
+small Gaussians shrink, and a lamp loses most of its light. With a shorter one it is more, and a lamp gains light.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ..rasterizer.render_options import EPS2D
+from ..scene import Camera
+from .renders import CameraTensors
+
+ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
+TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
+NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
+
+
+class FocalRange(NamedTuple):
+    """Focal lengths of the photos of a training, pixels."""
+
+    least: float
+    most: float
+
+    @staticmethod
+    def of(cameras: Iterable[Camera]) -> "FocalRange | None":
+        """Return the range of the cameras' focal lengths; None without cameras."""
+        focals = [camera.fx for camera in cameras]
+        return FocalRange(min(focals), max(focals)) if focals else None
+
+    def nearest(self, focal: float) -> float:
+        """Return the focal length of the range that is nearest to another."""
+        return min(max(focal, self.least), self.most)
+
+    def samples(self, focal: float) -> int:
+        """Return how many times finer a render with a focal length in pixels must be to resolve what photos resolve."""
+        return max(1, math.ceil(self.least / focal - TOLERANCE))
+
+    def variance(self, focal: float) -> float:
+        """Return the variance of the photos' filter in square pixels of a render with a focal length in pixels."""
+        ratio = focal / self.nearest(focal)
+        return EPS2D if abs(ratio - 1) < ROUNDING else EPS2D * ratio**2
+
+
+def keep_light(
+    opacities: Tensor, means: Tensor, log_scales: Tensor, quaternions: Tensor, camera: CameraTensors, variance: float
+) -> Tensor:
+    """Return opacities [N] with which Gaussians filtered by EPS2D give the light that they give if filtered by less.
+
+    As the opacity compensation of Mip-Splatting (Yu et al. 2024), with `variance` in place of no filter: the opacity
+    times the area of the projected Gaussian stays.
+
+    Args:
+        opacities: [N].
+        means: [N, 3].
+        log_scales: [N, 3].
+        quaternions: [N, 4], w first.
+        camera: A pinhole camera.
+        variance: Of the filter in training, square pixels of this camera; at most EPS2D.
+    """
+    pose, (fx, fy, _, _) = camera.world_to_camera, camera.intrinsics
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    z = z.clamp_min(NEAR)
+    zero = torch.zeros_like(z)
+    # Rows of the derivative of the pixel by the position, in world axes.
+    across = torch.stack([fx / z, zero, -fx * x / z**2], 1) @ pose[:3, :3]
+    down = torch.stack([zero, fy / z, -fy * y / z**2], 1) @ pose[:3, :3]
+    scales = log_scales.exp()
+    across, down = (_in_axes(quaternions, row) * scales for row in (across, down))
+    area, spread = torch.linalg.cross(across, down).square().sum(1), (across**2 + down**2).sum(1)
+    trained, drawn = (area + each * spread + each * each for each in (variance, EPS2D))
+    return opacities * (trained / drawn).nan_to_num(1.0).sqrt()
+
+
+def _in_axes(quaternions: Tensor, vectors: Tensor) -> Tensor:
+    """Return vectors [N, 3] in the axes of rotations [N, 4], w first."""
+    w, axis = functional.normalize(quaternions, dim=1).split([1, 3], dim=1)
+    turned = 2 * torch.linalg.cross(-axis, vectors)
+    return vectors + w * turned + torch.linalg.cross(-axis, turned)

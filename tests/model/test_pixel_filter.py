@@ -1,0 +1,100 @@
+"""Renders of another resolution than the photos give the same light."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp import Camera, load_run
+from sehdr_warp.kernels.constants import EPS2D
+from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.model.pixel_filter import FocalRange, keep_light
+from sehdr_warp.model.radiance_field import RadianceField
+from sehdr_warp.model.renders import CameraTensors
+from sehdr_warp.output.averaging import render_averaged
+from sehdr_warp.rasterizer.reference import project_reference
+from sehdr_warp.response import response_by_name
+
+from ..refusals import call
+
+PHOTO = Camera(48, 36, 40.0, 40.0, 24.0, 18.0, np.eye(4))
+FISHEYE = Camera(48, 36, 40.0, 40.0, 24.0, 18.0, np.eye(4), projection="OPENCV_FISHEYE", distortion=(0.0,) * 4)
+FOCALS = FocalRange(40.0, 40.0)
+
+
+def lamps(focals=FOCALS, **options):
+    """Bright Gaussians of a fifth of a pixel."""
+    places = torch.tensor([[-0.5, -0.3, 2.0], [0.1, 0.2, 3.0], [0.6, 0.4, 2.5]])
+    gaussians = Gaussians.from_points(places, torch.full((3, 3), math.log(1000.0)), 0, opacity=0.6)
+    gaussians.overwrite({"log_scales": torch.full((3, 3), math.log(0.01)) + torch.tensor([0.0, 0.5, 0.0])})
+    response = response_by_name("srgb")
+    return RadianceField(gaussians, response, base_time=1.0, photo_focals=focals, **options)
+
+
+def mean_light(field, camera, scale):
+    return float(field.render(camera.resized(round(48 * scale), round(36 * scale))).hdr.mean())
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0, 4.0])
+@pytest.mark.parametrize("camera", [PHOTO, FISHEYE], ids=["pinhole", "fisheye"])
+def test_small_lamps_keep_their_light_at_other_sizes(camera, scale):
+    as_photo = mean_light(lamps(), camera, 1.0)
+    assert mean_light(lamps(), camera, scale) == pytest.approx(as_photo, rel=0.05)
+    assert not 0.7 < mean_light(lamps(focals=None), camera, scale) / as_photo < 1.4, "what happens without"
+
+
+def test_photos_of_several_focal_lengths_are_rendered_as_in_training():
+    field, plain = lamps(FocalRange(20.0, 80.0)), lamps(focals=None)
+    for scale in (0.5, 1.0, 2.0):
+        camera = PHOTO.resized(round(48 * scale), round(36 * scale))
+        assert torch.equal(field.render(camera).hdr, plain.render(camera).hdr)
+
+
+def test_a_side_that_is_rounded_to_pixels_is_no_other_resolution():
+    focals = FocalRange(700.0, 700.0)
+    assert focals.variance(700.0 * 1.0009) == focals.variance(700.0 * 0.9991) == EPS2D
+    assert focals.samples(690.0) == 1 and focals.samples(600.0) == 2 and focals.samples(200.0) == 4
+
+
+def test_opacity_times_area_stays():
+    """By the projection in float64 of the reference."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(50, 3, generator=generator, dtype=torch.float64) * 0.1 + torch.tensor([0, 0, 3.0])
+    log_scales = torch.randn(50, 3, generator=generator, dtype=torch.float64) - 4
+    quaternions = torch.randn(50, 4, generator=generator, dtype=torch.float64)
+    opacities = torch.full((50,), 0.5, dtype=torch.float64)
+    pose, intrinsics = torch.eye(4, dtype=torch.float64), torch.tensor([20.0, 22.0, 12.0, 9.0], dtype=torch.float64)
+    camera = CameraTensors(24, 18, pose, intrinsics, torch.zeros(3, dtype=torch.float64))
+
+    def area(variance):
+        arguments = means, log_scales, quaternions, opacities, pose, intrinsics, 24, 18, 0.01, variance, 1e-9, False
+        a, b, c = project_reference(*arguments)[1].unbind(1)
+        return 1 / (a * c - b * b).sqrt()
+
+    kept = keep_light(opacities, means, log_scales, quaternions, camera, 0.05)
+    torch.testing.assert_close(kept * area(EPS2D), opacities * area(0.05), rtol=1e-9, atol=0)
+
+
+def test_pictures_of_half_the_size_are_means_of_the_photos_pixels(embedded_run):
+    run = load_run(embedded_run)
+    camera = run.cameras[0].camera
+    even = camera.resized(camera.width // 2 * 2, camera.height // 2 * 2)
+    full, half = run.render(even), render_averaged(run, even.resized(even.width // 2, even.height // 2))
+    means = full.hdr.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2))
+    torch.testing.assert_close(half.hdr, means, rtol=1e-4, atol=1e-5)
+    assert half.depth.shape == half.alpha.shape == half.hdr.shape[:2]
+
+
+def test_rendered_files_of_any_size_hold_the_same_light(embedded_run, tmp_path):
+    import OpenEXR
+
+    light = []
+    for side in (24, 48, 96):
+        out = tmp_path / str(side)
+        assert (
+            call("render", embedded_run, "--out", out, "--evs=0", "--size", f"{side}x{side}", "--cameras", "test") == 0
+        )
+        with OpenEXR.File(str(next(out.rglob("*.exr")))) as file:
+            light.append(float(file.channels()["RGB"].pixels.astype(np.float32).mean()))
+    assert light == pytest.approx([light[1]] * 3, rel=0.02)
