@@ -8,6 +8,7 @@ from ..checks import check_tensors
 from ..gradients import requires_ordered_sums
 from ..torch_contract import once_differentiable
 from ..warp_launch.launching import launch, warp_scalar
+from ..warp_launch.threads import one_torch_thread
 
 MAX_LOG_SIGMA, MAX_DEVIATION = 30.0, 30.0  # Inside these exp(-d^2 / 2) and its gradient are finite in float32
 
@@ -40,7 +41,10 @@ def fuse_exposures(
         outer_bias=(outer_bias, (3, 1, 1)),
     )
     learned = log_sigma, inner, inner_bias, outer, outer_bias
-    if encoded.is_cpu or encoded.requires_grad or requires_ordered_sums(encoded.device):
+    if encoded.is_cpu:
+        with one_torch_thread():  # Sums of matrix products depend on the number of threads.
+            return scale * (fusion_weights(encoded, *learned) * encoded).sum(dim=0)
+    if encoded.requires_grad or requires_ordered_sums(encoded.device):
         return scale * (fusion_weights(encoded, *learned) * encoded).sum(dim=0)
     return _Fusion.apply(encoded, *learned, scale)
 

@@ -45,6 +45,21 @@ def test_values_and_gradients_are_those_of_torch_in_float64(device, by_kernels, 
         assert relative_error(mine.grad, true.grad) < 10 * bound, name
 
 
+def test_fused_light_on_the_cpu_does_not_depend_on_torchs_threads():
+    generator = torch.Generator().manual_seed(0)
+    ours = [torch.randn(part.shape, generator=generator) for part in parts(learned(torch.float32, width=128))]
+    before, values = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 4, 8):
+            torch.set_num_threads(threads)
+            values.append([fuse_exposures(brackets(count).float(), *ours, scale=2.5) for count in (200, 1026)])
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    for others in values[1:]:
+        assert all(map(torch.equal, others, values[0]))
+
+
 def test_brackets_that_are_learned_have_gradients_too(device):
     encoded, ours = brackets().to(device), parts(learned(torch.float64, device))
     plain = fuse_exposures(encoded, *ours, scale=1.5)
