@@ -108,7 +108,7 @@ def known_cameras(entries: Iterable[CameraEntry]) -> list[PlacedPhoto]:
 
 
 def _with_saved_poses(scene: Scene, run: Run, place: str) -> Scene:
-    """Return a scene with the poses that a run was trained with.
+    """Return a scene with the poses that a run was trained with, and views that the run lacks in the same world.
 
     Poses that are found anew are turned, moved and scaled as a whole by chance.
 
@@ -123,11 +123,13 @@ def _with_saved_poses(scene: Scene, run: Run, place: str) -> Scene:
     pairs = [(view.camera, saved[view.name]) for view in views]
     turns = np.stack([old.world_to_camera[:3, :3].T @ new.world_to_camera[:3, :3] for new, old in pairs])
     u, _, vt = np.linalg.svd(turns.sum(0))
-    cosines = (np.einsum("nij,ij->n", turns, u @ vt) - 1) / 2
-    found, known = np.stack([(u @ vt @ new.position, old.position) for new, old in pairs], axis=1)
-    found, known = found - found.mean(0), known - known.mean(0)
-    scale = np.linalg.norm(known) / max(float(np.linalg.norm(found)), 1e-12)
-    distances = np.linalg.norm(scale * found - known, axis=1) / run.field.normalization.unit
+    turn = u @ vt
+    cosines = (np.einsum("nij,ij->n", turns, turn) - 1) / 2
+    found, known = np.stack([(turn @ new.position, old.position) for new, old in pairs], axis=1)
+    spread = np.linalg.norm(found - found.mean(0))
+    scale = np.linalg.norm(known - known.mean(0)) / spread if spread else 1.0
+    shift = known.mean(0) - scale * found.mean(0)
+    distances = np.linalg.norm(scale * found + shift - known, axis=1) / run.field.normalization.unit
     zooms = np.array([new.fx / new.width * old.width / old.fx for new, old in pairs])
     unlike = (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED) | (np.abs(zooms - 1) > _MOST_ZOOMED)
     if unlike.any():
@@ -135,10 +137,14 @@ def _with_saved_poses(scene: Scene, run: Run, place: str) -> Scene:
         remedy = "put photos and cameras back as they were then, or train again"
         names = first_names([view.name for view, is_other in zip(views, unlike, strict=True) if is_other])
         raise InputError(place, f"{problem}: {names}", remedy)
-    poses = {name: camera.world_to_camera for name, camera in saved.items()}
 
     def with_pose(view: View) -> View:
-        pose = poses.get(view.name, view.camera.world_to_camera)
+        if view.name in saved:
+            pose = saved[view.name].world_to_camera
+        else:
+            pose = view.camera.world_to_camera.copy()
+            pose[:3, :3] = pose[:3, :3] @ turn.T
+            pose[:3, 3] = -pose[:3, :3] @ (scale * turn @ view.camera.position + shift)
         return replace(view, camera=replace(view.camera, world_to_camera=pose))
 
     return replace(scene, views=tuple(map(with_pose, scene.views)))
