@@ -32,7 +32,8 @@ def training_svg(metrics: Sequence[Mapping]) -> Markup:
         return EMPTY
     seconds, decibels = zip(*(point for line in lines.values() for point in line))
     ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
-    times, levels = ticks.tick_values(0, max(seconds) or 1.0), ticks.tick_values(min(decibels), max(decibels))
+    least = min(decibels)
+    times, levels = ticks.tick_values(0, max(seconds) or 1.0), ticks.tick_values(least, max(*decibels, least + 1))
 
     def place(seconds: float, decibels: float) -> tuple[float, float]:
         return 40 + 440 * seconds / times[-1], 250 - 215 * (decibels - levels[0]) / (levels[-1] - levels[0])
