@@ -18,6 +18,7 @@ from ..exposure.stack import refuse_stack
 from ..file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
 from ..images.heif import HEIF_SUFFIXES, register_heif
 from ..images.ldr_files import PHOTO_SUFFIXES
+from ..photo_names import fold_name
 from ..photos import FEWEST_PHOTOS
 from ..raw.decode import color_matrix
 from ..sfm.panoramas import are_panoramas, reconstruct_panoramas
@@ -124,13 +125,16 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
 def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> tuple[DataparserOutputs, list[str]]:
     """Return bare photos with the cameras and splits of their file names, and the names of photos without one.
 
+    Case and the form of an accent do not matter: disks of cameras and Macs change them.
+
     Raises:
         InputError: if no photo has a camera.
     """
     by_name = {camera.file: camera for camera in cameras}
+    folded = {fold_name(name): name for name in by_name}
     placed, others, names = [], [], [record.image.name for record in dataset.records]
-    for index, record in enumerate(dataset.records):
-        if (camera := by_name.pop(record.image.name, None)) is None:
+    for index, (record, name) in enumerate(zip(dataset.records, names, strict=True)):
+        if (camera := by_name.pop(name if name in by_name else folded.get(fold_name(name), name), None)) is None:
             others.append(index)
         else:
             placed.append(replace(record, lens=camera.lens, world_to_camera=camera.world_to_camera, split=camera.split))

@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene.dataparser import PointCloud
+from sehdr_warp.scene.dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto, PointCloud
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
 from sehdr_warp.scene.readers import bare_photos
-from sehdr_warp.scene.readers.bare_photos import find_photos
+from sehdr_warp.scene.readers.bare_photos import find_photos, with_cameras
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.sfm.reconstruction import Reconstruction
 from sehdr_warp.scene.unused_files import unused_notes
@@ -289,3 +289,15 @@ def test_transforms_of_any_name_are_named_in_a_folder_and_read_as_a_file(tmp_pat
     assert find_photos(tmp_path).notes == ("undistorted.json states cameras: to use them, give the file itself",)
     dataset = parse_dataset(file)
     assert (dataset.format, dataset.folder, len(dataset.records)) == ("transforms", tmp_path, 6)
+
+
+def test_cameras_of_a_run_are_found_by_names_in_other_case_or_form_of_an_accent(tmp_path):
+    """Disks of cameras and Macs change names so; where names differ in case alone, each photo has its own camera."""
+    lens = Lens("SIMPLE_PINHOLE", 16, 12, (16.0, 8.0, 6.0), tmp_path)
+    kept = ["Schlo\u00df \u00e9.jpg", "a.JPG", "a.jpg", "b.JPG"]
+    cameras = [PlacedPhoto(name, lens, index * np.eye(4), "train", 1.0) for index, name in enumerate(kept)]
+    now = ["Schlo\u00df e\u0301.jpg", "a.jpg", "a.JPG", "b.jpg"]
+    records = tuple(ImageRecord(Path(name).stem, tmp_path / name, UNPLACED, np.eye(4)) for name in now)
+    dataset, others = with_cameras(DataparserOutputs("photos", records), cameras)
+    assert not others and [record.world_to_camera[0, 0] for record in dataset.records] == [0, 2, 1, 3]
+    assert not dataset.notes
