@@ -149,7 +149,10 @@ def test_an_override_is_blamed_by_its_flag_and_never_the_file():
         load_config("paper", {"fusion.enabled.x": 1})
 
 
-@pytest.mark.parametrize("table,field,value", [("schedule", "stated_for", 30_000), ("loss", "predictor", "net.pt")])
+@pytest.mark.parametrize(
+    "table,field,value",
+    [("schedule", "stated_for", 30_000), ("loss", "predictor", "net.pt"), ("mcmc", "sample_by", "opacity")],
+)
 def test_a_run_of_an_earlier_version_is_told_so(tmp_path, table, field, value):
     values = Config().model_dump()
     values[table][field] = value
