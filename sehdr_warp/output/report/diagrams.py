@@ -31,9 +31,10 @@ def training_svg(metrics: Sequence[Mapping]) -> Markup:
     if not lines:
         return EMPTY
     seconds, decibels = zip(*(point for line in lines.values() for point in line))
-    ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
-    least = min(decibels)
-    times, levels = ticks.tick_values(0, max(seconds) or 1.0), ticks.tick_values(least, max(*decibels, least + 1))
+    least, steps = min(decibels), [1, 2, 5, 10]
+    times = MaxNLocator(6, steps=steps).tick_values(0, max(seconds) or 1.0)
+    # At least 2 dB, so that all levels are whole: others are wider than the space beside the plot.
+    levels = MaxNLocator(6, steps=steps, integer=True).tick_values(least, max(*decibels, least + 2))
 
     def place(seconds: float, decibels: float) -> tuple[float, float]:
         return 40 + 440 * seconds / times[-1], 250 - 215 * (decibels - levels[0]) / (levels[-1] - levels[0])
