@@ -117,8 +117,8 @@ def load_scene(
     if guessed and cameras:  # The training estimated them by points of structure from motion, which are not here.
         kept = {camera.file: camera.exposure_time for camera in cameras}
         times = {name: kept[file] for name, file in guessed.items() if file in kept}
-        views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
-        scene = replace(scene, views=tuple(views))
+        timed = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
+        scene = replace(scene, views=tuple(timed))
     elif guessed:
         from .exposure.estimate import with_estimated_times
 
