@@ -287,9 +287,8 @@ def _has_many_photos(facts: SceneFacts) -> bool:
 
 
 def _is_usual_density(config: Config) -> bool:
-    """Return whether this is mcmc, and neither the user nor a preset chose its cap_density."""
-    usual = config.densification.strategy == "mcmc" and config.mcmc.cap_density == McmcConfig().cap_density
-    return usual and "mcmc.cap_density" not in config.plan.keep
+    """Return whether neither the user nor a preset chose mcmc.cap_density."""
+    return "mcmc.cap_density" not in config.plan.keep and config.mcmc.cap_density == McmcConfig().cap_density
 
 
 def _is_short_of_time(facts: SceneFacts, config: Config, device: torch.device) -> bool:

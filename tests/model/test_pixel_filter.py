@@ -1,6 +1,8 @@
 """Renders of another resolution than the photos give the same light."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.pixel_filter import FocalRange, keep_light
 from sehdr_warp.model.radiance_field import RadianceField
-from sehdr_warp.model.renders import CameraTensors
+from sehdr_warp.model.renders import CameraTensors, RenderedView
 from sehdr_warp.output.averaging import render_averaged
 from sehdr_warp.rasterizer.reference import project_reference
 from sehdr_warp.response import response_by_name
@@ -84,6 +86,28 @@ def test_pictures_of_half_the_size_are_means_of_the_photos_pixels(embedded_run):
     means = full.hdr.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2))
     torch.testing.assert_close(half.hdr, means, rtol=1e-4, atol=1e-5)
     assert half.depth.shape == half.alpha.shape == half.hdr.shape[:2]
+
+
+@pytest.mark.parametrize(
+    ("camera", "antialiased", "size"),
+    [
+        (PHOTO.resized(12, 9), False, (48, 36)),
+        (PHOTO.resized(12, 9), True, (12, 9)),
+        (FISHEYE.resized(12, 9), False, (12, 9)),
+        (replace(PHOTO, width=2400, height=1800, fx=1.0, fy=1.0), False, (2400, 1800)),
+    ],
+    ids=["coarse", "antialiased", "fisheye", "very wide"],
+)
+def test_pixels_are_finer_where_that_is_needed_and_fits_into_memory(camera, antialiased, size):
+    sizes = []
+
+    def render(camera):
+        sizes.append((camera.width, camera.height))
+        return RenderedView(torch.zeros(camera.height, camera.width, 3), *torch.zeros(2, camera.height, camera.width))
+
+    run = SimpleNamespace(field=SimpleNamespace(antialiased=antialiased, photo_focals=FOCALS), render=render)
+    assert render_averaged(run, camera).hdr.shape == (camera.height, camera.width, 3)
+    assert sizes == [size]
 
 
 def test_rendered_files_of_any_size_hold_the_same_light(embedded_run, tmp_path):

@@ -22,6 +22,7 @@ from sehdr_warp.training.plan import (
     make_plan,
 )
 from sehdr_warp.training.scene_facts import measure_scene
+from sehdr_warp.training.strategies import mcmc_cap
 from sehdr_warp.training.train import train
 
 from ..refusals import call
@@ -237,7 +238,9 @@ def test_a_gpu_gets_twice_the_gaussians_for_many_photos_of_one_place(facts):
     many, rule = replace(facts, photos=21, visibility=9.0), RULES["densification"]
     assert rule(many, config_of(), GPU).fields == {"mcmc.cap_density": 240.0}
     few, survey = replace(many, photos=20), replace(many, visibility=2.0)
-    others = ({"mcmc__cap_density": 60.0}, {"plan__keep": ["mcmc.cap_density"]}, {"densification__strategy": "adc"})
+    rivals = rule(many, config_of(densification__strategy="adc"), GPU).fields
+    assert rivals == {"densification.cap_max": mcmc_cap(config_of(mcmc__cap_density=240.0), many.pixels)}
+    others = {"mcmc__cap_density": 60.0}, {"plan__keep": ["mcmc.cap_density"]}
     cases = [(few, config_of(), GPU), (survey, config_of(), GPU), *((many, config_of(**each), GPU) for each in others)]
     for case, config, device in cases:
         assert "mcmc.cap_density" not in rule(case, config, device).fields
