@@ -21,7 +21,7 @@ from .base import SEED_STRIDE, Propose, Schedule, Strategy
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
 DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
-LEAST_MEAN_OPACITY = 0.02
+LEAST_MEAN_OPACITY = 0.03
 """New Gaussians are added only while the mean opacity stays above this. Copies share the opacity of their source. Where
 photos contradict each other, growth would make all Gaussians fainter until they are dead and the scene is lost."""
 MAX_NOISE_SIZES = 0.05
