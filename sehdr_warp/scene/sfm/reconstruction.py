@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import packages_distributions, version
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -168,12 +168,10 @@ def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Pat
 
 
 def cache_key(*parts) -> str:
-    """Return a name for a result made of everything that it depends on; the parts go through JSON.
-
-    Beside the parts, these are the constants of this module, pairs and brightened_codes(), and pycolmap's version.
-    """
+    """Name a result by all it depends on: `parts` (for JSON), constants here and of pairs, and pycolmap's version."""
     pairing = (EXHAUSTIVE_LIMIT, COMPARED_LIMIT, OVERLAP, FEATURES, PARTNERS, RATIO)
-    key = [_VERSION, version("pycolmap"), MAX_SIDE, SEED, FEWEST_SHARED, pairing, BRIGHTENING, *parts]
+    builds = sorted(version(name) for name in packages_distributions().get("pycolmap", ()))  # pycolmap-cuda12, too
+    key = [_VERSION, *builds, MAX_SIDE, SEED, FEWEST_SHARED, pairing, BRIGHTENING, *parts]
     return hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
 
 
