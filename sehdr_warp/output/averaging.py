@@ -14,9 +14,8 @@ MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered 
 
 def render_averaged(run: "RenderableScene", camera: Camera) -> "RenderedView":
     """Render a view; one of a pinhole camera that is coarser than the photos is rendered finer and averaged."""
-    field = getattr(run, "field", None)  # A scene under training has none.
-    focals = None if field is None or field.antialiased or not camera.is_pinhole else field.photo_focals
-    if focals is None:
+    focals = getattr(getattr(run, "field", None), "photo_focals", None)  # A scene under training states none.
+    if focals is None or run.field.antialiased or not camera.is_pinhole:
         return run.render(camera)
     finest = max(1, math.isqrt(MOST_PIXELS // (camera.width * camera.height)))
     factor = min(focals.samples(camera.fx), finest)
