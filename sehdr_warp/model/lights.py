@@ -154,8 +154,8 @@ def find_lights(
         deviation = None
         if confidence is not None:
             stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
-            shown = area_sums[:, 0] > 0.5 * area * angles_of_shape[holding]  # Else something hides the light.
-            measured = brightness[group] < measurable[holding][shown].max(initial=0.0)
+            unobstructed = area_sums[:, 0] > 0.5 * area * angles_of_shape[holding]  # Else something hides the light.
+            measured = brightness[group] < measurable[holding][unobstructed].max(initial=0.0)
             stops[measured] = np.minimum(stops, MEASURED_STOPS * shares[group])[measured]
             deviation = float(weights[group] @ stops / (weights[group] @ shares[group]))
         share = float(radiance.mean() * shape.solid_angle(middle)) / total

@@ -74,8 +74,8 @@ def keep_light(
     scales = log_scales.exp()
     across, down = (_in_axes(quaternions, row) * scales for row in (across, down))
     area, spread = torch.linalg.cross(across, down).square().sum(1), (across**2 + down**2).sum(1)
-    trained, drawn = (area + each * spread + each * each for each in (variance, EPS2D))
-    return opacities * (trained / drawn).nan_to_num(1.0).sqrt()
+    in_photos, in_render = (area + each * spread + each * each for each in (variance, EPS2D))
+    return opacities * (in_photos / in_render).nan_to_num(1.0).sqrt()
 
 
 def _in_axes(quaternions: Tensor, vectors: Tensor) -> Tensor:

@@ -115,8 +115,8 @@ def load_scene(
     named_views = zip(names, dataset.records, strict=True)
     guessed = {name: record.image.name for name, record in named_views if not record.time_known}
     if guessed and cameras:  # The training estimated them by points of structure from motion, which are not here.
-        kept = {camera.file: camera.exposure_time for camera in cameras}
-        times = {name: kept[file] for name, file in guessed.items() if file in kept}
+        run_times = {camera.file: camera.exposure_time for camera in cameras}
+        times = {name: run_times[file] for name, file in guessed.items() if file in run_times}
         timed = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
         scene = replace(scene, views=tuple(timed))
     elif guessed:

@@ -74,8 +74,8 @@ def test_opacity_times_area_stays():
         a, b, c = project_reference(*arguments)[1].unbind(1)
         return 1 / (a * c - b * b).sqrt()
 
-    kept = keep_light(opacities, means, log_scales, quaternions, camera, 0.05)
-    torch.testing.assert_close(kept * area(EPS2D), opacities * area(0.05), rtol=1e-9, atol=0)
+    new_opacities = keep_light(opacities, means, log_scales, quaternions, camera, 0.05)
+    torch.testing.assert_close(new_opacities * area(EPS2D), opacities * area(0.05), rtol=1e-9, atol=0)
 
 
 def test_pictures_of_half_the_size_are_means_of_the_photos_pixels(embedded_run):

@@ -128,7 +128,7 @@ def test_photos_of_another_place_are_refused(bare_run, tmp_path, capfd):
 
 
 def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, monkeypatch, capfd):
-    """Of a run whose scene.json has no lenses, cameras are found anew."""
+    """Cameras of a run whose scene.json has no lenses are found anew."""
     _, run, cameras = bare_run
     scene_file, checkpoints = run / "scene.json", run / "checkpoints"
     scene = json.loads(scene_file.read_text())
@@ -152,7 +152,7 @@ def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, mo
 
 
 def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_the_run():
-    """As structure from motion does by chance; one camera that moved, turned or zoomed is named."""
+    """Structure from motion turns the world by chance; one camera that moved, turned or zoomed is named."""
     scene = toy_scene(6, 8)
     run = SimpleNamespace(path="run", field=SimpleNamespace(normalization=Normalization(unit=4.0)))
     run.cameras = [CameraEntry(view.name, "train", view.camera, 1.0) for view in scene.views]

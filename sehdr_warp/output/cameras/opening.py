@@ -1,4 +1,4 @@
-"""What pages and the viewer open with: a camera that shows the subject, and the scene's cameras as plain values."""
+"""First view of pages and of the viewer: a camera that shows the subject, and the scene's cameras as plain values."""
 
 import math
 from collections.abc import Sequence

@@ -161,7 +161,7 @@ def test_a_floor_that_is_not_level_comes_with_the_option_that_levels_it(tmp_path
 
 
 def test_a_floor_far_from_up_by_the_photos_is_not_levelled(tmp_path, logged):
-    """Where --up is wrong, a wall counts as the floor, and what levels the wall is wrong, too."""
+    """A wall counts as the floor where --up is wrong; advice that levels the wall would be wrong, too."""
     run, turn = BallOnFloor(), np.radians(6)
     run.up = UpDirection(np.array([1.0, 0.0, 0.0]), "gps")
     write_proxy_mesh(run, tmp_path / "wall.obj", resolution=48, up=f"{np.sin(turn):.6f},{np.cos(turn):.6f},0")
