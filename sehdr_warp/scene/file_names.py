@@ -99,7 +99,7 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         source: the data file.
 
     Raises:
-        InputError: if the name leads out of the folder by `..` or a link.
+        InputError: if the name has `..` after its beginning, or leads out of the folder by a link.
     """
     names = dict.fromkeys((name, name.replace("\\", "/")))
     with suppress(UnicodeError):
@@ -109,7 +109,7 @@ def find_image(folder: Path, name: str, source: Path) -> Path | None:
         names |= {os.fsdecode(name.encode("latin-1")): None}
     if inner := _inside(folder, name, source):
         names = {inner: None}
-    elif PureWindowsPath(name).anchor and "\0" not in name:
+    elif (PureWindowsPath(name).anchor or PureWindowsPath(name).parts[:1] == ("..",)) and "\0" not in name:
         return None
     places = [resolve_inside(folder, each, source) for each in names]
     image = next((place for place in places if os.path.isfile(place)), None)

@@ -269,7 +269,9 @@ def test_names_without_a_suffix_may_have_dots(tmp_path):
     assert len(load(tmp_path, holdout=0).views) == 6
 
 
-@pytest.mark.parametrize("name", ["../images/r_{}.png", "../../data/set/images/r_{}.png", "r_{}.png", "r_{}"])
+@pytest.mark.parametrize(
+    "name", ["../images/r_{}.png", "../../data/set/images/r_{}.png", "../frames\\r_{}.png", "r_{}.png", "r_{}"]
+)
 def test_names_from_another_folder(tmp_path, name):
     """Relative to where a script ran, or without the folder."""
     write_blender(tmp_path)
@@ -280,7 +282,7 @@ def test_names_from_another_folder(tmp_path, name):
     (tmp_path.parent / "r_0.png").write_bytes((tmp_path / "images" / "r_0.png").read_bytes())
     shutil.rmtree(tmp_path / "images")
     try:
-        with pytest.raises(InputError, match="contains '..'; use a path relative to|image file not found"):
+        with pytest.raises(InputError, match="image file not found"):
             load(tmp_path)
     finally:
         (tmp_path.parent / "r_0.png").unlink()
