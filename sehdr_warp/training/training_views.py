@@ -82,7 +82,7 @@ class PhotoStream:
     """A replacement of ViewStack with SLOTS photos on the device.
 
     Call bring() for a view before at() returns it, and release() once the kernels that read it are launched. [i] is a
-    copy of view i.
+    copy of view i, with the same values as in ViewStack: steps that are not captured read it.
     """
 
     def __init__(self, source: PhotoSource):
@@ -114,6 +114,8 @@ class PhotoStream:
         if self._cuda:
             self._stream = torch.cuda.Stream(self._device)
             self._filled, self._free = ([torch.cuda.Event() for _ in range(SLOTS)] for _ in range(2))
+            for event in self._free:  # The slots are free once they are zeroed, on this stream.
+                event.record(torch.cuda.current_stream(self._device))
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -121,7 +123,11 @@ class PhotoStream:
 
     def __getitem__(self, index: int) -> TrainingView:
         """Return a copy of a view on the device."""
-        return self._source[index]
+        view, tensors = self._cameras[index], self._source.tensors(index)
+        tensors = {name: tensor.to(self._device) for name, tensor in tensors.items()}
+        if "mask" in self._slots:  # Without a mask, the loss has other kernels, whose sums have other last bits.
+            tensors.setdefault("mask", torch.ones_like(self._slots["mask"][0]))
+        return replace(view, target=Target(scale=self._source.scale, **tensors))
 
     @property
     def times(self) -> Tensor | float:

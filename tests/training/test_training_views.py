@@ -17,7 +17,7 @@ from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.photo_storage import PhotoKeeper
 from sehdr_warp.scene.wide_camera import pixel_directions, solid_angles
 from sehdr_warp.training.initialization import make_field
-from sehdr_warp.training.targets import PhotoSource
+from sehdr_warp.training.targets import PhotoSource, ViewStack
 from sehdr_warp.training.train import train
 from sehdr_warp.training.training_state import state_of
 from sehdr_warp.training.training_views import PhotoOrder, PhotoStream, check_projections
@@ -122,6 +122,15 @@ def test_a_densification_by_projected_centers_is_refused():
         check_projections(panoramas(3), config)
 
 
+def unlike_photos(scene):
+    """The scene with a training photo that has a mask, one of 16 bits, and one of another exposure time."""
+    views = list(scene.views)
+    views[0] = dataclasses.replace(views[0], mask=np.tri(32, dtype=np.float32))
+    views[1] = dataclasses.replace(views[1], codes=views[1].codes.astype(np.uint16) * 257)
+    views[2] = dataclasses.replace(views[2], exposure_time=0.7 * EXPOSURE_TIME)
+    return dataclasses.replace(scene, views=tuple(views))
+
+
 @pytest.mark.parametrize("truth", [False, True])
 def test_what_is_brought_is_the_view(device, truth):
     views = list(toy_scene().train_views)
@@ -143,6 +152,20 @@ def test_what_is_brought_is_the_view(device, truth):
             assert torch.equal(streamed.target.exposure_truth, whole.target.exposure_truth)
 
 
+@pytest.mark.parametrize("change", [lambda scene: scene, unlike_photos])
+def test_steps_without_a_graph_read_the_same_from_a_stack_and_a_stream(scene, device, change):
+    source = PhotoSource(change(scene).train_views, EXPOSURE_TIME, device, truth=True)
+    stack = ViewStack.of(list(source))
+    assert stack is not None
+    for view, other in zip(stack, PhotoStream(source), strict=True):
+        assert view.exposure_time == other.exposure_time
+        for part in ("camera", "target"):
+            for field in dataclasses.fields(getattr(view, part)):
+                value, other_value = (getattr(getattr(each, part), field.name) for each in (view, other))
+                both = isinstance(value, torch.Tensor) and isinstance(other_value, torch.Tensor)
+                assert torch.equal(value, other_value) if both else value == other_value, field.name
+
+
 def test_photos_of_several_sizes_have_no_common_place(device):
     views = toy_scene().train_views + toy_scene(size=16).train_views
     with pytest.raises(ValueError, match="photos differ in size"):
@@ -160,8 +183,10 @@ def test_a_training_on_a_file_is_the_same_bits(scene, trained, tmp_path):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene):
+@pytest.mark.parametrize("change", [lambda scene: scene, unlike_photos])
+def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene, change):
     config, states = override_config(VARIANTS["default"], {"deterministic": True}), []
+    scene = change(scene)
     for photos in ("device", "memory"):
         chosen = override_config(config, {"schedule.photo_cache": photos})
         trainer = make_trainer(scene, chosen, "cuda:0")
