@@ -118,3 +118,11 @@ def _resident(proc: Path) -> int:
     with suppress(OSError, ValueError, IndexError, AttributeError):
         return int((proc / "self" / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
+
+
+def format_bytes(count: float) -> str:
+    """Return a number of bytes in words of one unit, with two digits."""
+    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}" if count < 10 * size else f"{count / size:.0f} {unit}"
+    return f"{count / 1e3:.0f} KB"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sehdr_warp.limits import memory_left, processor_limit
+from sehdr_warp.limits import format_bytes, memory_left, processor_limit
 
 GB = 1 << 30
 
@@ -73,3 +73,8 @@ def test_slurm(tmp_path, monkeypatch):
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "3")
     processor_limit.cache_clear()
     assert processor_limit(*places) == 3
+
+
+def test_sizes_have_the_unit_that_suits_them():
+    texts = [format_bytes(count) for count in (312_000, 5.2e6, 48e6, 3.14e9, 2e13)]
+    assert texts == ["312 KB", "5.2 MB", "48 MB", "3.1 GB", "20 TB"]

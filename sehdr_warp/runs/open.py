@@ -99,7 +99,20 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
     scene = with_saved_splits(_with_saved_poses(scene, run, place), run.cameras)
     times = {entry.name: entry.exposure_time for entry in run.cameras}
     views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
-    return replace(scene, views=tuple(views))
+    scene = replace(scene, views=tuple(views))
+    _name_changed_photos(scene, run, place)
+    return scene
+
+
+def _name_changed_photos(scene: Scene, run: Run, place: str) -> None:
+    """Warn if photos are not those that a run was trained with, by the signatures in its scene.json."""
+    from .scene_description import changed_photos, photo_signature
+
+    saved = {view["name"]: view["photo"] for view in run.folder.read_scene()["views"] if view.get("photo")}
+    found = {view.name: photo_signature(view.codes, view.mask) for view in scene.views if view.name in saved}
+    if changed := changed_photos(saved, found):
+        text = "%s: %d of %d photos are other pictures than in the training of %s (or have other masks): %s"
+        log.warning(text, place, len(changed), len(scene.views), run.path, first_names(changed))
 
 
 def known_cameras(entries: Iterable[CameraEntry]) -> list[PlacedPhoto]:

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..caches import cache_folder, usable
 from ..errors import InputError
-from ..limits import available_memory
+from ..limits import available_memory, format_bytes
 from .types import View
 
 _LARGE = 1 << 14  # Bytes; smaller arrays are pickled
@@ -193,10 +193,10 @@ class PhotoKeeper:
             return
         folder = _folder()
         disk = shutil.disk_usage(folder).free
-        sizes = f"the photos take {_gigabytes(size)}; {_gigabytes(free)} of memory are free"
+        sizes = f"the photos take {format_bytes(size)}; {format_bytes(free)} of memory are free"
         if size > disk:
             remedy = "use smaller photos (--max-size), free some of it, or name a folder of another disk in SEHDR_CACHE"
-            raise InputError(folder, f"{sizes}, and {_gigabytes(disk)} of this disk", remedy)
+            raise InputError(folder, f"{sizes}, and {format_bytes(disk)} of this disk", remedy)
         # Views are at most as large as their photos; masks and truth are floats.
         self.file = PhotoFile(max(_LEAST, 2 * size, self.pixels * _MOST_BYTES), folder)
         self.note = (
@@ -209,7 +209,3 @@ def _folder() -> Path:
     if folder is None or not usable(folder):
         return Path(tempfile.gettempdir())
     return folder
-
-
-def _gigabytes(size: int) -> str:
-    return f"{size / 1e9:.3g} GB"

@@ -47,10 +47,11 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
     run, photos = trainer.run, len(trainer.scene.train_views)
     if trainer.iteration < trainer.total:
         return []
+    steps = trainer.total if "schedule.iterations" in trainer.config.plan.keep else None
     words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
     summary = run.summary() | {"metrics": run.metrics()}
     scene, unplaced = data.get("path") or "SCENE", trainer.scene.unplaced
-    return advice(run.path, summary, photos, scene, words, trainer.first_iteration, unplaced)
+    return advice(run.path, summary, photos, scene, words, trainer.first_iteration, unplaced, steps)
 
 
 def advice(
@@ -61,6 +62,7 @@ def advice(
     options: Sequence[str] = (),
     resumed_at: int = 0,
     unplaced: int = 0,
+    steps: int | None = None,
 ) -> list[str]:
     """Return lines of advice on a finished training; none if nothing stands out.
 
@@ -73,9 +75,11 @@ def advice(
         resumed_at: Iteration at which the training was resumed, 0 if it was not. If held-out photos were evaluated
             there, as at the end of a run that is given more steps, gains before it do not count.
         unplaced: Number of photos without a camera.
+        steps: Iterations that the user set, for the commands; None if they were planned.
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
-    again = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
+    shorter = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
+    again = shorter if steps is None else f"{shorter} --iterations {steps}"
     points, lines, gain = evaluations(summary["metrics"]), [], 0.0
     few_placed = 2 * unplaced >= train_photos
     if few_placed:
@@ -99,7 +103,7 @@ def advice(
             lines.append(
                 f"held-out photos were {best.psnr - points[-1].psnr:.1f} dB better at iteration {best.iteration}: "
                 f"{train_photos} photos hold no more; add photos from other places, or stop there: "
-                f"{again} --iterations {best.iteration}"
+                f"{shorter} --iterations {best.iteration}"
             )
         elif not few_placed and train_photos < _FEW_PHOTOS and points[-1].psnr < 25:
             lines.append(

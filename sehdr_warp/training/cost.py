@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, replace
 
 import torch
 
+from ..limits import format_bytes
 from ..parallel import thread_count
 
 STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 2.0e-4, 3.4e-10, 2.4e-9
@@ -187,7 +188,7 @@ def recommend(whole: Workload, blocks: int, memory: float | None, gpus: int = 1)
         fill = "30,000 steps or of densification.cap_max Gaussians"
         return f"--blocks {blocks}: the set fills {blocks} trainings of {fill}"
     if memory is not None and several.gpu_bytes > memory:
-        needs = f"{several.gpu_bytes / 1e9:.3g} GB are more than the {memory / 1e9:.3g} GB of a GPU"
+        needs = f"{format_bytes(several.gpu_bytes)} are more than the {format_bytes(memory)} of a GPU"
         return f"--blocks {math.ceil(OVERLAP * several.gpu_bytes / memory)}: {needs}"
     alone = training_cost(whole)
     if gpus > 1 and alone.seconds > SAVES * several.seconds:
@@ -201,11 +202,3 @@ def format_duration(seconds: float) -> str:
         if seconds >= 2 * size:
             return f"{seconds / size:.1f} {unit}" if seconds < 20 * size else f"{seconds / size:.0f} {unit}"
     return f"{seconds:.0f} s"
-
-
-def format_bytes(count: float) -> str:
-    """Return a number of bytes in words of one unit, with two digits."""
-    for unit, size in (("TB", 1e12), ("GB", 1e9)):
-        if count >= size:
-            return f"{count / size:.1f} {unit}" if count < 10 * size else f"{count / size:.0f} {unit}"
-    return f"{count / 1e6:.0f} MB"

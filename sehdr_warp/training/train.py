@@ -116,7 +116,8 @@ def create_trainer(
             folder.unlock()
             raise
     response, count = trainer.field.response, trainer.field.gaussians.count
-    log.info("response %s, %d Gaussians on %s", response.name, count, device)
+    use = " only of simulated photos, because the photos' light is known" if scene.light_known else ""
+    log.info("response %s%s, %d Gaussians on %s", response.name, use, count, device)
     for line in (*response.notes, *_cap_notes(trainer), *several_ranks_notes(trainer)):
         log.info("%s", line)
     return trainer

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError
+from ..limits import format_bytes
 from ..model.radiance_field import RadianceField
 from ..model.renders import CameraTensors
 from ..runs.config import Config
@@ -223,7 +224,7 @@ class TrainingViews:
             return photos
         limit = MAX_MEMORY_PART * torch.cuda.mem_get_info(device)[0]
         if where in ("memory", "disk") or (where == "auto" and photos.bytes > limit):
-            log.info("plan: photos: %.3g GB go to %s one by one, a step ahead", photos.bytes / 1e9, device)
+            log.info("plan: photos: %s go to %s one by one, a step ahead", format_bytes(photos.bytes), device)
             try:
                 return PhotoStream(photos) if self._use_cuda_graph else photos
             except ValueError as error:

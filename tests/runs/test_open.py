@@ -34,6 +34,7 @@ def test_photos_of_a_folder_and_of_a_video_are_loaded_again(monkeypatch, tmp_pat
         data={"path": str(place)}, path=tmp_path / "run", config=Config(), response=None, cameras=cameras
     )
     run.field = SimpleNamespace(normalization=Normalization())
+    run.folder = SimpleNamespace(read_scene=lambda: {"views": []})
     with pytest.raises(InputError, match="no longer there|no longer here"):
         opening.load_run_scene(run, None)
     if name == "clip.mp4":
@@ -104,6 +105,18 @@ def test_cameras_of_a_run_are_not_found_anew(bare_run, monkeypatch, tmp_path):
     (folder / f"{name}.png").unlink()
     notes = opening.load_run_scene(load_run(run), None).notes
     assert f"1 photo of the run is missing: {name}.png" in notes
+
+
+def test_other_pictures_under_the_names_of_the_photos_are_named(bare_run, tmp_path, logged):
+    folder, run, _ = bare_run
+    figures(run, tmp_path / "figures.json")
+    assert not any("other pictures" in line for line in logged)
+    moved, name = tmp_path / "moved", RunFolder(run).read_cameras()[3].name
+    shutil.copytree(folder, moved)
+    Image.open(moved / f"{name}.png").transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(moved / f"{name}.png")
+    assert call("eval", run, "--device", "cpu", "--data", moved) == 0
+    (line,) = (line for line in logged if "other pictures" in line)
+    assert line.startswith(f"{moved}: 1 of 9 photos ") and line.endswith(name)
 
 
 def test_a_time_that_was_estimated_by_points_is_the_same_when_a_training_goes_on(bare_run, tmp_path):

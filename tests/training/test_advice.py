@@ -56,6 +56,10 @@ def test_commands_keep_the_options_of_the_training():
     options = ["--max-size", "240", "--preset", "fast"]
     [line] = advice(Path("r"), summary([20, 26, 25, 24]), 12, "park", options)
     assert line.endswith("sehdr-warp train park --out r --max-size 240 --preset fast --overwrite --iterations 44")
+    [line] = advice(Path("r"), summary([20, 26, 25, 24]), 12, "park", options, steps=90)
+    assert line.count("--iterations") == 1 and line.endswith("--iterations 44")
+    [line] = advice(Path("r"), summary([22, 22, 22]), 12, "park", options, steps=90)
+    assert line.endswith("--preset fast --overwrite --iterations 90")
     assert option_words({"max_size": 240, "holdout": None, "schedule.iterations": 9, "preset": "fast"}) == options
 
 

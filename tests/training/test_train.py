@@ -74,6 +74,14 @@ def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, caplog):
         caplog.clear()
 
 
+def test_the_response_of_linear_photos_is_that_of_simulated_photos_alone(scene, tmp_path, logged):
+    linear = dataclasses.replace(scene, light_known=True, response=response_by_name("srgb"))
+    for name, photos in (("coded", scene), ("linear", linear)):
+        create_trainer(photos, tmp_path / name, quick(**{"response.name": "srgb"}), device="cpu")
+    lines = [line for line in logged if line.startswith("response srgb")]
+    assert ["only of simulated photos" in line for line in lines] == [False, True]
+
+
 def test_run_folder_is_complete_and_loads_without_photos(scene, trained):
     run = load_run(trained("default"))
     names = {path.name for path in run.path.iterdir()}
