@@ -40,6 +40,7 @@ class Evidence:
     stops: Tensor  # Mean uncertainty in stops
     clipped: Tensor  # Fraction of clipped values
     peak: Tensor  # Sum of blending weights, as in weight_sum, in the photo in which it is largest
+    clipped_stops: Tensor  # Part of `stops` that is of clipped values; divided by `clipped`, their mean uncertainty
 
     @property
     def contributes(self) -> Tensor:
@@ -48,7 +49,7 @@ class Evidence:
 
     def rows(self, index: Tensor) -> "Evidence":
         """Return the evidence of the Gaussians at an index or mask [N]."""
-        return Evidence(self.weight_sum[index], self.stops[index], self.clipped[index], self.peak[index])
+        return Evidence(**{name: values[index] for name, values in vars(self).items()})
 
     def confidence(self) -> Tensor:
         """Return [N] in [0, 1]: 1 observed unclipped and reproduced, 1/2 known to a factor of two, 0 never seen."""
@@ -57,8 +58,8 @@ class Evidence:
 
 def pixel_uncertainty(
     photo: Tensor, exposure: Tensor, response: Response, deviation: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Return the uncertainty of the light at a photo's pixels, in stops, and the clipped fraction of each pixel.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the uncertainty of the light at a photo's pixels, in stops, their clipped fraction, and its uncertainty.
 
     The uncertainty is the mean over channels of
 
@@ -76,7 +77,7 @@ def pixel_uncertainty(
         deviation: [H, W, 3] stops, of estimates of clipped light; infinite where there is none.
 
     Returns:
-        Two tensors [H, W].
+        Three tensors [H, W]. The last one is the part of the first that is of clipped channels.
     """
     half_code = response.decode(photo.new_full((1, 3), HALF_CODE))
     white = response.white
@@ -92,7 +93,7 @@ def pixel_uncertainty(
     if deviation is not None:
         unknown = torch.where(deviation.isfinite(), deviation.clamp_max(MAX_STOPS), unknown)
     stops = misfit + torch.where(clipped, unknown, rounding)
-    return stops.mean(2), clipped.to(photo).mean(2)
+    return stops.mean(2), clipped.to(photo).mean(2), (stops * clipped).mean(2)
 
 
 @torch.no_grad()
@@ -116,7 +117,7 @@ def gather_evidence(
     """
     # Of a paged field, pictures are on a GPU and Gaussians are not.
     device, home = field.render_device, field.gaussians.means.device
-    total = torch.zeros(field.gaussians.count, 3, device=home)
+    total = torch.zeros(field.gaussians.count, 4, device=home)
     peak = torch.zeros(field.gaussians.count, device=home)
     every = -(-len(views) // MAX_VIEWS) or 1
     for index, view in track_progress("measuring confidence on photos", views, log):
@@ -128,21 +129,21 @@ def gather_evidence(
         if truth and view.hdr is not None:
             observed = torch.tensor(view.hdr, device=device) * view.exposure_time
             stops = (exposure.clamp_min(1e-9) / observed.clamp_min(1e-9)).log2().abs().clamp_max(MAX_STOPS).mean(2)
-            clipped = torch.zeros_like(stops)
+            clipped = clipped_stops = torch.zeros_like(stops)
         else:
             photo = torch.tensor(view.image, device=device)
             deviation = None if certainties is None else _deviation(certainties[index].to(device), photo)
-            stops, clipped = pixel_uncertainty(photo, exposure, field.response, deviation)
+            stops, clipped, clipped_stops = pixel_uncertainty(photo, exposure, field.response, deviation)
             weight = weight + (RESIDUAL_WEIGHT - 1) * high_residual_mask(view, exposure, field.response)
         if view.mask is not None:
             weight = weight * torch.tensor(view.mask, device=device)
-        images = torch.stack([weight, weight * stops, weight * clipped], dim=2).to(home)
+        images = torch.stack([weight, weight * stops, weight * clipped, weight * clipped_stops], dim=2).to(home)
         sums = field.weighted_sums(field.camera_tensors(view.camera), images)
         total += sums
         peak = torch.maximum(peak, sums[:, 0])
     weight_sum = total[:, 0].clamp_min(0)
-    means = total[:, 1:] / weight_sum.clamp_min(1e-12)[:, None]
-    return Evidence(weight_sum, means[:, 0].clamp_min(0), means[:, 1].clamp(0, 1), peak)
+    stops, clipped, clipped_stops = (total[:, 1:] / weight_sum.clamp_min(1e-12)[:, None]).clamp_min(0).unbind(1)
+    return Evidence(weight_sum, stops, clipped.clamp_max(1), peak, clipped_stops)
 
 
 def _deviation(certainty: Tensor, photo: Tensor) -> Tensor:

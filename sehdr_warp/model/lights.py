@@ -13,15 +13,16 @@ from ..scene.wide_camera import pixels_of_directions, steradians, typical_focal_
 from ..subsets import every_nth
 from .radiance_field import RadianceField
 
-CLIPPED = 0.3  # Share of the photos' values that show a Gaussian, from which it can belong to a light
-BRIGHT = 0.7  # Times the photos' white, likewise
+CLIPPED = 0.3  # Share of the values of photos too bright for a Gaussian that clip, from which it can belong to a light
+BRIGHT = 0.7  # Times white, from which a Gaussian can belong to a light, and from which a photo is too bright for it
+MOST_CLIPPED = 0.1  # Share of all photos' pixels that may clip at the exposure whose white decides what a light is
 LEAST_SEEN = 0.3  # Pixels of blending weight over all views, likewise
 REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
 FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras
 MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
-MOST_LIGHTS, MOST_VIEWS = 64, 24  # MOST_VIEWS of the usual exposure, and of the darker ones
+MOST_LIGHTS, MOST_VIEWS = 64, 24  # MOST_VIEWS of the longest exposures, and of those of half of these or less
 LEAST_ROWS, MOST_ROWS = 128, 724
 """Rows of the map in which the light at a point is measured: as fine as the photos' pixels, within these bounds. In
 coarser pixels small Gaussians would no longer hide each other."""
@@ -63,9 +64,9 @@ class Light:
         radiance: [3] in the field's colors; with the shape it gives the light that the training views show. If each of
             these cuts the light off at its border, it is what reaches the place of the one that shows most of it.
         lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
-        deviation: of log2 radiance, stops, of what photos clip, from the confidence of its Gaussians; None if that was
-            not measured. Edges and colors that do not clip make a light no surer, because all its photos may err alike;
-            where photos of half the exposure or less do not clip, it is at most MEASURED_STOPS.
+        deviation: of log2 radiance, stops, of what photos clip; None if that was not measured. Edges and colors that do
+            not clip do not count, because all its photos may err alike; where photos of half the exposure or less do
+            not clip, it is at most MEASURED_STOPS.
         share: of the light that reaches the middle of the training cameras.
         members: [K] int64, its Gaussians.
     """
@@ -102,14 +103,10 @@ def find_lights(
     if not views:
         return []
     times = np.array([time for _, time in views])
-    white = field.response.white / float(np.median(times))
-    dark = times <= np.median(times) / 2
-    least_clipped = CLIPPED * float(np.mean(~dark))  # Darker photos measure lights: none clips.
+    longest = times > times.max() / 2
     middle = np.mean([camera.position for camera, _ in views], axis=0)
-    sample = [index for part in (~dark, dark) for index in every_nth(part.nonzero()[0], MOST_VIEWS)]
-    cameras = [views[index][0] for index in sample]
-    # Radiance up to which each photo measures what the others clip.
-    measurable = np.where(dark, field.response.white / times, 0.0)[sample]
+    sample = [index for part in (longest, ~longest) for index in every_nth(part.nonzero()[0], MOST_VIEWS)]
+    cameras, whites = [views[index][0] for index in sample], field.response.white / times[sample]
     focal = typical_focal_length(cameras)
 
     @cache
@@ -120,16 +117,24 @@ def find_lights(
     sums = [_view_sums(field, camera, degree) for camera in cameras]
     pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
     mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]
-    member = (clipped.to(mean.device) > least_clipped) & (pixels > LEAST_SEEN) & (mean.amax(1) > BRIGHT * white)
-    members = member.nonzero()[:, 0]
+    peak = mean.amax(1)
+    most = field.response.white / float(np.quantile(times, 0.75, method="lower"))
+    white = _reference_white(np.minimum(whites, most), peak, pixels)
+    # Photos of half the exposure or less measure lights and do not clip them, so these do not count.
+    usual = [(part[0], each) for part, each in zip(sums, whites, strict=True) if each < 2 * white]
+    too_bright = torch.stack([seen * (peak > BRIGHT * each) for seen, each in usual]).sum(0)
+    clips = clipped.to(mean.device) >= CLIPPED * too_bright / pixels.clamp_min(1e-20)
+    members = (clips & (pixels > LEAST_SEEN) & (peak > BRIGHT * white)).nonzero()[:, 0]
+    # Radiance up to which each photo measures what photos of the reference exposure clip.
+    measurable = np.where(whites >= 2 * white, whites, 0.0)
     if not len(members):
         return []
     gaussians = field.gaussians
     positions = field.normalization.scene_points(gaussians.means[members].cpu().numpy())
     widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
-    brightness = mean.amax(1)[members].cpu().numpy()
-    confidence = None if field.confidence is None else field.confidence.to(members.device)[members].cpu().numpy()
+    brightness = peak[members].cpu().numpy()
+    uncertainty = None if field.clipped_stops is None else field.clipped_stops.to(members.device)[members].cpu().numpy()
     shares = clipped.to(members.device)[members].cpu().numpy()
     covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
     total = max(float(_view_sums(field, _panorama(middle, focal), degree)[2].mean(1).sum()), 1e-30)
@@ -152,18 +157,33 @@ def find_lights(
         shape = replace(shape, size=(sides[0], sides[1]))
         radiance = _fit(shape, light_sums, places)
         deviation = None
-        if confidence is not None:
-            stops = -np.log2(np.clip(confidence[group], 2.0**-8, 1))
+        if uncertainty is not None:
+            clip = np.maximum(shares[group], 1e-6)
+            stops = uncertainty[group] / clip
             unobstructed = area_sums[:, 0] > 0.5 * area * angles_of_shape[holding]  # Else something hides the light.
             measured = brightness[group] < measurable[holding][unobstructed].max(initial=0.0)
-            stops[measured] = np.minimum(stops, MEASURED_STOPS * shares[group])[measured]
-            deviation = float(weights[group] @ stops / (weights[group] @ shares[group]))
+            stops[measured] = np.minimum(stops, MEASURED_STOPS)[measured]
+            deviation = float(np.average(stops, weights=weights[group] * clip))
         share = float(radiance.mean() * shape.solid_angle(middle)) / total
         if share >= LEAST_SHARE:
             bound = np.minimum(white, radiance)
             index = members[torch.from_numpy(group).to(members.device)]
             lights.append(Light(shape, radiance, bound, deviation, share, index))
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
+
+
+def _reference_white(whites: np.ndarray, radiance: Tensor, pixels: Tensor) -> float:
+    """Return the white that lights exceed: the lowest of the photos' at which at most MOST_CLIPPED would clip.
+
+    Args:
+        whites: Radiance of the photos' whites. The largest is returned if more would clip at all of them.
+        radiance: [N] of the Gaussians.
+        pixels: [N] that show them.
+    """
+    for white in np.unique(whites):
+        if float(pixels[radiance > white].sum()) <= MOST_CLIPPED * float(pixels.sum()):
+            return float(white)
+    return float(whites.max())
 
 
 def _panorama(position: np.ndarray, focal: float) -> Camera:

@@ -43,7 +43,7 @@ class PagedField(RadianceField):
             fusion=None if field.fusion is None else field.fusion.to(device),
             **_options(field),
         )
-        self.confidence = field.confidence
+        self.confidence, self.clipped_stops = field.confidence, field.clipped_stops
         self._device, self.budget = device, budget
         means = field.gaussians.means.detach()
         reach = DEVIATIONS * field.gaussians.log_scales.detach().amax(1, keepdim=True).exp()

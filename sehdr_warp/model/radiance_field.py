@@ -29,12 +29,14 @@ class RadianceField(nn.Module):
 
     Attributes:
         confidence: [N] in [0, 1], confidence in each Gaussian's light; None if it was not measured.
+        clipped_stops: [N], uncertainty of each Gaussian's clipped light, see Evidence; None if it was not measured.
         photo_focals: Focal lengths of the photos, with which renders of another resolution keep the light of small
             Gaussians; None in a training, and if they are not known.
         rasterizer: rasterize(); benchmarks set a function with the same arguments.
     """
 
     confidence: Tensor | None
+    clipped_stops: Tensor | None
     rasterizer: Callable[..., Rendering] = staticmethod(rasterize)
 
     def __init__(
@@ -74,7 +76,8 @@ class RadianceField(nn.Module):
         self.response, self.base_time = response, base_time
         self.color_model, self.tone_map = make_color_model(color_model), tone_map
         self.antialiased, self.deterministic = antialiased, deterministic
-        self.register_buffer("confidence", None, persistent=False)
+        for name in ("confidence", "clipped_stops"):
+            self.register_buffer(name, None, persistent=False)
 
     @property
     def render_device(self) -> torch.device:

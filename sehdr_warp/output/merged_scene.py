@@ -36,7 +36,9 @@ class MergedScene(RenderableScene):
         )
         field = field_of(_joined_gaussians(scenes, moves))
         field.response, field.deterministic = first.field.response, first.field.deterministic
-        field.confidence = _joined([scene.field.confidence for scene in scenes])
+        field.confidence, field.clipped_stops = (
+            _joined([getattr(scene.field, name) for scene in scenes]) for name in ("confidence", "clipped_stops")
+        )
         if all(scene.field.photo_focals for scene in scenes):
             field.photo_focals = photo_focals(self.cameras)
         self.field = on_device(field, first.device)

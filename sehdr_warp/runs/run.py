@@ -287,6 +287,7 @@ class Run(RenderableScene):
     def set_evidence(self, evidence: Evidence) -> None:
         """Set confidence and clipped fractions from the evidence of the training photos, in this object alone."""
         self.field.confidence, self._clipped = evidence.confidence(), evidence.clipped
+        self.field.clipped_stops = evidence.clipped_stops
 
 
 def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
@@ -307,7 +308,7 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
     field = field_from_checkpoint(checkpoint, config, info).requires_grad_(False)
-    field.confidence, clipped = folder.read_confidence(checkpoint) or (None, None)
+    field.confidence, clipped, field.clipped_stops = folder.read_confidence(checkpoint) or (None, None, None)
     return Run(folder, config, on_device(field, pick_device(device)), info, checkpoint.values, clipped)
 
 

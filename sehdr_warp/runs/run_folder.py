@@ -33,7 +33,7 @@ from torch import Tensor
 
 from ..errors import InputError, SehdrError
 from ..files import UnreadableError, has_file, refuse_links
-from ..model.confidence import Evidence
+from ..model.confidence import MAX_STOPS, Evidence
 from ..response import Response
 from ..scene import Camera, Scene
 from ..scene.dataparser import PlacedPhoto
@@ -62,8 +62,9 @@ NEW, READY = ".new", ".ready"
 _GIVE_RUN = "give the folder that a training wrote"
 _REMOVE_FILE = "remove this file, which a run does not need, or train again"
 _MAKE_AGAIN = "remove this file; `sehdr-warp report` makes it again from the photos"
-EVIDENCE_TENSORS = {"weight_sum": "seen", "stops": "stops", "clipped": "clipped", "peak": "peak"}
+EVIDENCE_TENSORS = {"weight_sum": "seen"} | {name: name for name in ("stops", "clipped", "peak", "clipped_stops")}
 """Name in confidence.safetensors of each field of Evidence."""
+_ADDED = "clipped_stops"  # Older runs have none.
 _Value = TypeVar("_Value")
 
 
@@ -86,6 +87,7 @@ class Confidence(NamedTuple):
 
     confidence: Tensor  # [N] in [0, 1], confidence in its light
     clipped: Tensor  # [N] in [0, 1], fraction of clipped values in the photos that show it
+    clipped_stops: Tensor  # [N], at least 0
 
 
 class RunFolder:
@@ -275,9 +277,13 @@ class RunFolder:
             if values.shape != expected:
                 problem = f"{name} has shape {tuple(values.shape)}, not {tuple(expected)}"
                 raise InputError(self.confidence, problem, _MAKE_AGAIN)
-            if not bool(((values >= 0) & (values <= 1)).all()):  # NaN is neither.
-                raise InputError(self.confidence, f"{name} holds values outside of 0 to 1", _MAKE_AGAIN)
-        return Confidence(**{name: values.float() for name, values in tensors.items()})
+            most = 2 * MAX_STOPS if name == _ADDED else 1
+            if not bool(((values >= 0) & (values <= most)).all()):  # NaN is neither.
+                raise InputError(self.confidence, f"{name} holds values outside of 0 to {most:g}", _MAKE_AGAIN)
+        result = {name: values.float() for name, values in tensors.items()}
+        if _ADDED not in result:  # The most that it can be
+            result[_ADDED] = (-result["confidence"].log2()).minimum(MAX_STOPS * result["clipped"])
+        return Confidence(**result)
 
     def read_evidence(self, checkpoint: Checkpoint) -> Evidence:
         """Return the evidence of the training photos for a checkpoint's Gaussians.
@@ -288,8 +294,10 @@ class RunFolder:
         names = tuple(EVIDENCE_TENSORS.values())
         tensors = self._confidence_tensors(checkpoint, names)
         count = checkpoint.tensors["gaussians.means"].shape[:1]
-        if tensors is None or any(tensors[name].shape != count for name in names):
+        if tensors is None or any(values.shape != count for values in tensors.values()):
             raise InputError(self.confidence, "is not of the newest checkpoint", "continue with --resume")
+        if _ADDED not in tensors:
+            tensors[_ADDED] = tensors["stops"].minimum(MAX_STOPS * tensors["clipped"])
         return Evidence(**{field: tensors[name] for field, name in EVIDENCE_TENSORS.items()})
 
     def _confidence_tensors(self, checkpoint: Checkpoint, names: tuple[str, ...]) -> dict[str, Tensor] | None:
@@ -305,6 +313,7 @@ class RunFolder:
                 metadata = json.loads((file.metadata() or {}).get("sehdr_warp", "{}"))
                 if metadata != confidence_metadata(checkpoint.values["sha256"]):
                     return None
+                names = tuple(name for name in names if name != _ADDED or name in set(file.keys()))
                 return {name: file.get_tensor(name) for name in names}
         except PermissionError as error:
             raise UnreadableError(path, error) from None

@@ -61,7 +61,7 @@ def read_run(folder: Path):
 def make_confidence(folder: Path) -> None:
     make_run(folder)
     checkpoint = RunFolder(folder).newest_checkpoint()
-    write_confidence(RunFolder(folder), Evidence(*torch.rand(4, 4)), checkpoint.values["sha256"])
+    write_confidence(RunFolder(folder), Evidence(*torch.rand(5, 4)), checkpoint.values["sha256"])
 
 
 def read_confidence(folder: Path):

@@ -27,7 +27,7 @@ CAMERA = Camera(20, 12, 15.0, 15.0, 10.0, 6.0, np.eye(4))
 
 
 def doubt(photo, exposure):
-    stops, clipped = pixel_uncertainty(torch.tensor([[photo]]), torch.tensor([[exposure]]), SRGB)
+    stops, clipped, _ = pixel_uncertainty(torch.tensor([[photo]]), torch.tensor([[exposure]]), SRGB)
     return float(stops), float(clipped)
 
 
@@ -110,9 +110,8 @@ def test_truth_is_not_clipped():
 
 
 def test_confidence_of_evidence():
-    evidence = Evidence(
-        torch.tensor([0.0, HALF_CONFIDENCE_PIXELS, 1e6]), torch.tensor([0.0, 1.0, 1.0]), torch.zeros(3), torch.ones(3)
-    )
+    weights, stops = torch.tensor([0.0, HALF_CONFIDENCE_PIXELS, 1e6]), torch.tensor([0.0, 1.0, 1.0])
+    evidence = Evidence(weights, stops, torch.zeros(3), torch.ones(3), torch.zeros(3))
     torch.testing.assert_close(evidence.confidence(), torch.tensor([0.0, 0.25, 0.5]))
 
 
@@ -134,7 +133,7 @@ def test_doubt_of_clipped_light_is_the_deviation_of_its_estimate():
     photo[0, 3, 1:] = 0.5
     exposure[0, 3, 1:] = SRGB.decode(photo[0, 3, 1:])
     deviation = torch.tensor([0.4, torch.inf, 50.0, 3.0])[None, :, None].expand(1, 4, 3)
-    stops, _ = pixel_uncertainty(photo, exposure, SRGB, deviation)
+    stops, _, _ = pixel_uncertainty(photo, exposure, SRGB, deviation)
     assert stops[0, :3].tolist() == pytest.approx([0.4, CLIPPED_STOPS, MAX_STOPS])
     # A saturated lamp clips one channel, which may be far above white. Codes of the others round by 0.01 stops.
     assert stops[0, 3] == pytest.approx(3.0 / 3, abs=0.01)

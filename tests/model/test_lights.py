@@ -5,20 +5,21 @@ import pytest
 import torch
 
 from sehdr_warp.model.baking import field_of
+from sehdr_warp.model.confidence import gather_evidence
 from sehdr_warp.model.lights import find_lights
 from sehdr_warp.output.lighting.environment_map import latlong
-from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.scene import Camera, View, codes_of, look_at
 from sehdr_warp.splats import GaussianArrays
 
 RADIANCE = np.array([40.0, 30.0, 20.0])
 
 
 def field(places, radiance, width):
-    """Opaque round Gaussians at places [N, 3] of one radiance."""
+    """Opaque round Gaussians at places [N, 3] of a radiance, [3] or [N, 3], and a width, one or [N, 1]."""
     count = len(places)
-    harmonics = np.tile(np.float32(radiance) / 0.28209479, (count, 1))[:, None].astype(np.float32)
+    harmonics = np.broadcast_to(np.float32(radiance) / 0.28209479, (count, 3))[:, None].astype(np.float32)
     quaternions = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
-    scales = np.full((count, 3), np.log(width), np.float32)
+    scales = np.broadcast_to(np.float32(np.log(width)), (count, 3)).copy()
     opacity = np.full(count, 6, np.float32)
     return field_of(GaussianArrays(np.float32(places), scales, quaternions, opacity, harmonics, "linear", 1.0))
 
@@ -143,7 +144,7 @@ def test_photos_so_dark_that_lights_do_not_clip_take_none_off_the_list():
 )
 def test_a_light_is_sure_if_a_darker_photo_shows_it_unclipped(darker, direction, stops):
     scene = field(panel(), RADIANCE, 0.03)
-    scene.confidence = torch.full((scene.gaussians.count,), 2.0**-1.2)
+    scene.clipped_stops = torch.full((scene.gaussians.count,), 1.2)
     (camera, time), *others = views()
     turned = look_at(camera.position, np.add(camera.position, (0, 0, direction)), up=(0, -1, 0))
     dark = (Camera(256, 192, 240.0, 240.0, 128.0, 96.0, turned), time / darker)
@@ -151,11 +152,67 @@ def test_a_light_is_sure_if_a_darker_photo_shows_it_unclipped(darker, direction,
     assert light.deviation == pytest.approx(stops, rel=0.01)
 
 
-def test_deviation_follows_the_confidence():
+def photograph(scene, views):
+    """Measure a scene on photos that it renders itself; return the clipped shares."""
+    photos = []
+    for camera, time in views:
+        image = scene.response.encode(scene.render(camera).hdr * time).clamp(0, 1).numpy()
+        photos.append(View(f"v{len(photos)}", codes_of(image, 8), camera, time, "train"))
+    evidence = gather_evidence(scene, photos)
+    scene.clipped_stops = evidence.clipped_stops
+    return evidence.clipped
+
+
+def small_views(targets=((0, 0, 4.0), (0.3, 0.3, 4.0))):
+    return [(camera.resized(85, 64), time) for target in targets for camera, time in views(target)]
+
+
+LAMPS = {
+    "apart": ([panel(0.3, 0.3, at=(-0.7, 0.2, 4)), panel(0.2, 0.2, at=(0.7, -0.2, 4))], 2),
+    "touching": ([panel(0.2, 0.2, at=(0, 0, 4)), panel(0.2, 0.2, at=(0.2, 0, 4))], 1),
+    "at the border": ([panel(0.3, 0.3, at=(2.4, 0, 4)), panel(0.3, 0.3, at=(-0.5, 0, 4))], 2),
+}
+
+
+@pytest.mark.parametrize(
+    "lamps, dark", [*(("apart", dark) for dark in (0, 1, 6, 8)), ("touching", 8), ("at the border", 11)]
+)
+def test_lights_are_listed_with_their_energy_however_many_photos_are_dark(lamps, dark):
+    """Lamps before a grey wall, in twelve photos of which some are six stops darker than the others."""
+    places, count = LAMPS[lamps]
+    wall = panel(6, 4, 0.12, at=(0, 0, 5.0))
+    radiance = np.concatenate([np.full((len(wall), 3), 0.3), np.tile(RADIANCE, (sum(map(len, places)), 1))])
+    scene = field(np.concatenate([wall, *places]), radiance, np.where(radiance[:, :1] < 1, 0.08, 0.03))
+    times = np.ones(12)
+    times[np.linspace(0, 11, dark).astype(int)] = 1 / 64
+    shots = [(camera, time) for (camera, _), time in zip(small_views(), times, strict=True)]
+    lights = find_lights(scene, photograph(scene, shots), shots)
+    assert len(lights) == count
+    # The light that the map of a camera in the middle lacks without them, in pixels as fine as the photos'
+    middle = np.mean([camera.position for camera, _ in shots], axis=0)
+    directions = torch.tensor(latlong(512), dtype=torch.float32)
+    options = {"focal_length": 80.0, "pixel_angle": 2 * np.pi / 512}
+    members = [light.members for light in lights]
+    with_lights, rest = (
+        scene.render_directions(middle, directions, without=without, **options).hdr.mean(2).numpy()
+        for without in ((), members)
+    )
+    angles = np.cos(np.arcsin(latlong(512)[..., 1])) * (2 * np.pi / 512) ** 2
+    lost, total = (float((image * angles).sum()) for image in (with_lights - rest, with_lights))
+    assert rest.max() < 1
+    energy = sum(light.radiance.mean() * light.shape.solid_angle(middle) for light in lights)
+    assert energy == pytest.approx(lost, rel=0.1) and sum(x.share for x in lights) == pytest.approx(
+        lost / total, rel=0.1
+    )
+    assert [light.deviation for light in lights] == pytest.approx([0.25 if dark else 1.0] * count, abs=0.01)
+
+
+def test_only_clipped_values_make_a_light_unsure():
+    """Photos whose unclipped values the scene misses by two stops, as edges of lamps are missed, do not."""
     scene = field(panel(), RADIANCE, 0.03)
-    scene.confidence = torch.full((scene.gaussians.count,), 0.5)
-    (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views())
-    assert light.deviation == pytest.approx(1.0)
-    # Values that do not clip, at its edges, say nothing of those that do.
-    (light,) = find_lights(scene, torch.full((scene.gaussians.count,), 0.5), views())
-    assert light.deviation == pytest.approx(2.0)
+    half = [(camera, 1.0 if index % 2 else 1 / 64) for index, (camera, _) in enumerate(small_views())]
+    clipped = photograph(scene, half)
+    wrong = [(camera, time if time == 1 else time / 4) for camera, time in half]
+    assert photograph(scene, wrong) == pytest.approx(clipped, abs=1e-3)
+    (light,) = find_lights(scene, clipped, [(camera, 1.0) for camera, _ in half])
+    assert light.deviation == pytest.approx(1.0, abs=0.02)

@@ -221,7 +221,7 @@ def test_resume_begins_where_nothing_was_begun(tmp_path):
 
 def test_confidence_is_the_same_file_each_time(run):
 
-    evidence, folder = Evidence(*torch.rand(4, 4)), RunFolder(run)
+    evidence, folder = Evidence(*torch.rand(5, 4)), RunFolder(run)
     contents = set()
     for _ in range(8):
         write_confidence(folder, evidence, "a" * 64)
