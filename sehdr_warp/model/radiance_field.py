@@ -98,6 +98,7 @@ class RadianceField(nn.Module):
         extra_images: frozenset[str] = frozenset(),
         max_intersections: int | None = None,
         encode: bool = True,
+        opacity_factors: Tensor | None = None,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
     ) -> TrainRender:
         """Render a training view, differentiably.
@@ -109,16 +110,18 @@ class RadianceField(nn.Module):
             extra_images: Further images to render: any of "exposure" and "base".
             max_intersections: As in rasterize().
             encode: If False, `encoded` stays None if `photo_exposure` is available.
+            opacity_factors: [N] factors on the opacities that are rendered, such as those of a dropout.
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
                 harmonics have in this direction; the harmonics themselves then get no gradient.
         """
         opacities = self.gaussians.opacities()
+        rendered_opacities = opacities if opacity_factors is None else opacities * opacity_factors
         ratio = exposure_time / self.base_time
         values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.display_referred:
-            rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, opacities)
+            rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, rendered_opacities)
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
@@ -126,7 +129,7 @@ class RadianceField(nn.Module):
         color_sets = self._color_sets(values, ratio, extra_images)
         first, *others = color_sets.values()
         features = torch.cat([first, *others], dim=1) if others else first
-        rendering = self._rasterize(camera, features, max_intersections, opacities)
+        rendering = self._rasterize(camera, features, max_intersections, rendered_opacities)
         # A single image is not split, because the derivative of a split is a copy.
         parts = rendering.image.split(3, dim=2) if others else (rendering.image,)
         images = dict(zip(color_sets, parts, strict=True))

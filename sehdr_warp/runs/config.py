@@ -63,6 +63,9 @@ class ModelConfig(_Table):
     """file of Gaussians (PLY, OpenUSD, glTF) in the scene's coordinates to start from instead of points; empty: none"""
     antialiased: bool = False
     """lower the opacity of Gaussians that the low-pass filter widens (Mip-Splatting)"""
+    dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+    """share of the Gaussians that the last step leaves out at random, against overfitting to few photos (DropGaussian);
+    it grows from 0"""
 
 
 class ResponseConfig(_Table):

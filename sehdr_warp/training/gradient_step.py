@@ -22,6 +22,7 @@ from ..rasterizer.tile_lists import MAX_SINGLE_SORT
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..scene import Scene
+from .dropout import Dropout
 from .losses import compared_image, data_loss, extra_images, opacity_loss
 from .optimizer import FlatGradients, guarded_step
 from .ranks import Ranks
@@ -128,6 +129,7 @@ class GradientStep:
         self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
         # They would fade before a photo shows them. Elsewhere the penalty removes copies that are not needed.
         self._spares_unseen = large_scene
+        self._dropout = Dropout(config.model.dropout, config.seed, config.schedule.iterations, device)
         self._flat_gradients: FlatGradients | None = None  # Buffer that ranks exchange
 
     def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:
@@ -138,8 +140,9 @@ class GradientStep:
         rows = self.field.gaussians.row_count
         return GraphKey(options, exact_response=rows < EXACT_BELOW, single_sort=rows <= MAX_SINGLE_SORT)
 
-    def prepare(self, options: StepOptions) -> None:
-        """Allocate the statistics that the next step adds to: in a capture, they would lie in the graph's memory."""
+    def prepare(self, options: StepOptions, iteration: int) -> None:
+        """Prepare what the step of an iteration reads or adds to: in a capture, it would lie in the graph's memory."""
+        self._dropout.draw(iteration, self.field.gaussians.row_count)
         if options.needs_means2d_grad:
             self.strategy.prepare(self.field.gaussians.row_count, self.step_counters.device)
 
@@ -183,6 +186,7 @@ class GradientStep:
             extra_images=extra_images(self._loss, target.exposure_truth is not None),
             max_intersections=max_intersections,
             encode=not target.scale.compares_exposures,
+            opacity_factors=self._dropout.factors,
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
         )
         loss = data_loss(field, render, target, self._loss, self._largest_truth)

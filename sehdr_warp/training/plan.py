@@ -42,6 +42,10 @@ SCALED_RATES = "means", "means_final", "log_scales", "opacity_logits", "harmonic
 FEW_PHOTOS_HARMONICS = 2.5e-4
 """optimizer.harmonics_rest if there are no more photos than harmonics of a Gaussian. These then fit the light of each
 photo and extrapolate between them; a quarter of the usual rate gains 0.6 and 1.1 dB on 10 and 8 photos."""
+FEW_PHOTOS_DROPOUT = 0.2
+"""model.dropout where photos are as few and each has DROPOUT_STEPS steps or more. Held-out photos of twelve captures
+gain 0.3 dB in the mean, and end 0.4 dB below their best in place of 0.6."""
+DROPOUT_STEPS = 250
 MAX_EXPOSURE_RATIO = 2.0**16
 """Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white."""
 COMPENSATION = "exposure-compensation"  # Name of the decision that compensation.py adds
@@ -340,6 +344,15 @@ def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     return Decision({f"optimizer.{name}": rate for name, rate in rates.items()}, ", ".join(choices), "; ".join(reasons))
 
 
+def _dropout(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+    steps, harmonics = config.schedule.iterations, (config.model.sh_degree + 1) ** 2
+    reason = f"{facts.photos} photos, {steps / facts.photos:.0f} steps on each"
+    few = facts.photos <= harmonics and steps >= DROPOUT_STEPS * facts.photos
+    if not few or config.densification.strategy != "mcmc" or config.model.dropout:
+        return Decision({}, f"{config.model.dropout:g}", reason)
+    return Decision({"model.dropout": FEW_PHOTOS_DROPOUT}, f"up to {FEW_PHOTOS_DROPOUT:.0%} of the Gaussians", reason)
+
+
 def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     unsure = facts.clipped + facts.black
     reason = f"{unsure:.1%} of the pixels are clipped or black, and a point is visible in {facts.visibility:.1f} photos"
@@ -354,6 +367,7 @@ RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Decision]] = {
     "densification": _densification,
     "iterations": _iterations,
     "rates": _rates,
+    "dropout": _dropout,
     "confidence": _confidence,
 }
 """The rules of a plan, in order."""

@@ -56,7 +56,7 @@ class StepGraphs:
         # Not if Gaussians.surround() has, for those that are rendered but not trained.
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
             self._reserve_rows(iteration)
-        step.prepare(options)
+        step.prepare(options, iteration)
         key = step.graph_key(views, options)
         if self.can_replay(views, key) and (capacity := self._capacity.next()) is not None:
             return self._replay(views, index, following, options, key, capacity, iteration)

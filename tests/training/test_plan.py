@@ -197,6 +197,16 @@ def test_few_photos_learn_view_dependent_color_slowly(facts):
     assert rate(16, optimizer__harmonics_rest=0.01) is None
 
 
+def test_long_trainings_on_few_photos_leave_gaussians_out(facts):
+    def share(photos: int, steps: int = 4000, **options) -> object:
+        config = config_of(schedule__iterations=steps, **options)
+        return RULES["dropout"](replace(facts, photos=photos), config, CPU).fields.get("model.dropout")
+
+    assert (share(16), share(17)) == (0.2, None)
+    assert (share(8, 2000), share(8, 1999)) == (0.2, None)
+    assert share(8, model__dropout=0.4) is share(8, densification__strategy="adc") is None
+
+
 def test_the_plan_names_only_those_rates_that_it_changes(facts):
     def choice(photos: int, steps: int, **options) -> str:
         config = config_of(schedule__iterations=steps, **options)

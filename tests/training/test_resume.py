@@ -112,7 +112,7 @@ def test_a_run_is_replaced_whole_or_not_at_all(scene, trained, tmp_path, monkeyp
     assert ends == sorted(ends) and {(0, 90), (5, 0)} < {*ends} and len({*ends[5::12]}) > 1
 
 
-@pytest.mark.parametrize("variant", ["adc", "hdr-gs"])
+@pytest.mark.parametrize("variant", ["adc", "dropout", "hdr-gs"])
 def test_a_trainer_continues_from_its_state(scene, variant):
     config = VARIANTS[variant]
     threads = torch.get_num_threads()

@@ -100,6 +100,6 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
-@pytest.mark.parametrize("variant", ["default", "adc"])
+@pytest.mark.parametrize("variant", ["default", "adc", "dropout"])
 def test_recorded_steps_train_like_launched_ones(variant):
     check_recorded_like_launched(toy_scene(), VARIANTS[variant], 60)

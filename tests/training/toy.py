@@ -107,6 +107,7 @@ VARIANTS = {
     "default": quick(),
     "adc": quick(**{"densification.strategy": "adc", "loss.opacity_weight": 0.0}),
     "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
+    "dropout": quick(**{"model.dropout": 0.5}),
     "paper": quick("paper", 130, **PAPER),
     "paper-truth": quick("paper-truth", 150, **PAPER),
     "linear truth": quick(**{"loss.linear_weight": 0.5, "loss.hdr_truth": True}),
